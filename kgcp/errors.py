@@ -1,0 +1,120 @@
+"""Known errors, and the one registry of reasons why a frame carries no measurement.
+
+A bad flight is a `KgcpError`: one line that says what, where and what to do.
+A frame that cannot be measured is not an error: its stage raises `Rejection` with a `Reason`,
+which becomes a row of the table.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Self
+
+
+class KgcpError(Exception):
+    """Something the user can put right. The text is one line: what, where, what to do."""
+
+
+class SettingError(KgcpError):
+    """A value that cannot be, before the file it came from is known.
+
+    Parameters
+    ----------
+    key : str
+        Name of the value, as in flight.toml.
+    problem : str
+        What is wrong with it, with its value.
+    remedy : str
+        What to do about it.
+    """
+
+    def __init__(self, key: str, problem: str, remedy: str) -> None:
+        super().__init__(f"{key}: {problem}; {remedy}")
+        self.key = key
+        self.problem = problem
+        self.remedy = remedy
+
+
+class Status(StrEnum):
+    """What became of one target in one frame."""
+
+    MEASURED = "measured"
+    NOT_FOUND = "not_found"
+    REJECTED = "rejected"
+    UNREADABLE = "unreadable"
+
+
+class Reason(StrEnum):
+    """Why a target was not measured: the word of the `reason` column.
+
+    Every member carries the status it leads to and a sentence for the documentation.
+    """
+
+    status: Status
+    description: str
+
+    def __new__(cls, word: str, status: Status, description: str) -> Self:
+        """Make a member whose value is the word alone."""
+        member = str.__new__(cls, word)
+        member._value_ = word
+        member.status = status
+        member.description = description
+        return member
+
+    NO_CANDIDATE = (
+        "no_candidate",
+        Status.NOT_FOUND,
+        "no cluster of concentric, nearly circular contours is in the frame",
+    )
+    CODE_MISMATCH = (
+        "code_mismatch",
+        Status.NOT_FOUND,
+        "clusters were found, but none carries this target's code",
+    )
+    NO_INNER_CIRCLE = (
+        "no_inner_circle",
+        Status.REJECTED,
+        "the code matches, but the ring's inner circle is missing from its cluster",
+    )
+    EDGES_LOST = (
+        "edges_lost",
+        Status.REJECTED,
+        "too few sub-pixel edge points are left on one of the circles",
+    )
+    POOR_ELLIPSE = (
+        "poor_ellipse",
+        Status.REJECTED,
+        "the edge points of a circle do not lie on an ellipse",
+    )
+    IMPOSSIBLE_GEOMETRY = (
+        "impossible_geometry",
+        Status.REJECTED,
+        "the two ellipses cannot be images of this target's concentric circles",
+    )
+    DECODE_FAILED = (
+        "decode_failed",
+        Status.UNREADABLE,
+        "the file is not an image, or is damaged",
+    )
+    WRONG_SIZE = (
+        "wrong_size",
+        Status.UNREADABLE,
+        "the frame's size is not the camera's",
+    )
+
+
+class Rejection(Exception):  # noqa: N818 - not an error: the outcome of one frame
+    """A stage cannot go on for this target in this frame.
+
+    Parameters
+    ----------
+    reason : Reason
+        The word of the registry.
+    detail : str
+        The numbers behind it, for the log and the debugging picture.
+    """
+
+    def __init__(self, reason: Reason, detail: str = "") -> None:
+        super().__init__(f"{reason.value}: {detail}" if detail else reason.value)
+        self.reason = reason
+        self.detail = detail

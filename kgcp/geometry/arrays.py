@@ -1,0 +1,11 @@
+"""Names for the arrays that travel through kgcp."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+GreyArray = npt.NDArray[Any]  # uint8, uint16 or float: one channel, (height, width)

@@ -1,0 +1,65 @@
+"""Rigid poses: target → camera, and the angles that the paper and the table report."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Pose of the target in the camera frame: p_camera = rotation @ p_target + translation_m.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        Target axes in the camera frame, as columns; the third is the plate's normal.
+    translation_m : (3,) array
+        Target centre in the camera frame [m].
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+
+    @property
+    def distance_m(self) -> float:
+        """Distance between the camera's projection centre and the target's centre [m]."""
+        return float(np.linalg.norm(self.translation_m))
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal (3,) of the plate in the camera frame, pointing into the plate."""
+        return self.rotation[:, 2]
+
+    @property
+    def quaternion_wxyz(self) -> FloatArray:
+        """Unit quaternion (4,) of the rotation, w first and not negative."""
+        return np.asarray(
+            Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
+        )
+
+    def transform(self, points_target: FloatArray) -> FloatArray:
+        """Bring points (n, 3) or (n, 2) on the plate [m] into the camera frame (n, 3) [m]."""
+        columns = points_target.shape[-1]
+        return points_target @ self.rotation[:, :columns].T + self.translation_m
+
+    @property
+    def roll_deg(self) -> float:
+        """φ of the paper's eq. 11: tilt of the diameter in the camera's yz plane; 0 for R = I.
+
+        The diameter of the plate that is parallel to the camera's yz plane has the direction
+        d ∝ n × e_x (n: plate normal); φ = atan2(d_z, d_y) with d_y > 0.
+        """
+        n = self.normal
+        return math.degrees(math.atan2(-n[1], n[2]))
+
+    @property
+    def pitch_deg(self) -> float:
+        """θ of the paper: tilt of the diameter in the camera's xz plane; 0 for R = I."""
+        n = self.normal
+        return math.degrees(math.atan2(-n[0], n[2]))

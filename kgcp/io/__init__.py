@@ -1,0 +1,1 @@
+"""Paths to records and back; decides nothing."""

@@ -1,0 +1,1 @@
+"""Writers of KGCPs, one module per receiving package."""

@@ -1,0 +1,98 @@
+"""Frozen settings with units and ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from kgcp.errors import SettingError
+
+
+def require_range(
+    key: str,
+    value: float,
+    low: float,
+    high: float,
+    *,
+    unit: str = "",
+    open_low: bool = False,
+) -> None:
+    """Raise `SettingError` unless low ≤ value ≤ high (low < value with `open_low`)."""
+    if (low < value if open_low else low <= value) and value <= high:
+        return
+    bounds = f"{'above' if open_low else 'at least'} {low:g} and at most {high:g}"
+    suffix = f" {unit}" if unit else ""
+    raise SettingError(key, f"{value:g}{suffix} is out of range", f"give a value {bounds}{suffix}")
+
+
+class Method(StrEnum):
+    """How a target is measured once it is found."""
+
+    PAPER = "paper"
+
+
+@dataclass(frozen=True, slots=True)
+class DetectSettings:
+    """Parameters of the search and of the measurement.
+
+    Attributes
+    ----------
+    method : Method
+        `paper`: the closed-form chain of Cucci (2016).
+    canny_low, canny_high : float
+        Hysteresis thresholds of the Canny detector on 8-bit grey values (§2.1).
+    min_radius_px : float
+        μ_min of §2.2: smallest mean radius of a contour [px].
+    max_circle_deviation : float
+        k of §2.2: largest standard deviation of the radius relative to its mean.
+    min_score : float
+        Threshold on the normalised cross-correlation of the code (§2.3).
+    """
+
+    method: Method = Method.PAPER
+    canny_low: float = 40.0
+    canny_high: float = 100.0
+    min_radius_px: float = 3.0
+    max_circle_deviation: float = 0.15
+    min_score: float = 0.8
+
+    def __post_init__(self) -> None:
+        require_range("canny_low", self.canny_low, 1.0, 255.0)
+        require_range("canny_high", self.canny_high, self.canny_low, 255.0)
+        require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")
+        require_range("max_circle_deviation", self.max_circle_deviation, 0.0, 0.5, open_low=True)
+        require_range("min_score", self.min_score, 0.0, 1.0, open_low=True)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSettings:
+    """The target carrier: how its trajectory leads to the target.
+
+    Attributes
+    ----------
+    lever_arm_m : tuple of float
+        Trajectory point → target centre in body axes (x forward, y right, z down) [m].
+    sd_lever_arm_m : tuple of float
+        Its standard deviations [m].
+    mount_deg : float
+        Rotation of the plate about its own z from the default mount of docs/conventions.md [deg].
+    sd_time_s : float
+        Standard deviation of the synchronisation of frames and trajectory [s].
+    time_offset_s : float
+        Added to frame times to bring them to the trajectory's clock [s].
+    """
+
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sd_lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount_deg: float = 0.0
+    sd_time_s: float = 0.0
+    time_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for value in self.lever_arm_m:
+            require_range("lever_arm_m", value, -100.0, 100.0, unit="m")
+        for value in self.sd_lever_arm_m:
+            require_range("sd_lever_arm_m", value, 0.0, 10.0, unit="m")
+        require_range("mount_deg", self.mount_deg, -360.0, 360.0, unit="deg")
+        require_range("sd_time_s", self.sd_time_s, 0.0, 60.0, unit="s")
+        require_range("time_offset_s", self.time_offset_s, -1e9, 1e9, unit="s")

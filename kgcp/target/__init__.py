@@ -1,0 +1,1 @@
+"""One grey array in, one observation (or a named rejection) out."""

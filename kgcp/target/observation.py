@@ -1,0 +1,124 @@
+"""What one frame says about one target: the records that leave the measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kgcp.errors import Rejection
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """What the image looked like at the target.
+
+    Attributes
+    ----------
+    radius_px : float
+        Semi-major axis of the main ring's outer ellipse [px].
+    black, white : float
+        Levels of ink and plate, 0…1 of the grey values' range.
+    saturated : float
+        Share of clipped pixels within the outer ellipse, 0…1.
+    edge_shift_px : float or None
+        δ: displacement of the edges towards the dark side, from both circles [px].
+    blur_px : float or None
+        Edge spread σ [px]; None where the method does not estimate it.
+    """
+
+    radius_px: float
+    black: float
+    white: float
+    saturated: float
+    edge_shift_px: float | None = None
+    blur_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """Covariances of one observation.
+
+    Attributes
+    ----------
+    pose_cov : (6, 6) array
+        Order tx ty tz [m], rotation vector x y z [rad], left perturbation in the camera frame.
+    centre_cov_px2 : (2, 2) array
+        Of the projected centre [px²].
+    sd_distance_m : float
+        Of the distance [m].
+    sd_roll_deg, sd_pitch_deg, sd_heading_deg : float
+        Of the three reported angles [deg].
+    """
+
+    pose_cov: FloatArray
+    centre_cov_px2: FloatArray
+    sd_distance_m: float
+    sd_roll_deg: float
+    sd_pitch_deg: float
+    sd_heading_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alternative:
+    """The other pose of the circle.
+
+    Attributes
+    ----------
+    pose : Pose
+        Same distance (nearly), normal mirrored about the viewing ray.
+    ambiguity : float
+        How much worse it fits; 0: cannot be told apart.
+    """
+
+    pose: Pose
+    ambiguity: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One measured target.
+
+    Attributes
+    ----------
+    target, ring : str
+        Name of the target, and of the ring (itself or a replica) that was measured.
+    instance : int
+        0, 1, … in order of score among plates of the same code in the frame.
+    score : float
+        Normalised cross-correlation of the code.
+    pose : Pose
+        Target → camera.
+    centre_px : (2,) array
+        Projected circle centre in the raw image [px].
+    heading_deg : float
+        In-image direction of the target's +x axis, clockwise from image x [deg].
+    appearance : Appearance
+    alternative : Alternative or None
+        None where the two poses coincide.
+    uncertainty : Uncertainty or None
+        None where the method gives none.
+    """
+
+    target: str
+    ring: str
+    instance: int
+    score: float
+    pose: Pose
+    centre_px: FloatArray
+    heading_deg: float
+    appearance: Appearance
+    alternative: Alternative | None
+    uncertainty: Uncertainty | None
+
+
+@dataclass(frozen=True, slots=True)
+class Miss:
+    """One target that was not measured, and why; `score` is that of the best candidate, if any."""
+
+    target: str
+    rejection: Rejection
+    score: float | None = None
+
+
+Outcome = Observation | Miss
