@@ -1,0 +1,105 @@
+"""Parquet tables with declared columns, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kgcp.errors import KgcpError
+from kgcp.io.columns import DETECTION_COLUMNS, Column, ColumnType
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Row = Mapping[str, object]
+
+_ARROW_TYPES = {
+    ColumnType.TEXT: pa.string(),
+    ColumnType.INTEGER: pa.int64(),
+    ColumnType.NUMBER: pa.float64(),
+    ColumnType.TIME: pa.timestamp("us", tz="UTC"),
+    ColumnType.NUMBERS: pa.list_(pa.float64()),
+}
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def time_cell(time_s: float | None) -> datetime | None:
+    """Return Unix seconds as a table cell: UTC, rounded to the microsecond."""
+    return None if time_s is None else _EPOCH + timedelta(microseconds=round(time_s * 1e6))
+
+
+def write_table(
+    path: Path, columns: Sequence[Column], rows: Iterable[Row], metadata: Mapping[str, str]
+) -> None:
+    """Write rows as Parquet under `path`, by a temporary name and a rename.
+
+    Parameters
+    ----------
+    path : Path
+        Target file; its folder is made if need be.
+    columns : sequence of Column
+        The declared columns; a row that lacks one or has others is a programming error.
+    rows : iterable of mapping
+        Column name to value; None is null.
+    metadata : mapping of str
+        Goes into the Parquet schema's key-value metadata.
+
+    Raises
+    ------
+    KgcpError
+        If the file cannot be written.
+    """
+    names = [column.name for column in columns]
+    cells: dict[str, list[Any]] = {name: [] for name in names}
+    for row in rows:
+        if row.keys() != cells.keys():
+            raise ValueError(f"row and columns differ in {sorted(row.keys() ^ cells.keys())}")
+        for name in names:
+            cells[name].append(row[name])
+    schema = pa.schema(
+        [pa.field(column.name, _ARROW_TYPES[column.type]) for column in columns],
+        metadata={f"kgcp.{key}": value for key, value in metadata.items()},
+    )
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(cells, schema=schema), temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+
+
+def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
+    """Read a table that `write_table` wrote.
+
+    Raises
+    ------
+    KgcpError
+        If the file is missing, not Parquet, or lacks declared columns.
+    """
+    if not path.is_file():
+        raise KgcpError(f"{path}: does not exist; run the command that writes it first")
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        reason = str(error).splitlines()[0]
+        raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error
+    missing = [column.name for column in columns if column.name not in table.column_names]
+    if missing:
+        raise KgcpError(
+            f"{path}: lacks the columns {', '.join(missing)}; remake it with this version of kgcp"
+        )
+    return table.to_pandas()
+
+
+def read_detections(path: Path) -> pd.DataFrame:
+    """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
+    if not path.is_file():
+        raise KgcpError(f"{path}: does not exist; run 'kgcp detect' on this flight first")
+    return read_table(path, DETECTION_COLUMNS)
