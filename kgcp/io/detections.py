@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.errors import Reason, Status
+from kgcp.errors import Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.columns import DETECTION_COLUMNS
 from kgcp.io.frames import Exif
@@ -58,10 +58,9 @@ def detection_rows(result: FrameResult) -> list[Row]:
 
 
 def _miss_cells(miss: Miss) -> Mapping[str, object]:
-    reason: Reason = miss.rejection.reason
     return {
-        "status": reason.status.value,
-        "reason": reason.value,
+        "status": miss.reason.status.value,
+        "reason": miss.reason.value,
         "scale_used": "",
         "score": miss.score,
     }

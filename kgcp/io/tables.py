@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -70,7 +69,7 @@ def write_table(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(cells, schema=schema), temporary)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except OSError as error:
         raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kgcp.errors import Rejection
+from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 
@@ -114,10 +114,25 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Miss:
-    """One target that was not measured, and why; `score` is that of the best candidate, if any."""
+    """One target that was not measured, and why.
+
+    A record and not the `Rejection` itself: a kept exception keeps the frame's arrays alive.
+
+    Attributes
+    ----------
+    target : str
+        Name of the target.
+    reason : Reason
+        The word of the registry.
+    detail : str
+        The numbers behind it.
+    score : float or None
+        Normalised cross-correlation of the best candidate, if there was one.
+    """
 
     target: str
-    rejection: Rejection
+    reason: Reason
+    detail: str = ""
     score: float | None = None
 
 
