@@ -1,0 +1,225 @@
+"""Between the flight's map (grid or degrees, with heights) and a local Cartesian frame.
+
+Map → the CRS's own geodetic coordinates (no datum shift) → Earth-centred Cartesian → local
+east, north, up (ENU) in metres, tangent to the ellipsoid at an origin. Distances, lever arms and
+attitudes are only meaningful in the latter: a grid shrinks 80 m by 32 mm in the middle of a UTM
+zone, and its north is not true north.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
+from pyproj.transformer import TransformerGroup
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+
+_JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFrame:
+    """A map and a local ENU frame over one point of it.
+
+    Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
+    the CRS's own units, and z = height: ellipsoidal and in metres unless the CRS is compound;
+    a compound CRS says itself what its heights are.
+
+    Attributes
+    ----------
+    crs : str
+        As in flight.toml.
+    origin_ecef_m : (3,) array
+        Origin of the ENU frame, Earth-centred [m].
+    ecef_from_enu : (3, 3) array
+        Directions east, north and up of the origin, as columns.
+    """
+
+    crs: str
+    origin_ecef_m: FloatArray
+    ecef_from_enu: FloatArray
+    _geodetic_from_map: Transformer
+    _ecef_from_geodetic: Transformer
+    _radians_per_unit: float
+
+    @classmethod
+    def at(cls, crs: str, origin_map: FloatArray) -> Self:
+        """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
+
+        Raises
+        ------
+        KgcpError
+            If the CRS is unknown or has no horizontal axes, if its heights need a grid that is
+            not installed, or if the origin lies outside the projection's domain.
+        """
+        horizontal = _parse(crs)
+        geodetic = horizontal.geodetic_crs
+        if geodetic is None or horizontal.is_geocentric:
+            raise KgcpError(
+                f"flight.toml: crs {crs!r} has no easting and northing or longitude and latitude;"
+                " give a projected or geographic CRS"
+            )
+        geodetic_from_map = _geodetic_from_map(crs, horizontal, geodetic.to_3d())
+        ellipsoid = geodetic.ellipsoid
+        if ellipsoid is None:
+            raise KgcpError(f"flight.toml: crs {crs!r} has no ellipsoid; give one that has")
+        cart = Transformer.from_pipeline(
+            f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
+        )
+        unit = geodetic.axis_info[0].unit_conversion_factor
+        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit)
+        geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
+        return cls(
+            crs,
+            draft._ecef(geodetic_origin)[0],
+            _level_axes(geodetic_origin)[0],
+            geodetic_from_map,
+            cart,
+            unit,
+        )
+
+    def enu_from_map(self, xyz: FloatArray) -> FloatArray:
+        """Bring map points (n, 3) into the ENU frame (n, 3) [m]."""
+        ecef = self._ecef(self._geodetic(np.asarray(xyz, dtype=np.float64)))
+        return (ecef - self.origin_ecef_m) @ self.ecef_from_enu
+
+    def map_from_enu(self, enu: FloatArray) -> FloatArray:
+        """Bring points (n, 3) of the ENU frame [m] into the map (n, 3)."""
+        geodetic = self._geodetic_from_enu(enu)
+        geodetic[:, :2] /= self._radians_per_unit
+        return self._transform(self._geodetic_from_map, geodetic, TransformDirection.INVERSE)
+
+    def map_axes_enu(self, enu: FloatArray) -> FloatArray:
+        """Return the Jacobian (3, 3) d(map)/d(enu) at one point (3,) of the ENU frame.
+
+        Rows are map x, y, z in the CRS's units, columns metres east, north, up of the origin.
+        """
+        steps = _JACOBIAN_STEP_M * np.vstack((np.eye(3), -np.eye(3)))
+        moved = self.map_from_enu(np.asarray(enu, dtype=np.float64) + steps)
+        jacobian: FloatArray = (moved[:3] - moved[3:]).T / (2.0 * _JACOBIAN_STEP_M)
+        return jacobian
+
+    def grid_rotation(self, enu: FloatArray) -> FloatArray:
+        """Return the rotation (3, 3) from the map's axes to ENU at one point (3,) of the frame.
+
+        Its columns are the directions of map x, y and z there, made orthonormal by the polar
+        decomposition: meridian convergence and the change of the vertical, without the scale.
+
+        Raises
+        ------
+        KgcpError
+            If the map's axes are left-handed.
+        """
+        jacobian = self.map_axes_enu(enu)
+        left, _, right = np.linalg.svd(jacobian / np.linalg.norm(jacobian, axis=1, keepdims=True))
+        enu_from_grid: FloatArray = (left @ right).T
+        if np.linalg.det(enu_from_grid) < 0.0:
+            raise KgcpError(
+                f"flight.toml: crs {self.crs!r} has left-handed axes;"
+                " give a CRS whose axes are east and north (or west and south)"
+            )
+        return enu_from_grid
+
+    def level_rotations(self, enu: FloatArray) -> FloatArray:
+        """Return the rotations (n, 3, 3) from east, north, up at points (n, 3) to ENU axes."""
+        rotations: FloatArray = self.ecef_from_enu.T @ _level_axes(self._geodetic_from_enu(enu))
+        return rotations
+
+    def _geodetic(self, xyz: FloatArray) -> FloatArray:
+        """Return longitude, latitude [rad] and ellipsoidal height [m] (n, 3) of map points."""
+        geodetic = self._transform(self._geodetic_from_map, xyz)
+        geodetic[:, :2] *= self._radians_per_unit
+        return geodetic
+
+    def _geodetic_from_enu(self, enu: FloatArray) -> FloatArray:
+        ecef = np.asarray(enu, dtype=np.float64) @ self.ecef_from_enu.T + self.origin_ecef_m
+        return self._transform(self._ecef_from_geodetic, ecef, TransformDirection.INVERSE)
+
+    def _ecef(self, geodetic: FloatArray) -> FloatArray:
+        return self._transform(self._ecef_from_geodetic, geodetic)
+
+    def _transform(
+        self,
+        transformer: Transformer,
+        points: FloatArray,
+        direction: TransformDirection = TransformDirection.FORWARD,
+    ) -> FloatArray:
+        radians = transformer is self._ecef_from_geodetic
+        try:
+            x, y, z = points.T
+            columns = transformer.transform(x, y, z, direction=direction, radians=radians)
+        except ProjError as error:
+            raise KgcpError(_explain(self.crs, error)) from error
+        result = np.column_stack(columns).astype(np.float64)
+        lost = np.flatnonzero(~np.isfinite(result).all(axis=1))
+        if lost.size:
+            where = ", ".join(f"{value:.10g}" for value in points[lost[0]])
+            raise KgcpError(
+                f"flight.toml: crs {self.crs!r} cannot hold the point ({where});"
+                " give the CRS of the coordinates, x = easting or longitude first"
+            )
+        return result
+
+
+def _parse(crs: str) -> CRS:
+    try:
+        parsed = CRS.from_user_input(crs)
+    except ProjError as error:
+        raise KgcpError(_explain(crs, error)) from error
+    while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed
+        parsed = parsed.source_crs
+    return parsed if parsed.is_compound else parsed.to_3d()
+
+
+def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS) -> Transformer:
+    """Return the transformer without datum shift; heights of a compound CRS through its geoid.
+
+    With ballpark operations allowed PROJ would leave heights unchanged, silently, where a geoid
+    grid is missing; `only_best` alone does not prevent it.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
+        known = TransformerGroup(source, geodetic, always_xy=True, allow_ballpark=False)
+    if known.transformers:
+        return Transformer.from_crs(
+            source, geodetic, always_xy=True, only_best=True, allow_ballpark=False
+        )
+    missing = [
+        grid.short_name
+        for operation in known.unavailable_operations[:1]
+        for grid in operation.grids
+        if not grid.available
+    ]
+    if not missing:
+        raise KgcpError(
+            f"flight.toml: crs {crs!r}: no way is known from its heights to ellipsoidal ones;"
+            " give ellipsoidal heights and the horizontal CRS alone"
+        )
+    raise KgcpError(
+        f"flight.toml: crs {crs!r}: its heights need the grid {', '.join(missing)}, which is not"
+        " installed; install it with 'pyproj sync --file NAME', or give ellipsoidal heights and"
+        " the horizontal CRS alone"
+    )
+
+
+def _explain(crs: str, error: ProjError) -> str:
+    text = " ".join(str(error).split())
+    return f"flight.toml: crs {crs!r} cannot be used ({text}); give one that pyproj reads"
+
+
+def _level_axes(geodetic: FloatArray) -> FloatArray:
+    """Return east, north, up (n, 3, 3), as columns in ECEF, at geodetic points (n, 3) [rad, m]."""
+    longitude, latitude = geodetic[:, 0], geodetic[:, 1]
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    east = np.column_stack((-sin_lon, cos_lon, np.zeros_like(longitude)))
+    north = np.column_stack((-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat))
+    up = np.column_stack((cos_lat * cos_lon, cos_lat * sin_lon, sin_lat))
+    return np.stack((east, north, up), axis=-1)
