@@ -1,0 +1,60 @@
+"""Times as text: UTC in ISO 8601, or Unix seconds."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+
+from kgcp.errors import SettingError
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_SECOND = timedelta(seconds=1)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
+
+
+def parse_time(text: str) -> float:
+    """Read a time as Unix seconds (UTC).
+
+    Parameters
+    ----------
+    text : str
+        ISO 8601 with `Z` or an offset, or Unix seconds. A time without a zone is refused: it is
+        not UTC unless somebody says so.
+
+    Returns
+    -------
+    float
+        Seconds since 1970-01-01T00:00:00Z, resolved to 0.25 µs in our century.
+
+    Raises
+    ------
+    SettingError
+        For anything else, with the text that was found.
+    """
+    text = text.strip()
+    if _NUMBER.fullmatch(text):
+        return _in_calendar(float(text), text)
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise SettingError("time", f"{text!r} is not a time", _REMEDY) from None
+    if moment.tzinfo is None:
+        raise SettingError("time", f"{text!r} names no time zone", _REMEDY)
+    return (moment - _EPOCH) / _SECOND
+
+
+def format_time(unix_s: float) -> str:
+    """Write Unix seconds as ISO 8601 in UTC with microseconds and `Z`."""
+    moment = _EPOCH + timedelta(microseconds=round(unix_s * 1e6))
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def _in_calendar(unix_s: float, text: str) -> float:
+    """Refuse seconds that no calendar date has: milliseconds, mostly."""
+    try:
+        format_time(unix_s)
+    except OverflowError:
+        problem = f"{text} is no date when read as Unix seconds"
+        raise SettingError("time", problem, _REMEDY) from None
+    return unix_s
