@@ -1,0 +1,92 @@
+"""The [[target]] tables of flight.toml into plates with their rings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from kgcp.io.toml_values import TomlTable
+from kgcp.target.family import check_targets
+from kgcp.target.layout import Ring, Target
+
+PLATE_KEYS = (
+    "name",
+    "outer_diameter_m",
+    "inner_diameter_m",
+    "code_diameter_m",
+    "dot_diameter_m",
+    "code_deg",
+    "sd_outer_diameter_m",
+    "position_m",
+    "sd_position_m",
+)
+REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
+
+
+def read_targets(flight: TomlTable) -> tuple[Target, ...]:
+    """Return the plates of a flight in the order of the file, each with its replicas.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, target, key and remedy: if a key or value is wrong, a replica's plate is
+        not there, or `check_targets` cannot tell two targets apart.
+    """
+    tables = [
+        _target_table(flight, index, values)
+        for index, values in enumerate(flight.tables("target"), start=1)
+    ]
+    plates = [table for table in tables if "replica_of" not in table]
+    replicas = [table for table in tables if "replica_of" in table]
+    names = [table.text("name") for table in plates]
+    for table in replicas:
+        if table.text("replica_of") not in names:
+            problem = f"{table.text('replica_of')!r} is not the name of a plate"
+            remedy = f"name one of {', '.join(names)}" if names else "describe the plate, too"
+            raise table.error("replica_of", problem, remedy)
+    targets = tuple(_read_target(table, replicas) for table in plates)
+    with flight.located():
+        check_targets(targets)
+    return targets
+
+
+def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -> TomlTable:
+    """Return a [[target]] table, called by its name or, failing that, by its place."""
+    name = values.get("name")
+    where = f"{flight.where} [[target]] {name if isinstance(name, str) else index}"
+    return TomlTable(where, values, REPLICA_KEYS if "replica_of" in values else PLATE_KEYS)
+
+
+def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
+    ring = _read_ring(table)
+    if "sd_position_m" in table and "position_m" not in table:
+        raise table.error("sd_position_m", "stands without position_m", "give both or none")
+    sd_position_m = table.vector("sd_position_m", (0.0, 0.0, 0.0))
+    if min(sd_position_m) < 0.0:
+        raise table.error("sd_position_m", "is negative", "give standard deviations in metres")
+    return Target(
+        ring=ring,
+        replicas=tuple(_read_replicas(ring, replicas)),
+        position_m=table.vector("position_m") if "position_m" in table else None,
+        sd_position_m=sd_position_m,
+    )
+
+
+def _read_ring(table: TomlTable) -> Ring:
+    with table.located():
+        return Ring(
+            name=table.text("name"),
+            outer_diameter_m=table.number("outer_diameter_m"),
+            inner_diameter_m=table.number("inner_diameter_m"),
+            code_diameter_m=table.number("code_diameter_m"),
+            dot_diameter_m=table.number("dot_diameter_m"),
+            code_deg=table.numbers("code_deg"),
+            sd_outer_diameter_m=table.number("sd_outer_diameter_m", 0.0),
+        )
+
+
+def _read_replicas(plate: Ring, tables: Sequence[TomlTable]) -> Iterator[Ring]:
+    """Yield the replicas of a plate, the largest first."""
+    own = [table for table in tables if table.text("replica_of") == plate.name]
+    for table in sorted(own, key=lambda table: -table.number("scale")):
+        with table.located():
+            yield plate.scaled(table.text("name"), table.number("scale"), table.numbers("code_deg"))

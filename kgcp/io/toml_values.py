@@ -1,0 +1,154 @@
+"""Typed access to the tables of a TOML file; whatever is wrong is named by file, table and key."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from kgcp.errors import KgcpError, SettingError
+
+_TYPE_NAMES = {
+    bool: "a boolean",
+    int: "a number",
+    float: "a number",
+    str: "a text",
+    list: "a list",
+    dict: "a table",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TomlTable:
+    """One table of a file, of which all keys are known.
+
+    Attributes
+    ----------
+    where : str
+        The file and the table, for messages: `flight.toml: [camera]`.
+    values : mapping
+        What tomllib read.
+    known : sequence of str
+        The keys that may stand in it.
+
+    Raises
+    ------
+    KgcpError
+        On making one, for a key that is not known; it names the nearest known key.
+    """
+
+    where: str
+    values: Mapping[str, object]
+    known: Sequence[str]
+
+    def __post_init__(self) -> None:
+        for key in self.values:
+            if key not in self.known:
+                nearest = difflib.get_close_matches(key, self.known, n=1, cutoff=0.0)[0]
+                raise KgcpError(
+                    f"{self.where} {key}: is not a known key; the nearest known key is '{nearest}'"
+                )
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    @contextmanager
+    def located(self) -> Iterator[None]:
+        """Name the file and the table in a `SettingError` that the block raises."""
+        try:
+            yield
+        except SettingError as error:
+            raise KgcpError(f"{self.where} {error}") from None
+
+    def error(self, key: str, problem: str, remedy: str) -> KgcpError:
+        """Return the error for a value of this table, to be raised."""
+        return KgcpError(f"{self.where} {SettingError(key, problem, remedy)}")
+
+    def text(self, key: str) -> str:
+        """Return a text that is not empty."""
+        value = self._required(key, "give it as a text in quotes")
+        if not isinstance(value, str):
+            raise self._wrong_type(key, value, "a text in quotes")
+        if not value.strip():
+            raise self.error(key, "is empty", "give a text or delete the line")
+        return value
+
+    def choice(self, key: str, words: Sequence[str]) -> str:
+        """Return one of the given words."""
+        word = self.text(key)
+        if word not in words:
+            listed = ", ".join(f'"{choice}"' for choice in words)
+            raise self.error(key, f"{word!r} is not known", f"give one of {listed}")
+        return word
+
+    def integer(self, key: str) -> int:
+        """Return a whole number; booleans are none."""
+        value = self._required(key, "give it as a whole number")
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise self._wrong_type(key, value, "a whole number")
+        return value
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """Return a finite number, or the default where the key is absent; booleans are none."""
+        if default is not None and key not in self:
+            return default
+        return self._finite(key, self._required(key, "give it as a number"))
+
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """Return a list of finite numbers."""
+        value = self._required(key, "give it as a list of numbers, [0, 43, 78]")
+        if not isinstance(value, list):
+            raise self._wrong_type(key, value, "a list of numbers, [0, 43, 78]")
+        return tuple(self._finite(key, element) for element in value)
+
+    def vector(
+        self, key: str, default: tuple[float, float, float] | None = None
+    ) -> tuple[float, float, float]:
+        """Return a list of exactly three finite numbers, or the default."""
+        if default is not None and key not in self:
+            return default
+        values = self.numbers(key)
+        if len(values) != 3:
+            problem = f"has {len(values)} numbers instead of 3"
+            raise self.error(key, problem, "give it as [x, y, z]")
+        return values[0], values[1], values[2]
+
+    def table(self, key: str, known: Sequence[str], *, required: bool = True) -> TomlTable:
+        """Return a sub-table with the keys that it may have; an empty one if it may be absent."""
+        if not required and key not in self:
+            return TomlTable(f"{self.where} [{key}]", {}, known)
+        value = self._required(key, f"write a table [{key}]")
+        if not isinstance(value, dict):
+            raise self._wrong_type(key, value, f"a table [{key}]")
+        return TomlTable(f"{self.where} [{key}]", value, known)
+
+    def tables(self, key: str) -> tuple[Mapping[str, object], ...]:
+        """Return an array of tables, not yet checked."""
+        value = self._required(key, f"write at least one table [[{key}]]")
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise self._wrong_type(key, value, f"tables, each headed [[{key}]]")
+        if not value:
+            raise self.error(key, "is empty", f"write at least one table [[{key}]]")
+        return tuple(value)
+
+    def _required(self, key: str, remedy: str) -> object:
+        if key not in self.values:
+            raise self.error(key, "is missing", remedy)
+        return self.values[key]
+
+    def _finite(self, key: str, value: object) -> float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise self._wrong_type(key, value, "a number")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            raise self.error(key, f"{value} is not a finite number", "give a number in range")
+        return number
+
+    def _wrong_type(self, key: str, value: object, wanted: str) -> KgcpError:
+        kind = _TYPE_NAMES.get(type(value), "a date or time")
+        return self.error(key, f"is {kind}", f"give {wanted}")
