@@ -1,0 +1,62 @@
+"""The command line: thin commands, and the one place that turns known errors into one line."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import click
+
+from kgcp import __version__
+from kgcp.errors import KgcpError
+
+# Name → module, in the order of the work; a module is imported when its command is called.
+COMMANDS = {
+    "detect": "kgcp.cli.detect",
+    "export-gcp": "kgcp.cli.export_gcp",
+    "bias-report": "kgcp.cli.bias_report",
+    "simulate": "kgcp.cli.simulate",
+}
+
+_EXIT_KNOWN_ERROR = 1  # 2 is click's own, for wrong usage
+_EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells count
+
+
+class Program(click.Group):
+    """The `kgcp` command: imports what it runs, and ends known errors in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """Name the commands in the order of the work."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+        """Import a command."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = import_module(COMMANDS[cmd_name]).command
+        return command
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run a command; unexpected exceptions keep their traceback."""
+        try:
+            return super().invoke(ctx)
+        except KgcpError as error:
+            line = str(error).replace("\n", " ")
+            click.echo(f"kgcp: error: {line}", err=True)
+            ctx.exit(_EXIT_KNOWN_ERROR)
+        except KeyboardInterrupt:
+            click.echo("kgcp: interrupted; files written so far are whole", err=True)
+            ctx.exit(_EXIT_INTERRUPTED)
+
+
+@click.group(cls=Program, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="kgcp")
+def main() -> None:
+    r"""Measure coded circular targets in aerial frames and make ground control of them.
+
+    The usual way through a flight folder:
+
+    \b
+      kgcp detect FLIGHT         find and measure the target in every frame
+      kgcp export-gcp FLIGHT     make kinematic ground control points of it
+      kgcp bias-report FLIGHT    compare the distances with reference poses
+    """

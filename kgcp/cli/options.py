@@ -1,0 +1,31 @@
+"""Arguments and options that commands share.
+
+flight_argument : `flight`, Path
+    The flight folder; the current folder by default.
+out_option : `out`, Path or None
+    Folder of the results; None means FLIGHT/kgcp.
+json_option : `as_json`, bool
+    Print a machine-readable summary to stdout.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+flight_argument = click.argument(
+    "flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), default="."
+)
+
+out_option = click.option(
+    "--out",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Folder of the results.  [default: FLIGHT/kgcp]",
+)
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print a machine-readable summary to stdout."
+)

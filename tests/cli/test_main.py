@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from kgcp import __version__
+from kgcp.cli import COMMANDS, Program, main
+from kgcp.errors import KgcpError
+
+HEAVY = {"cv2", "jinja2", "matplotlib", "numpy", "pandas", "PIL", "pyarrow", "pyproj", "scipy"}
+
+
+def run_raising(error: BaseException) -> tuple[int, str, str]:
+    """Run a program of one command that raises, and return exit code, stdout and stderr."""
+
+    class OneCommand(Program):
+        def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:  # noqa: ARG002 - click's signature
+            @click.command(cmd_name)
+            def fail() -> None:
+                raise error
+
+            return fail
+
+    result = CliRunner().invoke(OneCommand("kgcp"), ["detect"], catch_exceptions=False)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_a_known_error_is_one_line_and_exit_1() -> None:
+    error = KgcpError("flight.toml: [camera] fx: is missing; give it\nas a number")
+    assert run_raising(error) == (
+        1,
+        "",
+        "kgcp: error: flight.toml: [camera] fx: is missing; give it as a number\n",
+    )
+
+
+def test_an_interrupt_is_one_line_and_exit_130() -> None:
+    code, out, err = run_raising(KeyboardInterrupt())
+    assert (code, out, err.count("\n")) == (130, "", 1)
+    assert err.startswith("kgcp: interrupted")
+
+
+def test_an_unexpected_error_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run_raising(ZeroDivisionError())
+
+
+def test_wrong_usage_is_click_s_exit_2() -> None:
+    assert CliRunner().invoke(main, ["detekt"]).exit_code == 2
+    assert CliRunner().invoke(main, ["detect", "--no-such-option"]).exit_code == 2
+
+
+def test_a_folder_without_a_flight_is_a_known_error(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    folder = tmp_path_factory.mktemp("empty")
+    result = CliRunner().invoke(main, ["detect", str(folder)])
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"kgcp: error: {folder / 'flight.toml'}: does not exist;")
+    assert result.stderr.count("\n") == 1
+
+
+def test_every_command_is_listed() -> None:
+    text = CliRunner().invoke(main, ["--help"]).stdout
+    for name in COMMANDS:
+        assert f"\n  {name} " in text
+
+
+def test_the_module_runs_and_knows_its_version() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "kgcp", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"kgcp, version {__version__}\n"
+
+
+def test_help_loads_no_heavy_library_and_is_quick() -> None:
+    program = (
+        "import sys\n"
+        "from click.testing import CliRunner\n"
+        "from kgcp.cli import main\n"
+        "assert CliRunner().invoke(main, ['--help']).exit_code == 0\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})\n"
+    )
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    seconds = time.perf_counter() - start
+    assert not HEAVY & set(done.stdout.split())
+    assert seconds < 2.0  # 0.2 s on an idle machine; loose, as tests share theirs
