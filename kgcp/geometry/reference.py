@@ -1,0 +1,51 @@
+"""Reference poses of the camera as an adjustment gives them: map position, omega, phi, kappa."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray
+
+CAMERA_FROM_PHOTO: FloatArray = np.diag([1.0, -1.0, -1.0])
+"""From x right, y up, z backward (photogrammetry) to x right, y down, z forward (kgcp)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferencePoses:
+    """Exterior orientations of n frames.
+
+    Attributes
+    ----------
+    frames : tuple of str
+        Names as in the detections: relative to the frames folder, with /; unique.
+    position_map : (n, 3) array
+        Projection centres x, y, z in the flight's CRS.
+    opk_deg : (n, 3) array
+        Omega, phi, kappa relative to the map's axes [deg].
+    sd_position_m : (n, 3) array or None
+        Standard deviations along the map's axes [m]; None: not given.
+    sd_angle_deg : (n,) array or None
+        Of each of the three angles [deg]; None: not given.
+    """
+
+    frames: tuple[str, ...]
+    position_map: FloatArray
+    opk_deg: FloatArray
+    sd_position_m: FloatArray | None
+    sd_angle_deg: FloatArray | None
+
+
+def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:
+    """Return map ← camera rotations (n, 3, 3) from omega, phi, kappa (n, 3) [deg].
+
+    R = Rx(ω) Ry(φ) Rz(κ); its camera axes are x right, y up, z backward (docs/conventions.md).
+    """
+    return np.asarray(Rotation.from_euler("XYZ", opk_deg, degrees=True).as_matrix())
+
+
+def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
+    """Return omega, phi, kappa (n, 3) [deg] of rotations (n, 3, 3); undoes `rotation_from_opk`."""
+    return np.asarray(Rotation.from_matrix(map_from_photo).as_euler("XYZ", degrees=True))

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.carrier import Absence, Whereabouts
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.trajectory import Trajectory
+from kgcp.kgcps import Sighting, Skip, build_kgcps, exposure_time_s
+from kgcp.settings import VehicleSettings
+from kgcp.target.layout import Ring, Target
+
+_CAMERA = Camera(width=640, height=481, fx=900.0, fy=900.0, cx=320.0, cy=240.0)
+_RING = Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0))
+_GROUND = Ring("G", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 90.0, 200.0))
+_POSITION = (430620.0, 4583530.0, 120.0)
+
+
+def _sighting(number: int, target: str, time_s: float | None, instance: int = 0) -> Sighting:
+    return Sighting(
+        frame=f"f_{number:04d}.png",
+        number=number,
+        target=target,
+        instance=instance,
+        time_s=time_s,
+        centre_px=np.array([100.0, 480.0]),
+        centre_cov_px2=None,
+        distance_m=50.0,
+        sd_distance_m=None,
+    )
+
+
+def _whereabouts(settings: VehicleSettings) -> Whereabouts:
+    time_s = np.arange(0.0, 10.01, 0.1)
+    position = np.array([430606.1, 4583523.0, 120.0]) + np.outer(time_s, [10.0, 0.0, 0.0])
+    sd = np.full((len(time_s), 3), 0.02)
+    trajectory = Trajectory(time_s, position, np.zeros_like(position), sd, None)
+    static = Target(_GROUND, position_m=_POSITION, sd_position_m=(0.01, 0.02, 0.03))
+    return Whereabouts.of("EPSG:25831", [Target(_RING), static], trajectory, settings)
+
+
+def test_moving_points_are_named_by_frame_and_static_ones_by_target() -> None:
+    sightings = [_sighting(3, "A", 1.0), _sighting(3, "G", 1.0), _sighting(7, "G", None)]
+    kgcps, skipped = build_kgcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
+    assert [point.id for point in kgcps] == ["K0003", "G", "G"]
+    assert skipped == ()
+    np.testing.assert_allclose(kgcps[0].position_map, [430616.1, 4583523.0, 120.0], atol=1e-4)
+    for static in kgcps[1:]:
+        np.testing.assert_allclose(static.position_map, _POSITION, atol=1e-6)
+        assert static.cov_m2 is not None
+        np.testing.assert_allclose(np.sqrt(np.diag(static.cov_m2)), [0.01, 0.02, 0.03])
+
+
+def test_covariance_is_given_along_the_maps_axes() -> None:
+    kgcps, _ = build_kgcps([_sighting(1, "A", 5.0)], _whereabouts(VehicleSettings()), _CAMERA)
+    assert kgcps[0].cov_m2 is not None
+    np.testing.assert_allclose(kgcps[0].cov_m2, 0.02**2 * np.eye(3), atol=1e-12)
+
+
+def test_frames_outside_and_second_plates_are_counted_not_lost() -> None:
+    sightings = [
+        _sighting(1, "A", -5.0),
+        _sighting(2, "A", 5.0),
+        _sighting(2, "A", 5.0, instance=1),
+        _sighting(3, "A", None),
+    ]
+    kgcps, skipped = build_kgcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
+    assert [point.id for point in kgcps] == ["K0002"]
+    assert set(skipped) == {
+        Skip("f_0001.png", "A", Absence.BEFORE_TRAJECTORY),
+        Skip("f_0002.png", "A", None),
+        Skip("f_0003.png", "A", Absence.NO_TIME),
+    }
+
+
+def test_no_sightings_make_no_points() -> None:
+    assert build_kgcps([], _whereabouts(VehicleSettings()), _CAMERA) == ((), ())
+
+
+def test_a_rolling_shutter_reads_the_middle_row_at_mid_exposure() -> None:
+    rolling = Camera(640, 481, 900.0, 900.0, 320.0, 240.0, readout_s=0.03)
+    assert exposure_time_s(10.0, 0.0, rolling) == pytest.approx(10.0 - 0.015)
+    assert exposure_time_s(10.0, 240.0, rolling) == pytest.approx(10.0)
+    assert exposure_time_s(10.0, 480.0, rolling) == pytest.approx(10.0 + 0.015)
+    assert exposure_time_s(None, 480.0, rolling) is None
+
+
+def test_the_target_is_where_it_was_when_its_row_was_read() -> None:
+    rolling = Camera(640, 481, 900.0, 900.0, 320.0, 240.0, readout_s=0.03)
+    whereabouts = _whereabouts(VehicleSettings())
+    (late,), _ = build_kgcps([_sighting(1, "A", 5.0)], whereabouts, rolling)
+    (plain,), _ = build_kgcps([_sighting(1, "A", 5.0)], whereabouts, _CAMERA)
+    np.testing.assert_allclose(
+        late.position_map - plain.position_map, [0.15, 0.0, 0.0], atol=1e-4
+    )  # 10 m/s for half of 30 ms
+    assert late.time_s == pytest.approx(5.015)
+
+
+def test_time_is_that_of_the_trajectorys_clock() -> None:
+    whereabouts = _whereabouts(VehicleSettings(time_offset_s=-18.0))
+    (point,), _ = build_kgcps([_sighting(1, "A", 23.0)], whereabouts, _CAMERA)
+    assert point.time_s == pytest.approx(5.0)
