@@ -1,0 +1,65 @@
+# kgcp: every target does its own set-up, in .venv of this folder. `make` alone lists the targets.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+MINIMUM := (3, 11)
+CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check lint types format sample-flight clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.runs ## detect, export-gcp and bias-report on sample_flight/
+	$(BIN)/kgcp detect sample_flight
+	$(BIN)/kgcp export-gcp sample_flight
+	$(BIN)/kgcp bias-report sample_flight
+	@echo
+	@echo "The results are in sample_flight/kgcp:"
+	@ls -1 sample_flight/kgcp | sed 's/^/  /'
+	@echo "Open sample_flight/kgcp/bias_report.html in a browser."
+
+test: $(VENV)/.develops ## run the tests
+	$(BIN)/python -m pytest -n auto
+
+check: lint types test ## all that must pass before a change goes in
+
+lint: $(VENV)/.develops ## check style and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.develops ## check the type annotations
+	$(BIN)/mypy
+
+format: $(VENV)/.develops ## bring the code into the project's format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
+	$(BIN)/kgcp simulate sample_flight --preset sample --force
+
+clean: ## remove results and caches (the virtual environment stays)
+	rm -rf sample_flight/kgcp build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+# The stamps say what has been installed for which pyproject.toml.
+$(VENV)/.develops: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[dev]'
+	@touch $@ $(VENV)/.runs
+
+$(VENV)/.runs: pyproject.toml | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(BIN)/python:
+	@for python in $(CANDIDATES); do \
+	  if $$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < $(MINIMUM))' \
+	      2> /dev/null; then \
+	    echo "$$python -m venv $(VENV)"; exec $$python -m venv $(VENV); \
+	  fi; \
+	done; \
+	echo "kgcp needs Python 3.11 or newer with venv and pip;" \
+	  "install it, or name it: make PYTHON=/path/to/python3.11" >&2; \
+	exit 1
