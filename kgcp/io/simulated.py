@@ -1,0 +1,229 @@
+"""A simulated flight as a flight folder, with its truth beside it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import multiprocessing
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from PIL.TiffImagePlugin import IFDRational
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.io.simulated_text import flight_toml, readme
+from kgcp.io.times import format_time
+from kgcp.synthetic.flight import (
+    TARGET_PLATE,
+    FlightPlan,
+    FramePlan,
+    frame_name,
+    grow_ground,
+    render_frame,
+)
+from kgcp.synthetic.ground import Ground
+
+_PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
+_EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
+_ISO = 100
+_F_NUMBER = Fraction(28, 5)
+
+_TRUTH_COLUMNS = (
+    *("frame", "present", "decoy", "distance", "x", "y"),
+    *(f"r{row}{column}" for row in range(3) for column in range(3)),
+    *("cx", "cy", "cz", "gain", "psf", "radius_px", "X", "Y", "Z"),
+    *("streak_x", "streak_y", "black", "white"),
+)
+
+
+def write_simulated_flight(
+    plan: FlightPlan, out: Path, *, jobs: int, on_frame: Callable[[], object]
+) -> None:
+    """Render a flight and write its folder: all of it or nothing.
+
+    Parameters
+    ----------
+    plan : FlightPlan
+    out : Path
+        The folder to be; it must not exist, or be empty.
+    jobs : int
+        Worker processes; 1 works in this one. The files do not depend on it.
+    on_frame : callable
+        Called after each frame.
+
+    Raises
+    ------
+    KgcpError
+        If `out` holds something already or cannot be written.
+    """
+    out = out.resolve()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise KgcpError(f"{out}: holds something already; choose a new folder or empty it first")
+    partial = out.with_name(f".{out.name}.part")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+        (partial / "frames").mkdir(parents=True)
+        for _ in _write_frames(plan, partial / "frames", jobs):
+            on_frame()
+        _write_texts(plan, partial)
+        if out.exists():
+            out.rmdir()
+        partial.replace(out)
+    except OSError as error:
+        raise KgcpError(f"{out}: cannot be written ({error}); choose another folder") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def encode_frame(plan: FlightPlan, index: int, grey: GreyArray) -> bytes:
+    """Return a frame as a PNG or JPEG file, with exposure and time in its EXIF."""
+    quality = plan.settings.jpeg_quality
+    exif = _exif(plan, index)
+    buffer = io.BytesIO()
+    image = Image.fromarray(grey)
+    if quality is None:
+        image.save(buffer, "PNG", compress_level=_PNG_COMPRESSION, exif=exif)
+    else:
+        image.save(buffer, "JPEG", quality=quality, exif=exif)
+    return buffer.getvalue()
+
+
+def _exif(plan: FlightPlan, index: int) -> Image.Exif:
+    moment = datetime.fromtimestamp(float(plan.recorded_times_s[index]), UTC)
+    gain = Fraction(plan.frames[index].gain).limit_denominator(1000)
+    exposure = _EXPOSURE_AT_GAIN_1_S * gain
+    exif = Image.Exif()
+    tags = exif.get_ifd(IFD.Exif)
+    tags[Base.ExposureTime] = IFDRational(exposure.numerator, exposure.denominator)
+    tags[Base.FNumber] = IFDRational(_F_NUMBER.numerator, _F_NUMBER.denominator)
+    tags[Base.ISOSpeedRatings] = _ISO
+    tags[Base.DateTimeOriginal] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    tags[Base.SubsecTimeOriginal] = f"{moment.microsecond:06d}"
+    tags[Base.OffsetTimeOriginal] = "+00:00"
+    return exif
+
+
+def _write_frames(plan: FlightPlan, folder: Path, jobs: int) -> Iterator[None]:
+    """Render and write every frame, yielding after each."""
+    indices = range(len(plan.frames))
+    if jobs == 1:
+        _start_worker(plan, folder)
+        yield from map(_write_frame_in_worker, indices)
+        return
+    with ProcessPoolExecutor(
+        max_workers=min(jobs, len(indices)),
+        mp_context=multiprocessing.get_context("spawn"),  # forking a threaded parent may deadlock
+        initializer=_start_worker,
+        initargs=(plan, folder),
+    ) as pool:
+        yield from pool.map(_write_frame_in_worker, indices)
+
+
+_worker: tuple[FlightPlan, Path, Ground] | None = None  # once per process: the ground is large
+
+
+def _start_worker(plan: FlightPlan, folder: Path) -> None:
+    global _worker  # noqa: PLW0603 - the only state a pool's initializer can leave behind
+    _worker = plan, folder, grow_ground(plan.seed)
+
+
+def _write_frame_in_worker(index: int) -> None:
+    if _worker is None:
+        raise RuntimeError("worker used before it was started")
+    plan, folder, ground = _worker
+    encoded = encode_frame(plan, index, render_frame(plan, ground, index))
+    (folder / frame_name(plan.settings, index)).write_bytes(encoded)
+
+
+def _write_texts(plan: FlightPlan, folder: Path) -> None:
+    (folder / "flight.toml").write_text(flight_toml(plan), encoding="utf-8", newline="\n")
+    (folder / "README.md").write_text(readme(plan), encoding="utf-8", newline="\n")
+    names = [frame_name(plan.settings, frame.index) for frame in plan.frames]
+    times = [format_time(float(time_s)) for time_s in plan.recorded_times_s]
+    _write_csv(folder / "frames.csv", ("frame", "time"), zip(names, times, strict=True))
+    _write_csv(folder / "vehicle.csv", _vehicle_columns(), _vehicle_rows(plan))
+    _write_csv(folder / "reference.csv", _reference_columns(), _reference_rows(plan))
+    _write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(plan))
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _vehicle_columns() -> tuple[str, ...]:
+    state = ("x", "y", "z", "roll_deg", "pitch_deg", "heading_deg")
+    return ("time", *state, *(f"sd_{name}" for name in state))
+
+
+def _vehicle_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
+    trajectory = plan.trajectory
+    deviations = [
+        f"{deviation:g}"
+        for deviation in (*plan.settings.sd_position_m, *plan.settings.sd_attitude_deg)
+    ]
+    for time_s, position, attitude in zip(
+        trajectory.time_s, trajectory.position_map, trajectory.attitude_deg, strict=True
+    ):
+        yield (
+            format_time(float(time_s)),
+            *(f"{value:.5f}" for value in position),
+            *(f"{value:.6f}" for value in attitude),
+            *deviations,
+        )
+
+
+def _reference_columns() -> tuple[str, ...]:
+    position, angles = ("x", "y", "z"), ("omega_deg", "phi_deg", "kappa_deg")
+    return ("frame", *position, *angles, "sd_x", "sd_y", "sd_z", "sd_angle_deg")
+
+
+def _reference_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
+    settings, poses = plan.settings, plan.reference
+    deviations = [f"{settings.sd_reference_m:g}"] * 3 + [f"{settings.sd_reference_deg:g}"]
+    for frame, position, angles in zip(
+        poses.frames, poses.position_map, poses.opk_deg, strict=True
+    ):
+        yield (
+            frame,
+            *(f"{value:.5f}" for value in position),
+            *(f"{value:.7f}" for value in angles),
+            *deviations,
+        )
+
+
+def _truth_rows(plan: FlightPlan) -> Iterator[Sequence[object]]:
+    for frame, target_map in zip(plan.frames, plan.target_map, strict=True):
+        name = frame_name(plan.settings, frame.index)
+        numbers = _truth_numbers(plan, frame, target_map)
+        present, decoy = int(frame.present), int(bool(frame.decoys))
+        yield (name, present, decoy, *(repr(float(number)) for number in numbers))
+
+
+def _truth_numbers(plan: FlightPlan, frame: FramePlan, target_map: FloatArray) -> FloatArray:
+    """Return the numbers of a row of truth.csv, from `distance` on."""
+    camera, pose = plan.settings.camera, frame.target
+    outer_radius_m = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
+    light = np.minimum(frame.gain * np.array([TARGET_PLATE.black, TARGET_PLATE.white]), 1.0)
+    return np.concatenate(
+        (
+            [pose.distance_m],
+            camera.project(pose.translation_m[None])[0],
+            pose.rotation.ravel(),
+            pose.translation_m,
+            [frame.gain, frame.optics.psf_px, camera.fx * outer_radius_m / pose.distance_m],
+            target_map,
+            frame.optics.streak_px,
+            plan.settings.sensor.tone.apply(light),  # far from edges sharpening changes nothing
+        )
+    )

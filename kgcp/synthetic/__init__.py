@@ -1,0 +1,1 @@
+"""A public, seeded, deterministic flight simulator: rendered truth, no files."""

@@ -1,0 +1,202 @@
+"""From light to grey values: point spread, streak, sensor noise, tone curve, sharpening.
+
+The image model, in this order, with electrons as the unit in which physics is done:
+
+1. irradiance of a pixel = scene radiance ∗ Gaussian(σ) ∗ box along the streak ∗ pixel square;
+2. electrons = full well × gain × irradiance (irradiance 1: a perfectly white plate);
+3. noise: Gaussian with variance = electrons (the limit of Poisson's) + read noise²;
+4. clipped to 0 … full well and divided by it; tone curve, 0…1 → 0…1;
+5. unsharp mask y + amount · (y − y ∗ Gaussian), clipped to 0…1; times 255, rounded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import scipy.fft
+from scipy.ndimage import convolve, gaussian_filter
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.settings import require_range
+
+_WHITE_LEVEL = 255.0
+_FILM_CONTRAST = 0.7
+
+
+class ToneCurve(StrEnum):
+    """Response of the camera: relative exposure 0…1 to relative grey value 0…1.
+
+    `film` is the sRGB curve followed by an S-shaped increase of contrast, y − a·sin(2πy)/2π: a
+    toe that crushes shadows and a shoulder that compresses highlights, as cameras' "standard"
+    picture styles do.
+    """
+
+    LINEAR = "linear"
+    SRGB = "srgb"
+    FILM = "film"
+
+    def apply(self, exposure: FloatArray) -> FloatArray:
+        """Return the grey value 0…1 of a relative exposure 0…1."""
+        if self is ToneCurve.LINEAR:
+            return exposure
+        encoded: FloatArray = np.where(
+            exposure <= 0.0031308,  # IEC 61966-2-1
+            12.92 * exposure,
+            1.055 * np.maximum(exposure, 0.0031308) ** (1.0 / 2.4) - 0.055,
+        )
+        if self is ToneCurve.SRGB:
+            return encoded
+        return encoded - _FILM_CONTRAST * np.sin(2.0 * np.pi * encoded) / (2.0 * np.pi)
+
+    def slope(self, exposure: FloatArray) -> FloatArray:
+        """Return the derivative of `apply`."""
+        if self is ToneCurve.LINEAR:
+            return np.ones_like(exposure)
+        slope: FloatArray = np.where(
+            exposure <= 0.0031308,
+            12.92,
+            1.055 / 2.4 * np.maximum(exposure, 0.0031308) ** (1.0 / 2.4 - 1.0),
+        )
+        if self is ToneCurve.SRGB:
+            return slope
+        encoded = ToneCurve.SRGB.apply(exposure)
+        return slope * (1.0 - _FILM_CONTRAST * np.cos(2.0 * np.pi * encoded))
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What spreads the light of one frame.
+
+    Attributes
+    ----------
+    psf_px : float
+        σ of the Gaussian point spread [px].
+    streak_px : tuple of float
+        Motion of the image during the exposure, x and y [px]; symmetric about mid-exposure.
+    """
+
+    psf_px: float
+    streak_px: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def reach_px(self) -> int:
+        """How far light is spread, at most [px]."""
+        return math.ceil(5.0 * self.psf_px + 0.5 * math.hypot(*self.streak_px)) + 1
+
+    def spread(self, scene: FloatArray, oversampling: int) -> FloatArray:
+        """Blur a scene given on sub-pixels and integrate it over pixels.
+
+        The transfer functions of Gaussian and streak are applied exactly, in the frequency
+        domain; the scene goes on beyond its border as at the border.
+
+        Parameters
+        ----------
+        scene : (height · oversampling, width · oversampling) array
+            Radiance averaged over each sub-pixel.
+        oversampling : int
+            Sub-pixels per pixel and axis.
+
+        Returns
+        -------
+        (height, width) array
+            Irradiance of the pixels.
+        """
+        margin = self.reach_px * oversampling
+        padded_shape = [
+            scipy.fft.next_fast_len(size + 2 * margin, real=True) for size in scene.shape
+        ]
+        padding = [
+            (margin, total - size - margin)
+            for total, size in zip(padded_shape, scene.shape, strict=True)
+        ]
+        spectrum = scipy.fft.rfft2(np.pad(scene, padding, mode="edge"))
+        spectrum *= self._transfer(padded_shape, oversampling)
+        blurred = scipy.fft.irfft2(spectrum, s=padded_shape, overwrite_x=True)
+        height, width = scene.shape
+        blurred = blurred[margin : margin + height, margin : margin + width]
+        blocks = blurred.reshape(height // oversampling, oversampling, -1, oversampling)
+        irradiance: FloatArray = blocks.mean(axis=(1, 3))
+        return irradiance
+
+    def _transfer(self, shape: list[int], oversampling: int) -> FloatArray:
+        fy = scipy.fft.fftfreq(shape[0])[:, None] * oversampling  # cycles per pixel
+        fx = scipy.fft.rfftfreq(shape[1])[None, :] * oversampling
+        fall = -2.0 * (math.pi * self.psf_px) ** 2
+        transfer: FloatArray = np.exp(fall * fy * fy) * np.exp(fall * fx * fx)
+        if any(self.streak_px):
+            transfer *= np.sinc(self.streak_px[0] * fx + self.streak_px[1] * fy)
+        return transfer
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What makes grey values of light.
+
+    Attributes
+    ----------
+    full_well_e : float
+        Electrons at which a pixel clips.
+    read_noise_e : float
+        Standard deviation of the read noise [e⁻].
+    tone : ToneCurve
+    sharpening : float
+        Amount of the unsharp mask; 0: none.
+    sharpening_px : float
+        σ of its Gaussian [px].
+    """
+
+    full_well_e: float = 10_000.0
+    read_noise_e: float = 8.0
+    tone: ToneCurve = ToneCurve.LINEAR
+    sharpening: float = 0.0
+    sharpening_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_range("full_well_e", self.full_well_e, 100.0, 1e7, unit="e⁻")
+        require_range("read_noise_e", self.read_noise_e, 0.0, 1e4, unit="e⁻")
+        require_range("sharpening", self.sharpening, 0.0, 10.0)
+        require_range("sharpening_px", self.sharpening_px, 0.1, 10.0, unit="px")
+
+    def expected(self, irradiance: FloatArray, gain: float) -> FloatArray:
+        """Return grey values 0…255 of an exposure without noise, not rounded."""
+        return self._developed(np.minimum(gain * irradiance, 1.0))
+
+    def variance(self, irradiance: FloatArray, gain: float) -> FloatArray:
+        """Return the noise variance of the grey values, to first order.
+
+        Shot and read noise through the slope of the tone curve, spread by the squared kernel of
+        the unsharp mask (whose correlation between neighbours is not expressed), plus 1/12 for
+        rounding. Clipped pixels have the variance of rounding alone.
+        """
+        exposure = gain * irradiance
+        electrons = self.full_well_e * exposure + self.read_noise_e**2
+        light = electrons / self.full_well_e**2 * self.tone.slope(np.clip(exposure, 0.0, 1.0)) ** 2
+        light[(exposure <= 0.0) | (exposure >= 1.0)] = 0.0
+        return _WHITE_LEVEL**2 * self._sharpened_variance(light) + 1.0 / 12.0
+
+    def expose(self, irradiance: FloatArray, gain: float, rng: np.random.Generator) -> GreyArray:
+        """Return a frame of grey values (uint8) with noise."""
+        exposure = gain * np.maximum(irradiance, 0.0)
+        deviation = np.sqrt(self.full_well_e * exposure + self.read_noise_e**2) / self.full_well_e
+        exposure += deviation * rng.standard_normal(exposure.shape)
+        return np.rint(self._developed(np.clip(exposure, 0.0, 1.0))).astype(np.uint8)
+
+    def _developed(self, exposure: FloatArray) -> FloatArray:
+        grey = self.tone.apply(exposure)
+        if self.sharpening > 0.0:
+            grey = grey + self.sharpening * (grey - gaussian_filter(grey, self.sharpening_px))
+            grey = np.clip(grey, 0.0, 1.0)
+        return grey * _WHITE_LEVEL
+
+    def _sharpened_variance(self, variance: FloatArray) -> FloatArray:
+        if not self.sharpening:
+            return variance
+        impulse = np.zeros((2 * math.ceil(4.0 * self.sharpening_px) + 1,) * 2)
+        impulse[impulse.shape[0] // 2, impulse.shape[1] // 2] = 1.0
+        smooth = gaussian_filter(impulse, self.sharpening_px)
+        kernel = impulse + self.sharpening * (impulse - smooth)
+        spread: FloatArray = convolve(variance, kernel * kernel)
+        return spread
