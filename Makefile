@@ -38,7 +38,8 @@ format: $(VENV)/.develops ## bring the code into the project's format
 	$(BIN)/ruff format .
 
 sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
-	$(BIN)/kgcp simulate sample_flight --preset sample --force
+	rm -rf sample_flight
+	$(BIN)/kgcp simulate sample_flight --preset sample
 
 clean: ## remove results and caches (the virtual environment stays)
 	rm -rf sample_flight/kgcp build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
