@@ -8,43 +8,7 @@ from dataclasses import dataclass
 from kgcp.carrier import Absence, Place, Whereabouts
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
-    """One target measured in one frame.
-
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    number : int
-        Position of the frame among all frames of the flight, from 1.
-    target : str
-        Name in flight.toml.
-    instance : int
-        0 for the best plate with this code in the frame.
-    time_s : float or None
-        Mid-exposure, Unix UTC [s]; None: not known.
-    centre_px : (2,) array
-        Projected circle centre in the raw image [px].
-    centre_cov_px2 : (2, 2) array or None
-        Its covariance [px²].
-    distance_m : float
-        Projection centre to target centre [m].
-    sd_distance_m : float or None
-        Its standard deviation [m].
-    """
-
-    frame: str
-    number: int
-    target: str
-    instance: int
-    time_s: float | None
-    centre_px: FloatArray
-    centre_cov_px2: FloatArray | None
-    distance_m: float
-    sd_distance_m: float | None
+from kgcp.target.sighting import Sighting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +89,7 @@ def build_kgcps(
         As `Whereabouts.places`.
     """
     first = [sighting for sighting in sightings if sighting.instance == 0]
-    times = [exposure_time_s(seen.time_s, float(seen.centre_px[1]), camera) for seen in first]
+    times = [seen.row_time_s(camera) for seen in first]
     places = whereabouts.places([seen.target for seen in first], times)
     kgcps, skipped = (
         [],
@@ -137,17 +101,6 @@ def build_kgcps(
         else:
             skipped.append(Skip(seen.frame, seen.target, place))
     return tuple(kgcps), tuple(skipped)
-
-
-def exposure_time_s(time_s: float | None, y_px: float, camera: Camera) -> float | None:
-    """Return when row `y_px` was exposed, for a frame with mid-exposure `time_s` [s].
-
-    A rolling shutter reads from the first to the last row in `camera.readout_s`, and the middle
-    row at the frame's time.
-    """
-    if time_s is None:
-        return None
-    return time_s + (y_px / (camera.height - 1) - 0.5) * camera.readout_s
 
 
 def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Whereabouts) -> Kgcp:

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kgcp.carrier import Absence, Whereabouts
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.trajectory import Trajectory
-from kgcp.kgcps import Sighting, Skip, build_kgcps, exposure_time_s
+from kgcp.kgcps import Skip, build_kgcps
 from kgcp.settings import VehicleSettings
 from kgcp.target.layout import Ring, Target
+from kgcp.target.sighting import Sighting
 
 _CAMERA = Camera(width=640, height=481, fx=900.0, fy=900.0, cx=320.0, cy=240.0)
 _RING = Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0))
@@ -79,10 +82,11 @@ def test_no_sightings_make_no_points() -> None:
 
 def test_a_rolling_shutter_reads_the_middle_row_at_mid_exposure() -> None:
     rolling = Camera(640, 481, 900.0, 900.0, 320.0, 240.0, readout_s=0.03)
-    assert exposure_time_s(10.0, 0.0, rolling) == pytest.approx(10.0 - 0.015)
-    assert exposure_time_s(10.0, 240.0, rolling) == pytest.approx(10.0)
-    assert exposure_time_s(10.0, 480.0, rolling) == pytest.approx(10.0 + 0.015)
-    assert exposure_time_s(None, 480.0, rolling) is None
+    seen = _sighting(1, "A", 10.0)
+    for row, time_s in ((0.0, 9.985), (240.0, 10.0), (480.0, 10.015)):
+        in_row = replace(seen, centre_px=np.array([100.0, row]))
+        assert in_row.row_time_s(rolling) == pytest.approx(time_s)
+    assert _sighting(1, "A", None).row_time_s(rolling) is None
 
 
 def test_the_target_is_where_it_was_when_its_row_was_read() -> None:

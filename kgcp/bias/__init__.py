@@ -1,0 +1,1 @@
+"""Measured distances against reference poses, and the statistics of their differences."""

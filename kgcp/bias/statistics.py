@@ -1,0 +1,125 @@
+"""Numbers that describe residuals: spread, moving statistics, rates with confidence, ranks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+
+_Z_95 = 1.959963984540054
+_MIN_IN_WINDOW = 3
+_MIN_FOR_RANKS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Mean, standard deviation and root mean square of `count` values.
+
+    Attributes
+    ----------
+    count : int
+        At least 1.
+    mean, rms : float
+        In the values' unit.
+    sd : float or None
+        Of one value, with count − 1; None for a single value.
+    """
+
+    count: int
+    mean: float
+    sd: float | None
+    rms: float
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Self:
+        """Describe one or more finite values (n,)."""
+        sd = float(np.std(values, ddof=1)) if len(values) > 1 else None
+        rms = float(np.sqrt(np.mean(values**2)))
+        return cls(len(values), float(np.mean(values)), sd, rms)
+
+    @property
+    def sd_mean(self) -> float | None:
+        """Standard deviation of the mean, for independent values."""
+        return None if self.sd is None else self.sd / math.sqrt(self.count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingStatistics:
+    """Mean and standard deviation in a window that moves along x (the paper's Figure 9).
+
+    Attributes
+    ----------
+    centre, mean, sd : (n,) array
+        Window centres, and the values' statistics in each; NaN where a window holds fewer than
+        three values.
+    """
+
+    centre: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+
+
+def moving_statistics(x: FloatArray, y: FloatArray, window: float) -> MovingStatistics:
+    """Return mean and deviation of y (n,) within ± window/2 of x, in steps of window/10.
+
+    n ≥ 1, all finite.
+    """
+    step = window / 10.0
+    first, last = math.floor(x.min() / step), math.ceil(x.max() / step)
+    centre = step * np.arange(first, last + 1)
+    inside = np.abs(x - centre[:, None]) <= 0.5 * window
+    count = inside.sum(axis=1)
+    enough = count >= _MIN_IN_WINDOW
+    mean = np.full(len(centre), np.nan)
+    sd = np.full(len(centre), np.nan)
+    mean[enough] = (inside @ y)[enough] / count[enough]
+    squares = np.where(inside, (y - mean[:, None]) ** 2, 0.0).sum(axis=1)
+    sd[enough] = np.sqrt(squares[enough] / (count[enough] - 1))
+    return MovingStatistics(centre, mean, sd)
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a rate, by Wilson's score (1927, JASA 22, 209).
+
+    Unlike p ± 1.96·√(p(1−p)/n) it stays within 0…1 and does not collapse at 0 and 1.
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise ValueError(f"{successes} successes in {trials} trials")
+    rate, z2 = successes / trials, _Z_95**2
+    centre = (rate + z2 / (2.0 * trials)) / (1.0 + z2 / trials)
+    spread = math.sqrt(rate * (1.0 - rate) / trials + z2 / (4.0 * trials**2))
+    half = _Z_95 * spread / (1.0 + z2 / trials)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@dataclass(frozen=True, slots=True)
+class RankCorrelation:
+    """Spearman's rank correlation.
+
+    Attributes
+    ----------
+    count : int
+        Pairs.
+    rho : float
+        −1…1.
+    p_value : float
+        Chance of a |rho| at least as large without any relation.
+    """
+
+    count: int
+    rho: float
+    p_value: float
+
+
+def rank_correlation(x: FloatArray, y: FloatArray) -> RankCorrelation | None:
+    """Correlate the ranks of x and y (n,); None for fewer than 8 pairs or a constant."""
+    from scipy.stats import spearmanr  # takes longer to import than the rest of the command
+
+    if len(x) < _MIN_FOR_RANKS or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    result = spearmanr(x, y)
+    return RankCorrelation(len(x), float(result.statistic), float(result.pvalue))

@@ -1,0 +1,268 @@
+"""How well measured distances agree with reference poses, and how often the target is found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.carrier import Absence, Place, Whereabouts
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.reference import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
+from kgcp.mapframe import MapFrame
+from kgcp.target.layout import Target
+from kgcp.target.sighting import Sighting
+
+_FOLD_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What may move the edges: the columns of these names in the detections; None is null."""
+
+    radius_px: float | None
+    blur_px: float | None
+    edge_shift_px: float | None
+    black: float | None
+    white: float | None
+    saturated: float | None
+    exposure_time_s: float | None
+    iso: float | None
+    f_number: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One target looked for in one readable frame.
+
+    Attributes
+    ----------
+    frame, target : str
+        As in the detections.
+    time_s : float or None
+        Mid-exposure, Unix UTC [s].
+    sighting : Sighting or None
+        None where the target was not measured.
+    exposure : Exposure
+    """
+
+    frame: str
+    target: str
+    time_s: float | None
+    sighting: Sighting | None
+    exposure: Exposure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """One attempt against the reference.
+
+    Attributes
+    ----------
+    attempt : Attempt
+    reference_distance_m : float
+        Between the reference projection centre and the target's place at that time [m].
+    sd_reference_m : float or None
+        Its standard deviation [m]; None where trajectory or poses have none.
+    expected_px : (2,) array
+        Where the reference pose puts the centre in the raw image [px]; NaN behind the camera.
+    expected_radius_px : float
+        Outer radius that the main ring has there [px].
+    """
+
+    attempt: Attempt
+    reference_distance_m: float
+    sd_reference_m: float | None
+    expected_px: FloatArray
+    expected_radius_px: float
+
+    @property
+    def residual_m(self) -> float | None:
+        """Measured minus reference distance [m]; None where nothing was measured."""
+        seen = self.attempt.sighting
+        return None if seen is None else seen.distance_m - self.reference_distance_m
+
+    @property
+    def residual_percent(self) -> float | None:
+        """The residual in percent of the reference distance."""
+        residual = self.residual_m
+        return None if residual is None else 100.0 * residual / self.reference_distance_m
+
+    @property
+    def is_astray(self) -> bool:
+        """Whether something was measured that is not where the target must be.
+
+        The limit is one radius of the ring.
+        """
+        seen = self.attempt.sighting
+        if seen is None:
+            return False
+        return not math.dist(seen.centre_px, self.expected_px) <= self.expected_radius_px
+
+    def is_whole_in(self, camera: Camera) -> bool:
+        """Whether the reference puts the whole ring into the frame."""
+        margin = self.expected_radius_px
+        limit = np.array([camera.width, camera.height]) - 1.0 - margin
+        return bool(np.all((self.expected_px >= margin) & (self.expected_px <= limit)))
+
+
+@dataclass(frozen=True, slots=True)
+class BiasStudy:
+    """All that could be compared.
+
+    Attributes
+    ----------
+    measured : tuple of Comparison
+        With a residual, in the frames' order.
+    chances : tuple of Comparison
+        Frames in which the target must be wholly visible, measured or not.
+    attitudes_agree : bool
+        Whether most measured centres lie where the reference attitudes put them. If not, nothing
+        is called astray, and every frame with a pose counts as a chance.
+    frames_without_pose : tuple of str
+        Frames that the reference does not name.
+    absences : tuple of Absence
+        Of the frames whose target cannot be placed.
+    """
+
+    measured: tuple[Comparison, ...]
+    chances: tuple[Comparison, ...]
+    attitudes_agree: bool
+    frames_without_pose: tuple[str, ...]
+    absences: tuple[Absence, ...]
+
+    @property
+    def trusted(self) -> tuple[Comparison, ...]:
+        """Measurements that are of this target; statistics are made of these."""
+        return tuple(one for one in self.measured if not (self.attitudes_agree and one.is_astray))
+
+
+def study_bias(
+    attempts: Sequence[Attempt],
+    poses: ReferencePoses,
+    whereabouts: Whereabouts,
+    camera: Camera,
+    targets: Sequence[Target],
+) -> BiasStudy:
+    """Compare every attempt with the reference.
+
+    Parameters
+    ----------
+    attempts : sequence of Attempt
+        One per frame and target; targets never measured are left out.
+    poses : ReferencePoses
+        Of the camera.
+    whereabouts : Whereabouts
+        Of the targets.
+    camera : Camera
+        To know whether the target was in the frame.
+    targets : sequence of Target
+        Of the flight.
+
+    Raises
+    ------
+    KgcpError
+        If nothing was measured, no measured frame has a pose, or as `Whereabouts.places`.
+    """
+    ours = _with_measured_target(attempts)
+    posed = [attempt for attempt in ours if attempt.frame in set(poses.frames)]
+    if not any(attempt.sighting for attempt in posed):
+        raise KgcpError(_no_pose(ours, poses))
+    times = [
+        attempt.sighting.row_time_s(camera) if attempt.sighting else attempt.time_s
+        for attempt in posed
+    ]
+    places = whereabouts.places([attempt.target for attempt in posed], times)
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    views = _Views.of(poses, whereabouts.frame, camera)
+    diameters = {target.name: target.ring.outer_diameter_m for target in targets}
+    compared = [
+        views.compare(attempt, place, rows[attempt.frame], diameters[attempt.target])
+        for attempt, place in zip(posed, places, strict=True)
+        if isinstance(place, Place)
+    ]
+    measured = tuple(one for one in compared if one.attempt.sighting is not None)
+    agree = 2 * sum(one.is_astray for one in measured) < len(measured)
+    return BiasStudy(
+        measured=measured,
+        chances=tuple(one for one in compared if not agree or one.is_whole_in(camera)),
+        attitudes_agree=agree,
+        frames_without_pose=tuple(sorted({one.frame for one in ours} - set(poses.frames))),
+        absences=tuple(place for place in places if isinstance(place, Absence)),
+    )
+
+
+def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:
+    measured = {attempt.target for attempt in attempts if attempt.sighting is not None}
+    if not measured:
+        raise KgcpError(
+            f"no target was measured in any of {len(attempts)} attempts; there is nothing to"
+            " compare, see the reasons that 'kgcp detect' gives"
+        )
+    return [
+        attempt
+        for attempt in attempts
+        if attempt.target in measured
+        and (attempt.sighting is None or not attempt.sighting.instance)
+    ]
+
+
+def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
+    ours = next(attempt.frame for attempt in attempts if attempt.sighting is not None)
+    theirs = f"'{poses.frames[0]}'" if poses.frames else "no frame at all"
+    return (
+        f"no measured frame has a reference pose: measured is for example '{ours}', the file of"
+        f" [reference] poses names {theirs}; its names must be relative to the frames folder"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """Reference poses in the ENU frame: centres (n, 3), rotations (n, 3, 3), covariances."""
+
+    camera: Camera
+    centre_m: FloatArray
+    camera_from_enu: FloatArray
+    cov_m2: FloatArray | None
+
+    @classmethod
+    def of(cls, poses: ReferencePoses, frame: MapFrame, camera: Camera) -> _Views:
+        centre = frame.enu_from_map(poses.position_map)
+        enu_from_map = np.array([frame.grid_rotation(point) for point in centre])
+        enu_from_photo = enu_from_map @ rotation_from_opk(poses.opk_deg)
+        cov = None
+        if poses.sd_position_m is not None:
+            scaled = enu_from_map * poses.sd_position_m[:, None, :]
+            cov = scaled @ np.swapaxes(scaled, 1, 2)
+        return cls(camera, centre, CAMERA_FROM_PHOTO @ np.swapaxes(enu_from_photo, 1, 2), cov)
+
+    def compare(self, attempt: Attempt, place: Place, row: int, diameter_m: float) -> Comparison:
+        """Compare one attempt with the pose in `row`."""
+        sight = place.position_m - self.centre_m[row]
+        distance = float(np.linalg.norm(sight))
+        sd = None
+        if place.cov_m2 is not None and self.cov_m2 is not None:
+            direction = sight / distance
+            sd = math.sqrt(direction @ (place.cov_m2 + self.cov_m2[row]) @ direction)
+        return Comparison(
+            attempt=attempt,
+            reference_distance_m=distance,
+            sd_reference_m=sd,
+            expected_px=_project(self.camera, self.camera_from_enu[row] @ sight),
+            expected_radius_px=0.5 * diameter_m * self.camera.mean_focal_px / distance,
+        )
+
+
+def _project(camera: Camera, point_camera: FloatArray) -> FloatArray:
+    """Project one point (3,); NaN behind the camera, and beyond the fold of its distortion."""
+    if point_camera[2] <= 0.0:
+        return np.full(2, np.nan)
+    normalised = point_camera[:2] / point_camera[2]
+    pixel = camera.distort(normalised)
+    if not np.linalg.norm(camera.undistort(pixel[None])[0] - normalised) < _FOLD_TOLERANCE:
+        return np.full(2, np.nan)
+    return pixel

@@ -1,0 +1,55 @@
+"""Plain CSV: all that kgcp knows about every point, one line each."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.exporters.points import MapPoints
+from kgcp.io.times import format_time
+
+COLUMNS = (
+    *("id", "frame", "target", "time", "x", "y", "z", "sd_x", "sd_y", "sd_z"),
+    *("cov_xy", "cov_xz", "cov_yz", "x_px", "y_px", "sd_x_px", "sd_y_px", "cov_xy_px2"),
+    *("distance_m", "sd_distance_m", "crs"),
+)
+"""x is easting or longitude, y northing or latitude, z height, in `crs`; deviations in metres and
+covariances in m² along these axes; (0, 0) px is the centre of the top-left pixel."""
+
+
+def files(points: MapPoints) -> Mapping[str, str]:
+    """Return `kgcps.csv`."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for point in points.kgcps:
+        writer.writerow(
+            (
+                *(point.id, point.frame, point.target),
+                "" if point.time_s is None else format_time(point.time_s),
+                *points.coordinates(point),
+                *_covariance(point.cov_m2, 3),
+                *(f"{value:.4f}" for value in point.centre_px),
+                *_covariance(point.centre_cov_px2, 2),
+                f"{point.distance_m:.5f}",
+                _text(point.sd_distance_m),
+                points.crs,
+            )
+        )
+    return {"kgcps.csv": stream.getvalue()}
+
+
+def _covariance(cov: FloatArray | None, size: int) -> tuple[str, ...]:
+    """Return deviations, then the covariances above the diagonal, row by row."""
+    if cov is None:
+        return ("",) * (size * (size + 1) // 2)
+    values = (*np.sqrt(np.diag(cov)), *cov[np.triu_indices(size, k=1)])
+    return tuple(_text(float(value)) for value in values)
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.6g}"

@@ -1,0 +1,52 @@
+"""KGCPs and comparisons as rows of `kgcps.parquet` and `bias.parquet`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from kgcp.bias.study import Comparison
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.tables import Row, time_cell
+from kgcp.kgcps import Kgcp
+
+
+def kgcp_row(point: Kgcp) -> Row:
+    """Return the row of one KGCP."""
+    return {
+        "id": point.id,
+        "frame": point.frame,
+        "target": point.target,
+        "time": time_cell(point.time_s),
+        **dict(zip("xyz", point.position_map.tolist(), strict=True)),
+        **_deviations(("sd_x", "sd_y", "sd_z"), point.cov_m2),
+        "cov": None if point.cov_m2 is None else point.cov_m2.ravel().tolist(),
+        "x_px": float(point.centre_px[0]),
+        "y_px": float(point.centre_px[1]),
+        **_deviations(("sd_x_px", "sd_y_px"), point.centre_cov_px2),
+        "distance_m": point.distance_m,
+        "sd_distance_m": point.sd_distance_m,
+    }
+
+
+def bias_row(measured: Comparison) -> Row:
+    """Return the row of one comparison that has a residual."""
+    seen = measured.attempt.sighting
+    return {
+        "frame": measured.attempt.frame,
+        "target": measured.attempt.target,
+        "time": time_cell(measured.attempt.time_s),
+        "distance_m": None if seen is None else seen.distance_m,
+        "sd_distance_m": None if seen is None else seen.sd_distance_m,
+        "reference_distance_m": measured.reference_distance_m,
+        "residual_m": measured.residual_m,
+        "residual_percent": measured.residual_percent,
+        **asdict(measured.attempt.exposure),
+    }
+
+
+def _deviations(names: tuple[str, ...], cov: FloatArray | None) -> dict[str, float | None]:
+    if cov is None:
+        return dict.fromkeys(names)
+    return {name: float(sd) for name, sd in zip(names, np.sqrt(np.diag(cov)), strict=True)}

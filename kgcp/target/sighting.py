@@ -1,0 +1,56 @@
+"""What the chain from sightings to ground needs of one measured target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One target measured in one frame.
+
+    Attributes
+    ----------
+    frame : str
+        Path relative to the frames folder.
+    number : int
+        Position of the frame among all frames of the flight, from 1.
+    target : str
+        Name in flight.toml.
+    instance : int
+        0 for the best plate with this code in the frame.
+    time_s : float or None
+        Mid-exposure, Unix UTC [s]; None: not known.
+    centre_px : (2,) array
+        Projected circle centre in the raw image [px].
+    centre_cov_px2 : (2, 2) array or None
+        Its covariance [px²].
+    distance_m : float
+        Projection centre to target centre [m].
+    sd_distance_m : float or None
+        Its standard deviation [m].
+    """
+
+    frame: str
+    number: int
+    target: str
+    instance: int
+    time_s: float | None
+    centre_px: FloatArray
+    centre_cov_px2: FloatArray | None
+    distance_m: float
+    sd_distance_m: float | None
+
+    def row_time_s(self, camera: Camera) -> float | None:
+        """Return when the centre's row was exposed, Unix UTC [s].
+
+        A rolling shutter reads from the first to the last row in `camera.readout_s`, and the
+        middle row at the frame's time.
+        """
+        if self.time_s is None:
+            return None
+        since_middle = float(self.centre_px[1]) / (camera.height - 1) - 0.5
+        return self.time_s + since_middle * camera.readout_s
