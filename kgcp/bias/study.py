@@ -135,10 +135,14 @@ class BiasStudy:
     frames_without_pose: tuple[str, ...]
     absences: tuple[Absence, ...]
 
+    def trusts(self, one: Comparison) -> bool:
+        """Whether a comparison holds a measurement, and one of this target."""
+        return one.attempt.sighting is not None and not (self.attitudes_agree and one.is_astray)
+
     @property
     def trusted(self) -> tuple[Comparison, ...]:
-        """Measurements that are of this target; statistics are made of these."""
-        return tuple(one for one in self.measured if not (self.attitudes_agree and one.is_astray))
+        """Measurements that statistics are made of."""
+        return tuple(one for one in self.measured if self.trusts(one))
 
 
 def study_bias(

@@ -1,0 +1,53 @@
+"""`kgcp bias-report`: detections and reference poses in, report out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kgcp.cli.options import detections_option, flight_argument, json_option, out_option
+
+
+@click.command()
+@flight_argument
+@out_option
+@detections_option
+@json_option
+def command(flight: Path, out: Path | None, detections: Path | None, *, as_json: bool) -> None:
+    """Compare the measured distances of FLIGHT with reference poses of the camera.
+
+    Writes FLIGHT/kgcp/bias_report.html, its figures as PNG, and bias.parquet. Needs 'kgcp detect'
+    before it, and in flight.toml a crs, [reference] poses, and a [vehicle] or targets with
+    position_m.
+
+    Example: kgcp bias-report sample_flight
+    """
+    from kgcp.bias.study import study_bias
+    from kgcp.errors import KgcpError
+    from kgcp.io.flight import read_flight
+    from kgcp.io.poses import read_reference_poses
+    from kgcp.io.sightings import read_attempts
+    from kgcp.io.whereabouts import read_whereabouts
+    from kgcp.report.write import write_report
+
+    the_flight = read_flight(flight)
+    folder = out or the_flight.folder / "kgcp"
+    attempts = read_attempts(detections or folder / "detections.parquet", the_flight.targets)
+    if the_flight.reference_file is None:
+        raise KgcpError(
+            f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses = 'reference.csv'"
+            " with the camera's poses from an adjustment"
+        )
+    poses = read_reference_poses(the_flight.reference_file)
+    whereabouts = read_whereabouts(the_flight)
+    study = study_bias(attempts, poses, whereabouts, the_flight.camera, the_flight.targets)
+    report = write_report(study, the_flight, folder)
+    if as_json:
+        import json
+
+        click.echo(json.dumps(report.summary()))
+    for sentence in report.verdict:
+        click.echo(sentence, err=True)
+    for path in report.files:
+        click.echo(f"wrote {path}", err=True)

@@ -1,0 +1,1 @@
+"""The bias study as a page, its figures and its numbers."""
