@@ -93,7 +93,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     centre = (rate + z2 / (2.0 * trials)) / (1.0 + z2 / trials)
     spread = math.sqrt(rate * (1.0 - rate) / trials + z2 / (4.0 * trials**2))
     half = _Z_95 * spread / (1.0 + z2 / trials)
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # rounding must not push a rate of 0 or 1 out of its own interval
+    return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
 
 
 @dataclass(frozen=True, slots=True)
