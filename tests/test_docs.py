@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from kgcp.cli import COMMANDS, main
+from kgcp.errors import Reason
+from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, Column
+from kgcp.io.flight import CAMERA_KEYS, FRAMES_KEYS, REFERENCE_KEYS, VEHICLE_KEYS
+from kgcp.io.flight_targets import PLATE_KEYS, REPLICA_KEYS
+
+ROOT = Path(__file__).resolve().parents[1]
+CONVENTIONS = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+def section(heading: str) -> str:
+    """The text below a heading of docs/conventions.md, up to the next one of any level."""
+    match = re.search(
+        rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", CONVENTIONS, re.MULTILINE | re.DOTALL
+    )
+    assert match, heading
+    return match[1]
+
+
+def first_column(text: str) -> list[str]:
+    """The code words in the first column of a table."""
+    return [
+        word
+        for line in text.splitlines()
+        if line.startswith("| `")
+        for word in re.findall(r"`([^`]+)`", line.split("|")[1])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("heading", "columns"),
+    [
+        ("detections.parquet", DETECTION_COLUMNS),
+        ("kgcps.parquet", KGCP_COLUMNS),
+        ("bias.parquet", BIAS_COLUMNS),
+    ],
+)
+def test_exactly_the_columns_that_exist_are_documented(
+    heading: str, columns: tuple[Column, ...]
+) -> None:
+    documented = first_column(section(heading))
+    assert len(documented) == len(set(documented))
+    assert set(documented) == {column.name for column in columns}
+
+
+def test_every_reason_is_documented_in_its_own_words() -> None:
+    lines = [line for line in section("Reasons").splitlines() if line.startswith("| `")]
+    assert lines == [f"| `{r.value}` | `{r.status.value}` | {r.description} |" for r in Reason]
+
+
+@pytest.mark.parametrize(
+    "key",
+    sorted(
+        {*FRAMES_KEYS, *CAMERA_KEYS, *PLATE_KEYS, *REPLICA_KEYS, *VEHICLE_KEYS, *REFERENCE_KEYS}
+    ),
+)
+def test_every_key_of_flight_toml_is_documented(key: str) -> None:
+    text = section("flight.toml")
+    assert f"`{key}`" in text or (key[0] == "k" and "`k1` … `k6`" in text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        path, _, anchor = target.partition("#")
+        if path.startswith("https://"):
+            continue
+        linked = page.parent / path if path else page
+        assert linked.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {heading.lower().replace(" ", "-") for heading in headings}, target
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_explains_itself_with_an_example(name: str) -> None:
+    result = CliRunner().invoke(main, [name, "--help"])
+    assert result.exit_code == 0
+    assert f"kgcp {name} " in result.stdout.partition("\n")[2], "an example, below the usage line"
+    assert main.get_command(click.Context(main), name) is not None
+
+
+def test_the_commands_of_the_readme_exist() -> None:
+    lines = [line.strip().partition("#")[0] for line in README.splitlines() if line[:4] == " " * 4]
+    calls = [shlex.split(line)[1:] for line in lines if line.startswith("kgcp ")]
+    assert {call[0] for call in calls} == set(COMMANDS)
+    for name, *arguments in calls:
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        if "--help" not in arguments:
+            command.make_context(name, list(arguments))  # raises on unknown options
+
+
+def test_the_make_targets_of_the_readme_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"\bmake ([a-z-]+)", "\n".join(p.read_text() for p in PAGES)):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
