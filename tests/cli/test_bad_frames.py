@@ -1,0 +1,96 @@
+"""Frames that cannot be read are rows, folders that cannot be used are lines; nothing is lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+
+WIDTH, HEIGHT = 320, 200
+FLIGHT = f"""\
+[camera]
+width = {WIDTH}
+height = {HEIGHT}
+fx = 400.0
+fy = 400.0
+cx = 160.0
+cy = 100.0
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+
+def one_line_of_error(result: Result) -> str:
+    """The last line on stderr, after the checks that hold for every known error."""
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    errors = [line for line in result.stderr.splitlines() if "kgcp: error: " in line]
+    assert len(errors) == 1
+    assert errors[0] == result.stderr.splitlines()[-1]
+    assert "; " in errors[0], "the remedy follows a semicolon"
+    return errors[0]
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A flight of three frames of empty ground."""
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    (tmp_path / "flight.toml").write_text(FLIGHT)
+    rng = np.random.default_rng(3)
+    for number in range(3):
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, WIDTH)), (0, 0), 2.0)
+        assert cv2.imwrite(str(frames / f"good_{number}.jpg"), noise.astype(np.uint8))
+    return tmp_path
+
+
+def test_bad_frames_are_rows_among_the_good_ones(flight: Path) -> None:
+    frames = flight / "frames"
+    whole = (frames / "good_0.jpg").read_bytes()
+    (frames / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    (frames / "text.jpg").write_text("not an image\n")
+    (frames / "zero.png").touch()
+    assert cv2.imwrite(str(frames / "tiny.png"), np.zeros((1, 1), np.uint8))
+    result = run("detect", str(flight), "--jobs", "1", "--json")
+    assert result.exit_code == 0
+    summary = json.loads(result.stdout)
+    assert summary["frames"] == 7
+    assert summary["status"] == {"measured": 0, "not_found": 3, "rejected": 0, "unreadable": 4}
+    table = pq.read_table(flight / "kgcp" / "detections.parquet").to_pydict()
+    reasons = dict(zip(table["frame"], table["reason"], strict=True))
+    assert {frame: reasons[frame] for frame in sorted(reasons)[:1] + sorted(reasons)[4:]} == {
+        "cut.jpg": "decode_failed",
+        "text.jpg": "decode_failed",
+        "tiny.png": "wrong_size",
+        "zero.png": "decode_failed",
+    }
+    assert "4 unreadable" in result.stderr
+
+
+def test_an_empty_frames_folder_is_a_line(flight: Path) -> None:
+    for frame in (flight / "frames").iterdir():
+        frame.unlink()
+    line = one_line_of_error(run("detect", str(flight)))
+    assert f"{flight / 'frames'}: holds no images" in line
+    assert not (flight / "kgcp").exists()
+
+
+@pytest.mark.parametrize("command", ["export-gcp", "bias-report"])
+def test_a_command_before_detect_is_a_line(flight: Path, command: str) -> None:
+    assert "run 'kgcp detect'" in one_line_of_error(run(command, str(flight)))
