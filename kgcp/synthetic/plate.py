@@ -15,7 +15,7 @@ from kgcp.synthetic.patch import Patch, Window, outline_box
 from kgcp.synthetic.shapes import ConvexPolygon, Disc, Shape
 from kgcp.target.layout import Ring, Target
 
-_SUB_PIXELS_ACROSS = 1200  # of a window: memory and time are bounded, small targets get most
+_SUB_PIXELS_ACROSS = 1000  # of a window: memory and time are bounded, small targets get most
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +134,7 @@ def image_plate(
     if window is None:
         window = plate_window(camera, plate, pose, optics)
     longest = max(window.width, window.height)
-    oversampling = int(np.clip(_SUB_PIXELS_ACROSS // longest, 3, 8))
+    oversampling = int(np.clip(_SUB_PIXELS_ACROSS // longest, 4, 8))
     patch = Patch.of(camera, pose, window, oversampling)
     opacity = np.zeros_like(patch.x_m)
     patch.paint(opacity, plate.outline, 1.0)
