@@ -55,10 +55,19 @@ def test_a_constant_offset_is_called_a_bias_and_noise_is_not() -> None:
     distances = np.linspace(10.0, 100.0, 60)
     plain = bias_numbers(_study(*map(_comparison, distances, noise)))
     shifted = bias_numbers(_study(*map(_comparison, distances, noise - 0.2)))
-    assert not plain.is_biased
-    assert shifted.is_biased
+    assert not plain.biased
+    assert [row.label for row in shifted.biased] == ["over all distances"]
     assert any("too short" in sentence for sentence in verdict(shifted))
     assert any("No bias beyond noise" in sentence for sentence in verdict(plain))
+
+
+def test_a_bias_of_the_far_half_alone_is_found() -> None:
+    rng = np.random.default_rng(6)
+    near = zip(np.linspace(10, 49, 40), rng.normal(0.0, 0.3, 40), strict=True)
+    far = zip(np.linspace(51, 100, 12), rng.normal(0.15, 0.05, 12), strict=True)
+    numbers = bias_numbers(_study(*(_comparison(d, e) for d, e in (*near, *far))))
+    assert [row.label for row in numbers.biased] == ["50 m and more"]
+    assert any("too long 50 m and more" in sentence for sentence in verdict(numbers))
 
 
 def test_an_influence_of_exposure_is_named() -> None:

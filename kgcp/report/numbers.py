@@ -40,6 +40,12 @@ class RangeRow:
     percent: Spread
     metres: Spread
 
+    @property
+    def is_biased(self) -> bool:
+        """Whether the mean error stands out from its own noise."""
+        sd_mean = self.percent.sd_mean
+        return sd_mean is not None and abs(self.percent.mean) > _BIASED_SIGMAS * sd_mean
+
 
 @dataclass(frozen=True, slots=True)
 class DetectionRate:
@@ -129,10 +135,11 @@ class BiasNumbers:
     attitudes_agree: bool
 
     @property
-    def is_biased(self) -> bool:
-        """Whether the mean error stands out from its own noise."""
-        spread = self.total.percent
-        return spread.sd_mean is not None and abs(spread.mean) > _BIASED_SIGMAS * spread.sd_mean
+    def biased(self) -> tuple[RangeRow, ...]:
+        """The ranges whose mean error stands out from its own noise: all, or halves of it."""
+        if self.total.is_biased:
+            return (self.total,)
+        return tuple(half for half in self.halves if half.is_biased)
 
 
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
@@ -157,7 +164,7 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         distance_m=distance,
         residual_m=residual,
         residual_percent=percent,
-        total=RangeRow("all", Spread.of(percent), Spread.of(residual)),
+        total=RangeRow("over all distances", Spread.of(percent), Spread.of(residual)),
         halves=tuple(half for half in halves if half is not None),
         bins=tuple(one for one in bins if one is not None),
         rates=_rates(np.array([one.reference_distance_m for one in study.chances]), detected),

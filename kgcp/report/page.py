@@ -64,14 +64,19 @@ def _rms(row: RangeRow) -> str:
 
 
 def _bias(numbers: BiasNumbers) -> str:
-    percent = numbers.total.percent
-    if percent.sd_mean is None:
+    if numbers.total.percent.count == 1:
         return "One frame says nothing about bias."
-    mean = f"{percent.mean:+.3f} ± {percent.sd_mean:.3f} %".replace("-", "−")
-    if not numbers.is_biased:
-        return f"No bias beyond noise: the mean error is {mean}."
-    side = "long" if percent.mean > 0.0 else "short"
-    return f"Biased: distances are measured too {side}, by {mean} on average."
+    if not numbers.biased:
+        return f"No bias beyond noise: the mean error is {_mean(numbers.total)}."
+    sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
+    parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
+    return f"Biased: distances are measured {'; '.join(parts)}."
+
+
+def _mean(row: RangeRow) -> str:
+    sd_mean = row.percent.sd_mean
+    noise = "" if sd_mean is None else f" ± {sd_mean:.3f}"
+    return f"{row.percent.mean:+.3f}{noise} %".replace("-", "−")
 
 
 def _detection(numbers: BiasNumbers) -> list[str]:

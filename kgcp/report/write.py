@@ -39,7 +39,7 @@ class Report:
             "compared": numbers.total.percent.count,
             "residual_percent": asdict(numbers.total.percent),
             "residual_m": asdict(numbers.total.metres),
-            "biased": numbers.is_biased,
+            "biased": [row.label for row in numbers.biased],
             "detected": numbers.detected,
             "frames_with_target": numbers.chances,
             "astray": len(numbers.astray),
