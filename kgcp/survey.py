@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -26,6 +23,7 @@ from kgcp.settings import DetectSettings
 from kgcp.target.layout import Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Miss, Outcome
+from kgcp.workers import ordered_map
 
 _FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
 
@@ -63,11 +61,6 @@ class SurveySummary:
     reasons: Mapping[str, int]
     frames_without_time: int
     times_without_frame: int
-
-
-def usable_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def detect_flight(
@@ -121,18 +114,14 @@ def examine_frames(
     task: FrameTask, frames: Sequence[str], times: Mapping[str, float], *, jobs: int
 ) -> Iterator[FrameResult]:
     """Yield the result of every frame, in the order given, from a pool of `jobs` processes."""
-    frame_times = [times.get(frame) for frame in frames]
-    if jobs == 1:
-        _start_worker(task)
-        yield from map(_examine_in_worker, frames, frame_times)
-        return
-    with ProcessPoolExecutor(
-        max_workers=min(jobs, len(frames)),
-        mp_context=multiprocessing.get_context("spawn"),  # forking a threaded parent may deadlock
-        initializer=_start_worker,
-        initargs=(task,),
-    ) as pool:
-        yield from pool.map(_examine_in_worker, frames, frame_times, chunksize=_FRAMES_PER_TASK)
+    return ordered_map(
+        _examine_in_worker,
+        [(frame, times.get(frame)) for frame in frames],
+        jobs=jobs,
+        start=_start_worker,
+        start_arguments=(task,),
+        items_per_task=_FRAMES_PER_TASK,
+    )
 
 
 def examine_frame(task: FrameTask, frame: str, time_s: float | None) -> FrameResult:
@@ -168,10 +157,10 @@ def _start_worker(task: FrameTask) -> None:
     cv2.setNumThreads(0)  # the processes are the parallelism
 
 
-def _examine_in_worker(frame: str, time_s: float | None) -> FrameResult:
+def _examine_in_worker(frame_and_time: tuple[str, float | None]) -> FrameResult:
     if _worker_task is None:
         raise RuntimeError("worker used before it was started")
-    return examine_frame(_worker_task, frame, time_s)
+    return examine_frame(_worker_task, *frame_and_time)
 
 
 def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:

@@ -22,6 +22,7 @@ LAYERS = (
     ("carrier",),
     ("kgcps", "synthetic"),
     ("bias",),
+    ("workers",),
     ("io",),
     ("survey", "report"),
     ("cli",),
@@ -33,6 +34,7 @@ LEVEL = {member: level for level, members in enumerate(LAYERS) for member in mem
 LIBRARIES = {
     "errors": set(),
     "settings": set(),
+    "workers": set(),
     "geometry": {"numpy", "scipy"},
     "target": {"numpy", "scipy", "cv2"},
     "mapframe": {"numpy", "pyproj"},
@@ -105,7 +107,8 @@ def test_parts_use_only_the_libraries_of_their_layer(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["io"]],
+    # `workers` asks the system for its cores, and that is all
+    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["workers"]],
     ids=names,
 )
 def test_nothing_below_io_knows_files(path: Path) -> None:

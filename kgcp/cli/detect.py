@@ -66,13 +66,18 @@ def command(
     """
     import time
 
+    from kgcp.workers import use_one_core_each
+
+    use_one_core_each()  # before numpy is loaded
+
     from tqdm import tqdm
 
     from kgcp.io.detections import FrameResult
     from kgcp.io.flight import read_flight
     from kgcp.io.frames import list_frames
-    from kgcp.survey import detect_flight, usable_cores
+    from kgcp.survey import detect_flight
     from kgcp.target.observation import Observation
+    from kgcp.workers import usable_cores
 
     settings = DetectSettings(method=Method(method), min_radius_px=min_radius, min_score=min_score)
     the_flight = read_flight(flight)

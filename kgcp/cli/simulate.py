@@ -71,9 +71,9 @@ def command(
     from tqdm import tqdm
 
     from kgcp.io.simulated import write_simulated_flight
-    from kgcp.survey import usable_cores
     from kgcp.synthetic.flight import plan_flight
     from kgcp.synthetic.presets import preset
+    from kgcp.workers import usable_cores
 
     settings = preset(preset_name)
     if frames is not None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import multiprocessing
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
@@ -30,6 +28,7 @@ from kgcp.synthetic.flight import (
     render_frame,
 )
 from kgcp.synthetic.ground import Ground
+from kgcp.workers import ordered_map
 
 _PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
 _EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
@@ -113,18 +112,13 @@ def _exif(plan: FlightPlan, index: int) -> bytes:
 
 def _write_frames(plan: FlightPlan, folder: Path, jobs: int) -> Iterator[None]:
     """Render and write every frame, yielding after each."""
-    indices = range(len(plan.frames))
-    if jobs == 1:
-        _start_worker(plan, folder)
-        yield from map(_write_frame_in_worker, indices)
-        return
-    with ProcessPoolExecutor(
-        max_workers=min(jobs, len(indices)),
-        mp_context=multiprocessing.get_context("spawn"),  # forking a threaded parent may deadlock
-        initializer=_start_worker,
-        initargs=(plan, folder),
-    ) as pool:
-        yield from pool.map(_write_frame_in_worker, indices)
+    return ordered_map(
+        _write_frame_in_worker,
+        range(len(plan.frames)),
+        jobs=jobs,
+        start=_start_worker,
+        start_arguments=(plan, folder),
+    )
 
 
 _worker: tuple[FlightPlan, Path, Ground] | None = None  # once per process: the ground is large

@@ -94,7 +94,8 @@ def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
         raise KgcpError(
             f"{path}: lacks the columns {', '.join(missing)}; remake it with this version of kgcp"
         )
-    return table.to_pandas()
+    frame: pd.DataFrame = table.to_pandas()
+    return frame
 
 
 def read_detections(path: Path) -> pd.DataFrame:
