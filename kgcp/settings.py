@@ -52,7 +52,7 @@ class DetectSettings:
     method: Method = Method.PAPER
     canny_low: float = 40.0
     canny_high: float = 100.0
-    min_radius_px: float = 3.0
+    min_radius_px: float = 5.0
     max_circle_deviation: float = 0.15
     min_score: float = 0.8
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +49,16 @@ class Pose:
         columns = points_target.shape[-1]
         return points_target @ self.rotation[:, :columns].T + self.translation_m
 
+    def turned(self, angle_deg: float) -> Pose:
+        """Return this pose with the target turned about its own z axis, from +x towards +y."""
+        turn = Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
+        return Pose(self.rotation @ turn, self.translation_m)
+
+    def moved(self, step: FloatArray) -> Pose:
+        """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
+        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
+        return Pose(turn @ self.rotation, self.translation_m + step[:3])
+
     @property
     def roll_deg(self) -> float:
         """φ of the paper's eq. 11: tilt of the diameter in the camera's yz plane; 0 for R = I.
@@ -63,3 +74,16 @@ class Pose:
         """θ of the paper: tilt of the diameter in the camera's xz plane; 0 for R = I."""
         n = self.normal
         return math.degrees(math.atan2(-n[0], n[2]))
+
+
+def image_heading_deg(camera: Camera, pose: Pose) -> float:
+    """Direction of the target's +x axis in the raw image, at the projected centre.
+
+    Clockwise from image x, in (-180, 180] [deg]: the derivative of the distorted projection
+    along the axis, so independent of any length on the plate.
+    """
+    centre, axis = pose.translation_m, pose.rotation[:, 0]
+    normalised = centre[:2] / centre[2]
+    along = (axis[:2] - normalised * axis[2]) / centre[2]
+    dx, dy = camera.distort_jacobian(normalised) @ along
+    return math.degrees(math.atan2(dy, dx))

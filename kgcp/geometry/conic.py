@@ -1,0 +1,210 @@
+"""Conics in the plane as symmetric 3×3 matrices: x ᵀ Q x = 0 for homogeneous points x = (x, y, 1).
+
+The matrix of an ellipse is kept with two positive eigenvalues and a negative one, so that
+x ᵀ Q x is negative inside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray
+
+_MIN_POINTS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipse:
+    """An ellipse by its centre, semi-axes and direction.
+
+    Attributes
+    ----------
+    x, y : float
+        Centre.
+    a, b : float
+        Semi-major and semi-minor axis, in the unit of the centre.
+    angle_rad : float
+        Direction of the major axis, from x towards y, in (-π/2, π/2].
+    """
+
+    x: float
+    y: float
+    a: float
+    b: float
+    angle_rad: float
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre (2,)."""
+        return np.array([self.x, self.y])
+
+    @property
+    def mean_radius(self) -> float:
+        """Radius of the circle of the same area."""
+        return math.sqrt(self.a * self.b)
+
+    @property
+    def stretch(self) -> FloatArray:
+        """Symmetric matrix (2, 2) that makes this ellipse, up to its centre, of the unit circle."""
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        axes = np.array([[c, -s], [s, c]])
+        return np.asarray((axes * (self.a, self.b)) @ axes.T)
+
+    @property
+    def conic(self) -> FloatArray:
+        """Matrix (3, 3) of this ellipse."""
+        to_unit_circle = np.eye(3)
+        to_unit_circle[:2, :2] = np.linalg.inv(self.stretch)
+        to_unit_circle[:2, 2] = -to_unit_circle[:2, :2] @ self.centre
+        return to_unit_circle.T @ np.diag([1.0, 1.0, -1.0]) @ to_unit_circle
+
+    def points(self, angles_rad: FloatArray, factor: float = 1.0) -> FloatArray:
+        """Return points (…, 2) at angles (…) on the ellipse times `factor` about its centre.
+
+        The angles are those of the unit circle before it is stretched along the axes, without a
+        rotation: for a nearly frontal circle they are directions on the plate plus its heading.
+        """
+        unit = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1)
+        return factor * unit @ self.stretch + self.centre
+
+    def angles_rad(self, points: FloatArray) -> FloatArray:
+        """Return the angles (n,) of `points` for points (n, 2), wherever they lie radially."""
+        unit = (points - self.centre) @ np.linalg.inv(self.stretch)
+        return np.arctan2(unit[:, 1], unit[:, 0])
+
+    def scaled(self, factor: float) -> Ellipse:
+        """Return the ellipse with both axes times `factor` about the same centre."""
+        return Ellipse(self.x, self.y, factor * self.a, factor * self.b, self.angle_rad)
+
+
+def oriented(conic: FloatArray) -> FloatArray:
+    """Return the conic (3, 3) symmetric, of unit norm, and negative inside if it is an ellipse."""
+    symmetric = 0.5 * (conic + conic.T)
+    sign = 1.0 if np.trace(symmetric[:2, :2]) > 0.0 else -1.0
+    result: FloatArray = symmetric * (sign / np.linalg.norm(symmetric))
+    return result
+
+
+def transform_conic(conic: FloatArray, homography: FloatArray) -> FloatArray:
+    """Return the conic (3, 3) of the points x' = homography @ x for x on `conic`."""
+    inverse = np.linalg.inv(homography)
+    return oriented(inverse.T @ conic @ inverse)
+
+
+def ellipse_from_conic(conic: FloatArray) -> Ellipse:
+    """Return centre, axes and direction of a conic (3, 3).
+
+    Raises
+    ------
+    Rejection
+        POOR_ELLIPSE if the conic is not a real ellipse.
+    """
+    form = oriented(conic)
+    quadratic, linear = form[:2, :2], form[:2, 2]
+    curvatures, axes = np.linalg.eigh(quadratic)
+    if curvatures[0] <= 0.0:
+        raise Rejection(Reason.POOR_ELLIPSE, "the fitted conic is not an ellipse")
+    centre = np.linalg.solve(quadratic, -linear)
+    depth = -(form[2, 2] + linear @ centre)
+    if depth <= 0.0:
+        raise Rejection(Reason.POOR_ELLIPSE, "the fitted ellipse has no real points")
+    a, b = np.sqrt(depth / curvatures)
+    return Ellipse(float(centre[0]), float(centre[1]), float(a), float(b), _direction(axes[:, 0]))
+
+
+def _direction(axis: FloatArray) -> float:
+    """Angle of an undirected axis in (-π/2, π/2]."""
+    angle = math.atan2(axis[1], axis[0])
+    return angle - math.pi * math.ceil(angle / math.pi - 0.5)
+
+
+def fit_ellipse(points: FloatArray) -> FloatArray:
+    """Fit an ellipse to points by the direct least-squares method.
+
+    Fitzgibbon's constraint 4ac - b² = 1 in the block form of Halíř & Flusser (1998), "Numerically
+    stable direct least squares fitting of ellipses", on points centred and scaled to unit size.
+
+    Parameters
+    ----------
+    points : (n, 2) array
+        At least six points.
+
+    Returns
+    -------
+    (3, 3) array
+        The conic, in the coordinates of the points.
+
+    Raises
+    ------
+    Rejection
+        POOR_ELLIPSE if the points do not determine an ellipse.
+    """
+    if len(points) < _MIN_POINTS:
+        raise Rejection(Reason.POOR_ELLIPSE, f"{len(points)} points are too few for an ellipse")
+    mean = points.mean(axis=0)
+    scale = float(np.sqrt(np.mean((points - mean) ** 2)))
+    x, y = ((points - mean) / scale).T if scale > 0.0 else np.zeros((2, len(points)))
+    a, b, c, d, e, f = _direct_fit(x, y)
+    unit = np.array([[a, 0.5 * b, 0.5 * d], [0.5 * b, c, 0.5 * e], [0.5 * d, 0.5 * e, f]])
+    back = np.array([[scale, 0.0, mean[0]], [0.0, scale, mean[1]], [0.0, 0.0, 1.0]])
+    return transform_conic(unit, back)
+
+
+def _direct_fit(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Coefficients (6,) of x², xy, y², x, y, 1."""
+    quadratic = np.column_stack((x * x, x * y, y * y))
+    linear = np.column_stack((x, y, np.ones_like(x)))
+    try:
+        reduce = -np.linalg.solve(linear.T @ linear, linear.T @ quadratic)
+    except np.linalg.LinAlgError:
+        raise Rejection(Reason.POOR_ELLIPSE, "the points lie on a line") from None
+    scatter = quadratic.T @ (quadratic + linear @ reduce)
+    constrained = np.stack((0.5 * scatter[2], -scatter[1], 0.5 * scatter[0]))
+    vectors = np.real(np.linalg.eig(constrained)[1])
+    discriminant = 4.0 * vectors[0] * vectors[2] - vectors[1] ** 2
+    best = int(np.argmax(discriminant))
+    if not discriminant[best] > 0.0:
+        raise Rejection(Reason.POOR_ELLIPSE, "the points do not determine an ellipse")
+    return np.concatenate((vectors[:, best], reduce @ vectors[:, best]))
+
+
+def sampson_distance(conic: FloatArray, points: FloatArray) -> FloatArray:
+    """Return first-order signed distances (n,) of points (n, 2) from a conic, negative inside."""
+    homogeneous = np.column_stack((points, np.ones(len(points))))
+    form = homogeneous @ oriented(conic)
+    value = np.einsum("ni,ni->n", form, homogeneous)
+    return np.asarray(0.5 * value / np.hypot(form[:, 0], form[:, 1]))
+
+
+def chord(conic: FloatArray, point: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """Intersect an ellipse with lines through a point inside it.
+
+    Parameters
+    ----------
+    conic : (3, 3) array
+        The ellipse.
+    point : (2,) array
+        A point inside.
+    angles_rad : (n,) array
+        Directions of the lines, from x towards y [rad].
+
+    Returns
+    -------
+    (2, n, 2) array
+        For each line the end behind the point (A) and the end ahead of it (B); NaN where the
+        line misses the ellipse.
+    """
+    directions = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1)
+    form = oriented(conic)
+    origin = np.append(point, 1.0)
+    along = directions @ form[:2, :2]
+    quadratic = np.einsum("ni,ni->n", along, directions)
+    linear = directions @ (form[:2] @ origin)
+    with np.errstate(invalid="ignore"):  # a line that misses: NaN, as promised
+        half = np.sqrt(linear**2 - quadratic * (origin @ form @ origin))
+    lengths = np.stack((-linear - half, -linear + half)) / quadratic
+    return np.asarray(point + lengths[..., None] * directions)

@@ -1,0 +1,143 @@
+"""Nearly circular contours and clusters of concentric ones: §2.2 of Cucci (2016)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from kgcp.errors import Rejection
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
+from kgcp.settings import DetectSettings
+from kgcp.target.contours import Contours
+
+_MAX_BROKEN_DEVIATION = 0.45  # of the mean radius
+_MAX_HULL_DEVIATION = 0.1  # of a hull's mean radius: squares are out
+_MIN_CORNERS = 10
+_FIT_PASSES = 3
+_MAX_AXIS_RATIO = 2.0  # tilts to 60°
+_CONCENTRIC = 0.2  # of the smaller circle's radius
+_CONCENTRIC_PX = 1.0
+_SAME_CIRCLE_PX = 0.7
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """Concentric circles, as preliminary ellipses in the raw frame.
+
+    Attributes
+    ----------
+    ellipses : tuple of Ellipse
+        Largest first: the first is the cluster's representative [px].
+    """
+
+    ellipses: tuple[Ellipse, ...]
+
+    def nearest(self, outer: Ellipse, ratio: float, tolerance: float) -> Ellipse | None:
+        """Return the member whose radius relative to `outer` is nearest `ratio`.
+
+        None if no member is within `tolerance` times the wanted radius, or about its centre.
+        """
+        wanted = ratio * outer.mean_radius
+        near = [
+            ellipse
+            for ellipse in self.ellipses
+            if abs(ellipse.mean_radius - wanted) <= tolerance * wanted
+            and np.linalg.norm(ellipse.centre - outer.centre) <= tolerance * wanted
+        ]
+        return min(near, key=lambda ellipse: abs(ellipse.mean_radius - wanted), default=None)
+
+
+def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse, ...]:
+    """Return the contours that pass the paper's circle test, as ellipses [px].
+
+    With the mean μ and the standard deviation σ of the radius about the contour's mean point a
+    contour passes if μ > μ_min and σ < k μ. Where blur or overexposure open the dots towards the
+    plate, the contour runs through them into the ring: of a contour long enough to go round, but
+    too rough to pass, the convex hull is tested in its place.
+    """
+    if len(contours) == 0:
+        return ()
+    starts = contours.starts[:-1]
+    counts = np.diff(contours.starts)
+    centres = np.add.reduceat(contours.points, starts) / counts[:, None]
+    offsets = contours.points - np.repeat(centres, counts, axis=0)
+    radii = np.sqrt(np.einsum("ni,ni->n", offsets, offsets))
+    mean = np.add.reduceat(radii, starts) / counts
+    deviation = np.sqrt(np.maximum(np.add.reduceat(radii**2, starts) / counts - mean**2, 0.0))
+    largest = np.maximum.reduceat(radii, starts)
+    circular = (mean > settings.min_radius_px) & (deviation < settings.max_circle_deviation * mean)
+    broken = (
+        ~circular
+        & (deviation < _MAX_BROKEN_DEVIATION * mean)
+        & (largest > settings.min_radius_px)
+        & (counts > 2.0 * math.pi * largest)
+    )
+    curves = [contours.contour(int(index)) for index in np.flatnonzero(circular)]
+    hulls = (_circular_hull(contours.contour(int(i)), settings) for i in np.flatnonzero(broken))
+    curves += [hull for hull in hulls if hull is not None]
+    fits = (_preliminary_ellipse(curve) for curve in curves)
+    return tuple(ellipse for ellipse in fits if ellipse is not None)
+
+
+def _circular_hull(points: FloatArray, settings: DetectSettings) -> FloatArray | None:
+    """Return the corners (k, 2) of a contour's convex hull if they pass the circle test."""
+    hull = cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
+    radii = np.linalg.norm(hull - 0.5 * (hull.min(axis=0) + hull.max(axis=0)), axis=1)
+    mean, deviation = float(radii.mean()), float(radii.std())
+    circular = mean > settings.min_radius_px and deviation < _MAX_HULL_DEVIATION * mean
+    return hull if circular and len(hull) >= _MIN_CORNERS else None
+
+
+def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
+    """Fit an ellipse to one contour, leaving out where dots or clutter break into it."""
+    try:
+        conic = fit_ellipse(points)
+        for _ in range(_FIT_PASSES):
+            distance = np.abs(sampson_distance(conic, points))
+            near = distance <= max(1.0, 2.5 * float(np.median(distance)))
+            if near.all():
+                break
+            conic = fit_ellipse(points[near])
+        ellipse = ellipse_from_conic(conic)
+    except Rejection:
+        return None
+    return ellipse if ellipse.a <= _MAX_AXIS_RATIO * ellipse.b else None
+
+
+def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[Cluster, ...]:
+    """Group ellipses with a common centre, largest representative first.
+
+    Both contours along one edge are one circle: of ellipses that agree within a pixel's fraction
+    the larger is kept.
+    """
+    if not ellipses:
+        return ()
+    ordered = sorted(ellipses, key=lambda ellipse: (-ellipse.mean_radius, ellipse.x, ellipse.y))
+    centres = np.array([ellipse.centre for ellipse in ordered])
+    reach = _CONCENTRIC_PX + _CONCENTRIC * np.array([ellipse.mean_radius for ellipse in ordered])
+    free = np.ones(len(ordered), dtype=bool)
+    clusters = []
+    for first in range(len(ordered)):
+        if not free[first]:
+            continue
+        members = free & (np.linalg.norm(centres - centres[first], axis=1) <= reach)
+        free &= ~members
+        clusters.append(Cluster(_distinct([ordered[i] for i in np.flatnonzero(members)])))
+    return tuple(clusters)
+
+
+def _distinct(ellipses: list[Ellipse]) -> tuple[Ellipse, ...]:
+    kept: list[Ellipse] = []
+    for ellipse in ellipses:
+        if not any(_same(ellipse, other) for other in kept):
+            kept.append(ellipse)
+    return tuple(kept)
+
+
+def _same(one: Ellipse, other: Ellipse) -> bool:
+    difference = np.array([one.x - other.x, one.y - other.y, one.a - other.a, one.b - other.b])
+    return bool(np.all(np.abs(difference) < _SAME_CIRCLE_PX))
