@@ -71,6 +71,11 @@ class Reason(StrEnum):
         Status.NOT_FOUND,
         "clusters were found, but none carries this target's code",
     )
+    CUT = (
+        "cut",
+        Status.REJECTED,
+        "too much of the target is outside the frame",
+    )
     NO_INNER_CIRCLE = (
         "no_inner_circle",
         Status.REJECTED,
@@ -90,6 +95,16 @@ class Reason(StrEnum):
         "impossible_geometry",
         Status.REJECTED,
         "the two ellipses cannot be images of this target's concentric circles",
+    )
+    NO_CONTRAST = (
+        "no_contrast",
+        Status.REJECTED,
+        "ink is not darker than the plate: too dark, burnt out or too blurred",
+    )
+    POOR_FIT = (
+        "poor_fit",
+        Status.REJECTED,
+        "the grey values do not fit the image of this target",
     )
     DECODE_FAILED = (
         "decode_failed",

@@ -8,4 +8,5 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.intp]
 GreyArray = npt.NDArray[Any]  # uint8, uint16 or float: one channel, (height, width)

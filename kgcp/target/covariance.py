@@ -1,0 +1,164 @@
+"""Covariances that hold up: from the residuals as they are, correlation included.
+
+The inverse normal matrix is the covariance only if residuals are independent from pixel to pixel.
+Jagged print, JPEG, sharpening and the tails of unmodelled effects run along the contours. So the
+scores (derivatives of the log-likelihood) are summed over short arcs of every circle, and the
+scatter of these sums gives the covariance of the gradient: a cluster-robust ("sandwich") estimate
+(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.target.adjust import Fit
+from kgcp.target.observation import Uncertainty
+
+_ARC_PX = 6.0
+_EDGE_FLOOR_PX = 0.004  # no print and no pixel is known better: common to all of a circle's edge
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCovariance:
+    """Covariance of a pose.
+
+    Attributes
+    ----------
+    pose_cov : (6, 6) array
+        Translation [m] and rotation vector [rad], left perturbation in the camera frame.
+    inflation : float
+        Mean ratio of these variances to those of independent residuals.
+    """
+
+    pose_cov: FloatArray
+    inflation: float
+
+
+def pose_covariance(fit: Fit) -> PoseCovariance:
+    """Return the covariance of the pose of a fit.
+
+    From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
+    small common displacement of each circle's edge would do.
+    """
+    inverse = np.linalg.inv(fit.normal)
+    scaled = fit.jacobian[fit.unknowns.free] / fit.sd
+    circle, arc = _nearest_edges(fit)
+    count = int(arc.max()) + 1
+    scores = scaled * fit.misfit.score
+    sums = np.stack([np.bincount(arc, weights=row, minlength=count) for row in scores])
+    used = int(np.count_nonzero(np.bincount(arc, minlength=count)))
+    correction = used / max(used - len(scores), 0.25 * used)
+    robust = (correction * inverse @ (sums @ sums.T) @ inverse)[:6, :6]
+    plain = inverse[:6, :6]
+    inflation = max(1.0, float(np.trace(np.linalg.solve(plain, robust))) / 6.0)
+    shifts = (inverse @ _edge_pull(fit, scaled, circle))[:6] * _EDGE_FLOOR_PX
+    return PoseCovariance(_at_least(robust, plain) + shifts @ shifts.T, inflation)
+
+
+def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
+    """Return the gradient (p, 2) by one pixel's growth of the outer and of the inner circle.
+
+    Coming nearer by the share 1/r grows a circle of r pixels by one pixel.
+    """
+    imaging = fit.sample.imaging
+    translation_m = fit.parameters.pose.translation_m
+    by_approach = -(translation_m @ fit.jacobian[:3]) * fit.misfit.weight / fit.sd
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    pulls = [
+        scaled[:, circle == index] @ by_approach[circle == index] / (radius * px_per_m)
+        for index, radius in enumerate(imaging.circles.radii_m[:2])
+    ]
+    return np.stack(pulls, axis=1)
+
+
+def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> FloatArray:
+    """Return the robust covariance, nowhere below the plain one.
+
+    Few arcs can by chance agree too well in some direction; the noise of the pixels is there all
+    the same.
+    """
+    root = np.linalg.cholesky(plain)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, robust).T)
+    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    raised = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    covariance: FloatArray = root @ raised @ root.T
+    return covariance
+
+
+def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
+    """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
+    imaging = fit.sample.imaging
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    points = fit.prediction.view.points_m
+    nearest = np.full(points.shape[1], np.inf)
+    circle = np.zeros(points.shape[1], dtype=np.intp)
+    arc = circle.copy()
+    first = 0
+    for index, (centre, radius) in enumerate(
+        zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True)
+    ):
+        x, y = points - centre[:, None]
+        off_edge = np.abs(np.sqrt(x * x + y * y) - radius)
+        count = max(1, round(2.0 * np.pi * radius * px_per_m / _ARC_PX))
+        closer = np.flatnonzero(off_edge < nearest)
+        turn = (np.arctan2(y[closer], x[closer]) / (2.0 * np.pi)) % 1.0
+        arc[closer] = first + np.minimum((turn * count).astype(np.intp), count - 1)
+        circle[closer] = index
+        nearest[closer] = off_edge[closer]
+        first += count
+    return circle, arc
+
+
+def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:
+    """Carry the covariance of a pose to everything that is reported of it.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+    pose_cov : (6, 6) array
+        As in `Uncertainty`.
+    """
+    ray = pose.translation_m / pose.distance_m
+    centre = _centre_jacobian(camera, pose)
+    angles = _angle_jacobian(camera, pose)
+    sd_angles = np.sqrt(np.einsum("ij,jk,ik->i", angles, pose_cov, angles))
+    return Uncertainty(
+        pose_cov=pose_cov,
+        centre_cov_px2=centre @ pose_cov[:3, :3] @ centre.T,
+        sd_distance_m=float(np.sqrt(ray @ pose_cov[:3, :3] @ ray)),
+        sd_roll_deg=float(sd_angles[0]),
+        sd_pitch_deg=float(sd_angles[1]),
+        sd_heading_deg=float(sd_angles[2]),
+    )
+
+
+def _centre_jacobian(camera: Camera, pose: Pose) -> FloatArray:
+    x, y, z = pose.translation_m
+    normalised = np.array([[x / z, y / z]])
+    by_translation = np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]])
+    jacobian: FloatArray = camera.distort_jacobian(normalised)[0] @ by_translation
+    return jacobian
+
+
+def _angle_jacobian(camera: Camera, pose: Pose) -> FloatArray:
+    """Return the derivatives (3, 6) of roll, pitch and heading [deg], by central differences."""
+    jacobian = np.zeros((3, 6))
+    for i in range(6):
+        step = np.zeros(6)
+        step[i] = 1e-6 * (pose.distance_m if i < 3 else 1.0)
+        high, low = (_angles(camera, pose.moved(sign * step)) for sign in (1.0, -1.0))
+        change = (high - low + 180.0) % 360.0 - 180.0
+        jacobian[:, i] = change / (2.0 * step[i])
+    return jacobian
+
+
+def _angles(camera: Camera, pose: Pose) -> FloatArray:
+    return np.array([pose.roll_deg, pose.pitch_deg, image_heading_deg(camera, pose)])

@@ -1,0 +1,252 @@
+"""The measurement: a model of the image fitted to the grey values around all circles.
+
+Started by the paper's chain, which gives a pose good to a per cent or so. Both poses of the circle
+are adjusted; the one that fits better is reported, the other one kept with how much worse it fits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.target.adjust import Fit, Unknowns, adjust, first_levels, minimise
+from kgcp.target.covariance import pose_covariance, propagate
+from kgcp.target.layout import Target
+from kgcp.target.light import PARAM_COUNT, Light, Param, Parameters
+from kgcp.target.noise import find_censoring
+from kgcp.target.observation import Alternative, Appearance, Observation
+from kgcp.target.pairs import Blur
+from kgcp.target.plate import circles_of
+from kgcp.target.sample import Imaging, choose_sample
+from kgcp.target.window import cut_window, semi_major_axis_px
+
+_MARGIN_PX = 12.0
+_START_BLUR = Blur(0.5, 0.5, 0.0)
+_SHARPENING_PX = 1.0
+_SHORTEST_STREAK_PX = 1.0
+_MIRRORED_STEPS, _MIRRORED_GAIN = (2, 4), 0.5
+_HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
+
+_PRIOR_SD = {
+    Param.BLUR_DIFFERENCE: 0.5,
+    Param.BLUR_XY: 0.5,
+    Param.SLOPE_X: 0.05,
+    Param.SLOPE_Y: 0.05,
+    Param.TONE_1: 0.7,
+    Param.TONE_2: 0.5,
+    Param.SHARPENING: 0.7,
+}
+_ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
+_GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
+_STREAK = [Param.STREAK_X, Param.STREAK_Y]
+_OF_RESPONSE = {
+    Response.LINEAR: [],
+    Response.SRGB: [Param.SHARPENING],
+    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.SHARPENING],
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoPoses:
+    """The two poses of a circle, adjusted.
+
+    Attributes
+    ----------
+    best, other : Fit
+        The better and the worse one, on the same pixels with the same noise.
+    """
+
+    best: Fit
+    other: Fit
+
+
+def measure_by_model(
+    grey: GreyArray, camera: Camera, target: Target, start: Observation
+) -> Observation:
+    """Measure a target that the paper's chain has found.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame.
+    camera : Camera
+    target : Target
+        Its layout.
+    start : Observation
+        By the paper's chain.
+
+    Raises
+    ------
+    Rejection
+        `CUT`, `EDGES_LOST`, `NO_CONTRAST` or `POOR_FIT`.
+    """
+    imaging = _imaging(grey, camera, target, start.pose)
+    poses = fit_both_poses(imaging, start.pose)
+    _check_fit(poses.best)
+    return _observation(camera, target, start, poses)
+
+
+def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+    """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
+    for ring in target.rings:
+        radius_m = 0.5 * ring.outer_diameter_m
+        try:
+            window = cut_window(grey, camera, pose, radius_m, _MARGIN_PX)
+        except Rejection as rejection:
+            cut = rejection
+            continue
+        return Imaging(
+            window=window,
+            circles=circles_of(target.rings),
+            outer_radius_m=radius_m,
+            outer_radius_px=semi_major_axis_px(camera, pose, radius_m),
+            centre_px=camera.project(pose.translation_m[None])[0],
+            focal_px=camera.mean_focal_px,
+            censoring=find_censoring(window.levels, window.levels_per_count),
+            response=camera.response,
+            sharpening_px=0.0 if camera.response is Response.LINEAR else _SHARPENING_PX,
+        )
+    raise cut
+
+
+def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
+    """Adjust from a start pose, then from its mirror image about the viewing ray."""
+    sample = choose_sample(imaging, pose, _START_BLUR, None)
+    light = first_levels(sample, pose, _START_BLUR)
+    unknowns = _unknowns(imaging.response, has_streak=False)
+    best = adjust(imaging, Parameters(pose, _START_BLUR, light), unknowns, sample)
+    streak = _streak_of(best.parameters.blur)
+    if streak is not None:
+        unknowns = _unknowns(imaging.response, has_streak=True)
+        start = Parameters(best.parameters.pose, streak, best.parameters.light)
+        best = adjust(imaging, start, unknowns)
+    other = _mirrored_fit(best)
+    if other.total < best.total:
+        best = adjust(imaging, other.parameters, unknowns)
+        other = _mirrored_fit(best)
+    return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
+
+
+def _mirrored_fit(fit: Fit) -> Fit:
+    parameters = fit.parameters
+    mirrored = Parameters(mirror(parameters.pose), parameters.blur, parameters.light)
+    for steps in _MIRRORED_STEPS:
+        other = minimise(
+            fit.sample, mirrored, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
+        )
+        if other.total - fit.total > _HOPELESS:
+            break
+        mirrored = other.parameters
+    return other
+
+
+def mirror(pose: Pose) -> Pose:
+    """Return the pose with the plate's normal mirrored about the viewing ray of its centre."""
+    ray = pose.translation_m / pose.distance_m
+    normal = pose.normal
+    axis = np.cross(normal, ray)
+    sine, cosine = float(np.linalg.norm(axis)), float(normal @ ray)
+    if sine < 1e-9:
+        return pose
+    turn = Rotation.from_rotvec(axis / sine * 2.0 * math.atan2(sine, cosine))
+    return Pose(turn.as_matrix() @ pose.rotation, pose.translation_m)
+
+
+def _unknowns(response: Response, *, has_streak: bool) -> Unknowns:
+    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_RESPONSE[response]]
+    precision = np.zeros(PARAM_COUNT)
+    for param, sd in _PRIOR_SD.items():
+        precision[param] = sd**-2 if param in free else 0.0
+    return Unknowns(np.array(sorted(free)), np.zeros(PARAM_COUNT), precision)
+
+
+def _streak_of(blur: Blur) -> Blur | None:
+    """Read an elongated Gaussian as a streak of uniform motion; None if it is too short."""
+    difference, mean = 0.5 * (blur.xx - blur.yy), 0.5 * (blur.xx + blur.yy)
+    half_range = math.hypot(difference, blur.xy)
+    length = math.sqrt(24.0 * half_range)
+    if length < _SHORTEST_STREAK_PX:
+        return None
+    direction = 0.5 * math.atan2(blur.xy, difference)
+    across = mean - half_range
+    return Blur(across, across, 0.0, length * math.cos(direction), length * math.sin(direction))
+
+
+def _check_fit(fit: Fit) -> None:
+    """Refuse a fit that leaves too many outliers or too large residuals."""
+    share = fit.prediction.share
+    censoring = fit.sample.censoring
+    seen = ~(censoring.at_high | censoring.at_low)
+    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
+    light = fit.parameters.light
+    edge = (share > 0.2) & (share < 0.8)
+    noise = float(np.median(fit.sd[edge])) / abs(light.white - light.black) if edge.any() else 1.0
+    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or light.white <= light.black:
+        raise Rejection(
+            Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
+        )
+
+
+_MAX_OUTLIERS = 0.3
+_MAX_EDGE_NOISE = 0.15
+
+
+def _observation(
+    camera: Camera, target: Target, start: Observation, poses: TwoPoses
+) -> Observation:
+    best, other = poses.best, poses.other
+    pose = best.parameters.pose
+    covariance = pose_covariance(best)
+    ambiguity = max(0.0, 2.0 * (other.total - best.total)) / covariance.inflation
+    return Observation(
+        target=target.name,
+        ring=start.ring,
+        instance=start.instance,
+        score=start.score,
+        pose=pose,
+        centre_px=camera.project(pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, pose),
+        appearance=_appearance(camera, target, best),
+        alternative=Alternative(other.parameters.pose, ambiguity),
+        uncertainty=propagate(camera, pose, covariance.pose_cov),
+    )
+
+
+def _appearance(camera: Camera, target: Target, fit: Fit) -> Appearance:
+    light, blur = fit.parameters.light, fit.parameters.blur
+    imaging = fit.sample.imaging
+    inside = np.hypot(*fit.prediction.view.points_m) < imaging.outer_radius_m
+    clipped = fit.sample.censoring.at_high | fit.sample.censoring.at_low
+    return Appearance(
+        radius_px=semi_major_axis_px(
+            camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m
+        ),
+        black=float(np.clip(light.black, 0.0, 1.0)),
+        white=float(np.clip(light.white, 0.0, 1.0)),
+        saturated=float(np.mean(clipped[inside])),
+        edge_shift_px=_edge_shift_px(light, blur, fit.sample.imaging.censoring.high),
+        blur_px=blur.mean_sd_px,
+    )
+
+
+def _edge_shift_px(light: Light, blur: Blur, clip: float) -> float:
+    """Return how far a straight edge seems displaced towards the dark side.
+
+    The apparent edge is where the grey value passes midway between the plateaus as they are seen,
+    clipped; the true one is where half the light comes from either side.
+    """
+    share = np.linspace(0.0, 1.0, 401)
+    arch = share * (1.0 - share)
+    tone = share + arch * (light.tone_1 + light.tone_2 * (2.0 * share - 1.0))
+    grey = np.minimum(light.black + (light.white - light.black) * tone, clip)
+    middle = 0.5 * (grey[0] + grey[-1])
+    crossing = float(np.interp(middle, np.maximum.accumulate(grey), share))
+    return float(-blur.mean_sd_px * ndtri(np.clip(crossing, 1e-3, 1.0 - 1e-3)))

@@ -1,0 +1,154 @@
+"""The likelihood of grey values: noise that follows the level, clipped and outlying pixels.
+
+Noise is estimated from the plateaus of ink and plate, in between it grows linearly with the level
+(shot noise); near edges it is inflated to what the residuals there show (jagged prints, JPEG).
+Clipped pixels are censored observations (Tobin): they only say "at least white". Outliers (dirt,
+a finger of shadow, a hidden part) are weighted down as by a heavy-tailed distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import log_ndtr
+
+from kgcp.geometry.arrays import FloatArray
+
+_OUTLIER_SIGMAS = 3.5
+_MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
+_TRIM = 0.9
+_TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
+_MIN_SAMPLES = 8
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Censoring:
+    """Which pixels are clipped.
+
+    Attributes
+    ----------
+    high, low : float
+        Levels at and beyond which a value only says "at least" and "at most".
+    at_high, at_low : (n,) arrays
+        The pixels concerned.
+    """
+
+    high: float
+    low: float
+    at_high: BoolArray
+    at_low: BoolArray
+
+    @property
+    def share(self) -> float:
+        """Share of clipped pixels."""
+        return float(np.mean(self.at_high | self.at_low))
+
+
+def find_censoring(levels: FloatArray, count: float) -> Censoring:
+    """Find where a window is clipped: at the ends of the range, or where values pile up.
+
+    Parameters
+    ----------
+    levels : (n,) array
+        Grey values, 0…1 of the data type's range.
+    count : float
+        One grey value's step.
+    """
+    high = 1.0 - 0.5 * count
+    top = float(levels.max())
+    # a sensor of fewer bits than its files saturates below the end of the range
+    if top < high and np.mean(levels == top) > 0.05 > np.mean(
+        (levels < top) & (levels > 0.98 * top)
+    ):
+        high = top - 0.5 * count
+    low = 0.5 * count
+    return Censoring(high, low, levels >= high, levels <= low)
+
+
+def noise_variance(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    count: float,
+) -> FloatArray:
+    """Return the noise variance (n,) of every pixel from the residuals of a fit.
+
+    Parameters
+    ----------
+    residuals : (n,) array
+        Observed − modelled levels.
+    share : (n,) array
+        White share.
+    usable : (n,) array of bool
+        Neither clipped nor outlying by hundreds of counts.
+    count : float
+        One grey value's step.
+    """
+    floor = (_MIN_NOISE_COUNTS * count) ** 2
+    dark = _trimmed_variance(residuals[usable & (share < 0.15)])
+    bright = _trimmed_variance(residuals[usable & (share > 0.85)])
+    if dark is None or bright is None:
+        dark = bright = dark or bright or _trimmed_variance(residuals[usable]) or floor
+    variance = np.maximum(dark + (bright - dark) * np.clip(share, 0.0, 1.0), floor)
+    edge = usable & (share > 0.2) & (share < 0.8)
+    standardised = _trimmed_variance(residuals[edge] / np.sqrt(variance[edge]))
+    if standardised is not None and standardised > 1.0:
+        weight = np.clip(4.0 * share * (1.0 - share), 0.0, 1.0)
+        variance = variance * (1.0 + (standardised - 1.0) * weight)
+    return variance
+
+
+def _trimmed_variance(values: FloatArray) -> float | None:
+    """Return the variance of the central part, scaled to the whole; None if there are too few."""
+    if len(values) < _MIN_SAMPLES:
+        return None
+    squares = np.sort(values * values)[: max(1, int(_TRIM * len(values)))]
+    return float(squares.mean()) / _TRIMMED_VARIANCE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Misfit:
+    """Negative log-likelihood of a window, and what Newton's method needs of it.
+
+    Attributes
+    ----------
+    total : float
+        Up to a constant.
+    score : (n,) array
+        Its derivative with respect to the standardised model, times −1.
+    weight : (n,) array
+        Its second derivative, made positive.
+    """
+
+    total: float
+    score: FloatArray
+    weight: FloatArray
+
+
+def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Censoring) -> Misfit:
+    """Compare observed and modelled levels (n,) under noise of standard deviation `sd` (n,)."""
+    z = (levels - model) / sd
+    square = z * z
+    outlying = square > _OUTLIER_SIGMAS**2
+    down = np.where(outlying, _OUTLIER_SIGMAS**2 / np.maximum(square, 1e-12), 1.0)
+    # beyond the limit the density falls like a power of z: the loss grows as its logarithm
+    loss = np.where(outlying, 0.5 * _OUTLIER_SIGMAS**2 * (1.0 - np.log(down)), 0.5 * square)
+    score, weight = z * down, down
+    for clipped, limit, sign in (
+        (censoring.at_high, censoring.high, 1.0),
+        (censoring.at_low, censoring.low, -1.0),
+    ):
+        if not clipped.any():
+            continue
+        missing = sign * (limit - model[clipped]) / sd[clipped]
+        log_tail = log_ndtr(-missing)
+        hazard = np.exp(-0.5 * missing * missing - 0.5 * np.log(2.0 * np.pi) - log_tail)
+        far = np.minimum(1.0, _OUTLIER_SIGMAS / np.maximum(hazard, 1e-12))
+        loss[clipped] = -log_tail * far
+        score[clipped] = sign * hazard * far
+        weight[clipped] = np.maximum(hazard * (hazard - missing), 1e-9) * far
+    return Misfit(float(loss.sum()), score, weight)
