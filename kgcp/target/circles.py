@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
 from kgcp.settings import DetectSettings
+from kgcp.target.broken import circular_hulls
 from kgcp.target.contours import Contours
 
-_MAX_BROKEN_DEVIATION = 0.45  # of the mean radius
-_MAX_HULL_DEVIATION = 0.1  # of a hull's mean radius: squares are out
-_MIN_CORNERS = 10
+_MAX_ROUGH_DEVIATION = 0.45  # of the mean radius: an arc has more
 _FIT_PASSES = 3
 _MAX_AXIS_RATIO = 2.0  # tilts to 60°
 _CONCENTRIC = 0.2  # of the smaller circle's radius
@@ -68,28 +66,13 @@ def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse
     radii = np.sqrt(np.einsum("ni,ni->n", offsets, offsets))
     mean = np.add.reduceat(radii, starts) / counts
     deviation = np.sqrt(np.maximum(np.add.reduceat(radii**2, starts) / counts - mean**2, 0.0))
-    largest = np.maximum.reduceat(radii, starts)
     circular = (mean > settings.min_radius_px) & (deviation < settings.max_circle_deviation * mean)
-    broken = (
-        ~circular
-        & (deviation < _MAX_BROKEN_DEVIATION * mean)
-        & (largest > settings.min_radius_px)
-        & (counts > 2.0 * math.pi * largest)
-    )
+    rough = ~circular & (deviation < _MAX_ROUGH_DEVIATION * mean)
+    rough &= counts > 2.0 * math.pi * settings.min_radius_px
     curves = [contours.contour(int(index)) for index in np.flatnonzero(circular)]
-    hulls = (_circular_hull(contours.contour(int(i)), settings) for i in np.flatnonzero(broken))
-    curves += [hull for hull in hulls if hull is not None]
+    curves += circular_hulls(contours.chosen(np.flatnonzero(rough)), settings)
     fits = (_preliminary_ellipse(curve) for curve in curves)
     return tuple(ellipse for ellipse in fits if ellipse is not None)
-
-
-def _circular_hull(points: FloatArray, settings: DetectSettings) -> FloatArray | None:
-    """Return the corners (k, 2) of a contour's convex hull if they pass the circle test."""
-    hull = cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
-    radii = np.linalg.norm(hull - 0.5 * (hull.min(axis=0) + hull.max(axis=0)), axis=1)
-    mean, deviation = float(radii.mean()), float(radii.std())
-    circular = mean > settings.min_radius_px and deviation < _MAX_HULL_DEVIATION * mean
-    return hull if circular and len(hull) >= _MIN_CORNERS else None
 
 
 def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:

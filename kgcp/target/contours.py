@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.settings import DetectSettings
 
 _SMOOTHING_PX = 0.8  # as wide as a lens: noise and texture stop making edges, rings do not
@@ -27,7 +30,7 @@ class Contours:
     """
 
     points: FloatArray
-    starts: np.ndarray[tuple[int], np.dtype[np.intp]]
+    starts: IndexArray
 
     def __len__(self) -> int:
         """Count the contours."""
@@ -36,6 +39,18 @@ class Contours:
     def contour(self, index: int) -> FloatArray:
         """Points (k, 2) of one contour [px]."""
         return self.points[self.starts[index] : self.starts[index + 1]]
+
+    def chosen(self, indices: IndexArray) -> Contours:
+        """Contours of the given indices (k,) alone."""
+        return joined([self.contour(int(index)) for index in indices])
+
+
+def joined(contours: Sequence[npt.NDArray[Any]]) -> Contours:
+    """Put contours, each (k, 2), end to end."""
+    starts = np.zeros(len(contours) + 1, dtype=np.intp)
+    np.cumsum([len(contour) for contour in contours], out=starts[1:])
+    points = np.concatenate(contours) if contours else np.zeros((0, 2))
+    return Contours(points=points.astype(np.float64), starts=starts)
 
 
 def eight_bit(grey: GreyArray) -> GreyArray:
@@ -66,8 +81,4 @@ def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
     found, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     # A digital circle has at least 4 √2 pixels per pixel of radius.
     shortest = max(6, int(4.0 * np.sqrt(2.0) * settings.min_radius_px))
-    kept = [contour[:, 0] for contour in found if len(contour) >= shortest]
-    starts = np.zeros(len(kept) + 1, dtype=np.intp)
-    np.cumsum([len(contour) for contour in kept], out=starts[1:])
-    points = np.concatenate(kept) if kept else np.zeros((0, 2))
-    return Contours(points=points.astype(np.float64), starts=starts)
+    return joined([contour[:, 0] for contour in found if len(contour) >= shortest])
