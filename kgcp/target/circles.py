@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.errors import Rejection
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
 from kgcp.settings import DetectSettings
 from kgcp.target.broken import circular_hulls
@@ -20,6 +20,7 @@ _MAX_AXIS_RATIO = 2.0  # tilts to 60°
 _CONCENTRIC = 0.2  # of the smaller circle's radius
 _CONCENTRIC_PX = 1.0
 _SAME_CIRCLE_PX = 0.7
+_TWIN_RADIUS_PX = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +70,22 @@ def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse
     circular = (mean > settings.min_radius_px) & (deviation < settings.max_circle_deviation * mean)
     rough = ~circular & (deviation < _MAX_ROUGH_DEVIATION * mean)
     rough &= counts > 2.0 * math.pi * settings.min_radius_px
-    curves = [contours.contour(int(index)) for index in np.flatnonzero(circular)]
+    candidates = np.flatnonzero(circular)
+    single = _one_per_edge(centres[candidates], mean[candidates])
+    curves = [contours.contour(int(index)) for index in candidates[single]]
     curves += circular_hulls(contours.chosen(np.flatnonzero(rough)), settings)
     fits = (_preliminary_ellipse(curve) for curve in curves)
     return tuple(ellipse for ellipse in fits if ellipse is not None)
+
+
+def _one_per_edge(centres: FloatArray, mean_radii: FloatArray) -> IndexArray:
+    """Return the indices of circles without their smaller twins: an edge has a contour a side."""
+    kept: list[int] = []
+    for index in np.argsort(-mean_radii, kind="stable"):
+        near = np.abs(centres[kept] - centres[index]).max(axis=1) < _SAME_CIRCLE_PX
+        if not np.any(near & (mean_radii[kept] - mean_radii[index] < _TWIN_RADIUS_PX)):
+            kept.append(int(index))
+    return np.array(sorted(kept), dtype=np.intp)
 
 
 def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
