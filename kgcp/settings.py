@@ -28,6 +28,7 @@ def require_range(
 class Method(StrEnum):
     """How a target is measured once it is found."""
 
+    MODEL = "model"
     PAPER = "paper"
 
 
@@ -38,7 +39,8 @@ class DetectSettings:
     Attributes
     ----------
     method : Method
-        `paper`: the closed-form chain of Cucci (2016).
+        `model`: the image model of `kgcp.target.model`, started by the paper's chain;
+        `paper`: the closed-form chain of Cucci (2016) alone.
     canny_low, canny_high : float
         Hysteresis thresholds of the Canny detector on 8-bit grey values (§2.1).
     min_radius_px : float
@@ -49,7 +51,7 @@ class DetectSettings:
         Threshold on the normalised cross-correlation of the code (§2.3).
     """
 
-    method: Method = Method.PAPER
+    method: Method = Method.MODEL
     canny_low: float = 40.0
     canny_high: float = 100.0
     min_radius_px: float = 5.0

@@ -30,7 +30,8 @@ _DEFAULTS = DetectSettings()
     type=click.Choice([method.value for method in Method]),
     default=_DEFAULTS.method.value,
     show_default=True,
-    help="How a found target is measured: 'paper' is the closed-form chain of Cucci (2016).",
+    help="How a found target is measured: 'model' fits the image of the plate, 'paper' is the"
+    " closed-form chain of Cucci (2016).",
 )
 @click.option(
     "--min-radius",

@@ -9,11 +9,12 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.settings import DetectSettings
+from kgcp.settings import DetectSettings, Method
 from kgcp.target.circles import Cluster, concentric_clusters, near_circular
 from kgcp.target.code import CodeMatch, find_code, fixed_lag_score
 from kgcp.target.contours import find_contours
 from kgcp.target.layout import Ring, Target
+from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Miss, Observation, Outcome
 from kgcp.target.paper import measure_ring, points_of_code
 
@@ -25,9 +26,12 @@ _STAGES = (
     Reason.NO_INNER_CIRCLE,
     Reason.POOR_ELLIPSE,
     Reason.IMPOSSIBLE_GEOMETRY,
+    Reason.CUT,
+    Reason.NO_CONTRAST,
+    Reason.POOR_FIT,
 )
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
-_MIN_MAIN_SCORE = 0.6
+_MIN_MAIN_SCORE = 0.75
 
 
 def measure_frame(
@@ -82,6 +86,8 @@ def measure_target(
                 observation = measure_ring(grey, camera, target, match, settings)
                 if ring is not target.ring:
                     _check_main_ring(grey, camera, target.ring, observation)
+                if settings.method is Method.MODEL:
+                    observation = measure_by_model(grey, camera, target, observation)
                 found.append(observation)
             except Rejection as rejection:
                 rejections.append(rejection)

@@ -30,7 +30,7 @@ from kgcp.target.window import cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
 _START_BLUR = Blur(0.5, 0.5, 0.0)
-_SHARPENING_PX = 1.0
+_SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 _SHORTEST_STREAK_PX = 1.0
 _MIRRORED_STEPS, _MIRRORED_GAIN = (2, 4), 0.5
 _HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
@@ -88,10 +88,21 @@ def measure_by_model(
     Rejection
         `CUT`, `EDGES_LOST`, `NO_CONTRAST` or `POOR_FIT`.
     """
-    imaging = _imaging(grey, camera, target, start.pose)
-    poses = fit_both_poses(imaging, start.pose)
+    pose = _without_edge_shift(start)
+    imaging = _imaging(grey, camera, target, pose)
+    poses = fit_both_poses(imaging, pose)
     _check_fit(poses.best)
     return _observation(camera, target, start, poses)
+
+
+def _without_edge_shift(start: Observation) -> Pose:
+    """Return the pose that the paper's chain would give if the outer edge were not displaced.
+
+    The chain takes the distance from the outer circle alone; its radius is short by δ.
+    """
+    radius_px = start.appearance.radius_px
+    shrink = radius_px / (radius_px + (start.appearance.edge_shift_px or 0.0))
+    return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
 def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
