@@ -21,8 +21,9 @@ _MAX_SHIFT_PX = 1.5
 _MIN_SLOPE = 0.3  # of the median slope along the contour
 _PASSES = 3
 _DOT_REACH_PX = 2.5  # samples reach 1.5 px inwards, blur another pixel
+_MIN_CLEAR = 0.4  # of the edge
 _MARGIN_PX = 8
-_MIN_POINTS = 12
+_MIN_POINTS = 8
 _MIN_SHARE = 0.25  # of the contour's length
 _OUTLIER = 3.0  # of the residuals' standard deviation
 _MIN_OUTLIER_PX = 0.1
@@ -84,11 +85,15 @@ def patch_around(grey: GreyArray, ellipse: Ellipse) -> Patch:
 def clear_of_dots(
     angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it."""
+    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
+
+    On a small ring with many dots none may be: then the places farthest from dots are taken.
+    """
     on_edge = 0.5 * edge_diameter_m * np.exp(1j * angles_rad)
     dots = 0.5 * ring.code_diameter_m * np.exp(1j * np.radians(np.add(ring.code_deg, lag_deg)))
     gap_m = np.abs(on_edge[:, None] - dots).min(axis=1) - 0.5 * ring.dot_diameter_m
-    return np.asarray(gap_m * px_per_m > _DOT_REACH_PX)
+    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.quantile(gap_m, 1.0 - _MIN_CLEAR)))
+    return np.asarray(gap_m >= reach_m)
 
 
 def steepest_ellipse(
