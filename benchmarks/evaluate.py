@@ -18,7 +18,8 @@ from benchmarks.bands import join_truth, read_truth, summarise, table_lines
 from kgcp.io.flight import read_flight
 from kgcp.io.tables import read_detections
 from kgcp.settings import DetectSettings, Method
-from kgcp.survey import detect_flight, usable_cores
+from kgcp.survey import detect_flight
+from kgcp.workers import usable_cores
 
 
 def detect(flight_folder: Path, settings: DetectSettings, jobs: int) -> pd.DataFrame:
@@ -34,7 +35,9 @@ def detect(flight_folder: Path, settings: DetectSettings, jobs: int) -> pd.DataF
 @click.command()
 @click.argument("flight", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
-@click.option("--method", type=click.Choice(list(Method)), default=DetectSettings().method)
+@click.option(
+    "--method", type=click.Choice([m.value for m in Method]), default=DetectSettings().method.value
+)
 @click.option("--jobs", type=int, default=None)
 def main(flight: Path, truth: Path, method: str, jobs: int | None) -> None:
     """Print the table."""

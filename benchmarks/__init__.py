@@ -1,0 +1,1 @@
+"""What is measured about kgcp, as opposed to tested: accuracy, exposure, time."""
