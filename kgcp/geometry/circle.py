@@ -20,6 +20,8 @@ from kgcp.geometry.pose import Pose
 _GAMMAS = np.linspace(0.0, math.pi, 36, endpoint=False)
 _MAX_STEPS = 60
 _MAX_STEP = 0.05  # of the ellipse's radius
+_SMALLEST_RIDGE = 1e-12  # the two minima of a frontal circle are one, without any slope
+_NO_SPREAD = 1e-20  # sum of squared relative deviations
 _ALONG_X = 0.0
 _ALONG_Y = 0.5 * math.pi
 
@@ -172,16 +174,15 @@ def minimise_dispersion(conic: FloatArray, start: FloatArray) -> FloatArray:
     for _ in range(_MAX_STEPS):
         jacobian = _spread_slopes(centre, conic, 1e-6 * scale)
         normal = jacobian.T @ jacobian
-        step = np.linalg.solve(
-            normal + damping * np.trace(normal) * np.eye(2), -jacobian.T @ residuals
-        )
+        ridge = max(damping * float(np.trace(normal)), _SMALLEST_RIDGE)
+        step = np.linalg.solve(normal + ridge * np.eye(2), -jacobian.T @ residuals)
         step /= max(1.0, float(np.linalg.norm(step)) / (_MAX_STEP * scale))
         trial = _spread(centre + step, conic)
         if not trial @ trial < residuals @ residuals:
             damping *= 10.0
         else:
             centre, residuals, damping = centre + step, trial, 0.1 * damping
-        if np.linalg.norm(step) < 1e-10 * scale:
+        if np.linalg.norm(step) < 1e-10 * scale or residuals @ residuals < _NO_SPREAD:
             break
     return centre
 
