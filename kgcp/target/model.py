@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from kgcp.errors import Reason, Rejection
@@ -18,13 +17,14 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.adjust import Fit, Unknowns, adjust, first_levels, minimise
-from kgcp.target.covariance import pose_covariance, propagate
+from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
 from kgcp.target.layout import Target
 from kgcp.target.light import PARAM_COUNT, Light, Param, Parameters
 from kgcp.target.noise import find_censoring
 from kgcp.target.observation import Alternative, Appearance, Observation
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
+from kgcp.target.prior import NormalPrior
 from kgcp.target.sample import Imaging, choose_sample
 from kgcp.target.window import cut_window, semi_major_axis_px
 
@@ -69,7 +69,11 @@ class TwoPoses:
 
 
 def measure_by_model(
-    grey: GreyArray, camera: Camera, target: Target, start: Observation
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    prior: NormalPrior | None = None,
 ) -> Observation:
     """Measure a target that the paper's chain has found.
 
@@ -82,6 +86,9 @@ def measure_by_model(
         Its layout.
     start : Observation
         By the paper's chain.
+    prior : NormalPrior, optional
+        Of the plate's normal. It only helps to choose between the two poses, whose values remain
+        those of the image.
 
     Raises
     ------
@@ -91,8 +98,10 @@ def measure_by_model(
     pose = _without_edge_shift(start)
     imaging = _imaging(grey, camera, target, pose)
     poses = fit_both_poses(imaging, pose)
+    if prior is not None:
+        poses = _choose_by_prior(imaging, poses, prior)
     _check_fit(poses.best)
-    return _observation(camera, target, start, poses)
+    return _observation(camera, target, start, poses, prior)
 
 
 def _without_edge_shift(start: Observation) -> Pose:
@@ -146,9 +155,34 @@ def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
 
 
+def _choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
+    """Let the poses change places where the prior outweighs the image; adjust the new best one."""
+    if _advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
+        return poses
+    best = adjust(imaging, poses.other.parameters, poses.best.unknowns)
+    turned = TwoPoses(best, _mirrored_fit(best))
+    is_better = _advantage(turned, pose_covariance(best), prior) >= 0.0
+    return turned if is_better else poses
+
+
+def _advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | None) -> float:
+    """Return the Δχ² by which the other pose is worse: of the image, and of the prior.
+
+    That of the image counts as much as its residuals are independent; both normals are known
+    about equally well.
+    """
+    best, other = poses.best, poses.other
+    of_image = 2.0 * (other.total - best.total) / covariance.inflation
+    if prior is None:
+        return of_image
+    rotation_cov = covariance.pose_cov[3:, 3:]
+    worse, better = (prior.chi2(fit.parameters.pose, rotation_cov) for fit in (other, best))
+    return of_image + worse - better
+
+
 def _mirrored_fit(fit: Fit) -> Fit:
     parameters = fit.parameters
-    mirrored = Parameters(mirror(parameters.pose), parameters.blur, parameters.light)
+    mirrored = Parameters(parameters.pose.mirrored(), parameters.blur, parameters.light)
     for steps in _MIRRORED_STEPS:
         other = minimise(
             fit.sample, mirrored, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
@@ -157,18 +191,6 @@ def _mirrored_fit(fit: Fit) -> Fit:
             break
         mirrored = other.parameters
     return other
-
-
-def mirror(pose: Pose) -> Pose:
-    """Return the pose with the plate's normal mirrored about the viewing ray of its centre."""
-    ray = pose.translation_m / pose.distance_m
-    normal = pose.normal
-    axis = np.cross(normal, ray)
-    sine, cosine = float(np.linalg.norm(axis)), float(normal @ ray)
-    if sine < 1e-9:
-        return pose
-    turn = Rotation.from_rotvec(axis / sine * 2.0 * math.atan2(sine, cosine))
-    return Pose(turn.as_matrix() @ pose.rotation, pose.translation_m)
 
 
 def _unknowns(response: Response, *, has_streak: bool) -> Unknowns:
@@ -211,12 +233,16 @@ _MAX_EDGE_NOISE = 0.15
 
 
 def _observation(
-    camera: Camera, target: Target, start: Observation, poses: TwoPoses
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    poses: TwoPoses,
+    prior: NormalPrior | None,
 ) -> Observation:
     best, other = poses.best, poses.other
     pose = best.parameters.pose
     covariance = pose_covariance(best)
-    ambiguity = max(0.0, 2.0 * (other.total - best.total)) / covariance.inflation
+    ambiguity = max(0.0, _advantage(poses, covariance, prior))
     return Observation(
         target=target.name,
         ring=start.ring,

@@ -33,6 +33,11 @@ class Blur:
     streak_y: float = 0.0
 
     @property
+    def has_streak(self) -> bool:
+        """Tell whether there is motion."""
+        return bool(self.streak_x or self.streak_y)
+
+    @property
     def total_covariance(self) -> tuple[float, float, float]:
         """Covariance of Gaussian and streak together: xx, yy, xy [px²]."""
         return (
@@ -60,8 +65,10 @@ class EdgePairs:
 
     Attributes
     ----------
-    groups : tuple of (Quadrature, slice)
-        The pairs of each rule.
+    small_groups : tuple of (Quadrature, slice)
+        The pairs of each rule, of circles that are small against the blur.
+    small, large : slice
+        All these, and the pairs of large circles behind them.
     pixel : (m,) array of int
     centre_m : (2, m) array
     radius_m, sign : (m,) array
@@ -70,7 +77,9 @@ class EdgePairs:
         White share of every pixel from the circles whose edge it does not feel.
     """
 
-    groups: tuple[tuple[Quadrature, slice], ...]
+    small_groups: tuple[tuple[Quadrature, slice], ...]
+    small: slice
+    large: slice
     pixel: IndexArray
     centre_m: FloatArray
     radius_m: FloatArray
@@ -94,16 +103,70 @@ def pair_edges(view: PlateView, circles: Circles, blur: Blur) -> EdgePairs:
         pixels.append(np.flatnonzero(np.abs(inward) <= reach_m))
     counts = [len(found) for found in pixels]
     circle = np.repeat(order, counts)
-    ends = np.cumsum(counts)
+    ends = [0, *np.cumsum(counts).tolist()]
     groups = []
-    for rule in sorted(set(rules)):
+    for rule in sorted(set(rules) - {Quadrature.EDGE}):
         members = [i for i, other in enumerate(rules) if other is rule]
-        groups.append((rule, slice(int(ends[members[0]] - counts[members[0]]), ends[members[-1]])))
+        groups.append((rule, slice(ends[members[0]], ends[members[-1] + 1])))
+    small = slice(0, groups[-1][1].stop if groups else 0)
     return EdgePairs(
-        groups=tuple(groups),
+        small_groups=tuple(groups),
+        small=small,
+        large=slice(small.stop, ends[-1]),
         pixel=np.concatenate(pixels),
         centre_m=circles.centres_m[:, circle],
         radius_m=circles.radii_m[circle],
         sign=circles.signs[circle],
         background=background,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """How m pixels stand to the circles whose edges they feel.
+
+    Attributes
+    ----------
+    rho, x, y : (m,) array
+        Distance from the circle's centre [m] and unit direction.
+    radial, tangential, mixed : (m,) array
+        The blur's covariance in these directions [m²].
+    """
+
+    rho: FloatArray
+    x: FloatArray
+    y: FloatArray
+    radial: FloatArray
+    tangential: FloatArray
+    mixed: FloatArray
+
+
+def meet(points_m: FloatArray, spread: FloatArray, pairs: EdgePairs, which: slice) -> Meeting:
+    """Return how some of the pairs stand to each other.
+
+    Parameters
+    ----------
+    points_m : (2, n) array
+        The pixels on the plate.
+    spread : (3, n) array
+        The blur's covariance there, xx, xy, yy [m²].
+    pairs : EdgePairs
+    which : slice
+        Of the pairs.
+    """
+    pixel = pairs.pixel[which]
+    x = points_m[0].take(pixel) - pairs.centre_m[0, which]
+    y = points_m[1].take(pixel) - pairs.centre_m[1, which]
+    rho = np.sqrt(x * x + y * y) + 1e-12
+    x /= rho
+    y /= rho
+    xx, xy, yy = (row.take(pixel) for row in spread)
+    radial = (xx * x + 2.0 * xy * y) * x + yy * y * y
+    return Meeting(
+        rho=rho,
+        x=x,
+        y=y,
+        radial=radial,
+        tangential=xx + yy - radial,
+        mixed=(yy - xx) * x * y + xy * (x * x - y * y),
     )
