@@ -117,12 +117,14 @@ def _contributions(view: PlateView, blur: Blur, pairs: EdgePairs) -> FloatArray:
     if not blur.has_streak:
         return np.concatenate((small[:7], _derivatives(feel, still_edge(edge))), axis=1)
     disc, by_smear = smeared_edge(edge, np.abs(along))
-    pull = np.sign(along) * by_smear
-    large = np.concatenate((_derivatives(feel, disc), np.stack((pull * feel.x, pull * feel.y))))
-    turn = pull * across / feel.rho  # as in `_derivatives`, for the streak
-    large[1] += turn * feel.y
-    large[2] -= turn * feel.x
-    large[3] += pull * along
+    x, y = feel.x, feel.y
+    by_along, by_across = np.sign(along) * by_smear, disc.d_var_tangential * across / 6.0
+    by_streak = (by_along * x - by_across * y, by_along * y + by_across * x)
+    large = np.concatenate((_derivatives(feel, disc), np.stack(by_streak)))
+    turn = (by_along * across - by_across * along) / feel.rho  # of the streak against the circle
+    large[1] += turn * y
+    large[2] -= turn * x
+    large[3] += by_along * along + by_across * across
     return np.concatenate((small, large), axis=1)
 
 
