@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
+_SQUARE_VIEW = 1e-9  # sine of the angle between normal and ray below which the two poses are one
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
@@ -58,6 +60,19 @@ class Pose:
         """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
         turn = Rotation.from_rotvec(step[3:6]).as_matrix()
         return Pose(turn @ self.rotation, self.translation_m + step[:3])
+
+    def mirrored(self) -> Pose:
+        """Return the pose with the plate's normal mirrored about the viewing ray of its centre.
+
+        The least turn that does it: about the axis square to both, by twice their angle.
+        """
+        ray = self.translation_m / self.distance_m
+        axis = np.cross(self.normal, ray)
+        sine, cosine = float(np.linalg.norm(axis)), float(self.normal @ ray)
+        if sine < _SQUARE_VIEW:
+            return self
+        turn = Rotation.from_rotvec(axis / sine * 2.0 * math.atan2(sine, cosine))
+        return Pose(turn.as_matrix() @ self.rotation, self.translation_m)
 
     @property
     def roll_deg(self) -> float:

@@ -49,3 +49,14 @@ def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:
 def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
     """Return omega, phi, kappa (n, 3) [deg] of rotations (n, 3, 3); undoes `rotation_from_opk`."""
     return np.asarray(Rotation.from_matrix(map_from_photo).as_euler("XYZ", degrees=True))
+
+
+def down_in_camera(opk_deg: FloatArray) -> FloatArray:
+    """Return the vertical (n, 3), downwards, in the camera frame, from omega, phi, kappa (n, 3).
+
+    The third axis of every map is the local vertical, whichever way its grid is turned: neither
+    the meridian convergence nor the CRS matters.
+    """
+    photo_from_map = np.swapaxes(rotation_from_opk(opk_deg), 1, 2)
+    down: FloatArray = -photo_from_map[:, :, 2] @ CAMERA_FROM_PHOTO.T
+    return down

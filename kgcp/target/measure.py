@@ -17,6 +17,7 @@ from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Miss, Observation, Outcome
 from kgcp.target.paper import measure_ring, points_of_code
+from kgcp.target.prior import NormalPrior
 
 # How far the chain got: of several rejections the last in this order says most.
 _STAGES = (
@@ -35,7 +36,11 @@ _MIN_MAIN_SCORE = 0.75
 
 
 def measure_frame(
-    grey: GreyArray, camera: Camera, targets: tuple[Target, ...], settings: DetectSettings
+    grey: GreyArray,
+    camera: Camera,
+    targets: tuple[Target, ...],
+    settings: DetectSettings,
+    prior: NormalPrior | None = None,
 ) -> tuple[Outcome, ...]:
     """Look for every target in a frame and measure what is found.
 
@@ -49,6 +54,8 @@ def measure_frame(
         All that may be seen.
     settings : DetectSettings
         Of the search.
+    prior : NormalPrior, optional
+        Of the normal of the plate on the vehicle: of all targets without a position of their own.
 
     Returns
     -------
@@ -61,7 +68,9 @@ def measure_frame(
     return tuple(
         outcome
         for target in targets
-        for outcome in measure_target(grey, camera, clusters, target, settings)
+        for outcome in measure_target(
+            grey, camera, clusters, target, settings, prior if target.position_m is None else None
+        )
     )
 
 
@@ -71,6 +80,7 @@ def measure_target(
     clusters: tuple[Cluster, ...],
     target: Target,
     settings: DetectSettings,
+    prior: NormalPrior | None,
 ) -> tuple[Outcome, ...]:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
     found: list[Observation] = []
@@ -87,7 +97,7 @@ def measure_target(
                 if ring is not target.ring:
                     _check_main_ring(grey, camera, target.ring, observation)
                 if settings.method is Method.MODEL:
-                    observation = measure_by_model(grey, camera, target, observation)
+                    observation = measure_by_model(grey, camera, target, observation, prior)
                 found.append(observation)
             except Rejection as rejection:
                 rejections.append(rejection)
