@@ -28,7 +28,7 @@ class Kgcp:
         x, y, z in the flight's CRS.
     cov_m2 : (3, 3) array or None
         Covariance along the map's axes [m²]; None: the trajectory has no standard deviations.
-    centre_px, centre_cov_px2, distance_m, sd_distance_m
+    centre_px, centre_cov_px2, distance_m, sd_distance_m, sd_common_distance_m
         As in the sighting.
     """
 
@@ -42,6 +42,7 @@ class Kgcp:
     centre_cov_px2: FloatArray | None
     distance_m: float
     sd_distance_m: float | None
+    sd_common_distance_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,4 +123,5 @@ def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Where
         centre_cov_px2=seen.centre_cov_px2,
         distance_m=seen.distance_m,
         sd_distance_m=seen.sd_distance_m,
+        sd_common_distance_m=seen.sd_common_distance_m,
     )

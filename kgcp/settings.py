@@ -82,6 +82,9 @@ class VehicleSettings:
         Standard deviation of the synchronisation of frames and trajectory [s].
     time_offset_s : float
         Added to frame times to bring them to the trajectory's clock [s].
+    level_sd_deg : float or None
+        Standard deviation of the plate's normal against the vertical, about either horizontal
+        axis [deg]; None: nothing is known of it.
     """
 
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -89,6 +92,7 @@ class VehicleSettings:
     mount_deg: float = 0.0
     sd_time_s: float = 0.0
     time_offset_s: float = 0.0
+    level_sd_deg: float | None = None
 
     def __post_init__(self) -> None:
         for value in self.lever_arm_m:
@@ -98,3 +102,5 @@ class VehicleSettings:
         require_range("mount_deg", self.mount_deg, -360.0, 360.0, unit="deg")
         require_range("sd_time_s", self.sd_time_s, 0.0, 60.0, unit="s")
         require_range("time_offset_s", self.time_offset_s, -1e9, 1e9, unit="s")
+        if self.level_sd_deg is not None:
+            require_range("level_sd_deg", self.level_sd_deg, 0.0, 45.0, unit="deg", open_low=True)

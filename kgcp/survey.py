@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -13,16 +13,20 @@ import cv2
 
 from kgcp import __version__
 from kgcp.errors import KgcpError, Rejection, Status
+from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.detections import FrameResult, detection_rows
 from kgcp.io.flight import Flight
 from kgcp.io.frames import list_frames, read_exif, read_frame_times, read_grey
+from kgcp.io.poses import read_reference_poses
 from kgcp.io.tables import write_table
 from kgcp.settings import DetectSettings
+from kgcp.target.common import common_uncertainty
 from kgcp.target.layout import Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Miss, Outcome
+from kgcp.target.prior import NormalPrior, normal_priors
 from kgcp.workers import ordered_map
 
 _FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
@@ -34,8 +38,28 @@ class FrameTask:
 
     frames_folder: Path
     camera: Camera
+    calibration_covariance: CalibrationCovariance | None
     targets: tuple[Target, ...]
     settings: DetectSettings
+
+
+@dataclass(frozen=True, slots=True)
+class FrameNote:
+    """What a worker needs to know about one frame.
+
+    Attributes
+    ----------
+    frame : str
+        Path relative to the frames folder.
+    time_s : float or None
+        Mid-exposure from the times file, Unix UTC [s]; None: EXIF decides.
+    prior : NormalPrior or None
+        Of the normal of the plate on the vehicle; None: nothing is known of it.
+    """
+
+    frame: str
+    time_s: float | None
+    prior: NormalPrior | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +78,9 @@ class SurveySummary:
         Frames that neither the times file nor EXIF gives a time.
     times_without_frame : int
         Entries of the times file that name no frame.
+    frames_without_attitude : int
+        Frames whose camera attitude is not known, so that a level plate tells nothing about them;
+        0 where the plate is not said to be level.
     """
 
     frames: int
@@ -61,6 +88,7 @@ class SurveySummary:
     reasons: Mapping[str, int]
     frames_without_time: int
     times_without_frame: int
+    frames_without_attitude: int
 
 
 def detect_flight(
@@ -87,7 +115,8 @@ def detect_flight(
     Raises
     ------
     KgcpError
-        If there are no frames, the times file is bad, or `out` cannot be written.
+        If there are no frames, the times file or that of the reference poses is bad, or `out`
+        cannot be written.
     """
     frames = list_frames(flight.frames_folder)
     if not frames:
@@ -96,9 +125,16 @@ def detect_flight(
             " [frames] folder in flight.toml"
         )
     times = {} if flight.times_file is None else read_frame_times(flight.times_file)
-    task = FrameTask(flight.frames_folder, flight.camera, flight.targets, settings)
+    notes = _take_notes(flight, frames, times)
+    task = FrameTask(
+        flight.frames_folder,
+        flight.camera,
+        flight.calibration_covariance,
+        flight.targets,
+        settings,
+    )
     results = []
-    for result in examine_frames(task, frames, times, jobs=jobs):
+    for result in examine_frames(task, notes, jobs=jobs):
         on_frame(result)
         results.append(result)
     write_table(
@@ -107,16 +143,40 @@ def detect_flight(
         chain.from_iterable(map(detection_rows, results)),
         _provenance(flight, settings),
     )
-    return _summarise(results, times)
+    is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
+    without_attitude = sum(note.prior is None for note in notes) if is_level else 0
+    return _summarise(results, times, without_attitude)
+
+
+def _take_notes(
+    flight: Flight, frames: Sequence[str], times: Mapping[str, float]
+) -> list[FrameNote]:
+    """Return what is known of each frame before it is read.
+
+    Reference poses are mostly made after the detections: a file that is not there yet is no error.
+    """
+    priors: Sequence[NormalPrior | None] = [None] * len(frames)
+    if flight.vehicle is not None and flight.vehicle.level_sd_deg is not None:
+        path = flight.reference_file
+        priors = normal_priors(
+            frames,
+            read_reference_poses(path) if path is not None and path.is_file() else None,
+            level_sd_deg=flight.vehicle.level_sd_deg,
+            plumb_sd_deg=flight.plumb_sd_deg,
+        )
+    return [
+        FrameNote(frame, times.get(frame), prior)
+        for frame, prior in zip(frames, priors, strict=True)
+    ]
 
 
 def examine_frames(
-    task: FrameTask, frames: Sequence[str], times: Mapping[str, float], *, jobs: int
+    task: FrameTask, notes: Sequence[FrameNote], *, jobs: int
 ) -> Iterator[FrameResult]:
     """Yield the result of every frame, in the order given, from a pool of `jobs` processes."""
     return ordered_map(
         _examine_in_worker,
-        [(frame, times.get(frame)) for frame in frames],
+        notes,
         jobs=jobs,
         start=_start_worker,
         start_arguments=(task,),
@@ -124,28 +184,29 @@ def examine_frames(
     )
 
 
-def examine_frame(task: FrameTask, frame: str, time_s: float | None) -> FrameResult:
-    """Read and measure one frame; whatever a frame can do wrong becomes its result.
-
-    Parameters
-    ----------
-    task : FrameTask
-    frame : str
-        Path relative to the frames folder.
-    time_s : float or None
-        Mid-exposure from the times file, Unix UTC [s]; None: EXIF decides.
-    """
-    path = task.frames_folder / frame
+def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
+    """Read and measure one frame; whatever a frame can do wrong becomes its result."""
+    path = task.frames_folder / note.frame
     exif = read_exif(path)
     outcomes: tuple[Outcome, ...]
     try:
         grey = read_grey(path, task.camera)
-        outcomes = measure_frame(grey, task.camera, task.targets, task.settings)
+        measured = measure_frame(grey, task.camera, task.targets, task.settings, note.prior)
+        outcomes = tuple(_with_common_uncertainty(task, outcome) for outcome in measured)
     except Rejection as rejection:
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
         )
-    return FrameResult(frame, exif.time_s if time_s is None else time_s, exif, outcomes)
+    time_s = exif.time_s if note.time_s is None else note.time_s
+    return FrameResult(note.frame, time_s, exif, outcomes)
+
+
+def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
+    if isinstance(outcome, Miss):
+        return outcome
+    ring = next(target.ring for target in task.targets if target.name == outcome.target)
+    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
+    return replace(outcome, common=common)
 
 
 _worker_task: FrameTask | None = None  # set once per process: sent with every frame it would cost
@@ -157,10 +218,10 @@ def _start_worker(task: FrameTask) -> None:
     cv2.setNumThreads(0)  # the processes are the parallelism
 
 
-def _examine_in_worker(frame_and_time: tuple[str, float | None]) -> FrameResult:
+def _examine_in_worker(note: FrameNote) -> FrameResult:
     if _worker_task is None:
         raise RuntimeError("worker used before it was started")
-    return examine_frame(_worker_task, *frame_and_time)
+    return examine_frame(_worker_task, note)
 
 
 def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
@@ -172,7 +233,9 @@ def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
     }
 
 
-def _summarise(results: Sequence[FrameResult], times: Mapping[str, float]) -> SurveySummary:
+def _summarise(
+    results: Sequence[FrameResult], times: Mapping[str, float], frames_without_attitude: int
+) -> SurveySummary:
     outcomes = [outcome for result in results for outcome in result.outcomes]
     reasons = Counter(outcome.reason for outcome in outcomes if isinstance(outcome, Miss))
     status = Counter(
@@ -185,4 +248,5 @@ def _summarise(results: Sequence[FrameResult], times: Mapping[str, float]) -> Su
         reasons={reason.value: count for reason, count in reasons.most_common()},
         frames_without_time=sum(result.time_s is None for result in results),
         times_without_frame=len(times.keys() - {result.frame for result in results}),
+        frames_without_attitude=frames_without_attitude,
     )

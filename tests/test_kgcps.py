@@ -30,6 +30,7 @@ def _sighting(number: int, target: str, time_s: float | None, instance: int = 0)
         centre_cov_px2=None,
         distance_m=50.0,
         sd_distance_m=None,
+        sd_common_distance_m=0.004,
     )
 
 

@@ -18,7 +18,7 @@ def _comparison(
     if percent is not None:
         measured_m = distance_m * (1.0 + 0.01 * percent)
         at = np.array([500.0 + off_px, 500.0])
-        sighting = Sighting(frame, 1, "A", 0, 0.0, at, None, measured_m, None)
+        sighting = Sighting(frame, 1, "A", 0, 0.0, at, None, measured_m, None, None)
     exposure = Exposure(None, None, None, None, white, None, None, None, None)
     attempt = Attempt(frame, "A", 0.0, sighting, exposure)
     return Comparison(attempt, distance_m, 0.02, np.array([500.0, 500.0]), 20.0)

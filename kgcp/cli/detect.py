@@ -121,6 +121,12 @@ def _report(summary: SurveySummary, table: Path, seconds: float, *, as_json: boo
             " ([frames] times) to make KGCPs of them",
             err=True,
         )
+    if summary.frames_without_attitude:
+        click.echo(
+            f"{summary.frames_without_attitude} frames have no camera attitude, so that a level"
+            " plate does not tell their two poses apart: give [camera] plumb_sd_deg",
+            err=True,
+        )
     if summary.times_without_frame:
         click.echo(f"{summary.times_without_frame} times belong to no frame", err=True)
     click.echo(f"wrote {table}", err=True)

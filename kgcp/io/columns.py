@@ -30,6 +30,8 @@ class Column:
 _TEXT, _INTEGER, _NUMBER = ColumnType.TEXT, ColumnType.INTEGER, ColumnType.NUMBER
 _TIME, _NUMBERS = ColumnType.TIME, ColumnType.NUMBERS
 
+_COMMON = "share of calibration and diameter: one error in all frames, not in {}"
+
 _EXPOSURE = (
     Column("radius_px", _NUMBER, "semi-major axis of the main ring's outer ellipse [px]"),
     Column("blur_px", _NUMBER, "edge spread σ [px]"),
@@ -75,7 +77,14 @@ DETECTION_COLUMNS = (
     Column("alt_qx", _NUMBER, "rotation of the circle's other pose"),
     Column("alt_qy", _NUMBER, "rotation of the circle's other pose"),
     Column("alt_qz", _NUMBER, "rotation of the circle's other pose"),
-    Column("ambiguity", _NUMBER, "how much worse the other pose fits; 0: cannot be told apart"),
+    Column(
+        "ambiguity",
+        _NUMBER,
+        "Δχ² by which the other pose is worse, prior included",
+    ),
+    Column("sd_common_distance_m", _NUMBER, _COMMON.format("sd_distance_m") + " [m]"),
+    Column("sd_common_direction_mrad", _NUMBER, _COMMON.format("sd_x_px") + ", worst axis [mrad]"),
+    Column("common_pose_cov", _NUMBERS, _COMMON.format("pose_cov") + "; 36 numbers as there"),
     Column("score", _NUMBER, "normalised cross-correlation of the code"),
     *_EXPOSURE,
 )
@@ -98,6 +107,7 @@ KGCP_COLUMNS = (
     Column("sd_y_px", _NUMBER, "its standard deviation [px]"),
     Column("distance_m", _NUMBER, "camera centre to point [m]"),
     Column("sd_distance_m", _NUMBER, "its standard deviation [m]"),
+    Column("sd_common_distance_m", _NUMBER, _COMMON.format("sd_distance_m") + " [m]"),
 )
 
 BIAS_COLUMNS = (

@@ -12,7 +12,14 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.columns import DETECTION_COLUMNS
 from kgcp.io.frames import Exif
 from kgcp.io.tables import Row, time_cell
-from kgcp.target.observation import Appearance, Miss, Observation, Outcome, Uncertainty
+from kgcp.target.observation import (
+    Appearance,
+    CommonUncertainty,
+    Miss,
+    Observation,
+    Outcome,
+    Uncertainty,
+)
 
 _NULL_ROW: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
 
@@ -82,6 +89,7 @@ def _measured_cells(seen: Observation) -> Mapping[str, object]:
         "score": seen.score,
         **_appearance_cells(seen.appearance),
         **({} if seen.uncertainty is None else _uncertainty_cells(seen.uncertainty)),
+        **({} if seen.common is None else _common_cells(seen.common)),
         **_alternative_cells(seen),
     }
 
@@ -108,6 +116,14 @@ def _uncertainty_cells(uncertainty: Uncertainty) -> Mapping[str, object]:
         "sd_pitch_deg": uncertainty.sd_pitch_deg,
         "sd_heading_deg": uncertainty.sd_heading_deg,
         "pose_cov": uncertainty.pose_cov.ravel().tolist(),
+    }
+
+
+def _common_cells(common: CommonUncertainty) -> Mapping[str, object]:
+    return {
+        "sd_common_distance_m": common.sd_distance_m,
+        "sd_common_direction_mrad": common.sd_direction_mrad,
+        "common_pose_cov": common.pose_cov.ravel().tolist(),
     }
 
 

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.geometry.camera import Camera
+from kgcp.io.flight_camera import (
+    CAMERA_KEYS,
+    read_calibration_covariance,
+    read_camera,
+    read_plumb_sd_deg,
+)
 from kgcp.io.flight_targets import read_targets
 from kgcp.io.toml_values import TomlTable
 from kgcp.settings import VehicleSettings
@@ -15,17 +22,6 @@ from kgcp.target.layout import Target
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times")
-FOCAL_KEYS = ("fx", "fy", "cx", "cy")
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-CAMERA_KEYS = (
-    "file",
-    "width",
-    "height",
-    *FOCAL_KEYS,
-    *DISTORTION_KEYS,
-    "response",
-    "readout_s",
-)
 VEHICLE_KEYS = (
     "trajectory",
     "lever_arm_m",
@@ -33,6 +29,7 @@ VEHICLE_KEYS = (
     "mount_deg",
     "sd_time_s",
     "time_offset_s",
+    "level_sd_deg",
 )
 REFERENCE_KEYS = ("poses",)
 
@@ -54,6 +51,11 @@ class Flight:
     times_file : Path or None
         CSV of frame times; None: EXIF says when.
     camera : Camera
+    calibration_covariance : CalibrationCovariance or None
+        How well the camera is calibrated; None: flight.toml does not say.
+    plumb_sd_deg : float or None
+        Standard deviation of the camera's optical axis against the vertical, about either
+        horizontal axis, in frames without reference attitude [deg]; None: not known.
     targets : tuple of Target
         In the order of the file.
     vehicle : VehicleSettings or None
@@ -71,6 +73,8 @@ class Flight:
     frames_folder: Path
     times_file: Path | None
     camera: Camera
+    calibration_covariance: CalibrationCovariance | None
+    plumb_sd_deg: float | None
     targets: tuple[Target, ...]
     vehicle: VehicleSettings | None
     trajectory_file: Path | None
@@ -96,14 +100,22 @@ def read_flight(folder: Path) -> Flight:
         raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
     table = TomlTable(f"{path}:", values, FLIGHT_KEYS)
     frames_folder, times_file = _read_frames(table, folder)
+    camera = table.table("camera", CAMERA_KEYS)
     vehicle, trajectory_file = _read_vehicle(table, folder)
+    plumb_sd_deg = read_plumb_sd_deg(camera)
+    if plumb_sd_deg is not None and (vehicle is None or vehicle.level_sd_deg is None):
+        raise camera.error(
+            "plumb_sd_deg", "stands without [vehicle] level_sd_deg", "give both or none"
+        )
     return Flight(
         folder=folder,
         name=table.text("name") if "name" in table else folder.resolve().name,
         crs=table.text("crs") if "crs" in table else None,
         frames_folder=frames_folder,
         times_file=times_file,
-        camera=_read_camera(table.table("camera", CAMERA_KEYS), folder),
+        camera=read_camera(camera, folder),
+        calibration_covariance=read_calibration_covariance(camera),
+        plumb_sd_deg=plumb_sd_deg,
         targets=read_targets(table),
         vehicle=vehicle,
         trajectory_file=trajectory_file,
@@ -128,55 +140,9 @@ def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None]:
     if not (folder / name).is_dir():
         raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
     if "times" in table:
-        return folder / name, _existing_file(table, "times", folder)
+        return folder / name, table.existing_file("times", folder)
     default = folder / "frames.csv"
     return folder / name, default if default.is_file() else None
-
-
-def _existing_file(table: TomlTable, key: str, folder: Path) -> Path:
-    path = folder / table.text(key)
-    if not path.is_file():
-        raise table.error(key, f"{table.text(key)!r} does not exist", "create or correct it")
-    return path
-
-
-def _read_camera(table: TomlTable, folder: Path) -> Camera:
-    response = table.choice("response", tuple(Response)) if "response" in table else "unknown"
-    readout_s = table.number("readout_s", 0.0)
-    camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
-    with table.located():
-        return replace(camera, response=Response(response), readout_s=readout_s)
-
-
-def _inline_camera(table: TomlTable) -> Camera:
-    with table.located():
-        return Camera(
-            width=table.integer("width"),
-            height=table.integer("height"),
-            fx=table.number("fx"),
-            fy=table.number("fy"),
-            cx=table.number("cx"),
-            cy=table.number("cy"),
-            k1=table.number("k1", 0.0),
-            k2=table.number("k2", 0.0),
-            p1=table.number("p1", 0.0),
-            p2=table.number("p2", 0.0),
-            k3=table.number("k3", 0.0),
-            k4=table.number("k4", 0.0),
-            k5=table.number("k5", 0.0),
-            k6=table.number("k6", 0.0),
-        )
-
-
-def _file_camera(table: TomlTable, folder: Path) -> Camera:
-    from kgcp.io.calibrations import read_calibration
-
-    for key in (*FOCAL_KEYS, *DISTORTION_KEYS):
-        if key in table:
-            raise table.error(key, "stands beside a calibration file", "delete one of the two")
-    width = table.integer("width") if "width" in table else None
-    height = table.integer("height") if "height" in table else None
-    return read_calibration(_existing_file(table, "file", folder), (width, height))
 
 
 def _read_vehicle(flight: TomlTable, folder: Path) -> tuple[VehicleSettings | None, Path | None]:
@@ -190,6 +156,7 @@ def _read_vehicle(flight: TomlTable, folder: Path) -> tuple[VehicleSettings | No
             mount_deg=table.number("mount_deg", 0.0),
             sd_time_s=table.number("sd_time_s", 0.0),
             time_offset_s=table.number("time_offset_s", 0.0),
+            level_sd_deg=table.number("level_sd_deg") if "level_sd_deg" in table else None,
         )
     return settings, folder / table.text("trajectory")
 

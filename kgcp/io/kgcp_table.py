@@ -27,6 +27,7 @@ def kgcp_row(point: Kgcp) -> Row:
         **_deviations(("sd_x_px", "sd_y_px"), point.centre_cov_px2),
         "distance_m": point.distance_m,
         "sd_distance_m": point.sd_distance_m,
+        "sd_common_distance_m": point.sd_common_distance_m,
     }
 
 

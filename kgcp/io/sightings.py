@@ -71,6 +71,7 @@ def _sighting(row: _Row, number: int, time_s: float | None) -> Sighting:
         centre_cov_px2=cov,
         distance_m=_known(row, "distance_m"),
         sd_distance_m=_number(row, "sd_distance_m"),
+        sd_common_distance_m=_number(row, "sd_common_distance_m"),
     )
 
 

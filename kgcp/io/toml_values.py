@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from kgcp.errors import KgcpError, SettingError
 
@@ -102,6 +103,23 @@ class TomlTable:
         if not isinstance(value, list):
             raise self._wrong_type(key, value, "a list of numbers, [0, 43, 78]")
         return tuple(self._finite(key, element) for element in value)
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Return a list of texts."""
+        value = self._required(key, 'give it as a list of texts, ["fx", "fy"]')
+        if not isinstance(value, list):
+            raise self._wrong_type(key, value, 'a list of texts, ["fx", "fy"]')
+        for element in value:
+            if not isinstance(element, str):
+                raise self._wrong_type(key, element, "a text in quotes")
+        return tuple(value)
+
+    def existing_file(self, key: str, folder: Path) -> Path:
+        """Return a file that lies in the folder or below it."""
+        path = folder / self.text(key)
+        if not path.is_file():
+            raise self.error(key, f"{self.text(key)!r} does not exist", "create or correct it")
+        return path
 
     def vector(
         self, key: str, default: tuple[float, float, float] | None = None

@@ -60,6 +60,25 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CommonUncertainty:
+    """What is wrong in all frames alike: camera calibration and diameter; not in `Uncertainty`.
+
+    Attributes
+    ----------
+    pose_cov : (6, 6) array
+        As in `Uncertainty`.
+    sd_distance_m : float
+        Of the distance [m].
+    sd_direction_mrad : float
+        Of the direction to the target's centre in the camera frame, where it is worst [mrad].
+    """
+
+    pose_cov: FloatArray
+    sd_distance_m: float
+    sd_direction_mrad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
     """The other pose of the circle.
 
@@ -68,7 +87,9 @@ class Alternative:
     pose : Pose
         Same distance (nearly), normal mirrored about the viewing ray.
     ambiguity : float
-        How much worse it fits; 0: cannot be told apart.
+        How much worse it fits; 0: cannot be told apart. By the image model: Δχ² of the image,
+        deflated by the correlation of its residuals, and of the prior; by the paper's chain:
+        misfit of the inner ellipse's centre [px].
     """
 
     pose: Pose
@@ -98,6 +119,8 @@ class Observation:
         None where the two poses coincide.
     uncertainty : Uncertainty or None
         None where the method gives none.
+    common : CommonUncertainty or None
+        None where nothing is known about calibration and diameter.
     """
 
     target: str
@@ -110,6 +133,7 @@ class Observation:
     appearance: Appearance
     alternative: Alternative | None
     uncertainty: Uncertainty | None
+    common: CommonUncertainty | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,8 @@ class Sighting:
         Projection centre to target centre [m].
     sd_distance_m : float or None
         Its standard deviation [m].
+    sd_common_distance_m : float or None
+        Share of calibration and diameter: one error in all frames, not in `sd_distance_m` [m].
     """
 
     frame: str
@@ -43,6 +45,7 @@ class Sighting:
     centre_cov_px2: FloatArray | None
     distance_m: float
     sd_distance_m: float | None
+    sd_common_distance_m: float | None
 
     def row_time_s(self, camera: Camera) -> float | None:
         """Return when the centre's row was exposed, Unix UTC [s].

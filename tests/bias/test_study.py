@@ -59,7 +59,16 @@ def _attempt(index: int, distance_m: float | None, centre: tuple[float, float]) 
     sighting = None
     if distance_m is not None:
         sighting = Sighting(
-            _frame(index), index + 1, "A", 0, float(index), np.array(centre), None, distance_m, None
+            frame=_frame(index),
+            number=index + 1,
+            target="A",
+            instance=0,
+            time_s=float(index),
+            centre_px=np.array(centre),
+            centre_cov_px2=None,
+            distance_m=distance_m,
+            sd_distance_m=None,
+            sd_common_distance_m=None,
         )
     return Attempt(_frame(index), "A", float(index), sighting, _NOTHING)
 

@@ -21,6 +21,7 @@ def _points(crs: str, position: tuple[float, float, float], point_id: str = "K00
         centre_cov_px2=None,
         distance_m=50.0,
         sd_distance_m=None,
+        sd_common_distance_m=0.0123456789,
     )
     return MapPoints(crs, (point,))
 

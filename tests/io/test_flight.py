@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -30,6 +31,9 @@ k1 = -0.06
 k6 = 0.001
 response = "linear"
 readout_s = 0.01
+sd_fx = 0.5
+sd_k6 = 2e-4
+plumb_sd_deg = 8
 
 [[target]]
 name = "A"
@@ -63,6 +67,7 @@ sd_lever_arm_m = [0.005, 0.005, 0.005]
 mount_deg = 12.5
 sd_time_s = 0.001
 time_offset_s = -0.25
+level_sd_deg = 1.5
 
 [reference]
 poses = "aat.csv"
@@ -105,6 +110,23 @@ def test_every_value_arrives_in_its_record(write: Write) -> None:
     assert flight.vehicle.lever_arm_m == (-0.8, 0.15, -1.95)
     assert flight.vehicle.mount_deg == 12.5
     assert flight.vehicle.time_offset_s == -0.25
+    assert (flight.plumb_sd_deg, flight.vehicle.level_sd_deg) == (8.0, 1.5)
+    assert flight.calibration_covariance is not None
+    assert np.diag(flight.calibration_covariance.cov) == pytest.approx([0.25, *[0] * 10, 4e-8])
+
+
+def test_a_covariance_of_the_calibration_is_a_list_row_by_row(write: Write) -> None:
+    deviations = "sd_fx = 0.5\nsd_k6 = 2e-4\n"
+    text = changed(deviations, 'cov_of = ["cy", "fx"]\ncov = [4, 1.5, 1.5, 1]\n')
+    covariance = read_flight(write(text)).calibration_covariance
+    assert covariance is not None
+    assert covariance.cov[:4, :4].tolist() == [
+        [1.0, 0.0, 0.0, 1.5],
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0],
+        [1.5, 0.0, 0.0, 4.0],
+    ]
+    assert read_flight(write(changed(deviations, ""))).calibration_covariance is None
 
 
 def test_replicas_belong_to_their_plate(write: Write) -> None:
@@ -119,7 +141,7 @@ def test_replicas_belong_to_their_plate(write: Write) -> None:
 
 def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: Write) -> None:
     camera_and_target = FLIGHT[FLIGHT.index("[camera]") : FLIGHT.index('[[target]]\nname = "post')]
-    folder = write(camera_and_target)
+    folder = write(camera_and_target.replace("plumb_sd_deg = 8\n", ""))
     (tmp_path / "frames").mkdir()
     flight = read_flight(folder)
     assert flight.name == tmp_path.name
@@ -177,6 +199,17 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ("sd_time_s = 0.001", "sd_time_s = -1", r"\[vehicle\] sd_time_s: -1 s is out of range"),
         ("0.01, 0.01, 0.02", "0, 0, -1", "post sd_position_m: is negative"),
         ("position_m = [346937.1, 4582508.6, 122]\n", "", "sd_position_m: stands without"),
+        ("sd_fx = 0.5", "sd_fx = -0.5", r"\[camera\] sd_fx: -0.5 is out of range; give"),
+        ("sd_fx = 0.5", "cov = [1]", r"\[camera\] sd_k6: stands beside cov; delete"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]", r"\[camera\] cov_of: is missing; give"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov_of = ["fx"]', r"\[camera\] cov: is missing; give"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]\ncov_of = [1]", "cov_of: is a number; give a"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [1]\ncov_of = "fx"', "cov_of: is a text; give a"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [1, 2]\ncov_of = ["fx"]', "cov: has 2 numbers for 1"),
+        ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [-1]\ncov_of = ["fx"]', "cov: is not a covariance"),
+        ("plumb_sd_deg = 8", "plumb_sd_deg = 80", r"\[camera\] plumb_sd_deg: 80 deg is out of"),
+        ("level_sd_deg = 1.5", "level_sd_deg = 0", r"\[vehicle\] level_sd_deg: 0 deg is out of"),
+        ("level_sd_deg = 1.5\n", "", r"plumb_sd_deg: stands without \[vehicle\] level_sd_deg;"),
         # targets that do not go together
         ("[10, 80, 150, 250, 290]", "[30, 73, 108, 210]", "'A' and 'A-inner' are rotations"),
         ('name = "post"', 'name = "A"', "name: 'A' is the name of two targets"),
@@ -186,7 +219,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ('"pictures"', '"photos"', r"\[frames\] folder: 'photos' is not a folder; create"),
         ('"times.csv"', '"time.csv"', r"\[frames\] times: 'time.csv' does not exist; create"),
         # syntax
-        ("[reference]", "[reference", r"is not TOML: .*line 53.*; correct that line"),
+        ("[reference]", "[reference", r"is not TOML: .*line 57.*; correct that line"),
         ("fy = 2304\n", "fy = 2304\nfx = 1\n", "is not TOML: .*line 13"),
     ],
 )  # fmt: skip

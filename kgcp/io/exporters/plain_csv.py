@@ -15,7 +15,7 @@ from kgcp.io.times import format_time
 COLUMNS = (
     *("id", "frame", "target", "time", "x", "y", "z", "sd_x", "sd_y", "sd_z"),
     *("cov_xy", "cov_xz", "cov_yz", "x_px", "y_px", "sd_x_px", "sd_y_px", "cov_xy_px2"),
-    *("distance_m", "sd_distance_m", "crs"),
+    *("distance_m", "sd_distance_m", "sd_common_distance_m", "crs"),
 )
 """x is easting or longitude, y northing or latitude, z height, in `crs`; deviations in metres and
 covariances in m² along these axes; (0, 0) px is the centre of the top-left pixel."""
@@ -37,6 +37,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
                 *_covariance(point.centre_cov_px2, 2),
                 f"{point.distance_m:.5f}",
                 _text(point.sd_distance_m),
+                _text(point.sd_common_distance_m),
                 points.crs,
             )
         )

@@ -1,0 +1,114 @@
+"""How well a camera is calibrated, and what that does to its image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+
+CALIBRATION_PARAMETERS = (
+    *("fx", "fy", "cx", "cy"),
+    *("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+)
+"""Fields of `Camera` that a calibration estimates, in OpenCV's order."""
+
+_ASYMMETRY = 1e-9  # relative: both halves are the same number, perhaps rounded twice
+_NEGATIVE_EIGENVALUE = 1e-6  # of the correlations: what rounding to six digits may leave
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationCovariance:
+    """Covariance of the calibration: an error that all frames of a flight share.
+
+    Attributes
+    ----------
+    cov : (12, 12) array
+        In the order and the units of `CALIBRATION_PARAMETERS`; rows of zeros: taken for exact.
+    """
+
+    cov: FloatArray
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], cov: FloatArray) -> CalibrationCovariance:
+        """Return the covariance (n, n) of some parameters as one of all.
+
+        Raises
+        ------
+        SettingError
+            For `cov_of`, if a name is unknown or repeated; for `cov`, if its size is not that of
+            the names, or it is not symmetric or not positive semidefinite.
+        """
+        listed = ", ".join(CALIBRATION_PARAMETERS)
+        if not names or len(set(names)) < len(names) or not {*names} <= {*CALIBRATION_PARAMETERS}:
+            raise SettingError(
+                "cov_of", f"{list(names)} are not parameters", f"name each once of {listed}"
+            )
+        if cov.shape != (len(names), len(names)):
+            raise SettingError(
+                "cov",
+                f"has {cov.size} numbers for {len(names)} parameters",
+                f"give the {len(names)} x {len(names)} numbers row by row",
+            )
+        _check_covariance(cov)
+        places = [CALIBRATION_PARAMETERS.index(name) for name in names]
+        whole = np.zeros((len(CALIBRATION_PARAMETERS),) * 2)
+        whole[np.ix_(places, places)] = cov
+        return cls(whole)
+
+
+def _check_covariance(cov: FloatArray) -> None:
+    if not np.allclose(cov, cov.T, rtol=_ASYMMETRY, atol=0.0):
+        raise SettingError("cov", "is not symmetric", "give both halves of the matrix")
+    sd = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    scale = np.where(sd > 0.0, sd, 1.0)
+    correlation = cov / np.outer(scale, scale)
+    is_valid = np.all(np.diag(cov) >= 0.0) and not np.any(cov[sd == 0.0])
+    if not is_valid or np.linalg.eigvalsh(correlation)[0] < -_NEGATIVE_EIGENVALUE:
+        raise SettingError(
+            "cov",
+            "is not a covariance: some combination has a negative variance",
+            "give the calibration's matrix with all its digits",
+        )
+
+
+def image_by_calibration(camera: Camera, normalised: FloatArray) -> FloatArray:
+    """Return how raw pixels move with the calibration, at normalised coordinates (n, 2).
+
+    Returns
+    -------
+    (n, 2, 12) array
+        Derivatives of `Camera.distort`: rows x, y [px], columns `CALIBRATION_PARAMETERS`.
+    """
+    x, y = normalised[:, 0], normalised[:, 1]
+    r2 = x * x + y * y
+    above = 1.0 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+    below = 1.0 + r2 * (camera.k4 + r2 * (camera.k5 + r2 * camera.k6))
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    focal = np.array([[camera.fx], [camera.fy]])
+    x_distorted, y_distorted = ((camera.distort(normalised) - [camera.cx, camera.cy]) / focal.T).T
+    by_above = [r2 / below, r2**2 / below, r2**3 / below]
+    by_below = [-above * power for power in (r2 / below**2, r2**2 / below**2, r2**3 / below**2)]
+    xy2 = 2.0 * x * y
+    k1, k2, k3, k4, k5, k6 = (
+        focal * np.stack((x * change, y * change)) for change in (*by_above, *by_below)
+    )
+    columns = [
+        np.stack((x_distorted, zero)),
+        np.stack((zero, y_distorted)),
+        np.stack((one, zero)),
+        np.stack((zero, one)),
+        k1,
+        k2,
+        focal * np.stack((xy2, r2 + 2.0 * y * y)),
+        focal * np.stack((r2 + 2.0 * x * x, xy2)),
+        k3,
+        k4,
+        k5,
+        k6,
+    ]
+    derivatives: FloatArray = np.stack(columns, axis=-1).transpose(1, 0, 2)
+    return derivatives

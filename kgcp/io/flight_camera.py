@@ -1,0 +1,111 @@
+"""The [camera] table of flight.toml: the camera, how well it is calibrated, and how it hangs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
+from kgcp.geometry.camera import Camera, Response
+from kgcp.io.toml_values import TomlTable
+from kgcp.settings import require_range
+
+DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
+CAMERA_KEYS = (
+    "file",
+    "width",
+    "height",
+    *CALIBRATION_PARAMETERS,
+    *DEVIATION_KEYS,
+    "cov_of",
+    "cov",
+    "plumb_sd_deg",
+    "response",
+    "readout_s",
+)
+
+
+def read_camera(table: TomlTable, folder: Path) -> Camera:
+    """Return the camera, from the table or the calibration file that it names.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    response = table.choice("response", tuple(Response)) if "response" in table else "unknown"
+    readout_s = table.number("readout_s", 0.0)
+    camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
+    with table.located():
+        return replace(camera, response=Response(response), readout_s=readout_s)
+
+
+def _inline_camera(table: TomlTable) -> Camera:
+    with table.located():
+        return Camera(
+            width=table.integer("width"),
+            height=table.integer("height"),
+            fx=table.number("fx"),
+            fy=table.number("fy"),
+            cx=table.number("cx"),
+            cy=table.number("cy"),
+            k1=table.number("k1", 0.0),
+            k2=table.number("k2", 0.0),
+            p1=table.number("p1", 0.0),
+            p2=table.number("p2", 0.0),
+            k3=table.number("k3", 0.0),
+            k4=table.number("k4", 0.0),
+            k5=table.number("k5", 0.0),
+            k6=table.number("k6", 0.0),
+        )
+
+
+def _file_camera(table: TomlTable, folder: Path) -> Camera:
+    from kgcp.io.calibrations import read_calibration
+
+    for key in CALIBRATION_PARAMETERS:
+        if key in table:
+            raise table.error(key, "stands beside a calibration file", "delete one of the two")
+    width = table.integer("width") if "width" in table else None
+    height = table.integer("height") if "height" in table else None
+    return read_calibration(table.existing_file("file", folder), (width, height))
+
+
+def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | None:
+    """Return how well the camera is calibrated; None where the table says nothing about it.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy: for negative deviations, a matrix that is no covariance, or
+        both of them.
+    """
+    deviations = [key for key in DEVIATION_KEYS if key in table]
+    if "cov" in table or "cov_of" in table:
+        if deviations:
+            raise table.error(deviations[0], "stands beside cov", "delete one of the two")
+        numbers, names = np.array(table.numbers("cov")), table.texts("cov_of")
+        size = len(names)
+        cov = numbers.reshape(size, size) if numbers.size == size * size else numbers
+        with table.located():
+            return CalibrationCovariance.of(names, cov)
+    if not deviations:
+        return None
+    sd = np.array([table.number(key) for key in deviations])
+    with table.located():
+        for key, value in zip(deviations, sd, strict=True):
+            require_range(key, float(value), 0.0, 1e4)
+        names = tuple(key.removeprefix("sd_") for key in deviations)
+        return CalibrationCovariance.of(names, np.diag(sd**2))
+
+
+def read_plumb_sd_deg(table: TomlTable) -> float | None:
+    """Return how plumb the optical axis is [deg]; None where the table says nothing about it."""
+    if "plumb_sd_deg" not in table:
+        return None
+    sd_deg = table.number("plumb_sd_deg")
+    with table.located():
+        require_range("plumb_sd_deg", sd_deg, 0.0, 45.0, unit="deg")
+    return sd_deg

@@ -1,0 +1,133 @@
+"""From flight.toml to the table: what is known beforehand, and what all frames have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.columns import DETECTION_COLUMNS
+from kgcp.io.flight import read_flight
+from kgcp.io.simulated import write_simulated_flight
+from kgcp.io.tables import read_table
+from kgcp.settings import DetectSettings
+from kgcp.survey import SurveySummary, detect_flight
+from kgcp.synthetic.flight import plan_flight
+from kgcp.synthetic.imaging import Sensor
+from kgcp.synthetic.presets import preset
+
+LEVEL = ("sd_time_s = ", "level_sd_deg = 2.0\nsd_time_s = ")
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Far and noisy, from a tilted camera: the image cannot tell the two poses apart."""
+    settings = replace(
+        preset("far"),
+        sensor=Sensor(full_well_e=2000.0, read_noise_e=20.0),
+        frames=FRAMES,
+        distance_m=(105.0, 130.0),
+        tilt_deg=(12.0, 25.0),
+        absent_share=0.0,
+        decoy_share=0.0,
+    )
+    folder = tmp_path_factory.mktemp("survey") / "flight"
+    write_simulated_flight(plan_flight(settings, 5), folder, jobs=1, on_frame=lambda: None)
+    return folder
+
+
+def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 1) -> SurveySummary:
+    original = (folder / "flight.toml").read_text(encoding="utf-8")
+    text = original
+    for old, new in edits:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    (folder / "flight.toml").write_text(text, encoding="utf-8")
+    try:
+        return detect_flight(
+            read_flight(folder), DetectSettings(), out, jobs=jobs, on_frame=lambda _: None
+        )
+    finally:
+        (folder / "flight.toml").write_text(original, encoding="utf-8")
+
+
+def measured(out: Path) -> pd.DataFrame:
+    table = read_table(out / "detections.parquet", DETECTION_COLUMNS)
+    return table[table["status"] == "measured"].set_index("frame")
+
+
+def is_right(rows: pd.DataFrame, folder: Path) -> pd.Series[bool]:
+    """Whether the reported normal is nearer to the true one than the other pose's."""
+    truth = pd.read_csv(folder / "truth.csv", index_col="frame").loc[rows.index]
+    true_normal = truth[["r02", "r12", "r22"]].to_numpy()
+    near, far = (
+        np.einsum("ni,ni->n", true_normal, normals(rows[columns].to_numpy()))
+        for columns in (["qw", "qx", "qy", "qz"], ["alt_qw", "alt_qx", "alt_qy", "alt_qz"])
+    )
+    return pd.Series(near > far, index=rows.index)
+
+
+def normals(quaternions: FloatArray) -> FloatArray:
+    w, x, y, z = quaternions.T
+    return np.column_stack(
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    )
+
+
+def test_a_level_plate_and_reference_attitudes_find_the_right_side(
+    flight: Path, tmp_path: Path
+) -> None:
+    detect(flight, tmp_path / "plain")
+    summary = detect(flight, tmp_path / "level", LEVEL)
+    plain, level = measured(tmp_path / "plain"), measured(tmp_path / "level")
+    assert summary.frames_without_attitude == 0
+    assert len(plain) == len(level) >= FRAMES - 1
+    assert plain["ambiguity"].median() < 4.0, "the image alone is not sure"
+    assert level["ambiguity"].min() > 10.0
+    assert is_right(level, flight).all()
+    kept = is_right(plain, flight)
+    values = ["distance_m", "tx_m", "qw", "qx", "qy", "qz", "sd_distance_m", "x_px"]
+    pd.testing.assert_frame_equal(plain.loc[kept, values], level.loc[kept, values])
+
+
+def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_path: Path) -> None:
+    edits = (
+        LEVEL,
+        ('[[target]]\nname = "A"', '[[target]]\nsd_outer_diameter_m = 3e-4\nname = "A"'),
+    )
+    tables = []
+    for jobs in (1, 2):
+        detect(flight, tmp_path / str(jobs), *edits, jobs=jobs)
+        tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
+    assert tables[0] == tables[1]
+
+
+def test_without_reference_poses_the_camera_is_plumb_or_unknown(
+    flight: Path, tmp_path: Path
+) -> None:
+    no_poses = ('poses = "reference.csv"', 'poses = "later.csv"')
+    assert detect(flight, tmp_path / "a", LEVEL, no_poses).frames_without_attitude == FRAMES
+    plumb = ("[camera]\n", "[camera]\nplumb_sd_deg = 20.0\n")
+    assert detect(flight, tmp_path / "b", LEVEL, no_poses, plumb).frames_without_attitude == 0
+    with pytest.raises(KgcpError, match=r"plumb_sd_deg: stands without \[vehicle\] level_sd_deg;"):
+        detect(flight, tmp_path / "c", plumb)
+
+
+def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
+    plain_out, out = tmp_path / "plain", tmp_path / "common"
+    detect(flight, plain_out)
+    cov = 'cov_of = ["fx", "fy"]\ncov = [4.0, 4.0, 4.0, 4.0]\n'
+    detect(flight, out, ("[camera]\n", f"[camera]\n{cov}"))
+    plain, common = measured(plain_out), measured(out)
+    added = ["sd_common_distance_m", "sd_common_direction_mrad", "common_pose_cov"]
+    assert plain[added].isna().all(axis=None)
+    share = common["sd_common_distance_m"] / common["distance_m"]
+    assert np.allclose(share, 2.0 / 2306.0, rtol=0.1)
+    assert common["common_pose_cov"].map(len).eq(36).all()
+    pd.testing.assert_frame_equal(plain.drop(columns=added), common.drop(columns=added))
