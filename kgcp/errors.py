@@ -76,6 +76,11 @@ class Reason(StrEnum):
         Status.REJECTED,
         "too much of the target is outside the frame",
     )
+    OTHER_CODE = (
+        "other_code",
+        Status.REJECTED,
+        "a ring of this target's geometry, but with dots where its code has none",
+    )
     NO_INNER_CIRCLE = (
         "no_inner_circle",
         Status.REJECTED,

@@ -58,8 +58,7 @@ class Pose:
 
     def moved(self, step: FloatArray) -> Pose:
         """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
-        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
-        return Pose(turn @ self.rotation, self.translation_m + step[:3])
+        return Pose(rotation_about(step[3:6]) @ self.rotation, self.translation_m + step[:3])
 
     def mirrored(self) -> Pose:
         """Return the pose with the plate's normal mirrored about the viewing ray of its centre.
@@ -89,6 +88,20 @@ class Pose:
         """θ of the paper: tilt of the diameter in the camera's xz plane; 0 for R = I."""
         n = self.normal
         return math.degrees(math.atan2(-n[0], n[2]))
+
+
+def rotation_about(vector: FloatArray) -> FloatArray:
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad], by Rodrigues' formula.
+
+    Adjustments take so many small turns that the overhead of a general library shows.
+    """
+    angle = math.sqrt(float(vector @ vector))
+    x, y, z = vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    first = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    second = (1.0 - math.cos(angle)) / angle**2 if angle > 1e-4 else 0.5
+    matrix: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
+    return matrix
 
 
 def image_heading_deg(camera: Camera, pose: Pose) -> float:

@@ -21,7 +21,7 @@ def _nodes_and_basis(order: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _interpolator(axis: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """Return Chebyshev nodes on the range of an axis, and the weights (m, order) of their values."""
+    """Return Chebyshev nodes on the range of an axis, and the weights of values there."""
     nodes, basis = _nodes_and_basis(order)
     middle, half = 0.5 * (axis[0] + axis[-1]), max(0.5 * (axis[-1] - axis[0]), 0.5)
     vander = chebyshev.chebvander((axis - middle) / half, order - 1)

@@ -155,7 +155,8 @@ def adjust(
     for number in range(_MAX_ROUNDS):
         if sample is None:
             sample = choose_sample(imaging, parameters.pose, parameters.blur, parameters.light)
-        sd = noise_of(sample, predict(sample, parameters))
+        linear = linearise(sample, parameters)
+        sd = noise_of(sample, linear[0])
         is_first = number == 0
         fit = minimise(
             sample,
@@ -164,6 +165,7 @@ def adjust(
             unknowns,
             steps=_EARLY_STEPS if is_first else _STEPS,
             enough=_EARLY_GAIN if is_first else _LAST_GAIN,
+            linear=linear,
         )
         if not is_first and _is_settled(parameters, fit):
             break
@@ -204,6 +206,7 @@ def minimise(
     *,
     steps: int,
     enough: float,
+    linear: tuple[Prediction, FloatArray] | None = None,
 ) -> Fit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
@@ -211,7 +214,7 @@ def minimise(
     anew only while steps are large: near the minimum it hardly changes, and costs most.
     """
     damping = _DAMPING
-    prediction, jacobian = linearise(sample, parameters)
+    prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
     for _ in range(steps):

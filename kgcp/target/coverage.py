@@ -161,14 +161,13 @@ def _streak_nodes(blur: Blur) -> Iterable[tuple[float, float]]:
 
 def _spread_on_plate(a: FloatArray, blur: Blur) -> FloatArray:
     """Return the blur's covariance on the plate: xx, xy, yy as (3, n) [m²]."""
-    left = np.stack((blur.xx * a[:, 0] + blur.xy * a[:, 1], blur.xy * a[:, 0] + blur.yy * a[:, 1]))
-    return np.stack(
-        (
-            left[0, 0] * a[0, 0] + left[1, 0] * a[0, 1],
-            left[0, 0] * a[1, 0] + left[1, 0] * a[1, 1],
-            left[0, 1] * a[1, 0] + left[1, 1] * a[1, 1],
-        )
-    )
+    x_side = blur.xx * a[:, 0] + blur.xy * a[:, 1]
+    y_side = blur.xy * a[:, 0] + blur.yy * a[:, 1]
+    spread = np.empty((3, a.shape[2]))
+    spread[0] = x_side[0] * a[0, 0] + y_side[0] * a[0, 1]
+    spread[1] = x_side[0] * a[1, 0] + y_side[0] * a[1, 1]
+    spread[2] = x_side[1] * a[1, 0] + y_side[1] * a[1, 1]
+    return spread
 
 
 def _quadratic(matrix: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:

@@ -30,6 +30,7 @@ _STAGES = (
     Reason.CUT,
     Reason.NO_CONTRAST,
     Reason.POOR_FIT,
+    Reason.OTHER_CODE,
 )
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75

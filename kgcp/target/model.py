@@ -10,29 +10,30 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
 
-from kgcp.errors import Reason, Rejection
+from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.adjust import Fit, Unknowns, adjust, first_levels, minimise
+from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
 from kgcp.target.layout import Target
-from kgcp.target.light import PARAM_COUNT, Light, Param, Parameters
+from kgcp.target.light import PARAM_COUNT, Param, Parameters
 from kgcp.target.noise import find_censoring
-from kgcp.target.observation import Alternative, Appearance, Observation
+from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
 from kgcp.target.prior import NormalPrior
 from kgcp.target.sample import Imaging, choose_sample
-from kgcp.target.window import cut_window, semi_major_axis_px
+from kgcp.target.verify import check_code, check_fit, check_precision
+from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
 _START_BLUR = Blur(0.5, 0.5, 0.0)
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 _SHORTEST_STREAK_PX = 1.0
-_MIRRORED_STEPS, _MIRRORED_GAIN = (2, 4), 0.5
+_MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
 _HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
 
 _PRIOR_SD = {
@@ -93,15 +94,18 @@ def measure_by_model(
     Raises
     ------
     Rejection
-        `CUT`, `EDGES_LOST`, `NO_CONTRAST` or `POOR_FIT`.
+        `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
     pose = _without_edge_shift(start)
     imaging = _imaging(grey, camera, target, pose)
     poses = fit_both_poses(imaging, pose)
     if prior is not None:
         poses = _choose_by_prior(imaging, poses, prior)
-    _check_fit(poses.best)
-    return _observation(camera, target, start, poses, prior)
+    check_fit(poses.best)
+    check_code(poses.best, target.ring)
+    observation = _observation(camera, target, start, poses, prior)
+    check_precision(observation)
+    return observation
 
 
 def _without_edge_shift(start: Observation) -> Pose:
@@ -126,6 +130,7 @@ def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Ima
         return Imaging(
             window=window,
             circles=circles_of(target.rings),
+            measured_count=_measured_count(camera, target, pose),
             outer_radius_m=radius_m,
             outer_radius_px=semi_major_axis_px(camera, pose, radius_m),
             centre_px=camera.project(pose.translation_m[None])[0],
@@ -135,6 +140,17 @@ def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Ima
             sharpening_px=0.0 if camera.response is Response.LINEAR else _SHARPENING_PX,
         )
     raise cut
+
+
+def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
+    """Return how many of a target's circles are measured: the main ring's, or all if it is cut.
+
+    A whole main ring leaves its replicas little to add to the distance, at twice the time.
+    """
+    contour = contour_px(camera, pose, 0.5 * target.ring.outer_diameter_m)
+    whole = np.all((contour > 0.0) & (contour < (camera.width - 1.0, camera.height - 1.0)))
+    rings = (target.ring,) if whole else target.rings
+    return sum(2 + len(ring.code_deg) for ring in rings)
 
 
 def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
@@ -213,25 +229,6 @@ def _streak_of(blur: Blur) -> Blur | None:
     return Blur(across, across, 0.0, length * math.cos(direction), length * math.sin(direction))
 
 
-def _check_fit(fit: Fit) -> None:
-    """Refuse a fit that leaves too many outliers or too large residuals."""
-    share = fit.prediction.share
-    censoring = fit.sample.censoring
-    seen = ~(censoring.at_high | censoring.at_low)
-    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
-    light = fit.parameters.light
-    edge = (share > 0.2) & (share < 0.8)
-    noise = float(np.median(fit.sd[edge])) / abs(light.white - light.black) if edge.any() else 1.0
-    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or light.white <= light.black:
-        raise Rejection(
-            Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
-        )
-
-
-_MAX_OUTLIERS = 0.3
-_MAX_EDGE_NOISE = 0.15
-
-
 def _observation(
     camera: Camera,
     target: Target,
@@ -251,39 +248,7 @@ def _observation(
         pose=pose,
         centre_px=camera.project(pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, pose),
-        appearance=_appearance(camera, target, best),
+        appearance=appearance_of(camera, target, best),
         alternative=Alternative(other.parameters.pose, ambiguity),
         uncertainty=propagate(camera, pose, covariance.pose_cov),
     )
-
-
-def _appearance(camera: Camera, target: Target, fit: Fit) -> Appearance:
-    light, blur = fit.parameters.light, fit.parameters.blur
-    imaging = fit.sample.imaging
-    inside = np.hypot(*fit.prediction.view.points_m) < imaging.outer_radius_m
-    clipped = fit.sample.censoring.at_high | fit.sample.censoring.at_low
-    return Appearance(
-        radius_px=semi_major_axis_px(
-            camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m
-        ),
-        black=float(np.clip(light.black, 0.0, 1.0)),
-        white=float(np.clip(light.white, 0.0, 1.0)),
-        saturated=float(np.mean(clipped[inside])),
-        edge_shift_px=_edge_shift_px(light, blur, fit.sample.imaging.censoring.high),
-        blur_px=blur.mean_sd_px,
-    )
-
-
-def _edge_shift_px(light: Light, blur: Blur, clip: float) -> float:
-    """Return how far a straight edge seems displaced towards the dark side.
-
-    The apparent edge is where the grey value passes midway between the plateaus as they are seen,
-    clipped; the true one is where half the light comes from either side.
-    """
-    share = np.linspace(0.0, 1.0, 401)
-    arch = share * (1.0 - share)
-    tone = share + arch * (light.tone_1 + light.tone_2 * (2.0 * share - 1.0))
-    grey = np.minimum(light.black + (light.white - light.black) * tone, clip)
-    middle = 0.5 * (grey[0] + grey[-1])
-    crossing = float(np.interp(middle, np.maximum.accumulate(grey), share))
-    return float(-blur.mean_sd_px * ndtri(np.clip(crossing, 1e-3, 1.0 - 1e-3)))

@@ -84,18 +84,21 @@ def view_plate(pose: Pose, normalised: FloatArray, normalised_from_px: FloatArra
     x, y = normalised
     facing = normal[0] * x + normal[1] * y + normal[2]
     depth = (normal @ offset) / facing
-    arms = np.stack((depth * x - offset[0], depth * y - offset[1], depth - offset[2]))
+    arms = np.empty((3, len(x)))
+    np.multiply(depth, x, out=arms[0])
+    np.multiply(depth, y, out=arms[1])
+    arms[2] = depth
+    arms -= offset[:, None]
     slides = np.empty((2, 3, len(x)))
+    metres_per_px = np.empty((2, 2, len(x)))
+    from_px = depth * normalised_from_px
     for j in (0, 1):
         axis = axes[:, j]
         share = (axis[0] * x + axis[1] * y + axis[2]) / facing
-        slides[j] = axis[:, None] - share * normal[:, None]
-    metres_per_px = np.empty((2, 2, len(x)))
-    for j in (0, 1):
-        for k in (0, 1):
-            metres_per_px[j, k] = depth * (
-                slides[j, 0] * normalised_from_px[0, k] + slides[j, 1] * normalised_from_px[1, k]
-            )
+        np.multiply(share, -normal[:, None], out=slides[j])
+        slides[j] += axis[:, None]
+        np.multiply(slides[j, 0], from_px[0], out=metres_per_px[j])
+        metres_per_px[j] += slides[j, 1] * from_px[1]
     return PlateView(
         points_m=axes[:, :2].T @ arms,
         arms_m=arms,

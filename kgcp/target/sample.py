@@ -35,6 +35,8 @@ class Imaging:
     window : Window
     circles : Circles
         All circles of the plate.
+    measured_count : int
+        The first so many of them are measured; of the others only what they add there is modelled.
     outer_radius_m, outer_radius_px : float
         Of the ring that is measured.
     centre_px : (2,) array
@@ -50,6 +52,7 @@ class Imaging:
 
     window: Window
     circles: Circles
+    measured_count: int
     outer_radius_m: float
     outer_radius_px: float
     centre_px: FloatArray
@@ -87,23 +90,22 @@ def choose_sample(imaging: Imaging, pose: Pose, blur: Blur, light: Light | None)
         `EDGES_LOST` if too little of the target is within the frame.
     """
     window = imaging.window
-    rays, rays_from_px = window.normalised.T, window.normalised_from_px.transpose(1, 2, 0)
-    view = view_plate(pose, rays, rays_from_px)
+    view = view_plate(pose, window.normalised, window.normalised_from_px)
     x, y = view.points_m / imaging.outer_radius_m
     border_px = _BORDER_SIGMAS * blur.largest_sd_px + _BORDER_PX
     limit = 1.0 + min(_BORDER_RADII, border_px / imaging.outer_radius_px)
     within = x * x + y * y < limit * limit
     if light is not None:
         within &= ~_reached_by_surroundings(imaging, np.hypot(x, y) - 1.0, blur, light)
-    near, in_tail = _edge_zones(view, imaging.circles, blur)
+    near, in_tail = _edge_zones(view, imaging, blur)
     flat = np.flatnonzero(within & ~near & ~in_tail)
     chosen = within & near
     chosen[flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]] = True
     index = np.flatnonzero(chosen)
     if len(index) < 4 * PARAM_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
-    normalised = np.ascontiguousarray(rays[:, index])
-    normalised_from_px = np.ascontiguousarray(rays_from_px[:, :, index])
+    normalised = np.ascontiguousarray(window.normalised[:, index])
+    normalised_from_px = np.ascontiguousarray(window.normalised_from_px[:, :, index])
     clip = imaging.censoring
     return Sample(
         imaging=imaging,
@@ -157,17 +159,19 @@ def _reached_by_surroundings(
     return np.asarray(reached.ravel() > 0) & (beyond > -2.0 * reach / imaging.outer_radius_px)
 
 
-def _edge_zones(view: PlateView, circles: Circles, blur: Blur) -> tuple[BoolArray, BoolArray]:
-    """Tell which pixels are near an edge, and which in the tails of one."""
+def _edge_zones(view: PlateView, imaging: Imaging, blur: Blur) -> tuple[BoolArray, BoolArray]:
+    """Tell which pixels are near a measured edge, and which in the tails of any."""
     metres_per_px = largest_metres_per_px(view)
     near_m = (_NEAR_SIGMAS * blur.largest_sd_px + _NEAR_PX) * metres_per_px
     tail_m = REACH_SIGMAS * blur.largest_sd_px * metres_per_px
     near = np.zeros(view.points_m.shape[1], dtype=bool)
     in_tail = near.copy()
-    for centre, radius in zip(circles.centres_m.T, circles.radii_m, strict=True):
-        x, y = view.points_m - centre[:, None]
+    circles = imaging.circles
+    for index, radius in enumerate(circles.radii_m):
+        x, y = view.points_m - circles.centres_m[:, index, None]
         off_edge = np.abs(np.sqrt(x * x + y * y) - radius)
-        near |= off_edge < near_m
+        if index < imaging.measured_count:
+            near |= off_edge < near_m
         in_tail |= off_edge < tail_m
     return near, in_tail
 

@@ -10,6 +10,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.geometry.raster import normalised_window
 
 _CONTOUR_POINTS = 72
 
@@ -26,9 +27,9 @@ class Window:
         Grey values, 0…1 of the data type's range.
     levels_per_count : float
         One grey value's step.
-    normalised : (n, 2) array
+    normalised : (2, n) array
         Normalised image coordinates of the pixel centres, free of distortion.
-    normalised_from_px : (n, 2, 2) array
+    normalised_from_px : (2, 2, n) array
         Derivative of `normalised` with respect to the raw pixel coordinates.
     """
 
@@ -83,9 +84,9 @@ def cut_window(
     if (x1 - x0) <= 0 or (y1 - y0) <= 0 or (x1 - x0) * (y1 - y0) < 0.25 * np.prod(high - low):
         raise Rejection(Reason.CUT, f"box {low.round()} … {high.round()} px")
     scale = float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
-    columns, rows = np.meshgrid(np.arange(x0, x1), np.arange(y0, y1))
-    pixels = np.column_stack((columns.ravel(), rows.ravel())).astype(np.float64)
-    normalised = camera.undistort(pixels)
+    normalised, normalised_from_px = normalised_window(
+        camera, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)
+    )
     return Window(
         x0=x0,
         y0=y0,
@@ -94,13 +95,5 @@ def cut_window(
         levels=grey[y0:y1, x0:x1].ravel().astype(np.float64) / scale,
         levels_per_count=1.0 / scale,
         normalised=normalised,
-        normalised_from_px=_inverse_2x2(camera.distort_jacobian(normalised)),
+        normalised_from_px=normalised_from_px,
     )
-
-
-def _inverse_2x2(matrix: FloatArray) -> FloatArray:
-    a, b = matrix[:, 0, 0], matrix[:, 0, 1]
-    c, d = matrix[:, 1, 0], matrix[:, 1, 1]
-    adjugate = np.stack((np.stack((d, -b), axis=-1), np.stack((-c, a), axis=-1)), axis=-2)
-    inverse: FloatArray = adjugate / (a * d - b * c)[:, None, None]
-    return inverse

@@ -8,8 +8,9 @@ from scipy.stats import ncx2, norm
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.geometry.raster import normalised_grid
 from kgcp.synthetic.imaging import Optics
-from kgcp.synthetic.patch import Patch, Window, normalised_grid, outline_box
+from kgcp.synthetic.patch import Patch, Window, outline_box
 from kgcp.synthetic.shapes import Disc, Shape, rectangle, regular_polygon
 
 PLAIN = Camera(width=640, height=480, fx=1000.0, fy=1000.0, cx=320.3, cy=240.7)

@@ -1,0 +1,109 @@
+"""Is it really this target? What a fit must show before it is reported."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray
+from kgcp.target.adjust import Fit
+from kgcp.target.layout import Ring
+from kgcp.target.observation import Observation
+
+_MAX_OUTLIERS = 0.3
+_MAX_EDGE_NOISE = 0.15
+_MAX_RELATIVE_SD = 0.01
+_POSITIONS = 120  # around the code circle
+_MIN_PIXELS = 3
+_DOT = 0.6  # of a dot's contrast: so much more or less light is a dot, or the lack of one
+_DOTS_PER_MISSING = 4  # one dot in so many may be dirty
+
+
+def check_fit(fit: Fit) -> None:
+    """Refuse a fit that leaves too many outliers or too large residuals.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`.
+    """
+    share, light = fit.prediction.share, fit.parameters.light
+    censoring = fit.sample.censoring
+    seen = ~(censoring.at_high | censoring.at_low)
+    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
+    edge = (share > 0.2) & (share < 0.8)
+    noise = float(np.median(fit.sd[edge])) / abs(light.white - light.black) if edge.any() else 1.0
+    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or light.white <= light.black:
+        raise Rejection(
+            Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
+        )
+
+
+def check_precision(observation: Observation) -> None:
+    """Refuse a measurement so uncertain that it can hardly be of this target.
+
+    Even far, blurred and badly exposed targets are measured to some parts in a thousand; clutter
+    that happens to be round and dotted leaves residuals that say otherwise.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`.
+    """
+    if observation.uncertainty is None:
+        return
+    share = observation.uncertainty.sd_distance_m / observation.pose.distance_m
+    if share > _MAX_RELATIVE_SD:
+        raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
+
+
+def check_code(fit: Fit, ring: Ring) -> None:
+    """Refuse a ring that shows a dot where this code has none, or lacks more than a dirty one.
+
+    The residuals of the fit are averaged over discs of a dot's size all around the code circle.
+
+    Raises
+    ------
+    Rejection
+        `OTHER_CODE`.
+    """
+    excess = _light_around_code_circle(fit, ring)
+    angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
+    off_dot_deg = np.abs((angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0)
+    at_dot = off_dot_deg.argmin(axis=0)
+    between = off_dot_deg.min(axis=1) > 2.0 * ring.dot_half_angle_deg
+    with np.errstate(invalid="ignore"):  # NaN where the frame ends: says nothing
+        extra = float(np.nanmax(np.append(excess[between], 0.0)))
+        missing = int(np.count_nonzero(excess[at_dot] < -_DOT))
+    if extra > _DOT or missing > len(ring.code_deg) // _DOTS_PER_MISSING:
+        raise Rejection(
+            Reason.OTHER_CODE, f"{missing} dots missing, {extra:.0%} of a dot's light elsewhere"
+        )
+
+
+def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
+    """Return what the fit lacks of light all around the code circle, 1: a whole dot.
+
+    NaN where too few pixels are seen.
+    """
+    sample, light = fit.sample, fit.parameters.light
+    clip = sample.censoring.high
+    lack = sample.levels - np.minimum(fit.prediction.levels, clip)
+    lack = lack / max(min(light.white, clip) - light.black, sample.imaging.window.levels_per_count)
+    angles = np.arange(_POSITIONS) * (2.0 * np.pi / _POSITIONS)
+    centres = 0.5 * ring.code_diameter_m * np.stack((np.cos(angles), np.sin(angles)))
+    points = fit.prediction.view.points_m
+    near = np.abs(np.hypot(*points) - 0.5 * ring.code_diameter_m) < 0.5 * ring.dot_diameter_m
+    x, y = points[:, near, None] - centres[:, None, :]
+    within = x * x + y * y < (0.5 * ring.dot_diameter_m) ** 2
+    counts = within.sum(axis=0)
+    sums = lack[near] @ within
+    px_per_m = sample.imaging.outer_radius_px / sample.imaging.outer_radius_m
+    ratio = 0.5 * ring.dot_diameter_m * px_per_m / fit.parameters.blur.mean_sd_px
+    visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
+    mean = np.full(_POSITIONS, np.nan)
+    enough = counts >= _MIN_PIXELS
+    mean[enough] = sums[enough] / counts[enough] / visible
+    return mean
