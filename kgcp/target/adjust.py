@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.light import PARAM_COUNT, Light, Parameters
-from kgcp.target.noise import Misfit, misfit, noise_variance
+from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import PlateView, view_plate
 from kgcp.target.sample import Imaging, Sample, choose_sample
@@ -156,7 +156,7 @@ def adjust(
         if sample is None:
             sample = choose_sample(imaging, parameters.pose, parameters.blur, parameters.light)
         linear = linearise(sample, parameters)
-        sd = noise_of(sample, linear[0])
+        sd = noise_of(sample, linear[0]).sd
         is_first = number == 0
         fit = minimise(
             sample,
@@ -177,7 +177,7 @@ def _is_settled(before: Parameters, fit: Fit) -> bool:
     """Tell whether the pixels and the noise of a round are right for what it found."""
     imaging, after = fit.sample.imaging, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
-    noise = float(np.median(noise_of(fit.sample, fit.prediction) / fit.sd))
+    noise = float(np.median(noise_of(fit.sample, fit.prediction).sd / fit.sd))
     shift_m = after.pose.translation_m - before.pose.translation_m
     distance_m = after.pose.distance_m
     across_px = float(np.linalg.norm(shift_m[:2])) / distance_m * imaging.focal_px
@@ -189,12 +189,14 @@ def _is_settled(before: Parameters, fit: Fit) -> bool:
     )
 
 
-def noise_of(sample: Sample, prediction: Prediction) -> FloatArray:
-    """Return the noise of every pixel of a sample, from its residuals, as level."""
-    residuals = sample.levels - prediction.levels
+def noise_of(sample: Sample, prediction: Prediction) -> Noise:
+    """Return the noise of every pixel of a sample, from its residuals."""
     usable = ~(sample.censoring.at_high | sample.censoring.at_low)
-    return np.sqrt(
-        noise_variance(residuals, prediction.share, usable, sample.imaging.window.levels_per_count)
+    return estimate_noise(
+        sample.levels - prediction.levels,
+        prediction.share,
+        usable,
+        sample.imaging.window.levels_per_count,
     )
 
 

@@ -18,11 +18,13 @@ import numpy.typing as npt
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit
+from kgcp.target.adjust import Fit, noise_of
 from kgcp.target.observation import Uncertainty
 
 _ARC_PX = 6.0
-_EDGE_FLOOR_PX = 0.004  # no print and no pixel is known better: common to all of a circle's edge
+# Of a circle's edge as a whole: no print and no pixel is known better, …
+_EDGE_FLOOR_PX = 0.0005
+_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,8 +60,25 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     robust = (correction * inverse @ (sums @ sums.T) @ inverse)[:6, :6]
     plain = inverse[:6, :6]
     inflation = max(1.0, float(np.trace(np.linalg.solve(plain, robust))) / 6.0)
-    shifts = (inverse @ _edge_pull(fit, scaled, circle))[:6] * _EDGE_FLOOR_PX
+    shifts = (inverse @ _edge_pull(fit, scaled, circle))[:6] * _common_displacement_px(fit)
     return PoseCovariance(_at_least(robust, plain) + shifts @ shifts.T, inflation)
+
+
+def _common_displacement_px(fit: Fit) -> float:
+    """Return the standard deviation of the displacement that all of a circle's edge shares [px].
+
+    From the residuals: what edges scatter beyond the noise of the plateaus (coarse sampling of a
+    print, compression, tails of what is not modelled) averages out along a circle only in part.
+    """
+    noise = noise_of(fit.sample, fit.prediction)
+    share = fit.prediction.share
+    edge = (share > 0.3) & (share < 0.7)
+    if not edge.any():
+        return _EDGE_FLOOR_PX
+    light, blur = fit.parameters.light, fit.parameters.blur
+    slope_per_px = (light.white - light.black) / (np.sqrt(2.0 * np.pi) * blur.mean_sd_px)
+    excess = np.sqrt(np.median(noise.sd[edge] ** 2 - noise.plateau_sd[edge] ** 2))
+    return max(_EDGE_FLOOR_PX, float(_COMMON_SHARE * excess / slope_per_px))
 
 
 def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:

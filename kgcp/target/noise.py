@@ -69,13 +69,29 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
     return Censoring(high, low, levels >= high, levels <= low)
 
 
-def noise_variance(
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Noise of n pixels.
+
+    Attributes
+    ----------
+    sd : (n,) array
+        As level.
+    plateau_sd : (n,) array
+        Without what only edges have.
+    """
+
+    sd: FloatArray
+    plateau_sd: FloatArray
+
+
+def estimate_noise(
     residuals: FloatArray,
     share: FloatArray,
     usable: BoolArray,
     count: float,
-) -> FloatArray:
-    """Return the noise variance (n,) of every pixel from the residuals of a fit.
+) -> Noise:
+    """Return the noise of every pixel from the residuals of a fit.
 
     Parameters
     ----------
@@ -84,7 +100,7 @@ def noise_variance(
     share : (n,) array
         White share.
     usable : (n,) array of bool
-        Neither clipped nor outlying by hundreds of counts.
+        Not clipped.
     count : float
         One grey value's step.
     """
@@ -93,13 +109,12 @@ def noise_variance(
     bright = _trimmed_variance(residuals[usable & (share > 0.85)])
     if dark is None or bright is None:
         dark = bright = dark or bright or _trimmed_variance(residuals[usable]) or floor
-    variance = np.maximum(dark + (bright - dark) * np.clip(share, 0.0, 1.0), floor)
+    plateau = np.maximum(dark + (bright - dark) * np.clip(share, 0.0, 1.0), floor)
     edge = usable & (share > 0.2) & (share < 0.8)
-    standardised = _trimmed_variance(residuals[edge] / np.sqrt(variance[edge]))
-    if standardised is not None and standardised > 1.0:
-        weight = np.clip(4.0 * share * (1.0 - share), 0.0, 1.0)
-        variance = variance * (1.0 + (standardised - 1.0) * weight)
-    return variance
+    standardised = _trimmed_variance(residuals[edge] / np.sqrt(plateau[edge]))
+    excess = max(0.0, standardised - 1.0) if standardised is not None else 0.0
+    variance = plateau * (1.0 + excess * np.clip(4.0 * share * (1.0 - share), 0.0, 1.0))
+    return Noise(np.sqrt(variance), np.sqrt(plateau))
 
 
 def _trimmed_variance(values: FloatArray) -> float | None:
