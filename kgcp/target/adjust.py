@@ -219,14 +219,15 @@ def minimise(
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
-    for _ in range(steps):
+    for number in range(steps):
         normal, gradient = _normal_equations(jacobian, parameters, sd, current, unknowns)
         while True:
             step = np.zeros(PARAM_COUNT)
             damped = _solve(normal + damping * np.diag(np.diag(normal)), gradient)
             step[unknowns.free] = damped
             candidate = parameters.moved(step)
-            if 0.5 * float(gradient @ damped) > _LARGE_GAIN:
+            is_large = 0.5 * float(gradient @ damped) > _LARGE_GAIN
+            if is_large and number < steps - 1:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian

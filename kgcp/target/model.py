@@ -32,7 +32,7 @@ from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 _MARGIN_PX = 12.0
 _START_BLUR = Blur(0.5, 0.5, 0.0)
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
-_SHORTEST_STREAK_PX = 1.0
+_SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
 _HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
 

@@ -182,5 +182,6 @@ def _unblurred(view: PlateView, circles: Circles) -> FloatArray:
     for centre, radius, sign in zip(
         circles.centres_m.T, circles.radii_m, circles.signs, strict=True
     ):
-        share[np.hypot(*(view.points_m - centre[:, None])) < radius] += sign
+        x, y = view.points_m - centre[:, None]
+        share += sign * (x * x + y * y < radius * radius)
     return share

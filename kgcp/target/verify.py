@@ -15,7 +15,7 @@ from kgcp.target.observation import Observation
 _MAX_OUTLIERS = 0.3
 _MAX_EDGE_NOISE = 0.15
 _MAX_RELATIVE_SD = 0.01
-_POSITIONS = 120  # around the code circle
+_POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
 _DOT = 0.6  # of a dot's contrast: so much more or less light is a dot, or the lack of one
 _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
