@@ -61,6 +61,20 @@ def test_a_constant_offset_is_called_a_bias_and_noise_is_not() -> None:
     assert any("No bias beyond noise" in sentence for sentence in verdict(plain))
 
 
+def test_what_the_reference_may_be_off_is_no_bias() -> None:
+    rng = np.random.default_rng(8)
+    errors = rng.normal(0.12, 0.05, 40)  # known to 0.02 m: 0.1 % at 20 m, for all frames alike
+    numbers = bias_numbers(_study(*map(_comparison, np.linspace(18.0, 22.0, 40), errors)))
+    assert numbers.total.sd_reference_percent == pytest.approx(0.1, rel=0.01)
+    assert not numbers.biased
+    assert any("the reference's own errors" in sentence for sentence in verdict(numbers))
+
+
+def test_rounding_is_not_an_exposure_that_varies() -> None:
+    compared = [_comparison(20.0 + i, 0.01 * i, 0.8 + 2e-16 * (i % 2)) for i in range(9)]
+    assert bias_numbers(_study(*compared)).influences == ()
+
+
 def test_a_bias_of_the_far_half_alone_is_found() -> None:
     rng = np.random.default_rng(6)
     near = zip(np.linspace(10, 49, 40), rng.normal(0.0, 0.3, 40), strict=True)

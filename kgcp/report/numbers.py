@@ -18,6 +18,7 @@ _NEAR_M = 50.0  # the paper states its accuracy below and above
 _BIASED_SIGMAS = 3.0
 _RELATED_P = 0.01
 _RELATED_RHO = 0.3
+_ROUNDING = 1e-9  # a quantity that varies by less does not vary
 
 QUANTITIES = {
     "black": "level of black",
@@ -34,17 +35,35 @@ QUANTITIES = {
 
 @dataclass(frozen=True, slots=True)
 class RangeRow:
-    """Residuals of one range of reference distances, in percent and metres."""
+    """Residuals of one range of reference distances, in percent and metres.
+
+    Attributes
+    ----------
+    label : str
+        The range.
+    percent, metres : Spread
+        Of the residuals.
+    sd_reference_percent : float or None
+        Mean standard deviation of the reference distances [%]; None where none is known.
+    """
 
     label: str
     percent: Spread
     metres: Spread
+    sd_reference_percent: float | None
 
     @property
     def is_biased(self) -> bool:
-        """Whether the mean error stands out from its own noise."""
+        """Whether the mean error stands out from its own noise and that of the reference.
+
+        Errors of a trajectory and of reference poses last for many frames: averaging is not
+        trusted to lessen them.
+        """
         sd_mean = self.percent.sd_mean
-        return sd_mean is not None and abs(self.percent.mean) > _BIASED_SIGMAS * sd_mean
+        if sd_mean is None:
+            return False
+        sd = math.hypot(sd_mean, self.sd_reference_percent or 0.0)
+        return abs(self.percent.mean) > _BIASED_SIGMAS * sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,34 +167,45 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
     distance = np.array([one.reference_distance_m for one in trusted])
     residual = np.array([one.residual_m for one in trusted], dtype=np.float64)
     percent = 100.0 * residual / distance
+    sds = np.array([one.sd_reference_m for one in trusted], dtype=np.float64)  # NaN: not known
+    known = np.isfinite(sds)
     edges = np.unique(np.floor(distance / BIN_M)) * BIN_M
 
-    def row(label: str, low: float, high: float) -> RangeRow | None:
-        inside = (distance >= low) & (distance < high)
-        if not inside.any():
-            return None
-        return RangeRow(label, Spread.of(percent[inside]), Spread.of(residual[inside]))
+    def rows(*ranges: tuple[str, float, float]) -> tuple[RangeRow, ...]:
+        insides = [(distance >= low) & (distance < high) for _, low, high in ranges]
+        return tuple(
+            RangeRow(
+                label,
+                Spread.of(percent[inside]),
+                Spread.of(residual[inside]),
+                _mean_or_none((100.0 * sds / distance)[inside & known]),
+            )
+            for (label, _, _), inside in zip(ranges, insides, strict=True)
+            if inside.any()
+        )
 
-    halves = (row("below 50 m", 0.0, _NEAR_M), row("50 m and more", _NEAR_M, math.inf))
-    bins = [row(f"{low:.0f}–{low + BIN_M:.0f} m", low, low + BIN_M) for low in edges]
-    sds = [one.sd_reference_m for one in trusted if one.sd_reference_m is not None]
+    (total,) = rows(("over all distances", 0.0, math.inf))
     detected = [study.trusts(one) for one in study.chances]
     return BiasNumbers(
         distance_m=distance,
         residual_m=residual,
         residual_percent=percent,
-        total=RangeRow("over all distances", Spread.of(percent), Spread.of(residual)),
-        halves=tuple(half for half in halves if half is not None),
-        bins=tuple(one for one in bins if one is not None),
+        total=total,
+        halves=rows(("below 50 m", 0.0, _NEAR_M), ("50 m and more", _NEAR_M, math.inf)),
+        bins=rows(*((f"{low:.0f}–{low + BIN_M:.0f} m", low, low + BIN_M) for low in edges)),
         rates=_rates(np.array([one.reference_distance_m for one in study.chances]), detected),
         influences=_influences(trusted, percent),
-        sd_reference_m=float(np.median(sds)) if sds else None,
+        sd_reference_m=float(np.median(sds[known])) if known.any() else None,
         astray=tuple(one.attempt.frame for one in study.measured if not study.trusts(one)),
         detected=sum(detected),
         chances=len(detected),
         left_out=_left_out(study),
         attitudes_agree=study.attitudes_agree,
     )
+
+
+def _mean_or_none(values: FloatArray) -> float | None:
+    return float(values.mean()) if values.size else None
 
 
 def _rates(distance_m: FloatArray, detected: Sequence[bool]) -> tuple[DetectionRate, ...]:
@@ -204,7 +234,7 @@ def _influences(trusted: Sequence[Comparison], percent: FloatArray) -> tuple[Inf
         )
         known = np.isfinite(column)
         values = column[known]
-        if len(values) > 1 and np.ptp(values) > 0.0:
+        if len(values) > 1 and np.ptp(values) > _ROUNDING:
             residual = percent[known]
             influences.append(
                 Influence(label, values, residual, rank_correlation(values, residual))

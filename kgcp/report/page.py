@@ -28,7 +28,7 @@ def render_page(flight_name: str, numbers: BiasNumbers, figures: Mapping[str, by
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["signed"] = lambda value, digits: f"{value:+.{digits}f}".replace("-", "−")
+    environment.filters["signed"] = _signed
     environment.filters["fixed"] = lambda value, digits: f"{value:.{digits}f}"
     images = {
         name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
@@ -38,6 +38,11 @@ def render_page(flight_name: str, numbers: BiasNumbers, figures: Mapping[str, by
     return template.render(
         name=flight_name, numbers=numbers, images=images, verdict=verdict(numbers)
     )
+
+
+def _signed(value: float, digits: int) -> str:
+    rounded = round(value, digits) + 0.0  # −0.000 would look like a finding
+    return f"{rounded:+.{digits}f}".replace("-", "−")
 
 
 def verdict(numbers: BiasNumbers) -> list[str]:
@@ -67,7 +72,9 @@ def _bias(numbers: BiasNumbers) -> str:
     if numbers.total.percent.count == 1:
         return "One frame says nothing about bias."
     if not numbers.biased:
-        return f"No bias beyond noise: the mean error is {_mean(numbers.total)}."
+        known = numbers.total.sd_reference_percent is not None
+        beyond = "noise and the reference's own errors" if known else "noise"
+        return f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
     parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
     return f"Biased: distances are measured {'; '.join(parts)}."
