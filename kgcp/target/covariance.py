@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit, noise_of
 from kgcp.target.observation import Uncertainty
 
@@ -168,16 +168,23 @@ def _centre_jacobian(camera: Camera, pose: Pose) -> FloatArray:
 
 
 def _angle_jacobian(camera: Camera, pose: Pose) -> FloatArray:
-    """Return the derivatives (3, 6) of roll, pitch and heading [deg], by central differences."""
+    """Return the derivatives (3, 6) of roll, pitch and heading [deg].
+
+    A turn ω moves a direction d by ω × d, so that its component k changes by (d × e_k) · ω.
+    """
     jacobian = np.zeros((3, 6))
-    for i in range(6):
-        step = np.zeros(6)
-        step[i] = 1e-6 * (pose.distance_m if i < 3 else 1.0)
-        high, low = (_angles(camera, pose.moved(sign * step)) for sign in (1.0, -1.0))
-        change = (high - low + 180.0) % 360.0 - 180.0
-        jacobian[:, i] = change / (2.0 * step[i])
-    return jacobian
-
-
-def _angles(camera: Camera, pose: Pose) -> FloatArray:
-    return np.array([pose.roll_deg, pose.pitch_deg, image_heading_deg(camera, pose)])
+    normal, axis = pose.rotation[:, 2], pose.rotation[:, 0]
+    turned_normal, turned_axis = np.cross(normal, np.eye(3)), np.cross(axis, np.eye(3))
+    for row, k in ((0, 1), (1, 0)):  # atan2(−n_k, n_z)
+        by_k, by_z = -normal[2] * turned_normal[k], normal[k] * turned_normal[2]
+        jacobian[row, 3:] = (by_k + by_z) / (normal[2] ** 2 + normal[k] ** 2)
+    x, y, z = pose.translation_m
+    lens = camera.distort_jacobian(np.array([x / z, y / z]))
+    # the image of the axis is lens @ (d_xy − (x, y)/z · d_z)/z; how the lens changes is negligible
+    direction = lens @ (axis[:2] - np.array([x, y]) / z * axis[2])
+    across = np.array([-direction[1], direction[0]]) / (direction @ direction) @ lens
+    by_axis = np.array([across[0], across[1], -(across @ np.array([x, y])) / z])
+    jacobian[2, 3:] = by_axis @ turned_axis
+    by_offset = -axis[2] / z * across
+    jacobian[2, :3] = (*by_offset, -(by_offset @ np.array([x, y])) / z)
+    return np.degrees(jacobian)

@@ -27,6 +27,10 @@ class Circles:
     radii_m: FloatArray
     signs: FloatArray
 
+    def part(self, which: slice) -> Circles:
+        """Return some of the circles."""
+        return Circles(self.centres_m[:, which], self.radii_m[which], self.signs[which])
+
 
 def circles_of(rings: tuple[Ring, ...]) -> Circles:
     """Return all circles of concentric rings: edges and dots."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
+from kgcp.target.coverage import white_level
 from kgcp.target.light import PARAM_COUNT, Grid, Imager, Light
 from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
@@ -124,8 +125,19 @@ def choose_sample(imaging: Imaging, pose: Pose, blur: Blur, light: Light | None)
             imaging.sharpening_px,
         ),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
-        pairs=pair_edges(view_plate(pose, normalised, normalised_from_px), imaging.circles, blur),
+        pairs=_pairs(view_plate(pose, normalised, normalised_from_px), imaging, blur),
     )
+
+
+def _pairs(view: PlateView, imaging: Imaging, blur: Blur) -> EdgePairs:
+    """Pair the pixels with the measured circles; the others are as they are for this pose."""
+    measured = imaging.circles.part(slice(0, imaging.measured_count))
+    others = imaging.circles.part(slice(imaging.measured_count, None))
+    pairs = pair_edges(view, measured, blur)
+    if len(others.radii_m) == 0:
+        return pairs
+    added = white_level(view, blur, pair_edges(view, others, blur)) - 1.0
+    return replace(pairs, background=pairs.background + added)
 
 
 def _reached_by_surroundings(
