@@ -1,0 +1,89 @@
+"""The camera against OpenCV's own projection, and against itself there and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+PLAIN = Camera(1600, 1100, 2306.0, 2302.0, 792.6, 543.9)
+LENSES = {
+    "plain": PLAIN,
+    "radial": replace(PLAIN, k1=-0.18, k2=0.07, k3=-0.01),
+    "tangential": replace(PLAIN, k1=-0.07, p1=2e-3, p2=-1e-3),
+    "rational": replace(
+        PLAIN, k1=0.21, k2=-0.12, p1=4e-4, p2=-3e-4, k3=0.02, k4=0.28, k5=-0.15, k6=0.03
+    ),
+}
+
+
+def opencv_pixels(camera: Camera, points: FloatArray) -> FloatArray:
+    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    distortion = np.array([getattr(camera, name) for name in DISTORTION])
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+    return np.asarray(pixels[:, 0])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_projection_is_opencv_s(lens: str) -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform((-3.0, -2.0, 9.0), (3.0, 2.0, 30.0), (200, 3))
+    camera = LENSES[lens]
+    np.testing.assert_allclose(camera.project(points), opencv_pixels(camera, points), atol=1e-9)
+
+
+@given(lens=st.sampled_from(sorted(LENSES)), x=st.floats(-0.5, 1599.5), y=st.floats(-0.5, 1099.5))
+def test_undistorted_pixels_come_back(lens: str, x: float, y: float) -> None:
+    pixel = np.array([[x, y]])
+    camera = LENSES[lens]
+    np.testing.assert_allclose(camera.distort(camera.undistort(pixel)), pixel, atol=1e-8)
+
+
+@given(lens=st.sampled_from(sorted(LENSES)), x=st.floats(-0.35, 0.35), y=st.floats(-0.25, 0.25))
+def test_jacobian_is_the_derivative(lens: str, x: float, y: float) -> None:
+    camera, step = LENSES[lens], 1e-6
+    analytic = camera.distort_jacobian(np.array([[x, y]]))[0]
+    for column, axis in enumerate(np.eye(2)):
+        high, low = (camera.distort(np.array([[x, y]]) + sign * step * axis) for sign in (1, -1))
+        np.testing.assert_allclose(analytic[:, column], (high - low)[0] / (2.0 * step), atol=1e-4)
+
+
+def test_pixels_beyond_the_fold_are_nan_and_leave_the_others_alone() -> None:
+    """With k1 = −0.5 the distorted radius r − r³/2 never exceeds 0.544."""
+    camera = replace(PLAIN, k1=-0.5)
+    farthest = 2.0 / 3.0 * np.sqrt(2.0 / 3.0)
+    pixels = camera.cx + camera.fx * farthest * np.array([0.99, 1.01]), np.full(2, camera.cy)
+    inside, beyond = camera.undistort(np.column_stack(pixels))
+    assert np.isnan(beyond).all()
+    np.testing.assert_allclose(camera.distort(inside), (pixels[0][0], camera.cy), atol=1e-8)
+    assert inside[0] < np.sqrt(2.0 / 3.0), "the branch that holds the optical axis"
+
+
+def test_any_shape_of_points_is_kept() -> None:
+    camera = LENSES["rational"]
+    grid = np.stack(np.meshgrid(np.linspace(0.0, 1500.0, 5), np.linspace(0.0, 1000.0, 3)), axis=-1)
+    assert camera.undistort(grid).shape == grid.shape
+    np.testing.assert_array_equal(
+        camera.undistort(grid)[1, 2], camera.undistort(grid[1, 2][None])[0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("fx", 0.0), ("fy", -1.0), ("width", 1), ("cx", 5000.0), ("cy", float("nan")),
+     ("k2", float("inf")), ("readout_s", -0.01)],
+)  # fmt: skip
+def test_impossible_cameras_are_refused_by_name(key: str, value: Any) -> None:
+    with pytest.raises(SettingError) as caught:
+        replace(PLAIN, **{key: value})
+    assert caught.value.key == key
