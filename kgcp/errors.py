@@ -64,12 +64,12 @@ class Reason(StrEnum):
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
-        "no cluster of concentric, nearly circular contours is in the frame",
+        "no dark ring between a bright disc and a bright plate is in the frame",
     )
     CODE_MISMATCH = (
         "code_mismatch",
         Status.NOT_FOUND,
-        "clusters were found, but none carries this target's code",
+        "rings were found, but none carries this target's code",
     )
     CUT = (
         "cut",
@@ -79,12 +79,12 @@ class Reason(StrEnum):
     OTHER_CODE = (
         "other_code",
         Status.REJECTED,
-        "a ring of this target's geometry, but with dots where its code has none",
+        "a ring of this target's geometry, but with dots that are not this code's",
     )
     NO_INNER_CIRCLE = (
         "no_inner_circle",
         Status.REJECTED,
-        "the code matches, but the ring's inner circle is missing from its cluster",
+        "the code matches, but the edge of the ring's inner circle is not found",
     )
     EDGES_LOST = (
         "edges_lost",

@@ -41,28 +41,18 @@ class DetectSettings:
     method : Method
         `model`: the image model of `kgcp.target.model`, started by the paper's chain;
         `paper`: the closed-form chain of Cucci (2016) alone.
-    canny_low, canny_high : float
-        Hysteresis thresholds of the Canny detector on 8-bit grey values (§2.1).
     min_radius_px : float
-        μ_min of §2.2: smallest mean radius of a contour [px].
-    max_circle_deviation : float
-        k of §2.2: largest standard deviation of the radius relative to its mean.
+        Smallest radius of a ring's outer circle that is looked for [px].
     min_score : float
-        Threshold on the normalised cross-correlation of the code (§2.3).
+        Threshold on the normalised cross-correlation of a ring with its code (§2.3).
     """
 
     method: Method = Method.MODEL
-    canny_low: float = 40.0
-    canny_high: float = 100.0
-    min_radius_px: float = 5.0
-    max_circle_deviation: float = 0.15
+    min_radius_px: float = 6.0
     min_score: float = 0.8
 
     def __post_init__(self) -> None:
-        require_range("canny_low", self.canny_low, 1.0, 255.0)
-        require_range("canny_high", self.canny_high, self.canny_low, 255.0)
         require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")
-        require_range("max_circle_deviation", self.max_circle_deviation, 0.0, 0.5, open_low=True)
         require_range("min_score", self.min_score, 0.0, 1.0, open_low=True)
 
 

@@ -77,8 +77,7 @@ def normalised_window(
     at_nodes = camera.undistort(np.stack(np.meshgrid(x_nodes, y_nodes), axis=-1))
     inverse = _inverse_2x2(camera.distort_jacobian(at_nodes))
     fields = np.concatenate((at_nodes, inverse.reshape(*at_nodes.shape[:2], 4)), axis=-1)
-    values = np.einsum("nk,klf,ml->fnm", rows, fields, columns, optimize=True)
-    flat = values.reshape(6, -1)
+    flat = (rows @ np.moveaxis(fields, -1, 0) @ columns.T).reshape(6, -1)
     return flat[:2], flat[2:].reshape(2, 2, -1)
 
 

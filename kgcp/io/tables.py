@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,6 +72,8 @@ def write_table(
         pq.write_table(pa.table(cells, schema=schema), temporary)
         temporary.replace(path)
     except OSError as error:
+        with suppress(OSError):  # where the folder itself is no folder
+            temporary.unlink()
         raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
 
 

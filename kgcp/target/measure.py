@@ -1,4 +1,4 @@
-"""All targets of one frame: contours, circles, codes and poses, in the order of the paper."""
+"""All targets of one frame: outlines of rings, codes and poses."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings, Method
-from kgcp.target.circles import Cluster, concentric_clusters, near_circular
-from kgcp.target.code import CodeMatch, find_code, fixed_lag_score
-from kgcp.target.contours import find_contours
+from kgcp.target.code import CodeMatch, fixed_lag_score
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Miss, Observation, Outcome
 from kgcp.target.paper import measure_ring, points_of_code
 from kgcp.target.prior import NormalPrior
+from kgcp.target.search import find_code, find_rings, verify
 
 # How far the chain got: of several rejections the last in this order says most.
 _STAGES = (
     Reason.NO_CANDIDATE,
     Reason.CODE_MISMATCH,
+    Reason.OTHER_CODE,
     Reason.EDGES_LOST,
     Reason.NO_INNER_CIRCLE,
     Reason.POOR_ELLIPSE,
@@ -30,7 +31,6 @@ _STAGES = (
     Reason.CUT,
     Reason.NO_CONTRAST,
     Reason.POOR_FIT,
-    Reason.OTHER_CODE,
 )
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75
@@ -64,13 +64,12 @@ def measure_frame(
         In the order of the targets; of each either its plates as observations, instance 0, 1, …
         in order of score, or one Miss with the reason that got farthest.
     """
-    contours = find_contours(grey, settings)
-    clusters = concentric_clusters(near_circular(contours, settings))
+    outlines = find_rings(grey, settings)
     return tuple(
         outcome
         for target in targets
         for outcome in measure_target(
-            grey, camera, clusters, target, settings, prior if target.position_m is None else None
+            grey, camera, outlines, target, settings, prior if target.position_m is None else None
         )
     )
 
@@ -78,7 +77,7 @@ def measure_frame(
 def measure_target(
     grey: GreyArray,
     camera: Camera,
-    clusters: tuple[Cluster, ...],
+    outlines: tuple[Ellipse, ...],
     target: Target,
     settings: DetectSettings,
     prior: NormalPrior | None,
@@ -88,13 +87,15 @@ def measure_target(
     rejections: list[Rejection] = []
     scores: list[float] = []
     for ring in target.rings:
-        matches, best_score = find_code(grey, clusters, ring, settings)
-        scores += [] if best_score is None else [best_score]
+        matches, refused = find_code(grey, outlines, ring, settings)
+        rejections += [rejection for _, rejection in refused]
+        scores += [score for score, _ in refused] + [match.score for match in matches]
         for match in matches:
             if any(_on_plate(match, observation) for observation in found):
                 continue
             try:
-                observation = measure_ring(grey, camera, target, match, settings)
+                observation = measure_ring(grey, camera, target, match)
+                verify(grey, camera, observation.pose, ring, settings)
                 if ring is not target.ring:
                     _check_main_ring(grey, camera, target.ring, observation)
                 if settings.method is Method.MODEL:

@@ -134,8 +134,10 @@ def _pairs(view: PlateView, imaging: Imaging, blur: Blur) -> EdgePairs:
     measured = imaging.circles.part(slice(0, imaging.measured_count))
     others = imaging.circles.part(slice(imaging.measured_count, None))
     pairs = pair_edges(view, measured, blur)
-    if len(others.radii_m) == 0:
-        return pairs
+    reach_m = REACH_SIGMAS * blur.largest_sd_px * largest_metres_per_px(view)
+    x, y = view.points_m
+    if (x * x + y * y).min() > (others.radii_m.max(initial=-reach_m) + reach_m) ** 2:
+        return pairs  # all replicas lie inside
     added = white_level(view, blur, pair_edges(view, others, blur)) - 1.0
     return replace(pairs, background=pairs.background + added)
 
