@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from kgcp.errors import KgcpError
@@ -131,3 +134,35 @@ def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
     assert np.allclose(share, 2.0 / 2306.0, rtol=0.1)
     assert common["common_pose_cov"].map(len).eq(36).all()
     pd.testing.assert_frame_equal(plain.drop(columns=added), common.drop(columns=added))
+
+
+def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    (folder / "frames" / "east").mkdir(parents=True)
+    shutil.copy(flight / "flight.toml", folder)
+    for name in ("frame_0000.png", "frame_0003.png"):
+        shutil.copy(flight / "frames" / name, folder / "frames")
+    shutil.copy(flight / "frames" / "frame_0002.png", folder / "frames" / "east")
+    content = (flight / "frames" / "frame_0001.png").read_bytes()
+    (folder / "frames" / "frame_0001.png").write_bytes(content[: len(content) // 3])
+    (folder / "frames.csv").write_text(
+        "frame,time\nframe_0001.png,2026-06-16T08:15:01Z\nfrom_another_flight.png,12.0\n",
+        encoding="utf-8",
+    )
+    tables = []
+    for jobs in (1, 2):
+        summary = detect(folder, tmp_path / str(jobs), jobs=jobs)
+        tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
+    assert tables[0] == tables[1]
+    table = read_table(tmp_path / "1" / "detections.parquet", DETECTION_COLUMNS)
+    names = ["east/frame_0002.png", "frame_0000.png", "frame_0001.png", "frame_0003.png"]
+    assert table["frame"].to_list() == names
+    assert table["status"].to_list() == ["measured", "measured", "unreadable", "measured"]
+    assert table["reason"].to_list() == ["", "", "decode_failed", ""]
+    assert table["time"].notna().all(), "from EXIF where the times file has none"
+    assert (summary.frames, summary.times_without_frame) == (4, 1)
+    assert summary.reasons == {"decode_failed": 1}
+    metadata = pq.read_schema(tmp_path / "1" / "detections.parquet").metadata
+    assert metadata[b"kgcp.flight_toml"] == (folder / "flight.toml").read_bytes()
+    settings = json.loads(metadata[b"kgcp.settings"])
+    assert settings == asdict(DetectSettings())
