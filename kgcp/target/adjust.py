@@ -10,7 +10,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
-from kgcp.target.light import PARAM_COUNT, Light, Parameters
+from kgcp.target.light import PARAM_COUNT, Light, Parameters, light_of_levels
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import PlateView, view_plate
@@ -52,7 +52,7 @@ class Unknowns:
     ----------
     free : (p,) array of int
         Estimated parameters, by `Param`.
-    mean, precision : (18,) array
+    mean, precision : (19,) array
         Independent normal priors on the nuisance parameters; precision 0: none.
     """
 
@@ -75,7 +75,7 @@ class Fit:
     sample : Sample
     parameters : Parameters
     prediction : Prediction
-    jacobian : (18, n) array
+    jacobian : (19, n) array
     sd : (n,) array
         Noise of every pixel, as level.
     misfit : Misfit
@@ -108,7 +108,7 @@ def predict(sample: Sample, parameters: Parameters) -> Prediction:
 
 
 def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
-    """Model the grey values of a sample, and return their Jacobian (18, n) with them."""
+    """Model the grey values of a sample, and return their Jacobian (19, n) with them."""
     view = view_plate(parameters.pose, sample.normalised, sample.normalised_from_px)
     share = white_share(view, parameters.blur, sample.pairs)
     levels, jacobian = sample.imager.linearised(share, parameters.light)
@@ -130,7 +130,7 @@ def first_levels(sample: Sample, pose: Pose, blur: Blur) -> Light:
     white = float(np.median(levels[share >= min(0.9, np.quantile(share, 0.9))]))
     if white - black < 4.0 * sample.imaging.window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
-    return Light(black, white)
+    return light_of_levels(black, white, sample.imaging.response)
 
 
 def adjust(

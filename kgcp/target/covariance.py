@@ -19,6 +19,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit, noise_of
+from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Uncertainty
 
 _ARC_PX = 6.0
@@ -75,8 +76,8 @@ def _common_displacement_px(fit: Fit) -> float:
     edge = (share > 0.3) & (share < 0.7)
     if not edge.any():
         return _EDGE_FLOOR_PX
-    light, blur = fit.parameters.light, fit.parameters.blur
-    slope_per_px = (light.white - light.black) / (np.sqrt(2.0 * np.pi) * blur.mean_sd_px)
+    black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
+    slope_per_px = (white - black) / (np.sqrt(2.0 * np.pi) * fit.parameters.blur.mean_sd_px)
     excess = np.sqrt(np.median(noise.sd[edge] ** 2 - noise.plateau_sd[edge] ** 2))
     return max(_EDGE_FLOOR_PX, float(_COMMON_SHARE * excess / slope_per_px))
 

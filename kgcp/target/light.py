@@ -1,7 +1,7 @@
 """From white share to grey value: levels, tone, a lit gradient, in-camera sharpening.
 
 grey = sharpen(tone(black + (white − black) · share) · (1 + slope · offset)): the tone curve of an
-unknown response is a monotone function of the share between ink and plate, here with two shape
+unknown response is a monotone function of the share between ink and plate, here with three shape
 parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve as in cameras.
 Together they are what displaces apparent edges: δ is a consequence here, not a parameter.
 """
@@ -35,13 +35,14 @@ class Param(IntEnum):
     SLOPE_Y = 14
     TONE_1 = 15
     TONE_2 = 16
-    SHARPENING = 17
+    TONE_3 = 17
+    SHARPENING = 18
 
 
-PARAM_COUNT = 18
+PARAM_COUNT = 19
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
-_FILTERED = [*range(11), Param.BLACK, Param.WHITE, Param.TONE_1, Param.TONE_2]
+_FILTERED = [*range(11), Param.BLACK, Param.WHITE, *range(Param.TONE_1, Param.SHARPENING)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +55,8 @@ class Light:
         Levels of ink and plate before clipping, 1 = full scale.
     slope_x, slope_y : float
         Relative gradient of the light over one ring radius.
-    tone_1, tone_2 : float
-        Shape of an unknown tone curve between black and white; 0, 0 is linear.
+    tone_1, tone_2, tone_3 : float
+        Shape of an unknown tone curve between black and white; 0, 0, 0 is linear.
     sharpening : float
         Strength of the unsharp mask.
     """
@@ -66,6 +67,7 @@ class Light:
     slope_y: float = 0.0
     tone_1: float = 0.0
     tone_2: float = 0.0
+    tone_3: float = 0.0
     sharpening: float = 0.0
 
 
@@ -78,7 +80,7 @@ class Parameters:
     light: Light
 
     def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (18,) in the order of `Param`."""
+        """Return the parameters after a step (19,) in the order of `Param`."""
         old = self.blur
         mean = max(0.5 * (old.xx + old.yy) + float(step[Param.BLUR_MEAN]), _MIN_VARIANCE_PX2)
         difference = 0.5 * (old.xx - old.yy) + float(step[Param.BLUR_DIFFERENCE])
@@ -102,7 +104,7 @@ class Parameters:
 
     @property
     def nuisance_vector(self) -> FloatArray:
-        """All parameters (18,) in the order of `Param`, with zeros for the pose."""
+        """All parameters (19,) in the order of `Param`, with zeros for the pose."""
         blur, light = self.blur, self.light
         values = [getattr(light, field.name) for field in fields(Light)]
         return np.array(
@@ -158,8 +160,8 @@ class Imager:
 
     def levels(self, share: FloatArray, light: Light) -> FloatArray:
         """Return the modelled grey values (n,) before clipping."""
-        core = light.black + (light.white - light.black) * _tone(share, light)
-        value = self._encoded(core * self._lit(light))
+        core = light.black + (light.white - light.black) * tone_curve(share, light)
+        value = encoded(core * self._lit(light), self.response)
         if self.sharpening_px == 0.0:
             return value
         layers = self._plateaus(light)[:, None]
@@ -167,11 +169,11 @@ class Imager:
         return value + light.sharpening * self._detail(layers)[:, 0]
 
     def linearised(self, share: WhiteShare, light: Light) -> tuple[FloatArray, FloatArray]:
-        """Return the grey values (n,) and their Jacobian (18, n)."""
+        """Return the grey values (n,) and their Jacobian (19, n)."""
         t = share.value
         arch = t * (1.0 - t)
-        tone = _tone(t, light)
-        slope = 1.0 + light.tone_1 * (1.0 - 2.0 * t) + light.tone_2 * (6.0 * arch - 1.0)
+        tone = tone_curve(t, light)
+        slope = _tone_slope(t, light)
         contrast = light.white - light.black
         gain = self._lit(light)
         core = light.black + contrast * tone
@@ -186,6 +188,7 @@ class Imager:
         np.multiply(self.grid.offsets, core, out=jacobian[Param.SLOPE_X : Param.SLOPE_Y + 1])
         jacobian[Param.TONE_1] = gain * contrast * arch
         jacobian[Param.TONE_2] = jacobian[Param.TONE_1] * (2.0 * t - 1.0)
+        jacobian[Param.TONE_3] = jacobian[Param.TONE_2] * (2.0 * t - 1.0)
         jacobian[Param.SHARPENING] = 0.0
         return (
             (value, jacobian)
@@ -198,12 +201,10 @@ class Imager:
         lit += light.slope_y * self.grid.offsets[1]
         return lit
 
-    def _encoded(self, value: FloatArray) -> FloatArray:
-        return srgb_encoded(value) if self.response is Response.SRGB else value
-
     def _plateaus(self, light: Light) -> FloatArray:
+        """Return the window without blur; the light's gradient hardly changes over the mask."""
         plateau = self.grid.plateau
-        return self._encoded(light.black + (light.white - light.black) * plateau)
+        return encoded(light.black + (light.white - light.black) * plateau, self.response)
 
     def _sharpened(
         self, value: FloatArray, jacobian: FloatArray, light: Light
@@ -211,8 +212,11 @@ class Imager:
         grid = self.grid
         layers = np.zeros((len(grid.plateau), 1 + len(_FILTERED)))
         layers[:, 0] = self._plateaus(light)
-        layers[:, 1 + _FILTERED.index(Param.BLACK)] = 1.0 - grid.plateau
-        layers[:, 1 + _FILTERED.index(Param.WHITE)] = grid.plateau
+        gain = np.ones_like(grid.plateau)
+        if self.response is Response.SRGB:
+            gain = _srgb_slope(light.black + (light.white - light.black) * grid.plateau)
+        layers[:, 1 + _FILTERED.index(Param.BLACK)] = gain * (1.0 - grid.plateau)
+        layers[:, 1 + _FILTERED.index(Param.WHITE)] = gain * grid.plateau
         layers[grid.index, 0] = value
         layers[grid.index, 1:] = jacobian[_FILTERED].T
         detail = self._detail(layers)
@@ -230,11 +234,49 @@ class Imager:
         return detail
 
 
-def _tone(share: FloatArray, light: Light) -> FloatArray:
-    """Return the tone curve between ink (0) and plate (1)."""
-    arch = share * (1.0 - share)
-    tone: FloatArray = share + arch * (light.tone_1 + light.tone_2 * (2.0 * share - 1.0))
+def tone_curve(share: FloatArray, light: Light) -> FloatArray:
+    """Return the tone curve (n,) between ink (0) and plate (1), at white shares (n,)."""
+    arch, lean = share * (1.0 - share), 2.0 * share - 1.0
+    tone: FloatArray = share + arch * (light.tone_1 + lean * (light.tone_2 + lean * light.tone_3))
     return tone
+
+
+def _tone_slope(share: FloatArray, light: Light) -> FloatArray:
+    arch, lean = share * (1.0 - share), 2.0 * share - 1.0
+    slope: FloatArray = (
+        1.0
+        - light.tone_1 * lean
+        + light.tone_2 * (6.0 * arch - 1.0)
+        + light.tone_3 * lean * (8.0 * arch - 1.0)
+    )
+    return slope
+
+
+def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
+    """Return the grey values of ink and plate before clipping.
+
+    They are the light's own levels, but for a camera with a known encoding.
+    """
+    black, white = encoded(np.array([light.black, light.white]), response)
+    return float(black), float(white)
+
+
+def encoded(level: FloatArray, response: Response) -> FloatArray:
+    """Return grey values from the light of a camera with a known response."""
+    return srgb_encoded(level) if response is Response.SRGB else level
+
+
+def light_of_levels(black: float, white: float, response: Response) -> Light:
+    """Return the light that gives these grey values of ink and plate."""
+    if response is Response.SRGB:
+        black, white = (float(level) for level in srgb_decoded(np.array([black, white])))
+    return Light(black, white)
+
+
+def srgb_decoded(level: FloatArray) -> FloatArray:
+    """Return linear light from sRGB grey values, both 0…1 (IEC 61966-2-1)."""
+    bright = ((np.maximum(level, 0.0) + 0.055) / 1.055) ** 2.4
+    return np.where(level <= 0.04045, level / 12.92, bright)
 
 
 def srgb_encoded(light: FloatArray) -> FloatArray:

@@ -43,6 +43,7 @@ _PRIOR_SD = {
     Param.SLOPE_Y: 0.05,
     Param.TONE_1: 0.7,
     Param.TONE_2: 0.5,
+    Param.TONE_3: 0.5,
     Param.SHARPENING: 0.7,
 }
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
@@ -51,7 +52,7 @@ _STREAK = [Param.STREAK_X, Param.STREAK_Y]
 _OF_RESPONSE = {
     Response.LINEAR: [],
     Response.SRGB: [Param.SHARPENING],
-    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.SHARPENING],
+    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
 }
 
 

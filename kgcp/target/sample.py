@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
-from kgcp.target.light import PARAM_COUNT, Grid, Imager, Light
+from kgcp.target.light import PARAM_COUNT, Grid, Imager, Light, plateau_levels
 from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
 from kgcp.target.plate import Circles, PlateView, largest_metres_per_px, view_plate
@@ -157,8 +157,8 @@ def _reached_by_surroundings(
     """
     window = imaging.window
     size = (window.height, window.width)
-    contrast = light.white - light.black
-    white = min(light.white, 1.0)
+    black, white = plateau_levels(light, imaging.response)
+    contrast, white = white - black, min(white, 1.0)
     seen = cv2.medianBlur(window.levels.reshape(size).astype(np.float32), 3).ravel()
     outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
     foreign = outside & (np.abs(seen - white) > _FOREIGN_CONTRAST * contrast)

@@ -10,6 +10,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.adjust import Fit
 from kgcp.target.layout import Ring
+from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3
@@ -34,8 +35,9 @@ def check_fit(fit: Fit) -> None:
     seen = ~(censoring.at_high | censoring.at_low)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
     edge = (share > 0.2) & (share < 0.8)
-    noise = float(np.median(fit.sd[edge])) / abs(light.white - light.black) if edge.any() else 1.0
-    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or light.white <= light.black:
+    black, white = plateau_levels(light, fit.sample.imaging.response)
+    noise = float(np.median(fit.sd[edge])) / abs(white - black) if edge.any() else 1.0
+    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or white <= black:
         raise Rejection(
             Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
         )
@@ -88,10 +90,10 @@ def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
 
     NaN where too few pixels are seen.
     """
-    sample, light = fit.sample, fit.parameters.light
-    clip = sample.censoring.high
+    sample, clip = fit.sample, fit.sample.censoring.high
+    black, white = plateau_levels(fit.parameters.light, sample.imaging.response)
     lack = sample.levels - np.minimum(fit.prediction.levels, clip)
-    lack = lack / max(min(light.white, clip) - light.black, sample.imaging.window.levels_per_count)
+    lack = lack / max(min(white, clip) - black, sample.imaging.window.levels_per_count)
     angles = np.arange(_POSITIONS) * (2.0 * np.pi / _POSITIONS)
     centres = 0.5 * ring.code_diameter_m * np.stack((np.cos(angles), np.sin(angles)))
     points = fit.prediction.view.points_m
