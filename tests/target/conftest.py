@@ -10,9 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring, Target
+from kgcp.target.noise import find_censoring
+from kgcp.target.plate import circles_of
+from kgcp.target.sample import Imaging
+from kgcp.target.window import cut_window, semi_major_axis_px
 
 SUBPIXELS = 4
 DrawFrame = Callable[..., GreyArray]
@@ -108,3 +112,27 @@ def _on_plate(camera: Camera, pose: Pose, pixels: FloatArray) -> FloatArray:
     rays = np.concatenate((normalised, np.ones((*normalised.shape[:-1], 1))), axis=-1)
     depth = (pose.normal @ pose.translation_m) / (rays @ pose.normal)
     return np.asarray((rays * depth[..., None] - pose.translation_m) @ pose.rotation[:, :2])
+
+
+@pytest.fixture(scope="session")
+def imaging_of() -> Callable[..., Imaging]:
+    """What the adjustment of a drawn or photographed target starts from."""
+
+    def collect(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+        radius_m = 0.5 * target.ring.outer_diameter_m
+        window = cut_window(grey, camera, pose, radius_m, 12.0)
+        circles = circles_of(target.rings)
+        return Imaging(
+            window=window,
+            circles=circles,
+            measured_count=len(circles.radii_m),
+            outer_radius_m=radius_m,
+            outer_radius_px=semi_major_axis_px(camera, pose, radius_m),
+            centre_px=camera.project(pose.translation_m),
+            focal_px=camera.mean_focal_px,
+            censoring=find_censoring(window.levels, window.levels_per_count),
+            response=camera.response,
+            sharpening_px=0.0 if camera.response is Response.LINEAR else 1.2,
+        )
+
+    return collect

@@ -1,0 +1,122 @@
+"""Which pixels take part: plate only, of whatever shape the plate is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.synthetic.imaging import Optics, Sensor
+from kgcp.synthetic.plate import Plate, PlateImage, image_plate
+from kgcp.synthetic.shapes import ConvexPolygon, regular_polygon
+from kgcp.target.layout import Target
+from kgcp.target.light import Light
+from kgcp.target.pairs import Blur
+from kgcp.target.plate import view_plate
+from kgcp.target.sample import Imaging, Sample, choose_sample
+
+PlacePlate = Callable[..., Pose]
+ImagingOf = Callable[..., Imaging]
+PSF_PX = 0.7
+BLUR = Blur(PSF_PX**2 + 1.0 / 12.0, PSF_PX**2 + 1.0 / 12.0, 0.0)
+WHITE, BLACK = 0.8, 0.06
+LIGHT = Light(BLACK, WHITE)
+WIDE, NARROW = regular_polygon(8, 0.60), regular_polygon(4, 0.51)
+BORDER_PX = 2.4
+
+
+def photograph(
+    camera: Camera, target: Target, pose: Pose, outline: ConvexPolygon, ground: float
+) -> tuple[GreyArray, PlateImage]:
+    image = image_plate(camera, Plate(target, outline, WHITE, BLACK), pose, Optics(PSF_PX))
+    irradiance = np.full((camera.height, camera.width), ground)
+    image.paste(irradiance)
+    return Sensor().expose(irradiance, 1.0, np.random.default_rng(5)), image
+
+
+def opacity_of(sample: Sample, image: PlateImage) -> FloatArray:
+    window = sample.imaging.window
+    x, y = window.pixels(sample.imager.grid.index).astype(int).T
+    return np.asarray(image.opacity[y - image.window.row, x - image.window.column])
+
+
+def beyond_px(sample: Sample, pose: Pose) -> FloatArray:
+    """How far the pixels are beyond the outer circle."""
+    imaging = sample.imaging
+    points = view_plate(pose, sample.normalised, sample.normalised_from_px).points_m
+    beyond = np.hypot(*points) / imaging.outer_radius_m - 1.0
+    return np.asarray(beyond * imaging.outer_radius_px)
+
+
+@pytest.mark.parametrize("ground", [0.05, 0.35])
+@pytest.mark.parametrize("corners", [4, 5, 8])
+@pytest.mark.parametrize("radius_px", [14.0, 40.0])
+def test_what_mixes_with_the_surroundings_is_left_out(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    imaging_of: ImagingOf,
+    ground: float,
+    corners: int,
+    radius_px: float,
+) -> None:
+    """On a plate whose border is nowhere narrower than BORDER_PX."""
+    pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
+    outline = regular_polygon(corners, 0.45 * (1.0 + BORDER_PX / radius_px))
+    grey, image = photograph(camera, target, pose, outline, ground)
+    imaging = imaging_of(grey, camera, target, pose)
+    sample = choose_sample(imaging, pose, BLUR, LIGHT)
+    everything = choose_sample(imaging, pose, BLUR, None)
+    mixed, unfiltered = (
+        (WHITE - ground) * (1.0 - opacity_of(each, image)) for each in (sample, everything)
+    )
+    assert mixed.max() < 0.05
+    assert np.mean(mixed > 0.02) < 0.015
+    assert len(sample.levels) > 0.85 * len(everything.levels)
+    assert unfiltered.max() > 0.1, "without levels nothing is known to be foreign"
+
+
+def test_surroundings_as_bright_as_the_plate_are_no_loss(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    pose = place_plate((205.4, 190.7), 20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, NARROW, WHITE)
+    imaging = imaging_of(grey, camera, target, pose)
+    found, everything = (choose_sample(imaging, pose, BLUR, light) for light in (LIGHT, None))
+    np.testing.assert_array_equal(found.imager.grid.index, everything.imager.grid.index)
+
+
+def test_all_that_says_where_edges_are_is_used(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    """On a wide plate: all pixels within 1.5 σ of a circle, and levels beyond the ring."""
+    pose = place_plate((205.4, 190.7), 40.0, tilt_deg=20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, WIDE, 0.2)
+    imaging = imaging_of(grey, camera, target, pose)
+    sample = choose_sample(imaging, pose, BLUR, LIGHT)
+    window = imaging.window
+    everywhere = view_plate(pose, window.normalised, window.normalised_from_px).points_m
+    near = np.zeros(everywhere.shape[1], bool)
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    for centre, radius in zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True):
+        off_edge = np.hypot(*(everywhere - centre[:, None])) - radius
+        near |= np.abs(off_edge) * px_per_m < 1.5 * BLUR.largest_sd_px
+    assert set(np.flatnonzero(near)) <= set(sample.imager.grid.index)
+    assert 1.5 < beyond_px(sample, pose).max() < 4.0
+    np.testing.assert_array_equal(sample.levels, window.levels[sample.imager.grid.index])
+
+
+def test_a_target_outside_its_window_has_lost_its_edges(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    pose, elsewhere = place_plate((205.4, 190.7), 20.0), place_plate((300.0, 250.0), 20.0)
+    grey, _ = photograph(camera, target, pose, NARROW, 0.05)
+    imaging = imaging_of(grey, camera, target, pose)
+    with pytest.raises(Rejection) as caught:
+        choose_sample(imaging, elsewhere, BLUR, LIGHT)
+    assert caught.value.reason is Reason.EDGES_LOST
