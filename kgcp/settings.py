@@ -49,7 +49,7 @@ class DetectSettings:
 
     method: Method = Method.MODEL
     min_radius_px: float = 6.0
-    min_score: float = 0.8
+    min_score: float = 0.86
 
     def __post_init__(self) -> None:
         require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")

@@ -19,19 +19,6 @@ from kgcp.target.paper import measure_ring, points_of_code
 from kgcp.target.prior import NormalPrior
 from kgcp.target.search import find_code, find_rings, verify
 
-# How far the chain got: of several rejections the last in this order says most.
-_STAGES = (
-    Reason.NO_CANDIDATE,
-    Reason.CODE_MISMATCH,
-    Reason.OTHER_CODE,
-    Reason.EDGES_LOST,
-    Reason.NO_INNER_CIRCLE,
-    Reason.POOR_ELLIPSE,
-    Reason.IMPOSSIBLE_GEOMETRY,
-    Reason.CUT,
-    Reason.NO_CONTRAST,
-    Reason.POOR_FIT,
-)
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75
 
@@ -62,7 +49,7 @@ def measure_frame(
     -------
     tuple of Outcome
         In the order of the targets; of each either its plates as observations, instance 0, 1, …
-        in order of score, or one Miss with the reason that got farthest.
+        in order of score, or one Miss with the reason of its best candidate.
     """
     outlines = find_rings(grey, settings)
     return tuple(
@@ -84,12 +71,11 @@ def measure_target(
 ) -> tuple[Outcome, ...]:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
     found: list[Observation] = []
-    rejections: list[Rejection] = []
-    scores: list[float] = []
+    rejections: list[tuple[float, Rejection]] = []
+    refusals: list[tuple[float, Rejection]] = []
     for ring in target.rings:
         matches, refused = find_code(grey, outlines, ring, settings)
-        rejections += [rejection for _, rejection in refused]
-        scores += [score for score, _ in refused] + [match.score for match in matches]
+        refusals += refused
         for match in matches:
             if any(_on_plate(match, observation) for observation in found):
                 continue
@@ -102,11 +88,11 @@ def measure_target(
                     observation = measure_by_model(grey, camera, target, observation, prior)
                 found.append(observation)
             except Rejection as rejection:
-                rejections.append(rejection)
+                rejections.append((match.score, rejection))
     if found:
         found.sort(key=lambda observation: -observation.score)
         return tuple(replace(observation, instance=i) for i, observation in enumerate(found))
-    return (_miss(target, rejections, scores),)
+    return (_miss(target, rejections or refusals),)
 
 
 def _on_plate(match: CodeMatch, observation: Observation) -> bool:
@@ -134,12 +120,9 @@ def _check_main_ring(grey: GreyArray, camera: Camera, main: Ring, observation: O
         )
 
 
-def _miss(target: Target, rejections: list[Rejection], scores: list[float]) -> Miss:
-    best = max(scores, default=None)
-    if rejections:
-        farthest = max(rejections, key=lambda rejection: _STAGES.index(rejection.reason))
-    elif best is not None:
-        farthest = Rejection(Reason.CODE_MISMATCH, f"best score {best:.2f}")
-    else:
-        farthest = Rejection(Reason.NO_CANDIDATE)
-    return Miss(target.name, farthest.reason, farthest.detail, best)
+def _miss(target: Target, rejections: list[tuple[float, Rejection]]) -> Miss:
+    """Give the reason of the best candidate, of those that got as far as any."""
+    if not rejections:
+        return Miss(target.name, Reason.NO_CANDIDATE)
+    score, rejection = max(rejections, key=lambda scored: scored[0])
+    return Miss(target.name, rejection.reason, rejection.detail, score)

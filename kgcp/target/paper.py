@@ -19,7 +19,7 @@ from kgcp.geometry.circle import (
     minimise_dispersion,
     pose_on_plane,
 )
-from kgcp.geometry.conic import Ellipse, ellipse_from_conic
+from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
 from kgcp.target.edges import EdgeFit, Patch, fit_edge, patch_around
@@ -96,7 +96,7 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
     """Fit the outer ellipse, then the inner one (§2.4).
 
     Blur and overexposure can join the dots to the disc so that no contour follows the inner
-    circle. The outer ellipse, made smaller, says where to look for its edge points.
+    circle. The poses of the outer circle say where to look for its edge points.
     """
     ring = match.ring
     patch = patch_around(grey, match.outer)
@@ -108,11 +108,30 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
         edge_diameter_m=ring.outer_diameter_m,
         lag_deg=match.lag_deg,
     )
-    predicted = outer.ellipse.scaled(ring.inner_ratio)
-    try:
-        return RingEdges(outer, _fit_inner(patch, camera, match, predicted))
-    except Rejection as failure:
-        raise Rejection(Reason.NO_INNER_CIRCLE, failure.detail) from failure
+    fits: list[EdgeFit] = []
+    rejection = Rejection(Reason.NO_INNER_CIRCLE)
+    for start in _inner_circles(camera, outer, ring):
+        try:
+            fits.append(_fit_inner(patch, camera, match, start))
+        except Rejection as failure:
+            rejection = Rejection(Reason.NO_INNER_CIRCLE, failure.detail)
+    if not fits:
+        raise rejection
+    return RingEdges(outer, max(fits, key=lambda fit: len(fit.points_px)))
+
+
+def _inner_circles(camera: Camera, outer: EdgeFit, ring: Ring) -> list[Ellipse]:
+    """Return where either pose of the outer circle puts the inner one [px]."""
+    towards = camera.undistort(outer.ellipse.points(np.zeros(1)))[0]
+    angles = CODE_ANGLES_RAD[::10]
+    circle_m = 0.5 * ring.inner_diameter_m * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    poses = (
+        pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards)
+        for plane in circle_planes(outer.conic)
+    )
+    return [
+        ellipse_from_conic(fit_ellipse(camera.project(pose.transform(circle_m)))) for pose in poses
+    ]
 
 
 def _fit_inner(patch: Patch, camera: Camera, match: CodeMatch, start: Ellipse) -> EdgeFit:

@@ -6,22 +6,22 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.settings import DetectSettings
-from kgcp.target.circles import Cluster
 from kgcp.target.code import (
     CODE_ANGLES_RAD,
-    code_signals,
-    find_code,
     fixed_lag_score,
     match_code,
     reference_signals,
-    ring_levels,
+    sample_grey,
 )
 from kgcp.target.layout import Ring, Target
+from kgcp.target.search import find_code, judge
+from kgcp.target.template import ANGLES_RAD, SAMPLED_RADII
 
 CODE_RATIO = 0.642857143 / 0.9
 
@@ -63,10 +63,14 @@ def test_the_signal_follows_the_ellipse_of_a_tilted_plate(
     x, y = camera.project(pose.translation_m)
     short = math.cos(math.radians(40.0))
     ellipse = Ellipse(float(x), float(y), 50.0, 50.0 * short, math.radians(25.0))
-    scores, _ = match_code(code_signals(frame, (ellipse,), CODE_RATIO), target.ring)
+    scores, _ = match_code(
+        sample_grey(frame, ellipse.points(CODE_ANGLES_RAD, CODE_RATIO)[None]), target.ring
+    )
     assert scores[0] > 0.97
     circle = Ellipse(ellipse.x, ellipse.y, 44.0, 44.0, 0.0)
-    scores, _ = match_code(code_signals(frame, (circle,), CODE_RATIO), target.ring)
+    scores, _ = match_code(
+        sample_grey(frame, circle.points(CODE_ANGLES_RAD, CODE_RATIO)[None]), target.ring
+    )
     assert scores[0] < 0.9
 
 
@@ -86,12 +90,12 @@ def test_a_similar_code_of_the_same_geometry_is_another_target(
     ring = target.ring
     other = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, other_code))
     outer = Ellipse(250.0, 170.0, radius_px, radius_px, 0.0)
-    clusters = (Cluster((outer,)),)
     for plate, expected in ((target, 1), (other, 0)):
         pose = place_plate((250.0, 170.0), radius_px, turn_deg=100.0)
         frame = draw_frame((plate, pose))
-        matches, _ = find_code(frame, clusters, ring, DetectSettings())
+        matches, refused = find_code(frame, (outer,), ring, DetectSettings())
         assert len(matches) == expected
+        assert [rejection.reason for _, rejection in refused] == [Reason.OTHER_CODE][expected:]
 
 
 def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
@@ -102,9 +106,13 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
     for angle in np.radians(target.ring.code_deg):
         x, y = 100.0 + 40.0 * CODE_RATIO * np.array([math.cos(angle), math.sin(angle)])
         frame[np.hypot(columns - x, rows - y) < 5.7] = 200
-    signal = code_signals(frame, (outer,), CODE_RATIO)
+    signal = sample_grey(frame, outer.points(CODE_ANGLES_RAD, CODE_RATIO)[None])
     assert match_code(signal, target.ring)[0][0] > 0.95
-    assert ring_levels(frame, outer, target.ring, signal[0], 0.0) is None
+    assert find_code(frame, (outer,), target.ring, DetectSettings()) == ((), ())
+    patch = np.stack([outer.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
+    verdict = judge(sample_grey(frame, patch), target.ring)
+    with pytest.raises(Rejection):
+        verdict.check(DetectSettings().min_score)
 
 
 def test_a_code_in_view_is_held_against_its_known_heading(

@@ -1,0 +1,187 @@
+"""Which of the rings in a frame carry a target's code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.pose import Pose
+from kgcp.settings import DetectSettings
+from kgcp.target.code import CodeMatch, sample_grey
+from kgcp.target.layout import Ring
+from kgcp.target.outline import find_outlines
+from kgcp.target.seeds import build_pyramid, find_seeds
+from kgcp.target.template import (
+    ANGLES,
+    ANGLES_RAD,
+    SAMPLED_RADII,
+    SHIFTS,
+    Templates,
+    best_template,
+    templates_of,
+)
+
+_MIN_CONTRAST = 0.02  # of the grey values' range
+_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
+_UNEVEN = 0.5  # grey values of ink, disc and plate, of the contrast
+_DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
+_MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
+_DARKEST_BLACK = -0.15  # of the contrast; sharpening makes ink darker than it is
+_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
+_CODE_LIKE = 0.7  # score above which a ring with dots is a code, if another one
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How well one ring in the frame looks like a target's.
+
+    Attributes
+    ----------
+    score : float
+        Normalised cross-correlation of the whole ring with its best template, -1…1.
+    lag_deg : float
+        Heading of the plate's +x axis, as an angle of the sampled circles [deg].
+    black, white : float
+        Levels of ink and plate [grey values].
+    misfit : float
+        Largest difference to the template along the code, of a dot's contrast: 1 is a dot too
+        many or too few.
+    limit : float
+        What `misfit` may be: less where blur leaves little of the dots.
+    """
+
+    score: float
+    lag_deg: float
+    black: float
+    white: float
+    misfit: float
+    limit: float
+
+    def check(self, min_score: float) -> None:
+        """Raise `Rejection` unless this is the target's ring."""
+        numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
+        if self.score < min(_CODE_LIKE, min_score):
+            raise Rejection(Reason.CODE_MISMATCH, numbers)
+        if self.misfit > self.limit:
+            raise Rejection(Reason.OTHER_CODE, numbers)
+        if self.score < min_score:
+            raise Rejection(Reason.CODE_MISMATCH, numbers)
+        contrast = self.white - self.black
+        if contrast <= 0.0 or self.black < _DARKEST_BLACK * contrast:
+            raise Rejection(Reason.NO_CONTRAST, f"levels {self.black:.0f} and {self.white:.0f}")
+
+
+def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
+    """Return the outlines of all dark rings in a frame that may be a target's."""
+    pyramid = build_pyramid(grey)
+    return find_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
+
+
+def find_code(
+    grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring, settings: DetectSettings
+) -> tuple[tuple[CodeMatch, ...], tuple[tuple[float, Rejection], ...]]:
+    """Look for a ring's code in all outlines.
+
+    Returns
+    -------
+    matches : tuple of CodeMatch
+        Best first.
+    refused : tuple of (float, Rejection)
+        Scores of the others and what speaks against them.
+    """
+    matches: list[CodeMatch] = []
+    refused: list[tuple[float, Rejection]] = []
+    for outline in _dotted(grey, outlines, ring):
+        points = np.stack([outline.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
+        verdict = judge(sample_grey(grey, points), ring)
+        try:
+            verdict.check(settings.min_score - _CIRCLE_LOSS)
+        except Rejection as rejection:
+            refused.append((verdict.score, rejection))
+            continue
+        matches.append(
+            CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)
+        )
+    return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
+
+
+def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> list[Ellipse]:
+    """Return the outlines with a dark ring between bright disc and plate, brighter in places."""
+    if not outlines:
+        return []
+    code = ring.code_diameter_m / ring.outer_diameter_m
+    radii = (_DISC_SHARE * ring.inner_ratio, code, _PLATE)
+    points = np.stack([[o.points(ANGLES_RAD, radius) for radius in radii] for o in outlines])
+    values = sample_grey(grey, points.reshape(-1, ANGLES, 2)).reshape(-1, len(radii), ANGLES)
+    values.sort(axis=2)
+    disc, code_circle, plate = values.transpose(1, 0, 2)
+    black, white = code_circle[:, _rank(0.25)], plate[:, _rank(0.5)]
+    contrast = np.minimum(disc[:, _rank(0.5)], white) - black
+    good = contrast > _MIN_CONTRAST * float(np.iinfo(grey.dtype).max)
+    good &= code_circle[:, _rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
+    for circle, low, high in ((code_circle, 0.05, 0.35), (disc, 0.3, 0.7), (plate, 0.4, 0.8)):
+        good &= circle[:, _rank(high)] - circle[:, _rank(low)] < _UNEVEN * contrast
+    return [outlines[i] for i in np.flatnonzero(good)]
+
+
+def _rank(share: float) -> int:
+    return round(share * (ANGLES - 1))
+
+
+def verify(
+    grey: GreyArray, camera: Camera, pose: Pose, ring: Ring, settings: DetectSettings
+) -> None:
+    """Raise `Rejection` unless a ring shows its code in the true perspective of its pose."""
+    radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
+    circle = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
+    points = camera.project(pose.transform((radii_m[:, None, None] * circle).reshape(-1, 2)))
+    judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring).check(
+        settings.min_score
+    )
+
+
+def judge(patch: FloatArray, ring: Ring) -> Verdict:
+    """Compare a polar patch (radii, angles) of the frame with the ring's templates."""
+    templates = templates_of(ring)
+    score, index, shift, lag = best_template(patch, templates)
+    image = np.roll(templates.images[index], lag, axis=1)
+    seen = patch[shift : shift + len(image)]
+    black, contrast = _fit_levels(image, seen, templates)
+    band = _code_rows(ring)
+    dots = _smoothed(image[band].mean(axis=0), ring)
+    rest = _smoothed((seen - black - contrast * image)[band].mean(axis=0), ring)
+    dot_contrast = float(np.ptp(dots))
+    scale = max(abs(contrast) * dot_contrast, 1e-6)
+    return Verdict(
+        score=score,
+        lag_deg=lag * 360.0 / ANGLES,
+        black=black,
+        white=black + contrast,
+        misfit=float(np.abs(rest).max()) / scale,
+        limit=min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * dot_contrast),
+    )
+
+
+def _fit_levels(image: FloatArray, seen: FloatArray, templates: Templates) -> tuple[float, float]:
+    weights = templates.weights[:, None]
+    image_mean, seen_mean = float(np.sum(image * weights)), float(np.sum(seen * weights))
+    centred = image - image_mean
+    contrast = float(np.sum(centred * seen * weights) / np.sum(centred**2 * weights))
+    return seen_mean - contrast * image_mean, contrast
+
+
+def _code_rows(ring: Ring) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
+    return np.asarray(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
+
+
+def _smoothed(signal: FloatArray, ring: Ring) -> FloatArray:
+    """Average a periodic signal over the width of a dot."""
+    half = max(1, round(ring.dot_half_angle_deg * ANGLES / 360.0))
+    padded = np.concatenate((signal[-half:], signal, signal[:half]))
+    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
