@@ -11,6 +11,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings, Method
+from kgcp.target.circles import paper_outlines
 from kgcp.target.code import CodeMatch, fixed_lag_score
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
@@ -51,7 +52,8 @@ def measure_frame(
         In the order of the targets; of each either its plates as observations, instance 0, 1, …
         in order of score, or one Miss with the reason of its best candidate.
     """
-    outlines = find_rings(grey, settings)
+    search = paper_outlines if settings.method is Method.PAPER else find_rings
+    outlines = search(grey, settings)
     return tuple(
         outcome
         for target in targets
