@@ -11,9 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
-from kgcp.geometry.pose import Pose
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.synthetic.flight import TARGET_PLATE
+from kgcp.synthetic.imaging import Optics, Sensor
+from kgcp.synthetic.plate import Plate, image_plate
 from kgcp.target.layout import Ring, Target
 from kgcp.target.noise import find_censoring
+from kgcp.target.observation import Appearance, Observation
 from kgcp.target.plate import circles_of
 from kgcp.target.sample import Imaging
 from kgcp.target.window import cut_window, semi_major_axis_px
@@ -136,3 +140,46 @@ def imaging_of() -> Callable[..., Imaging]:
         )
 
     return collect
+
+
+@pytest.fixture(scope="session")
+def photograph() -> Callable[..., GreyArray]:
+    """Frame of one plate by the simulator; `shade` takes light away, by pixel coordinates."""
+
+    def take(
+        camera: Camera,
+        pose: Pose,
+        rng: np.random.Generator,
+        *,
+        plate: Plate = TARGET_PLATE,
+        sensor: Sensor = Sensor(),  # noqa: B008 - frozen
+        gain: float = 0.9,
+        shade: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+    ) -> GreyArray:
+        irradiance = np.full((camera.height, camera.width), 0.2)
+        image_plate(camera, plate, pose, Optics(0.7)).paste(irradiance)
+        if shade is not None:
+            y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+            irradiance *= shade(x, y)
+        return sensor.expose(irradiance, gain, rng)
+
+    return take
+
+
+@pytest.fixture(scope="session")
+def start_near() -> Callable[..., Observation]:
+    """What the closed-form chain might say: a per cent, some tenths of a pixel, three degrees."""
+
+    def observe(camera: Camera, pose: Pose, rng: np.random.Generator) -> Observation:
+        error = rng.normal(0.0, (0.3, 0.3, 0.01, 0.05, 0.05, 0.01))
+        translation_m = pose.translation_m * (1.0 + error[2])
+        translation_m[:2] += error[:2] * pose.distance_m / camera.mean_focal_px
+        near = Pose(pose.rotation, translation_m).moved(np.array([0.0, 0.0, 0.0, *error[3:]]))
+        return Observation(
+            *("A", "A", 0, 0.97, near, camera.project(translation_m)),
+            image_heading_deg(camera, near),
+            Appearance(semi_major_axis_px(camera, near, 0.45), 0.1, 0.8, 0.0, 0.0),
+            *(None, None),
+        )
+
+    return observe
