@@ -42,6 +42,7 @@ class Param(IntEnum):
 PARAM_COUNT = 19
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
+# The gradient of the light is left out: over a whole ring, it is flat over the mask.
 _FILTERED = [*range(11), Param.BLACK, Param.WHITE, *range(Param.TONE_1, Param.SHARPENING)]
 
 
