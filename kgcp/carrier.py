@@ -69,6 +69,7 @@ class Carrier:
             frame_from_body=frame_from_ned @ body_to_ned(*trajectory.attitude_deg.T),
             sd_position_m=trajectory.sd_position_m,
             sd_attitude_deg=trajectory.sd_attitude_deg,
+            cov_position_m2=trajectory.cov_position_m2,
         )
         return cls(motion, settings, frame)
 
@@ -94,7 +95,10 @@ class Carrier:
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
         axes = np.array([self.frame.grid_rotation(point) for point in states.position_m])
-        return _spread(axes, sd_position_m)
+        if states.cov_position_m2 is None:
+            return _spread(axes, sd_position_m)
+        turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
+        return turned
 
     def _mount_cov(self, states: States, lever: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of attitude, lever arm and synchronisation."""

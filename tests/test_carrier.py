@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 from pathlib import Path
 
@@ -232,3 +233,16 @@ def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str
     offset_px = (flight.camera.project(in_camera) - centre_px)[seen]
     sd_px = 2300.0 * np.hypot(math.radians(0.003), 0.003 / distance[seen, None])
     assert 0.6 < np.sqrt(np.mean((offset_px / sd_px) ** 2)) < 1.5
+
+
+def test_a_full_covariance_of_the_trajectory_keeps_its_correlations() -> None:
+    cov = np.array([[4.0, 2.5, -1.0], [2.5, 3.0, 0.5], [-1.0, 0.5, 9.0]]) * 1e-4
+    base = _straight(30.0, np.sqrt(np.diag(cov)))
+    n = len(base.time_s)
+    growing = cov * np.linspace(1.0, 3.0, n)[:, None, None]  # threefold after 10 s
+    trajectory = dataclasses.replace(base, cov_position_m2=growing)
+    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], trajectory, VehicleSettings())
+    place = _only_place(whereabouts.places(["A"], [5.03]))
+    assert place.cov_m2 is not None
+    grid = whereabouts.frame.grid_rotation(place.position_m)
+    np.testing.assert_allclose(grid.T @ place.cov_m2 @ grid, cov * 2.006, atol=1e-12)

@@ -52,6 +52,9 @@ class Trajectory:
         Standard deviations along the map's axes [m]; None: the file has none.
     sd_attitude_deg : (n, 3) array or None
         Of roll, pitch, heading [deg]; None: the file has none.
+    cov_position_m2 : (n, 3, 3) array or None
+        Covariances along the map's axes [m²], of which `sd_position_m` is the diagonal; None: the
+        file tells no more than standard deviations.
     """
 
     time_s: FloatArray
@@ -59,6 +62,7 @@ class Trajectory:
     attitude_deg: FloatArray
     sd_position_m: FloatArray | None
     sd_attitude_deg: FloatArray | None
+    cov_position_m2: FloatArray | None = None
 
 
 class Coverage(StrEnum):
@@ -83,6 +87,7 @@ class States:
     angular_velocity_rad_s : (n, 3) array
         In the frame's axes [rad/s].
     sd_position_m, sd_attitude_deg : (n, 3) array or None
+    cov_position_m2 : (n, 3, 3) array or None
         As in `Trajectory`.
     """
 
@@ -92,6 +97,7 @@ class States:
     angular_velocity_rad_s: FloatArray
     sd_position_m: FloatArray | None
     sd_attitude_deg: FloatArray | None
+    cov_position_m2: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +113,7 @@ class Motion:
     frame_from_body : (n, 3, 3) array
         Body axes in the frame, as columns.
     sd_position_m, sd_attitude_deg : (n, 3) array or None
+    cov_position_m2 : (n, 3, 3) array or None
         As in `Trajectory`.
     """
 
@@ -115,6 +122,7 @@ class Motion:
     frame_from_body: FloatArray
     sd_position_m: FloatArray | None
     sd_attitude_deg: FloatArray | None
+    cov_position_m2: FloatArray | None = None
 
     @property
     def max_gap_s(self) -> float:
@@ -155,6 +163,7 @@ class Motion:
             rate,
             _between(self.sd_position_m, left, fraction),
             _between(self.sd_attitude_deg, left, fraction),
+            _between(self.cov_position_m2, left, fraction),
         )
 
     def _left(self, time_s: FloatArray) -> IndexArray:
@@ -191,5 +200,6 @@ def _between(
     if samples is None:
         return None
     step = samples[left + 1] - samples[left]
-    between: FloatArray = samples[left] + fraction[:, None] * step
+    share = fraction.reshape(-1, *(1 for _ in samples.shape[1:]))
+    between: FloatArray = samples[left] + share * step
     return between
