@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from kgcp.bias.study import Attempt, Exposure
 from kgcp.errors import KgcpError, Status
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
 from kgcp.io.tables import read_detections
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
@@ -72,7 +75,27 @@ def _sighting(row: _Row, number: int, time_s: float | None) -> Sighting:
         distance_m=_known(row, "distance_m"),
         sd_distance_m=_number(row, "sd_distance_m"),
         sd_common_distance_m=_number(row, "sd_common_distance_m"),
+        pose=_pose(row),
+        pose_cov=_square(row, "pose_cov", 6),
+        score=_number(row, "score"),
+        ambiguity=_number(row, "ambiguity"),
     )
+
+
+def _pose(row: _Row) -> Pose | None:
+    translation = [_number(row, name) for name in ("tx_m", "ty_m", "tz_m")]
+    quaternion = [_number(row, name) for name in ("qw", "qx", "qy", "qz")]
+    if None in translation or None in quaternion:
+        return None
+    rotation = Rotation.from_quat(np.array(quaternion, float), scalar_first=True)
+    return Pose(rotation.as_matrix(), np.array(translation, float))
+
+
+def _square(row: _Row, name: str, size: int) -> FloatArray | None:
+    value = row[name]
+    if not isinstance(value, np.ndarray) or value.size != size * size:
+        return None
+    return value.astype(np.float64).reshape(size, size)
 
 
 def _number(row: _Row, name: str) -> float | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +35,14 @@ class Sighting:
         Its standard deviation [m].
     sd_common_distance_m : float or None
         Share of calibration and diameter: one error in all frames, not in `sd_distance_m` [m].
+    pose : Pose or None
+        Target → camera; None: not measured.
+    pose_cov : (6, 6) array or None
+        Its covariance: translation [m], left rotation vector in the camera frame [rad].
+    score : float or None
+        Normalised cross-correlation of the code.
+    ambiguity : float or None
+        Δχ² by which the circle's other pose is worse.
     """
 
     frame: str
@@ -46,6 +55,10 @@ class Sighting:
     distance_m: float
     sd_distance_m: float | None
     sd_common_distance_m: float | None
+    pose: Pose | None = None
+    pose_cov: FloatArray | None = None
+    score: float | None = None
+    ambiguity: float | None = None
 
     def row_time_s(self, camera: Camera) -> float | None:
         """Return when the centre's row was exposed, Unix UTC [s].
