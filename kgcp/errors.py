@@ -15,6 +15,10 @@ class KgcpError(Exception):
     """Something the user can put right. The text is one line: what, where, what to do."""
 
 
+class KgcpWarning(UserWarning):
+    """Something the user should know while the work goes on. The text is one line."""
+
+
 class SettingError(KgcpError):
     """A value that cannot be, before the file it came from is known.
 

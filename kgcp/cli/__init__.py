@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
+from typing import TextIO
 
 import click
 
 from kgcp import __version__
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 
 # Name → module, in the order of the work; a module is imported when its command is called.
 COMMANDS = {
@@ -19,6 +23,30 @@ COMMANDS = {
 
 _EXIT_KNOWN_ERROR = 1  # 2 is click's own, for wrong usage
 _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells count
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print each `KgcpWarning` as one line; other warnings are shown as Python shows them."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def show_in_one_line(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, KgcpWarning):
+                click.echo(f"kgcp: warning: {message}", err=True)
+            else:
+                show(message, category, filename, lineno, file, line)
+
+        warnings.simplefilter("always", KgcpWarning)
+        warnings.showwarning = show_in_one_line
+        yield
 
 
 class Program(click.Group):
@@ -38,7 +66,8 @@ class Program(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; unexpected exceptions keep their traceback."""
         try:
-            return super().invoke(ctx)
+            with _one_line_warnings():
+                return super().invoke(ctx)
         except KgcpError as error:
             line = str(error).replace("\n", " ")
             click.echo(f"kgcp: error: {line}", err=True)

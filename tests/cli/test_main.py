@@ -3,6 +3,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+import warnings
 
 import click
 import pytest
@@ -10,7 +11,7 @@ from click.testing import CliRunner
 
 from kgcp import __version__
 from kgcp.cli import COMMANDS, Program, main
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, KgcpWarning
 
 HEAVY = {"cv2", "jinja2", "matplotlib", "numpy", "pandas", "PIL", "pyarrow", "pyproj", "scipy"}
 
@@ -37,6 +38,21 @@ def test_a_known_error_is_one_line_and_exit_1() -> None:
         "",
         "kgcp: error: flight.toml: [camera] fx: is missing; give it as a number\n",
     )
+
+
+def test_a_known_warning_is_one_line_and_the_work_goes_on() -> None:
+    class OneCommand(Program):
+        def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:  # noqa: ARG002 - click's signature
+            @click.command(cmd_name)
+            def warn() -> None:
+                warnings.warn("leap seconds are known until 2027", KgcpWarning, stacklevel=1)
+                click.echo("done")
+
+            return warn
+
+    result = CliRunner().invoke(OneCommand("kgcp"), ["detect"], catch_exceptions=False)
+    assert (result.exit_code, result.stdout) == (0, "done\n")
+    assert result.stderr == "kgcp: warning: leap seconds are known until 2027\n"
 
 
 def test_an_interrupt_is_one_line_and_exit_130() -> None:
