@@ -26,6 +26,22 @@ from kgcp.target.layout import Target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Ride:
+    """How the vehicle moved while it carried a target to its place.
+
+    Attributes
+    ----------
+    velocity_m_s : (3,) array
+        Of the target's centre, in the ENU frame [m/s].
+    frame_from_body : (3, 3) array
+        The vehicle's body axes in the ENU frame, as columns.
+    """
+
+    velocity_m_s: FloatArray
+    frame_from_body: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Place:
     """Where the centre of a target was.
 
@@ -35,10 +51,18 @@ class Place:
         In the ENU frame [m].
     cov_m2 : (3, 3) array or None
         Covariance in ENU axes [m²]; None where the trajectory has no standard deviations.
+    common_m : (3, 4) array or None
+        How one standard deviation of lever arm x, y, z and of the synchronisation moves the
+        place, ENU axes, as columns [m]. These four errors are the same in all frames; between
+        the places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
+    ride : Ride or None
+        None: the target stands still.
     """
 
     position_m: FloatArray
     cov_m2: FloatArray | None
+    common_m: FloatArray | None = None
+    ride: Ride | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,11 +110,15 @@ class Carrier:
         """
         states = self.motion.states(time_s + self.settings.time_offset_s)
         lever = states.frame_from_body @ np.array(self.settings.lever_arm_m)
-        position = states.position_m + lever
-        if states.sd_position_m is None:
-            return [Place(point, None) for point in position]
-        cov = self._trajectory_cov(states, states.sd_position_m) + self._mount_cov(states, lever)
-        return [Place(point, matrix) for point, matrix in zip(position, cov, strict=True)]
+        velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
+        common = self._common_effects(states.frame_from_body, velocity)
+        cov: Sequence[FloatArray | None] = [None] * len(time_s)
+        if states.sd_position_m is not None:
+            own = self._trajectory_cov(states, states.sd_position_m)
+            own = own + self._attitude_cov(states, lever)
+            cov = list(own + common @ np.swapaxes(common, 1, 2))
+        rides = map(Ride, velocity, states.frame_from_body)
+        return list(map(Place, states.position_m + lever, cov, common, rides))
 
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
@@ -100,17 +128,20 @@ class Carrier:
         turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
         return turned
 
-    def _mount_cov(self, states: States, lever: FloatArray) -> FloatArray:
-        """Return the share (n, 3, 3) of attitude, lever arm and synchronisation."""
-        shares = _spread(states.frame_from_body, np.array(self.settings.sd_lever_arm_m))
-        if states.sd_attitude_deg is not None:
-            up = self.frame.level_rotations(states.position_m)[:, :, 2]
-            axes = _attitude_axes(states.frame_from_body, -up)
-            effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
-            shares = shares + _spread(effects, np.radians(states.sd_attitude_deg))
-        velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
-        shift = self.settings.sd_time_s * velocity
-        return shares + shift[:, :, None] * shift[:, None, :]
+    def _attitude_cov(self, states: States, lever: FloatArray) -> FloatArray:
+        """Return the share (n, 3, 3) of attitude times lever arm."""
+        if states.sd_attitude_deg is None:
+            return np.zeros_like(states.frame_from_body)
+        up = self.frame.level_rotations(states.position_m)[:, :, 2]
+        axes = _attitude_axes(states.frame_from_body, -up)
+        effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
+        return _spread(effects, np.radians(states.sd_attitude_deg))
+
+    def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
+        """Return what `Place.common_m` holds, (n, 3, 4)."""
+        arm = frame_from_body * np.array(self.settings.sd_lever_arm_m)
+        shift = velocity_m_s * self.settings.sd_time_s
+        return np.concatenate((arm, shift[:, :, None]), axis=2)
 
 
 class Absence(StrEnum):

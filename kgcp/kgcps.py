@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 from kgcp.carrier import Absence, Place, Whereabouts
 from kgcp.geometry.arrays import FloatArray
@@ -30,6 +31,16 @@ class Kgcp:
         Covariance along the map's axes [m²]; None: the trajectory has no standard deviations.
     centre_px, centre_cov_px2, distance_m, sd_distance_m, sd_common_distance_m
         As in the sighting.
+    common_m : (3, k) array or None
+        How one standard deviation of each of k errors that all points share moves this one,
+        along the map's axes [m]; k = 4: lever arm x, y, z and synchronisation. It is part of
+        `cov_m2`. None: the target stands still, and its points are one point.
+    score, ambiguity
+        As in the sighting.
+    is_checkpoint : bool
+        Whether the point is to check an adjustment instead of controlling it.
+    flag : Flag or None
+        What does not fit a smooth flight; None: nothing, or it could not be examined.
     """
 
     id: str
@@ -43,6 +54,38 @@ class Kgcp:
     distance_m: float
     sd_distance_m: float | None
     sd_common_distance_m: float | None
+    common_m: FloatArray | None = None
+    score: float | None = None
+    ambiguity: float | None = None
+    is_checkpoint: bool = False
+    flag: Flag | None = None
+
+    @property
+    def cov_common_m2(self) -> FloatArray | None:
+        """Share (3, 3) of `cov_m2` that is one error in all points [m²]."""
+        if self.common_m is None or self.cov_m2 is None:
+            return self.cov_m2
+        product: FloatArray = self.common_m @ self.common_m.T
+        return product
+
+
+class Flag(StrEnum):
+    """What of a point does not fit a smooth flight."""
+
+    DISTANCE = "distance_jump"
+    HEIGHT = "height_jump"
+
+
+class Omission(StrEnum):
+    """Why a sighting that could be placed is no KGCP."""
+
+    SECOND_PLATE = "second_plate"
+    DISTANCE_JUMP = Flag.DISTANCE.value
+    HEIGHT_JUMP = Flag.HEIGHT.value
+    UNCERTAIN = "uncertain"
+    LOW_SCORE = "low_score"
+    AMBIGUOUS = "ambiguous"
+    CLOSE = "too_close"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +96,13 @@ class Skip:
     ----------
     frame, target : str
         As in the sighting.
-    reason : Absence or None
-        Why it is not known where the target was; None for a second plate of the same code in a
-        frame, since only one can be the target.
+    reason : Absence or Omission
+        Why it is not known where the target was, or why the point is left out.
     """
 
     frame: str
     target: str
-    reason: Absence | None
+    reason: Absence | Omission
 
 
 def build_kgcps(
@@ -94,7 +136,11 @@ def build_kgcps(
     places = whereabouts.places([seen.target for seen in first], times)
     kgcps, skipped = (
         [],
-        [Skip(seen.frame, seen.target, None) for seen in sightings if seen.instance > 0],
+        [
+            Skip(seen.frame, seen.target, Omission.SECOND_PLATE)
+            for seen in sightings
+            if seen.instance > 0
+        ],
     )
     for seen, time_s, place in zip(first, times, places, strict=True):
         if isinstance(place, Place):
@@ -106,10 +152,7 @@ def build_kgcps(
 
 def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Whereabouts) -> Kgcp:
     frame = whereabouts.frame
-    cov_m2 = None
-    if place.cov_m2 is not None:
-        axes = frame.grid_rotation(place.position_m)
-        cov_m2 = axes.T @ place.cov_m2 @ axes
+    axes = frame.grid_rotation(place.position_m)
     moves = seen.target not in whereabouts.static
     offset_s = whereabouts.carrier.settings.time_offset_s if whereabouts.carrier else 0.0
     return Kgcp(
@@ -118,10 +161,13 @@ def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Where
         target=seen.target,
         time_s=None if time_s is None else time_s + offset_s,
         position_map=frame.map_from_enu(place.position_m[None])[0],
-        cov_m2=cov_m2,
+        cov_m2=None if place.cov_m2 is None else axes.T @ place.cov_m2 @ axes,
+        common_m=None if place.common_m is None else axes.T @ place.common_m,
         centre_px=seen.centre_px,
         centre_cov_px2=seen.centre_cov_px2,
         distance_m=seen.distance_m,
         sd_distance_m=seen.sd_distance_m,
         sd_common_distance_m=seen.sd_common_distance_m,
+        score=seen.score,
+        ambiguity=seen.ambiguity,
     )

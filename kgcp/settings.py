@@ -85,6 +85,9 @@ class VehicleSettings:
     level_sd_deg : float or None
         Standard deviation of the plate's normal against the vertical, about either horizontal
         axis [deg]; None: nothing is known of it.
+    correlation_s : float
+        Time over which errors of the trajectory fall to 1/e of their covariance [s]; 0: they are
+        independent from frame to frame.
     """
 
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -93,6 +96,7 @@ class VehicleSettings:
     sd_time_s: float = 0.0
     time_offset_s: float = 0.0
     level_sd_deg: float | None = None
+    correlation_s: float = 60.0
 
     def __post_init__(self) -> None:
         for value in self.lever_arm_m:
@@ -102,5 +106,6 @@ class VehicleSettings:
         require_range("mount_deg", self.mount_deg, -360.0, 360.0, unit="deg")
         require_range("sd_time_s", self.sd_time_s, 0.0, 60.0, unit="s")
         require_range("time_offset_s", self.time_offset_s, -1e9, 1e9, unit="s")
+        require_range("correlation_s", self.correlation_s, 0.0, 1e6, unit="s")
         if self.level_sd_deg is not None:
             require_range("level_sd_deg", self.level_sd_deg, 0.0, 45.0, unit="deg", open_low=True)

@@ -8,7 +8,7 @@ import pytest
 from kgcp.carrier import Absence, Whereabouts
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.trajectory import Trajectory
-from kgcp.kgcps import Skip, build_kgcps
+from kgcp.kgcps import Omission, Skip, build_kgcps
 from kgcp.settings import VehicleSettings
 from kgcp.target.layout import Ring, Target
 from kgcp.target.sighting import Sighting
@@ -72,7 +72,7 @@ def test_frames_outside_and_second_plates_are_counted_not_lost() -> None:
     assert [point.id for point in kgcps] == ["K0002"]
     assert set(skipped) == {
         Skip("f_0001.png", "A", Absence.BEFORE_TRAJECTORY),
-        Skip("f_0002.png", "A", None),
+        Skip("f_0002.png", "A", Omission.SECOND_PLATE),
         Skip("f_0003.png", "A", Absence.NO_TIME),
     }
 

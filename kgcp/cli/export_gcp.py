@@ -86,7 +86,7 @@ def _report(
 ) -> None:
     from collections import Counter
 
-    reasons = Counter(skip.reason.value if skip.reason else "second_plate" for skip in skipped)
+    reasons = Counter(skip.reason.value for skip in skipped)
     if as_json:
         import json
 

@@ -101,6 +101,8 @@ KGCP_COLUMNS = (
     Column("sd_y", _NUMBER, "standard deviation along map y [m]"),
     Column("sd_z", _NUMBER, "standard deviation along map z [m]"),
     Column("cov", _NUMBERS, "9 numbers, row-major, in map axes [m²]"),
+    Column("cov_common", _NUMBERS, "share of lever arm and synchronisation in cov [m²]"),
+    Column("common_effects", _NUMBERS, "3 × 4, row-major: factor of cov_common [m]"),
     Column("x_px", _NUMBER, "image point in the raw image [px]"),
     Column("y_px", _NUMBER, "image point in the raw image [px]"),
     Column("sd_x_px", _NUMBER, "its standard deviation [px]"),
@@ -108,6 +110,8 @@ KGCP_COLUMNS = (
     Column("distance_m", _NUMBER, "camera centre to point [m]"),
     Column("sd_distance_m", _NUMBER, "its standard deviation [m]"),
     Column("sd_common_distance_m", _NUMBER, _COMMON.format("sd_distance_m") + " [m]"),
+    Column("role", _TEXT, "control or check"),
+    Column("flag", _TEXT, "empty, or what does not fit a smooth flight"),
 )
 
 BIAS_COLUMNS = (

@@ -30,6 +30,7 @@ VEHICLE_KEYS = (
     "sd_time_s",
     "time_offset_s",
     "level_sd_deg",
+    "correlation_s",
 )
 REFERENCE_KEYS = ("poses",)
 
@@ -157,6 +158,7 @@ def _read_vehicle(flight: TomlTable, folder: Path) -> tuple[VehicleSettings | No
             sd_time_s=table.number("sd_time_s", 0.0),
             time_offset_s=table.number("time_offset_s", 0.0),
             level_sd_deg=table.number("level_sd_deg") if "level_sd_deg" in table else None,
+            correlation_s=table.number("correlation_s", 60.0),
         )
     return settings, folder / table.text("trajectory")
 

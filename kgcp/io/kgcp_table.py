@@ -21,13 +21,17 @@ def kgcp_row(point: Kgcp) -> Row:
         "time": time_cell(point.time_s),
         **dict(zip("xyz", point.position_map.tolist(), strict=True)),
         **_deviations(("sd_x", "sd_y", "sd_z"), point.cov_m2),
-        "cov": None if point.cov_m2 is None else point.cov_m2.ravel().tolist(),
+        "cov": _flat(point.cov_m2),
+        "cov_common": _flat(point.cov_common_m2),
+        "common_effects": _flat(point.common_m),
         "x_px": float(point.centre_px[0]),
         "y_px": float(point.centre_px[1]),
         **_deviations(("sd_x_px", "sd_y_px"), point.centre_cov_px2),
         "distance_m": point.distance_m,
         "sd_distance_m": point.sd_distance_m,
         "sd_common_distance_m": point.sd_common_distance_m,
+        "role": "check" if point.is_checkpoint else "control",
+        "flag": "" if point.flag is None else point.flag.value,
     }
 
 
@@ -45,6 +49,10 @@ def bias_row(measured: Comparison) -> Row:
         "residual_percent": measured.residual_percent,
         **asdict(measured.attempt.exposure),
     }
+
+
+def _flat(matrix: FloatArray | None) -> list[float] | None:
+    return None if matrix is None else matrix.ravel().tolist()
 
 
 def _deviations(names: tuple[str, ...], cov: FloatArray | None) -> dict[str, float | None]:
