@@ -77,7 +77,7 @@ def measure_target(
     refusals: list[tuple[float, Rejection]] = []
     for ring in target.rings:
         matches, refused = find_code(grey, outlines, ring, settings)
-        refusals += refused
+        refusals += [(refusal.score, refusal.rejection) for refusal in refused]
         for match in matches:
             if any(_on_plate(match, observation) for observation in found):
                 continue

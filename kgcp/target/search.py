@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from kgcp.settings import DetectSettings
 from kgcp.target.code import CodeMatch, sample_grey
 from kgcp.target.layout import Ring
 from kgcp.target.outline import find_outlines
-from kgcp.target.seeds import build_pyramid, find_seeds
+from kgcp.target.seeds import Seeds, build_pyramid, find_seeds
 from kgcp.target.template import (
     ANGLES,
     ANGLES_RAD,
@@ -34,6 +34,8 @@ _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _DARKEST_BLACK = -0.15  # of the contrast; sharpening makes ink darker than it is
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _CODE_LIKE = 0.7  # score above which a ring with dots is a code, if another one
+_SEED_REACH = 2.0  # around places that are pointed out, of their radii
+_SMALLEST_WINDOW_PX = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,33 +78,72 @@ class Verdict:
             raise Rejection(Reason.NO_CONTRAST, f"levels {self.black:.0f} and {self.white:.0f}")
 
 
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A ring in the frame that is not the one looked for.
+
+    Attributes
+    ----------
+    outline : Ellipse
+        Of its outer circle [px].
+    score : float
+        Normalised cross-correlation of the whole ring, -1…1.
+    rejection : Rejection
+        What speaks against it.
+    """
+
+    outline: Ellipse
+    score: float
+    rejection: Rejection
+
+
 def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
     """Return the outlines of all dark rings in a frame that may be a target's."""
     pyramid = build_pyramid(grey)
     return find_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
 
 
+def find_rings_at(
+    grey: GreyArray, centres_px: FloatArray, radii_px: FloatArray
+) -> tuple[Ellipse, ...]:
+    """Return the outlines of rings at places (n, 2) of about some radii (n,), however faint.
+
+    Nothing but the part of the frame around them is looked at.
+    """
+    reach = _SEED_REACH * radii_px[:, None] + 1.0
+    low = np.maximum(np.floor((centres_px - reach).min(axis=0)).astype(int), 0)
+    x1, y1 = np.ceil((centres_px + reach).max(axis=0)).astype(int) + 1
+    window = grey[low[1] : max(y1, 0), low[0] : max(x1, 0)]
+    if min(window.shape) < _SMALLEST_WINDOW_PX:
+        return ()
+    seeds = Seeds(centres_px - low, radii_px, np.ones(len(radii_px)))
+    return tuple(
+        replace(outline, x=outline.x + float(low[0]), y=outline.y + float(low[1]))
+        for outline in find_outlines(build_pyramid(window), seeds)
+    )
+
+
 def find_code(
     grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring, settings: DetectSettings
-) -> tuple[tuple[CodeMatch, ...], tuple[tuple[float, Rejection], ...]]:
+) -> tuple[tuple[CodeMatch, ...], tuple[Refusal, ...]]:
     """Look for a ring's code in all outlines.
 
     Returns
     -------
     matches : tuple of CodeMatch
         Best first.
-    refused : tuple of (float, Rejection)
-        Scores of the others and what speaks against them.
+    refused : tuple of Refusal
+        The others that have dots.
     """
     matches: list[CodeMatch] = []
-    refused: list[tuple[float, Rejection]] = []
+    refused: list[Refusal] = []
     for outline in _dotted(grey, outlines, ring):
         points = np.stack([outline.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
         verdict = judge(sample_grey(grey, points), ring)
         try:
             verdict.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:
-            refused.append((verdict.score, rejection))
+            refused.append(Refusal(outline, verdict.score, rejection))
             continue
         matches.append(
             CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)

@@ -95,7 +95,7 @@ def test_a_similar_code_of_the_same_geometry_is_another_target(
         frame = draw_frame((plate, pose))
         matches, refused = find_code(frame, (outer,), ring, DetectSettings())
         assert len(matches) == expected
-        assert [rejection.reason for _, rejection in refused] == [Reason.OTHER_CODE][expected:]
+        assert [refusal.rejection.reason for refusal in refused] == [Reason.OTHER_CODE][expected:]
 
 
 def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
