@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+
+import numpy as np
 
 from kgcp.carrier import Absence, Place, Whereabouts
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.mapchange import MapChange
 from kgcp.target.sighting import Sighting
 
 
@@ -170,4 +173,27 @@ def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Where
         sd_common_distance_m=seen.sd_common_distance_m,
         score=seen.score,
         ambiguity=seen.ambiguity,
+    )
+
+
+def on_map(kgcps: Sequence[Kgcp], change: MapChange) -> tuple[Kgcp, ...]:
+    """Return the points with positions and covariances on another map.
+
+    Raises
+    ------
+    KgcpError
+        As `MapChange.positions` and `MapChange.axes`.
+    """
+    if not kgcps:
+        return ()
+    positions = change.positions(np.array([point.position_map for point in kgcps]))
+    return tuple(map(_moved, kgcps, positions, (change.axes(p.position_map) for p in kgcps)))
+
+
+def _moved(point: Kgcp, position_map: FloatArray, axes: FloatArray) -> Kgcp:
+    return replace(
+        point,
+        position_map=position_map,
+        cov_m2=None if point.cov_m2 is None else axes @ point.cov_m2 @ axes.T,
+        common_m=None if point.common_m is None else axes @ point.common_m,
     )

@@ -21,6 +21,7 @@ from pyproj.transformer import TransformerGroup
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 
+FLIGHT_TOML = "flight.toml: crs"
 _JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
 
 
@@ -48,10 +49,13 @@ class MapFrame:
     _geodetic_from_map: Transformer
     _ecef_from_geodetic: Transformer
     _radians_per_unit: float
+    _where: str = FLIGHT_TOML
 
     @classmethod
-    def at(cls, crs: str, origin_map: FloatArray) -> Self:
+    def at(cls, crs: str, origin_map: FloatArray, where: str = FLIGHT_TOML) -> Self:
         """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
+
+        `where` is what an error names as the place that the CRS was given in.
 
         Raises
         ------
@@ -59,22 +63,22 @@ class MapFrame:
             If the CRS is unknown or has no horizontal axes, if its heights need a grid that is
             not installed, or if the origin lies outside the projection's domain.
         """
-        horizontal = _parse(crs)
+        horizontal = parse_crs(crs, where)
         geodetic = horizontal.geodetic_crs
         if geodetic is None or horizontal.is_geocentric:
             raise KgcpError(
-                f"flight.toml: crs {crs!r} has no easting and northing or longitude and latitude;"
+                f"{where} {crs!r} has no easting and northing or longitude and latitude;"
                 " give a projected or geographic CRS"
             )
-        geodetic_from_map = _geodetic_from_map(crs, horizontal, geodetic.to_3d())
+        geodetic_from_map = _geodetic_from_map(crs, horizontal, geodetic.to_3d(), where)
         ellipsoid = geodetic.ellipsoid
         if ellipsoid is None:
-            raise KgcpError(f"flight.toml: crs {crs!r} has no ellipsoid; give one that has")
+            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give one that has")
         cart = Transformer.from_pipeline(
             f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
         )
         unit = geodetic.axis_info[0].unit_conversion_factor
-        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit)
+        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit, where)
         geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
         return cls(
             crs,
@@ -83,6 +87,7 @@ class MapFrame:
             geodetic_from_map,
             cart,
             unit,
+            where,
         )
 
     def enu_from_map(self, xyz: FloatArray) -> FloatArray:
@@ -122,7 +127,7 @@ class MapFrame:
         enu_from_grid: FloatArray = (left @ right).T
         if np.linalg.det(enu_from_grid) < 0.0:
             raise KgcpError(
-                f"flight.toml: crs {self.crs!r} has left-handed axes;"
+                f"{self._where} {self.crs!r} has left-handed axes;"
                 " give a CRS whose axes are east and north (or west and south)"
             )
         return enu_from_grid
@@ -156,29 +161,36 @@ class MapFrame:
             x, y, z = points.T
             columns = transformer.transform(x, y, z, direction=direction, radians=radians)
         except ProjError as error:
-            raise KgcpError(_explain(self.crs, error)) from error
+            raise KgcpError(_explain(self.crs, error, self._where)) from error
         result = np.column_stack(columns).astype(np.float64)
         lost = np.flatnonzero(~np.isfinite(result).all(axis=1))
         if lost.size:
-            where = ", ".join(f"{value:.10g}" for value in points[lost[0]])
+            point = ", ".join(f"{value:.10g}" for value in points[lost[0]])
             raise KgcpError(
-                f"flight.toml: crs {self.crs!r} cannot hold the point ({where});"
+                f"{self._where} {self.crs!r} cannot hold the point ({point});"
                 " give the CRS of the coordinates, x = easting or longitude first"
             )
         return result
 
 
-def _parse(crs: str) -> CRS:
+def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
+    """Return a CRS with heights; ellipsoidal ones, in metres, unless it is compound.
+
+    Raises
+    ------
+    KgcpError
+        Beginning with `where`, if pyproj cannot read it.
+    """
     try:
         parsed = CRS.from_user_input(crs)
     except ProjError as error:
-        raise KgcpError(_explain(crs, error)) from error
+        raise KgcpError(_explain(crs, error, where)) from error
     while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed
         parsed = parsed.source_crs
     return parsed if parsed.is_compound else parsed.to_3d()
 
 
-def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS) -> Transformer:
+def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS, where: str) -> Transformer:
     """Return the transformer without datum shift; heights of a compound CRS through its geoid.
 
     With ballpark operations allowed PROJ would leave heights unchanged, silently, where a geoid
@@ -199,19 +211,19 @@ def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS) -> Transformer:
     ]
     if not missing:
         raise KgcpError(
-            f"flight.toml: crs {crs!r}: no way is known from its heights to ellipsoidal ones;"
+            f"{where} {crs!r}: no way is known from its heights to ellipsoidal ones;"
             " give ellipsoidal heights and the horizontal CRS alone"
         )
     raise KgcpError(
-        f"flight.toml: crs {crs!r}: its heights need the grid {', '.join(missing)}, which is not"
-        " installed; install it with 'pyproj sync --file NAME', or give ellipsoidal heights and"
-        " the horizontal CRS alone"
+        f"{where} {crs!r}: its heights need the grid {', '.join(missing)}, which is not installed;"
+        f" install it with 'pyproj sync --file {missing[0]}', or give ellipsoidal heights and the"
+        " horizontal CRS alone"
     )
 
 
-def _explain(crs: str, error: ProjError) -> str:
+def _explain(crs: str, error: ProjError, where: str) -> str:
     text = " ".join(str(error).split())
-    return f"flight.toml: crs {crs!r} cannot be used ({text}); give one that pyproj reads"
+    return f"{where} {crs!r} cannot be used ({text}); give one that pyproj reads"
 
 
 def _level_axes(geodetic: FloatArray) -> FloatArray:

@@ -12,10 +12,10 @@ from kgcp.carrier import Absence, Place, Whereabouts
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.reference import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
-from kgcp.mapframe import MapFrame
+from kgcp.geometry.reference import ReferencePoses
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
+from kgcp.views import Views
 
 _FOLD_TOLERANCE = 1e-6
 
@@ -182,10 +182,10 @@ def study_bias(
     ]
     places = whereabouts.places([attempt.target for attempt in posed], times)
     rows = {frame: row for row, frame in enumerate(poses.frames)}
-    views = _Views.of(poses, whereabouts.frame, camera)
+    views = Views.of(poses, whereabouts.frame)
     diameters = {target.name: target.ring.outer_diameter_m for target in targets}
     compared = [
-        views.compare(attempt, place, rows[attempt.frame], diameters[attempt.target])
+        _compare(camera, views, rows[attempt.frame], attempt, place, diameters[attempt.target])
         for attempt, place in zip(posed, places, strict=True)
         if isinstance(place, Place)
     ]
@@ -224,41 +224,23 @@ def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Views:
-    """Reference poses in the ENU frame: centres (n, 3), rotations (n, 3, 3), covariances."""
-
-    camera: Camera
-    centre_m: FloatArray
-    camera_from_enu: FloatArray
-    cov_m2: FloatArray | None
-
-    @classmethod
-    def of(cls, poses: ReferencePoses, frame: MapFrame, camera: Camera) -> _Views:
-        centre = frame.enu_from_map(poses.position_map)
-        enu_from_map = np.array([frame.grid_rotation(point) for point in centre])
-        enu_from_photo = enu_from_map @ rotation_from_opk(poses.opk_deg)
-        cov = None
-        if poses.sd_position_m is not None:
-            scaled = enu_from_map * poses.sd_position_m[:, None, :]
-            cov = scaled @ np.swapaxes(scaled, 1, 2)
-        return cls(camera, centre, CAMERA_FROM_PHOTO @ np.swapaxes(enu_from_photo, 1, 2), cov)
-
-    def compare(self, attempt: Attempt, place: Place, row: int, diameter_m: float) -> Comparison:
-        """Compare one attempt with the pose in `row`."""
-        sight = place.position_m - self.centre_m[row]
-        distance = float(np.linalg.norm(sight))
-        sd = None
-        if place.cov_m2 is not None and self.cov_m2 is not None:
-            direction = sight / distance
-            sd = math.sqrt(direction @ (place.cov_m2 + self.cov_m2[row]) @ direction)
-        return Comparison(
-            attempt=attempt,
-            reference_distance_m=distance,
-            sd_reference_m=sd,
-            expected_px=_project(self.camera, self.camera_from_enu[row] @ sight),
-            expected_radius_px=0.5 * diameter_m * self.camera.mean_focal_px / distance,
-        )
+def _compare(
+    camera: Camera, views: Views, row: int, attempt: Attempt, place: Place, diameter_m: float
+) -> Comparison:
+    """Compare one attempt with the pose in `row`."""
+    sight = place.position_m - views.centre_m[row]
+    distance = float(np.linalg.norm(sight))
+    sd = None
+    if place.cov_m2 is not None and views.cov_m2 is not None:
+        direction = sight / distance
+        sd = math.sqrt(direction @ (place.cov_m2 + views.cov_m2[row]) @ direction)
+    return Comparison(
+        attempt=attempt,
+        reference_distance_m=distance,
+        sd_reference_m=sd,
+        expected_px=_project(camera, sight @ views.enu_from_camera[row]),
+        expected_radius_px=0.5 * diameter_m * camera.mean_focal_px / distance,
+    )
 
 
 def _project(camera: Camera, point_camera: FloatArray) -> FloatArray:

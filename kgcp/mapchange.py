@@ -1,0 +1,111 @@
+"""From one map to another: positions, and what is given along the map's axes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
+from pyproj.transformer import TransformerGroup
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.mapframe import MapFrame, parse_crs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapChange:
+    """The way from the flight's map to another one, datum and geoid included.
+
+    Attributes
+    ----------
+    source : MapFrame
+        The flight's.
+    target : MapFrame
+        Of the other CRS.
+    """
+
+    source: MapFrame
+    target: MapFrame
+    _between: Transformer
+
+    @classmethod
+    def to(cls, crs: str, source: MapFrame, near_map: FloatArray) -> Self:
+        """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
+
+        Raises
+        ------
+        KgcpError
+            If the CRS is unknown or unusable, no exact operation leads to it, or one that PROJ
+            knows needs a grid that is not installed.
+        """
+        between = _best(source.crs, crs)
+        draft = cls(source, source, between)
+        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], "--crs")
+        return cls(source, target, between)
+
+    def positions(self, xyz: FloatArray) -> FloatArray:
+        """Bring points (n, 3) of the source map into the other one (n, 3)."""
+        x, y, z = np.asarray(xyz, dtype=np.float64).T
+        try:
+            moved = np.column_stack(self._between.transform(x, y, z, errcheck=True))
+        except ProjError as error:
+            text = " ".join(str(error).split())
+            raise KgcpError(
+                f"--crs: {self.source.crs!r} does not lead to the CRS asked for here ({text});"
+                " give one that covers the flight"
+            ) from error
+        return moved
+
+    def axes(self, xyz: FloatArray) -> FloatArray:
+        """Return the rotation (3, 3) from the source map's axes to the other's at a point (3,).
+
+        Both maps are compared with east, north and up of the same place: what datums differ
+        from each other in direction is some 1e-5, which no standard deviation feels.
+        """
+        points = np.reshape(np.asarray(xyz, dtype=np.float64), (1, 3))
+        here = _level_from_grid(self.source, points)
+        there = _level_from_grid(self.target, self.positions(points))
+        rotation: FloatArray = there.T @ here
+        return rotation
+
+
+def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
+    enu = frame.enu_from_map(xyz)
+    rotation: FloatArray = frame.level_rotations(enu)[0].T @ frame.grid_rotation(enu[0])
+    return rotation
+
+
+def _best(source: str, target: str) -> Transformer:
+    """Return the best operation between two CRS, or say which grid it lacks.
+
+    A second-best one would be metres off and look the same, above all where the heights of a
+    geoid are taken as ellipsoidal.
+    """
+    ends: tuple[CRS, CRS] = (parse_crs(source), parse_crs(target, "--crs"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
+        known = TransformerGroup(*ends, always_xy=True, allow_ballpark=False)
+    if known.best_available and known.transformers:
+        return Transformer.from_crs(*ends, always_xy=True, only_best=True, allow_ballpark=False)
+    missing = sorted(
+        {
+            grid.short_name
+            for operation in known.unavailable_operations[:1]
+            for grid in operation.grids
+            if not grid.available
+        }
+    )
+    if missing:
+        raise KgcpError(
+            f"--crs {target!r}: the way from {source!r} needs the grid {', '.join(missing)}, which"
+            f" is not installed; install it with 'pyproj sync --file {missing[0]}', or give a CRS"
+            " of the flight's datum and heights"
+        )
+    raise KgcpError(
+        f"--crs {target!r}: no exact way is known from {source!r};"
+        " give a CRS of the flight's datum and heights"
+    )

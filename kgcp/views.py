@@ -1,0 +1,44 @@
+"""Reference poses of the camera in the Cartesian frame of the flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.reference import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
+from kgcp.mapframe import MapFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Exterior orientations of n frames.
+
+    Attributes
+    ----------
+    centre_m : (n, 3) array
+        Projection centres in the ENU frame [m].
+    enu_from_camera : (n, 3, 3) array
+        Camera axes (x right, y down, z forward) in the ENU frame, as columns.
+    cov_m2 : (n, 3, 3) array or None
+        Covariance of the centres in ENU axes [m²]; None: the poses have no deviations.
+    """
+
+    centre_m: FloatArray
+    enu_from_camera: FloatArray
+    cov_m2: FloatArray | None
+
+    @classmethod
+    def of(cls, poses: ReferencePoses, frame: MapFrame) -> Self:
+        """Bring reference poses from the map into the ENU frame."""
+        centre = frame.enu_from_map(poses.position_map)
+        enu_from_map = np.array([frame.grid_rotation(point) for point in centre])
+        cov = None
+        if poses.sd_position_m is not None:
+            scaled = enu_from_map * poses.sd_position_m[:, None, :]
+            cov = scaled @ np.swapaxes(scaled, 1, 2)
+        # diag(1, -1, -1) is its own inverse
+        enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
+        return cls(centre, enu_from_camera, cov)
