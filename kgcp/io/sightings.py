@@ -79,6 +79,7 @@ def _sighting(row: _Row, number: int, time_s: float | None) -> Sighting:
         pose_cov=_square(row, "pose_cov", 6),
         score=_number(row, "score"),
         ambiguity=_number(row, "ambiguity"),
+        common_pose_cov=_square(row, "common_pose_cov", 6),
     )
 
 

@@ -39,6 +39,8 @@ class Sighting:
         Target → camera; None: not measured.
     pose_cov : (6, 6) array or None
         Its covariance: translation [m], left rotation vector in the camera frame [rad].
+    common_pose_cov : (6, 6) array or None
+        Share of calibration and diameter, not in `pose_cov`; None: not known.
     score : float or None
         Normalised cross-correlation of the code.
     ambiguity : float or None
@@ -59,6 +61,7 @@ class Sighting:
     pose_cov: FloatArray | None = None
     score: float | None = None
     ambiguity: float | None = None
+    common_pose_cov: FloatArray | None = None
 
     def row_time_s(self, camera: Camera) -> float | None:
         """Return when the centre's row was exposed, Unix UTC [s].
