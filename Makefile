@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-accuracy sample-flight clean
+.PHONY: help demo test check lint types format bench-accuracy bench-search sample-flight clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,6 +39,12 @@ format: $(VENV)/.develops ## bring the code into the project's format
 
 bench-accuracy: $(VENV)/.runs ## measure simulated flights: errors, scatter, Cramér-Rao bound (minutes)
 	$(BIN)/python -m benchmarks.accuracy $(BENCH)
+
+PHOTOS := ../shared/real
+
+bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed, wrong (half an hour)
+	$(BIN)/python -m benchmarks.search $(BENCH)
+	$(BIN)/python -m benchmarks.false_alarms $(PHOTOS)
 
 sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
 	rm -rf sample_flight

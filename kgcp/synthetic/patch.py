@@ -34,6 +34,17 @@ class Window:
         """Whether some of the window is within the camera's frame."""
         return -self.width < self.column < camera.width and -self.height < self.row < camera.height
 
+    def exceeds(self, camera: Camera) -> bool:
+        """Whether the window is wider or higher than the camera's frame."""
+        return self.width > camera.width or self.height > camera.height
+
+    def near(self, camera: Camera, margin_px: int) -> Window:
+        """Return the part of the window that is at most `margin_px` outside the camera's frame."""
+        column, row = max(self.column, -margin_px), max(self.row, -margin_px)
+        last_column = min(self.column + self.width, camera.width + margin_px)
+        last_row = min(self.row + self.height, camera.height + margin_px)
+        return Window(column, row, last_column - column, last_row - row)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:

@@ -41,15 +41,15 @@ class Scene:
     ----------
     ground : Pose
         Ground plane (x east, y south, z down) → camera.
-    carrier : PlatePose
-        The target on its vehicle.
-    decoys : tuple of PlatePose
-        Plates of another code, on the ground.
+    carrier : PlatePose or None
+        A plate on its vehicle; None: there is no vehicle.
+    others : tuple of PlatePose
+        Plates without a vehicle.
     """
 
     ground: Pose
-    carrier: PlatePose
-    decoys: tuple[PlatePose, ...]
+    carrier: PlatePose | None
+    others: tuple[PlatePose, ...]
 
 
 def render_irradiance(
@@ -63,11 +63,15 @@ def render_irradiance(
     patch = Patch.of(camera, scene.ground, Window(0, 0, camera.width, camera.height))
     light = ground.radiance(patch)
     _scatter_clutter(patch, light, rng)
-    _park_vehicle(patch, light, scene)
+    if scene.carrier is not None:
+        _park_vehicle(patch, light, scene.ground, scene.carrier.pose)
     irradiance = optics.spread(light, 1)
-    for seen in (*scene.decoys, scene.carrier):
+    carried = () if scene.carrier is None else (scene.carrier,)
+    for seen in (*scene.others, *carried):
         window = plate_window(camera, seen.plate, seen.pose, optics)
         if window.meets(camera):
+            if window.exceeds(camera):
+                window = window.near(camera, optics.reach_px)
             image_plate(camera, seen.plate, seen.pose, optics, window).paste(irradiance)
     return irradiance
 
@@ -112,12 +116,11 @@ def _piece(
     return [(rectangle(centre, 8.0 * size_m, 0.08 * size_m, direction), value)]
 
 
-def _park_vehicle(patch: Patch, light: FloatArray, scene: Scene) -> None:
-    """Paint the vehicle's shadow, body and windscreen under the plate, in place."""
-    pose = scene.carrier.pose
+def _park_vehicle(patch: Patch, light: FloatArray, ground: Pose, pose: Pose) -> None:
+    """Paint the vehicle's shadow, body and windscreen under its plate, in place."""
     roof = Pose(pose.rotation, pose.translation_m + _BODY_BELOW_PLATE_M * pose.normal)
-    corners = roof.transform(np.array(_BODY.vertices_m)) - scene.ground.translation_m
-    footprint = (corners @ scene.ground.rotation)[:, :2]
+    corners = roof.transform(np.array(_BODY.vertices_m)) - ground.translation_m
+    footprint = (corners @ ground.rotation)[:, :2]
     patch.paint(light, polygon(list(footprint + _SHADOW_SHIFT_M)), 0.04, 0.7)
     for shape, radiance in ((_BODY, 0.35), (_WINDSCREEN, 0.06), (_REAR_WINDOW, 0.07)):
         _paint_plane(patch, light, roof, shape, radiance)

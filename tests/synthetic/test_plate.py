@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -77,6 +79,20 @@ def test_pasting_clips_at_the_frame() -> None:
         whole[:, -image.window.column :],
     )
     assert_allclose(frame[:, 400:], 0.3)
+
+
+def test_of_plates_larger_than_the_frame_only_what_it_shows_is_rendered() -> None:
+    small = replace(CAMERA, width=160, height=120, cx=85.2, cy=51.7)
+    pose = Pose(POSE.rotation, np.array([-0.3, 0.2, 6.0]))
+    whole = plate_window(small, TARGET_PLATE, pose, OPTICS)
+    part = whole.near(small, OPTICS.reach_px)
+    assert whole.exceeds(small)
+    assert part.width * part.height < 0.6 * whole.width * whole.height
+    frames = [np.full((120, 160), 0.3), np.full((120, 160), 0.3)]
+    for window, frame in zip((whole, part), frames, strict=True):
+        image_plate(small, TARGET_PLATE, pose, OPTICS, window).paste(frame)
+    assert np.ptp(frames[0]) > 0.7
+    assert_allclose(frames[1], frames[0], atol=3e-3)  # their sub-pixels differ
 
 
 def test_opaque_plates_hide_the_background() -> None:
