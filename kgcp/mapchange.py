@@ -42,7 +42,11 @@ class MapChange:
             If the CRS is unknown or unusable, no exact operation leads to it, or one that PROJ
             knows needs a grid that is not installed.
         """
-        between = _best(source.crs, crs)
+        between = best_transformer(
+            parse_crs(source.crs),
+            parse_crs(crs, "--crs"),
+            f"--crs {crs!r}: the way from {source.crs!r}",
+        )
         draft = cls(source, source, between)
         target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], "--crs")
         return cls(source, target, between)
@@ -79,18 +83,25 @@ def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
     return rotation
 
 
-def _best(source: str, target: str) -> Transformer:
+def best_transformer(source: CRS, target: CRS, where: str) -> Transformer:
     """Return the best operation between two CRS, or say which grid it lacks.
 
     A second-best one would be metres off and look the same, above all where the heights of a
     geoid are taken as ellipsoidal.
+
+    Raises
+    ------
+    KgcpError
+        Beginning with `where`, which names both, if no exact operation is known, or one that PROJ
+        knows needs a grid that is not installed.
     """
-    ends: tuple[CRS, CRS] = (parse_crs(source), parse_crs(target, "--crs"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
-        known = TransformerGroup(*ends, always_xy=True, allow_ballpark=False)
+        known = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
     if known.best_available and known.transformers:
-        return Transformer.from_crs(*ends, always_xy=True, only_best=True, allow_ballpark=False)
+        return Transformer.from_crs(
+            source, target, always_xy=True, only_best=True, allow_ballpark=False
+        )
     missing = sorted(
         {
             grid.short_name
@@ -101,11 +112,7 @@ def _best(source: str, target: str) -> Transformer:
     )
     if missing:
         raise KgcpError(
-            f"--crs {target!r}: the way from {source!r} needs the grid {', '.join(missing)}, which"
-            f" is not installed; install it with 'pyproj sync --file {missing[0]}', or give a CRS"
-            " of the flight's datum and heights"
+            f"{where} needs the grid {', '.join(missing)}, which is not installed; install it with"
+            f" 'pyproj sync --file {missing[0]}', or give a CRS of the flight's datum and heights"
         )
-    raise KgcpError(
-        f"--crs {target!r}: no exact way is known from {source!r};"
-        " give a CRS of the flight's datum and heights"
-    )
+    raise KgcpError(f"{where} is not known exactly; give a CRS of the flight's datum and heights")
