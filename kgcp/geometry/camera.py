@@ -28,6 +28,18 @@ class Response(StrEnum):
     UNKNOWN = "unknown"
 
 
+class TimeReference(StrEnum):
+    """Which moment of the exposure the frames' times are of."""
+
+    START = "start"
+    MIDDLE = "middle"
+    END = "end"
+
+    def to_middle_s(self, exposure_time_s: float) -> float:
+        """Return what leads from this moment to mid-exposure [s]."""
+        return {"start": 0.5, "middle": 0.0, "end": -0.5}[self.value] * exposure_time_s
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Interior orientation of a frame camera.
@@ -44,6 +56,8 @@ class Camera:
         How grey values follow light.
     readout_s : float
         Rolling shutter: time from the first to the last row [s]; 0 is a global shutter.
+    time_reference : TimeReference
+        What the frames' times are of, before they are brought to mid-exposure.
     """
 
     width: int
@@ -62,6 +76,7 @@ class Camera:
     k6: float = 0.0
     response: Response = Response.UNKNOWN
     readout_s: float = 0.0
+    time_reference: TimeReference = TimeReference.MIDDLE
 
     def __post_init__(self) -> None:
         for key, size in (("width", self.width), ("height", self.height)):

@@ -71,5 +71,8 @@ class Sighting:
         """
         if self.time_s is None:
             return None
-        since_middle = float(self.centre_px[1]) / (camera.height - 1) - 0.5
-        return self.time_s + since_middle * camera.readout_s
+        return self.time_s + self.rows_since_middle(camera) * camera.readout_s
+
+    def rows_since_middle(self, camera: Camera) -> float:
+        """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""
+        return float(self.centre_px[1]) / (camera.height - 1) - 0.5

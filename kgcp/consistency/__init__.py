@@ -1,0 +1,1 @@
+"""Whether the vehicle and the reference poses put the target in the same places."""

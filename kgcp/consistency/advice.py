@@ -1,0 +1,58 @@
+"""What to change in flight.toml where vehicle and camera disagree, in words."""
+
+from __future__ import annotations
+
+import math
+
+from kgcp.consistency.corrections import Correction
+from kgcp.consistency.study import Consistency
+
+_TANGLED_CHI2 = 3.0  # of χ² over its degrees of freedom: disagreement without a single culprit
+_AXES = {"forward": 0, "right": 1, "down": 2}
+
+
+def advice(found: Consistency) -> tuple[str, ...]:
+    """Return one line per correction that is more than chance; none where all is well."""
+    lines = [
+        _line(correction) for correction in found.estimate.corrections if correction.is_significant
+    ]
+    factor = found.estimate.variance_factor
+    if factor > _TANGLED_CHI2:
+        lines.append(
+            f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their deviations"
+            " say, whatever is corrected: look at consistency.parquet for when, and check sd_x …"
+            " of trajectory and reference poses"
+        )
+    return tuple(lines)
+
+
+def _line(correction: Correction) -> str:
+    text = _remedy(correction)
+    if correction.tangled_with:
+        others = " and ".join(correction.tangled_with)
+        text += f"; only if {others} is right: this flight cannot tell them apart"
+    return text
+
+
+def _remedy(correction: Correction) -> str:
+    quantity, _, unit = correction.name.rpartition("_")
+    amount = _amount(correction, unit)
+    if quantity == "time_offset":
+        return f"add {amount} to [vehicle] time_offset_s in flight.toml"
+    if quantity == "readout":
+        return f"add {amount} to [camera] readout_s in flight.toml"
+    if quantity.startswith("lever_arm_"):
+        axis = quantity.removeprefix("lever_arm_")
+        return f"add {amount} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
+    axis = quantity.removeprefix("boresight_")
+    return (
+        f"the images are turned by {amount} about the camera's {axis} axis against the reference"
+        " poses: check that [reference] poses and [camera] are of the same adjustment"
+    )
+
+
+def _amount(correction: Correction, unit: str) -> str:
+    """Return value ± deviation, both to the deviation's second digit."""
+    value, sd = correction.value or 0.0, correction.sd or 0.0
+    decimals = max(0, 1 - math.floor(math.log10(sd))) if sd > 0.0 else 6
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f} {unit}"
