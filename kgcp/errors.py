@@ -68,7 +68,7 @@ class Reason(StrEnum):
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
-        "no dark ring between a bright disc and a bright plate is in the frame",
+        "no dark ring with dots between bright disc and plate, other targets' apart",
     )
     CODE_MISMATCH = (
         "code_mismatch",
@@ -84,6 +84,26 @@ class Reason(StrEnum):
         "other_code",
         Status.REJECTED,
         "a ring of this target's geometry, but with dots that are not this code's",
+    )
+    TOO_SMALL = (
+        "too_small",
+        Status.REJECTED,
+        "a ring like this target's, but with less than the smallest radius across",
+    )
+    TOO_BLURRED = (
+        "too_blurred",
+        Status.REJECTED,
+        "a ring like this target's, but blur has left too little of its dots",
+    )
+    CLIPPED = (
+        "clipped",
+        Status.REJECTED,
+        "a ring like this target's, but its white is burnt out and its edges have moved",
+    )
+    HIDDEN = (
+        "hidden",
+        Status.REJECTED,
+        "a ring like this target's, but too little of its outer edge is seen",
     )
     NO_INNER_CIRCLE = (
         "no_inner_circle",

@@ -45,6 +45,11 @@ class DetectSettings:
         Smallest radius of a ring's outer circle that is looked for [px]; μ_min of §2.2.
     min_score : float
         Threshold on the normalised cross-correlation of a ring with its code (§2.3).
+    false_alarm : float
+        Chance per frame, at most, that random light on a ring is taken for the code; see
+        `kgcp.target.chance`.
+    is_guided : bool
+        Whether frames without a target are looked at again where it must be.
     canny_low, canny_high : float
         With `paper`: hysteresis thresholds of the Canny detector on 8-bit grey values (§2.1).
     max_circle_deviation : float
@@ -54,6 +59,8 @@ class DetectSettings:
     method: Method = Method.MODEL
     min_radius_px: float = 6.0
     min_score: float = 0.86
+    false_alarm: float = 1e-5
+    is_guided: bool = True
     canny_low: float = 40.0
     canny_high: float = 100.0
     max_circle_deviation: float = 0.15
@@ -61,6 +68,7 @@ class DetectSettings:
     def __post_init__(self) -> None:
         require_range("min_radius_px", self.min_radius_px, 1.0, 1e4, unit="px")
         require_range("min_score", self.min_score, 0.0, 1.0, open_low=True)
+        require_range("false_alarm", self.false_alarm, 0.0, 1.0, open_low=True)
         require_range("canny_low", self.canny_low, 1.0, 255.0)
         require_range("canny_high", self.canny_high, self.canny_low, 255.0)
         require_range("max_circle_deviation", self.max_circle_deviation, 0.0, 0.5, open_low=True)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 
 
 class ColumnType(StrEnum):
-    """Storage types of table columns; all but `TEXT` and `INTEGER` may be null."""
+    """Storage types of table columns; `TEXT`, `INTEGER` and `BOOLEAN` are never null."""
 
     TEXT = "text"
     INTEGER = "integer"
+    BOOLEAN = "boolean"
     NUMBER = "number"
     TIME = "time"
     NUMBERS = "numbers"
@@ -28,6 +29,7 @@ class Column:
 
 
 _TEXT, _INTEGER, _NUMBER = ColumnType.TEXT, ColumnType.INTEGER, ColumnType.NUMBER
+_BOOLEAN = ColumnType.BOOLEAN
 _TIME, _NUMBERS = ColumnType.TIME, ColumnType.NUMBERS
 
 _COMMON = "share of calibration and diameter: one error in all frames, not in {}"
@@ -51,6 +53,9 @@ DETECTION_COLUMNS = (
     Column("instance", _INTEGER, "0, 1, … among plates of one code in a frame, by score"),
     Column("status", _TEXT, "measured, not_found, rejected or unreadable"),
     Column("reason", _TEXT, "empty when measured, else a word of the registry"),
+    Column("detail", _TEXT, "the numbers behind the reason; empty when measured"),
+    Column("candidates", _INTEGER, "rings compared with a target that was not measured; else 0"),
+    Column("guided", _BOOLEAN, "found only where other frames or the reference said it must be"),
     Column("scale_used", _TEXT, "the target's name, or the replica that was measured"),
     Column("x_px", _NUMBER, "projected circle centre in the raw image [px]"),
     Column("y_px", _NUMBER, "projected circle centre in the raw image [px]"),

@@ -68,6 +68,9 @@ def _miss_cells(miss: Miss) -> Mapping[str, object]:
     return {
         "status": miss.reason.status.value,
         "reason": miss.reason.value,
+        "detail": miss.detail,
+        "candidates": miss.candidates,
+        "guided": False,
         "scale_used": "",
         "score": miss.score,
     }
@@ -77,6 +80,9 @@ def _measured_cells(seen: Observation) -> Mapping[str, object]:
     return {
         "status": Status.MEASURED.value,
         "reason": "",
+        "detail": "",
+        "candidates": 0,
+        "guided": seen.is_guided,
         "scale_used": seen.ring,
         "x_px": float(seen.centre_px[0]),
         "y_px": float(seen.centre_px[1]),

@@ -22,6 +22,7 @@ Row = Mapping[str, object]
 _ARROW_TYPES = {
     ColumnType.TEXT: pa.string(),
     ColumnType.INTEGER: pa.int64(),
+    ColumnType.BOOLEAN: pa.bool_(),
     ColumnType.NUMBER: pa.float64(),
     ColumnType.TIME: pa.timestamp("us", tz="UTC"),
     ColumnType.NUMBERS: pa.list_(pa.float64()),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,17 +12,45 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings, Method
+from kgcp.target.chance import check_chance
 from kgcp.target.circles import paper_outlines
-from kgcp.target.code import CodeMatch, fixed_lag_score
+from kgcp.target.code import fixed_lag_score
+from kgcp.target.explain import explain
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
-from kgcp.target.observation import Miss, Observation, Outcome
+from kgcp.target.observation import Considered, Miss, Observation, Outcome
 from kgcp.target.paper import measure_ring, points_of_code
 from kgcp.target.prior import NormalPrior
 from kgcp.target.search import find_code, find_rings, verify
 
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What one frame says about all targets.
+
+    Attributes
+    ----------
+    outcomes : tuple of Outcome
+        In the order of the targets; of each either its plates as observations, instance 0, 1, …
+        in order of score, or one Miss with the reason of its best candidate.
+    considered : tuple of Considered
+        All rings that were compared with a target's.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    considered: tuple[Considered, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """What became of one target, before the others are known."""
+
+    target: Target
+    found: tuple[Observation, ...]
+    considered: tuple[Considered, ...]
 
 
 def measure_frame(
@@ -31,6 +60,17 @@ def measure_frame(
     settings: DetectSettings,
     prior: NormalPrior | None = None,
 ) -> tuple[Outcome, ...]:
+    """Return the outcomes of `examine`."""
+    return examine(grey, camera, targets, settings, prior).outcomes
+
+
+def examine(
+    grey: GreyArray,
+    camera: Camera,
+    targets: tuple[Target, ...],
+    settings: DetectSettings,
+    prior: NormalPrior | None = None,
+) -> Examination:
     """Look for every target in a frame and measure what is found.
 
     Parameters
@@ -45,62 +85,118 @@ def measure_frame(
         Of the search.
     prior : NormalPrior, optional
         Of the normal of the plate on the vehicle: of all targets without a position of their own.
-
-    Returns
-    -------
-    tuple of Outcome
-        In the order of the targets; of each either its plates as observations, instance 0, 1, …
-        in order of score, or one Miss with the reason of its best candidate.
     """
     search = paper_outlines if settings.method is Method.PAPER else find_rings
     outlines = search(grey, settings)
-    return tuple(
-        outcome
-        for target in targets
-        for outcome in measure_target(
+    trials = [
+        _try_target(
             grey, camera, outlines, target, settings, prior if target.position_m is None else None
         )
-    )
+        for target in targets
+    ]
+    outcomes: list[Outcome] = []
+    considered: list[Considered] = []
+    for trial in trials:
+        rivals = [seen for other in trials if other is not trial for seen in other.found]
+        own = _undisputed(trial.found, rivals)
+        free = [one for one in trial.considered if not any(map(one.is_on_plate_of, rivals))]
+        outcomes += own or (miss_of(grey, trial.target, free, settings),)
+        considered += trial.considered
+    return Examination(tuple(outcomes), tuple(considered))
 
 
-def measure_target(
+def _undisputed(
+    found: tuple[Observation, ...], rivals: list[Observation]
+) -> tuple[Observation, ...]:
+    """Leave out plates that look more like another target's; number the others by score."""
+    kept = [
+        seen
+        for seen in found
+        if not any(rival.score > seen.score and _share_a_plate(rival, seen) for rival in rivals)
+    ]
+    kept.sort(key=lambda seen: -seen.score)
+    return tuple(replace(seen, instance=i) for i, seen in enumerate(kept))
+
+
+def _share_a_plate(one: Observation, other: Observation) -> bool:
+    radius_px = max(one.appearance.radius_px, other.appearance.radius_px)
+    return bool(np.linalg.norm(one.centre_px - other.centre_px) < radius_px)
+
+
+def _try_target(
     grey: GreyArray,
     camera: Camera,
     outlines: tuple[Ellipse, ...],
     target: Target,
     settings: DetectSettings,
     prior: NormalPrior | None,
-) -> tuple[Outcome, ...]:
+) -> _Trial:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
     found: list[Observation] = []
-    rejections: list[tuple[float, Rejection]] = []
-    refusals: list[tuple[float, Rejection]] = []
+    considered: list[Considered] = []
     for ring in target.rings:
         matches, refused = find_code(grey, outlines, ring, settings)
-        refusals += [(refusal.score, refusal.rejection) for refusal in refused]
+        considered += [
+            Considered(
+                *(target.name, ring.name, one.outline, one.score),
+                is_match=False,
+                reason=one.rejection.reason,
+                detail=one.rejection.detail,
+            )
+            for one in refused
+        ]
         for match in matches:
-            if any(_on_plate(match, observation) for observation in found):
+            candidate = Considered(target.name, ring.name, match.outer, match.score, is_match=True)
+            if any(map(candidate.is_on_plate_of, found)):
                 continue
             try:
-                observation = measure_ring(grey, camera, target, match)
-                verify(grey, camera, observation.pose, ring, settings)
-                if ring is not target.ring:
-                    _check_main_ring(grey, camera, target.ring, observation)
-                if settings.method is Method.MODEL:
-                    observation = measure_by_model(grey, camera, target, observation, prior)
-                found.append(observation)
+                start = measure_ring(grey, camera, target, match)
+                found.append(confirm(grey, camera, target, start, settings, prior))
             except Rejection as rejection:
-                rejections.append((match.score, rejection))
-    if found:
-        found.sort(key=lambda observation: -observation.score)
-        return tuple(replace(observation, instance=i) for i, observation in enumerate(found))
-    return (_miss(target, rejections or refusals),)
+                candidate = replace(candidate, reason=rejection.reason, detail=rejection.detail)
+            considered.append(candidate)
+    return _Trial(target, tuple(found), tuple(considered))
 
 
-def _on_plate(match: CodeMatch, observation: Observation) -> bool:
-    """Tell whether a match lies on a plate that is measured already."""
-    offset = np.linalg.norm(match.outer.centre - observation.centre_px)
-    return bool(offset < observation.appearance.radius_px)
+def confirm(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    settings: DetectSettings,
+    prior: NormalPrior | None,
+) -> Observation:
+    """Measure what the closed-form chain has found, and make sure that it is the target.
+
+    Raises
+    ------
+    Rejection
+        With the reason of the first test that is not passed.
+    """
+    ring = next(ring for ring in target.rings if ring.name == start.ring)
+    verify(grey, camera, start.pose, ring, settings)
+    if ring is not target.ring:
+        _check_main_ring(grey, camera, target.ring, start)
+    if settings.method is Method.PAPER:
+        return start
+    observation = measure_by_model(grey, camera, target, start, prior)
+    check_chance(observation, target, ring, settings.false_alarm)
+    return observation
+
+
+def miss_of(
+    grey: GreyArray, target: Target, considered: Sequence[Considered], settings: DetectSettings
+) -> Miss:
+    """Give the reason of the best candidate, of those that got as far as any."""
+    if not considered:
+        return Miss(target.name, Reason.NO_CANDIDATE)
+    best = max(considered, key=lambda one: (one.is_match, one.score))
+    ring = next(ring for ring in target.rings if ring.name == best.ring)
+    best = explain(grey, ring, best, settings.min_radius_px)
+    outlines = {one.outline for one in considered}
+    return Miss(
+        target.name, best.reason or Reason.CODE_MISMATCH, best.detail, best.score, len(outlines)
+    )
 
 
 def _check_main_ring(grey: GreyArray, camera: Camera, main: Ring, observation: Observation) -> None:
@@ -120,11 +216,3 @@ def _check_main_ring(grey: GreyArray, camera: Camera, main: Ring, observation: O
             Reason.CODE_MISMATCH,
             f"the ring around the replica {observation.ring} is not {main.name}: {score:.2f}",
         )
-
-
-def _miss(target: Target, rejections: list[tuple[float, Rejection]]) -> Miss:
-    """Give the reason of the best candidate, of those that got as far as any."""
-    if not rejections:
-        return Miss(target.name, Reason.NO_CANDIDATE)
-    score, rejection = max(rejections, key=lambda scored: scored[0])
-    return Miss(target.name, rejection.reason, rejection.detail, score)

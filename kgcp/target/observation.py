@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 
 
@@ -121,6 +124,8 @@ class Observation:
         None where the method gives none.
     common : CommonUncertainty or None
         None where nothing is known about calibration and diameter.
+    is_guided : bool
+        Whether it was found only where other frames or the reference poses said it must be.
     """
 
     target: str
@@ -134,6 +139,7 @@ class Observation:
     alternative: Alternative | None
     uncertainty: Uncertainty | None
     common: CommonUncertainty | None = None
+    is_guided: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +158,49 @@ class Miss:
         The numbers behind it.
     score : float or None
         Normalised cross-correlation of the best candidate, if there was one.
+    candidates : int
+        Rings that were compared with the target's, but for those of other measured targets.
     """
 
     target: str
     reason: Reason
     detail: str = ""
     score: float | None = None
+    candidates: int = 0
 
 
 Outcome = Observation | Miss
+
+
+@dataclass(frozen=True, slots=True)
+class Considered:
+    """One ring in the frame that was compared with one of a target's.
+
+    Attributes
+    ----------
+    target, ring : str
+        What it was compared with.
+    outline : Ellipse
+        Its outer circle [px].
+    score : float
+        Normalised cross-correlation.
+    is_match : bool
+        Whether the code was there, so that it was worth measuring.
+    reason : Reason or None
+        Why it was dropped; None: it was measured.
+    detail : str
+        The numbers behind it.
+    """
+
+    target: str
+    ring: str
+    outline: Ellipse
+    score: float
+    is_match: bool
+    reason: Reason | None = None
+    detail: str = ""
+
+    def is_on_plate_of(self, observation: Observation) -> bool:
+        """Tell whether this ring lies on a plate that is measured."""
+        offset = np.linalg.norm(self.outline.centre - observation.centre_px)
+        return bool(offset < observation.appearance.radius_px)

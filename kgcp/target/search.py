@@ -33,7 +33,8 @@ _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of t
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _DARKEST_BLACK = -0.15  # of the contrast; sharpening makes ink darker than it is
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
-_CODE_LIKE = 0.7  # score above which a ring with dots is a code, if another one
+CODE_LIKE = 0.7
+"""Score above which a ring with dots is a code, if another one."""
 _SEED_REACH = 2.0  # around places that are pointed out, of their radii
 _SMALLEST_WINDOW_PX = 12
 
@@ -53,8 +54,8 @@ class Verdict:
     misfit : float
         Largest difference to the template along the code, of a dot's contrast: 1 is a dot too
         many or too few.
-    limit : float
-        What `misfit` may be: less where blur leaves little of the dots.
+    dot_contrast : float
+        Of the template's dots, of the ring's contrast: less than 1 where they are blurred.
     """
 
     score: float
@@ -62,12 +63,17 @@ class Verdict:
     black: float
     white: float
     misfit: float
-    limit: float
+    dot_contrast: float
+
+    @property
+    def limit(self) -> float:
+        """What `misfit` may be: less where blur leaves little of the dots."""
+        return min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * self.dot_contrast)
 
     def check(self, min_score: float) -> None:
         """Raise `Rejection` unless this is the target's ring."""
         numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
-        if self.score < min(_CODE_LIKE, min_score):
+        if self.score < min(CODE_LIKE, min_score):
             raise Rejection(Reason.CODE_MISMATCH, numbers)
         if self.misfit > self.limit:
             raise Rejection(Reason.OTHER_CODE, numbers)
@@ -138,8 +144,7 @@ def find_code(
     matches: list[CodeMatch] = []
     refused: list[Refusal] = []
     for outline in _dotted(grey, outlines, ring):
-        points = np.stack([outline.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
-        verdict = judge(sample_grey(grey, points), ring)
+        verdict = judge(polar_patch(grey, outline), ring)
         try:
             verdict.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:
@@ -186,6 +191,13 @@ def verify(
     )
 
 
+def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
+    """Sample a frame around an outline, for `judge`: (radii, angles)."""
+    return sample_grey(
+        grey, np.stack([outline.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
+    )
+
+
 def judge(patch: FloatArray, ring: Ring) -> Verdict:
     """Compare a polar patch (radii, angles) of the frame with the ring's templates."""
     templates = templates_of(ring)
@@ -204,7 +216,7 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
         black=black,
         white=black + contrast,
         misfit=float(np.abs(rest).max()) / scale,
-        limit=min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * dot_contrast),
+        dot_contrast=dot_contrast,
     )
 
 

@@ -44,13 +44,16 @@ FULL = Observation(
 )
 BARE = replace(FULL, instance=1, alternative=None, uncertainty=None, common=None)
 NAMES = [column.name for column in DETECTION_COLUMNS]
-ABOUT_THE_FRAME = {"frame", "target", "time", "instance", "status", "reason", "scale_used"}
+ABOUT_THE_FRAME = {
+    *("frame", "target", "time", "instance", "status", "reason", "detail", "candidates"),
+    *("guided", "scale_used"),
+}
 EXPOSURE = {"exposure_time_s", "iso", "f_number"}
 FRAME = FrameResult(
     "east/0007.jpg",
     1_781_597_700.25,
     Exif(exposure_time_s=0.0008, iso=200.0, f_number=5.6),
-    (BARE, Miss("C", Reason.CUT, "half of it", 0.7), FULL, Miss("A", Reason.NO_CANDIDATE)),
+    (BARE, Miss("C", Reason.CUT, "half of it", 0.7, 3), FULL, Miss("A", Reason.NO_CANDIDATE)),
 )
 
 
@@ -95,11 +98,12 @@ def test_what_a_method_does_not_give_is_null() -> None:
 
 def test_a_miss_has_its_reason_and_no_measurement() -> None:
     first, *_, last = detection_rows(FRAME)
-    for row, status, reason, score in (
-        (first, "not_found", "no_candidate", None),
-        (last, "rejected", "cut", 0.7),
+    for row, status, reason, score, detail, candidates in (
+        (first, "not_found", "no_candidate", None, "", 0),
+        (last, "rejected", "cut", 0.7, "half of it", 3),
     ):
         assert (row["status"], row["reason"], row["score"]) == (status, reason, score)
+        assert (row["detail"], row["candidates"], row["guided"]) == (detail, candidates, False)
         filled = {name for name in NAMES if row[name] is not None}
         assert filled - {"score"} == ABOUT_THE_FRAME | EXPOSURE
 
