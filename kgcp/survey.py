@@ -18,7 +18,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.detections import FrameResult, detection_rows
 from kgcp.io.flight import Flight
-from kgcp.io.frames import list_frames, read_exif, read_frame_times, read_grey
+from kgcp.io.frames import list_frames, read_exif, read_grey
+from kgcp.io.frametimes import read_times
 from kgcp.io.poses import read_reference_poses
 from kgcp.io.tables import write_table
 from kgcp.settings import DetectSettings
@@ -29,7 +30,9 @@ from kgcp.target.observation import Miss, Outcome
 from kgcp.target.prior import NormalPrior, normal_priors
 from kgcp.workers import ordered_map
 
-_FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
+_FRAMES_PER_TASK = (
+    4  # small enough to keep the progress bar moving and the workers evenly busy
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,8 @@ class SurveySummary:
         Frames that neither the times file nor EXIF gives a time.
     times_without_frame : int
         Entries of the times file that name no frame.
+    exif_times_in_whole_seconds : int
+        Frames whose time is EXIF's, if all of these times are whole seconds; else 0.
     frames_without_attitude : int
         Frames whose camera attitude is not known, so that a level plate tells nothing about them;
         0 where the plate is not said to be level.
@@ -88,6 +93,7 @@ class SurveySummary:
     reasons: Mapping[str, int]
     frames_without_time: int
     times_without_frame: int
+    exif_times_in_whole_seconds: int
     frames_without_attitude: int
 
 
@@ -124,7 +130,9 @@ def detect_flight(
             f"{flight.frames_folder}: holds no images; put the frames there or correct"
             " [frames] folder in flight.toml"
         )
-    times = {} if flight.times_file is None else read_frame_times(flight.times_file)
+    times = {}
+    if flight.times_file is not None:
+        times = read_times(flight.times_file, frames, flight.times_format)
     notes = _take_notes(flight, frames, times)
     task = FrameTask(
         flight.frames_folder,
@@ -191,11 +199,16 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     outcomes: tuple[Outcome, ...]
     try:
         grey = read_grey(path, task.camera)
-        measured = measure_frame(grey, task.camera, task.targets, task.settings, note.prior)
-        outcomes = tuple(_with_common_uncertainty(task, outcome) for outcome in measured)
+        measured = measure_frame(
+            grey, task.camera, task.targets, task.settings, note.prior
+        )
+        outcomes = tuple(
+            _with_common_uncertainty(task, outcome) for outcome in measured
+        )
     except Rejection as rejection:
         outcomes = tuple(
-            Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
+            Miss(target.name, rejection.reason, rejection.detail)
+            for target in task.targets
         )
     time_s = exif.time_s if note.time_s is None else note.time_s
     return FrameResult(note.frame, time_s, exif, outcomes)
@@ -205,11 +218,15 @@ def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
     if isinstance(outcome, Miss):
         return outcome
     ring = next(target.ring for target in task.targets if target.name == outcome.target)
-    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
+    common = common_uncertainty(
+        task.camera, task.calibration_covariance, ring, outcome.pose
+    )
     return replace(outcome, common=common)
 
 
-_worker_task: FrameTask | None = None  # set once per process: sent with every frame it would cost
+_worker_task: FrameTask | None = (
+    None  # set once per process: sent with every frame it would cost
+)
 
 
 def _start_worker(task: FrameTask) -> None:
@@ -234,10 +251,14 @@ def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
 
 
 def _summarise(
-    results: Sequence[FrameResult], times: Mapping[str, float], frames_without_attitude: int
+    results: Sequence[FrameResult],
+    times: Mapping[str, float],
+    frames_without_attitude: int,
 ) -> SurveySummary:
     outcomes = [outcome for result in results for outcome in result.outcomes]
-    reasons = Counter(outcome.reason for outcome in outcomes if isinstance(outcome, Miss))
+    reasons = Counter(
+        outcome.reason for outcome in outcomes if isinstance(outcome, Miss)
+    )
     status = Counter(
         outcome.reason.status if isinstance(outcome, Miss) else Status.MEASURED
         for outcome in outcomes
@@ -248,5 +269,16 @@ def _summarise(
         reasons={reason.value: count for reason, count in reasons.most_common()},
         frames_without_time=sum(result.time_s is None for result in results),
         times_without_frame=len(times.keys() - {result.frame for result in results}),
+        exif_times_in_whole_seconds=_whole_seconds(results, times),
         frames_without_attitude=frames_without_attitude,
     )
+
+
+def _whole_seconds(results: Sequence[FrameResult], times: Mapping[str, float]) -> int:
+    """Count the times from EXIF if none of them has a fraction of a second."""
+    from_exif = [
+        result.exif.time_s
+        for result in results
+        if result.frame not in times and result.exif.time_s is not None
+    ]
+    return len(from_exif) if all(time_s.is_integer() for time_s in from_exif) else 0

@@ -209,7 +209,7 @@ def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str
     whereabouts = Whereabouts.of(
         flight.crs,
         flight.targets,
-        read_trajectory(flight.trajectory_file),
+        read_trajectory(flight.trajectory_file, flight.crs),
         flight.vehicle or VehicleSettings(),
     )
     places = whereabouts.places(["A"] * len(truth), times)

@@ -121,6 +121,13 @@ def _report(summary: SurveySummary, table: Path, seconds: float, *, as_json: boo
             " ([frames] times) to make KGCPs of them",
             err=True,
         )
+    if summary.exif_times_in_whole_seconds:
+        click.echo(
+            f"{summary.exif_times_in_whole_seconds} frames have times from EXIF in whole seconds"
+            " only, in which a vehicle goes metres: name a times file in flight.toml"
+            " ([frames] times) to make KGCPs of them",
+            err=True,
+        )
     if summary.frames_without_attitude:
         click.echo(
             f"{summary.frames_without_attitude} frames have no camera attitude, so that a level"

@@ -16,22 +16,15 @@ from kgcp.io.flight_camera import (
     read_plumb_sd_deg,
 )
 from kgcp.io.flight_targets import read_targets
+from kgcp.io.flight_vehicle import read_vehicle
+from kgcp.io.frametimes import TimesFormat
 from kgcp.io.toml_values import TomlTable
+from kgcp.io.trajectories.notation import TrajectoryNotation
 from kgcp.settings import VehicleSettings
 from kgcp.target.layout import Target
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
-FRAMES_KEYS = ("folder", "times")
-VEHICLE_KEYS = (
-    "trajectory",
-    "lever_arm_m",
-    "sd_lever_arm_m",
-    "mount_deg",
-    "sd_time_s",
-    "time_offset_s",
-    "level_sd_deg",
-    "correlation_s",
-)
+FRAMES_KEYS = ("folder", "times", "times_format")
 REFERENCE_KEYS = ("poses",)
 
 
@@ -50,7 +43,9 @@ class Flight:
     frames_folder : Path
         Where the images lie.
     times_file : Path or None
-        CSV of frame times; None: EXIF says when.
+        Frame times; None: EXIF says when.
+    times_format : TimesFormat or None
+        Of that file; None: its content tells.
     camera : Camera
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
@@ -62,6 +57,8 @@ class Flight:
     vehicle : VehicleSettings or None
     trajectory_file : Path or None
         Of the vehicle; it is not looked for until a command needs it.
+    trajectory_notation : TrajectoryNotation or None
+        How that file is to be understood.
     reference_file : Path or None
         Reference poses of the camera; it is not looked for until a command needs it.
     toml_text : str
@@ -73,12 +70,14 @@ class Flight:
     crs: str | None
     frames_folder: Path
     times_file: Path | None
+    times_format: TimesFormat | None
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
     vehicle: VehicleSettings | None
     trajectory_file: Path | None
+    trajectory_notation: TrajectoryNotation | None
     reference_file: Path | None
     toml_text: str
 
@@ -100,11 +99,13 @@ def read_flight(folder: Path) -> Flight:
     except tomllib.TOMLDecodeError as error:
         raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
     table = TomlTable(f"{path}:", values, FLIGHT_KEYS)
-    frames_folder, times_file = _read_frames(table, folder)
+    frames_folder, times_file, times_format = _read_frames(table, folder)
     camera = table.table("camera", CAMERA_KEYS)
-    vehicle, trajectory_file = _read_vehicle(table, folder)
+    vehicle = read_vehicle(table, folder)
     plumb_sd_deg = read_plumb_sd_deg(camera)
-    if plumb_sd_deg is not None and (vehicle is None or vehicle.level_sd_deg is None):
+    if plumb_sd_deg is not None and (
+        vehicle is None or vehicle.settings.level_sd_deg is None
+    ):
         raise camera.error(
             "plumb_sd_deg", "stands without [vehicle] level_sd_deg", "give both or none"
         )
@@ -114,12 +115,14 @@ def read_flight(folder: Path) -> Flight:
         crs=table.text("crs") if "crs" in table else None,
         frames_folder=frames_folder,
         times_file=times_file,
+        times_format=times_format,
         camera=read_camera(camera, folder),
         calibration_covariance=read_calibration_covariance(camera),
         plumb_sd_deg=plumb_sd_deg,
         targets=read_targets(table),
-        vehicle=vehicle,
-        trajectory_file=trajectory_file,
+        vehicle=None if vehicle is None else vehicle.settings,
+        trajectory_file=None if vehicle is None else vehicle.trajectory_file,
+        trajectory_notation=None if vehicle is None else vehicle.notation,
         reference_file=_read_reference(table, folder),
         toml_text=text,
     )
@@ -127,40 +130,35 @@ def read_flight(folder: Path) -> Flight:
 
 def _read_text(path: Path) -> str:
     if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
+        raise KgcpError(
+            f"{path}: does not exist; name a flight folder, which has a flight.toml"
+        )
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
 
 
-def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None]:
-    """Return the frames' folder and the times file; both have defaults by the folder's layout."""
+def _read_frames(
+    flight: TomlTable, folder: Path
+) -> tuple[Path, Path | None, TimesFormat | None]:
+    """Return the frames' folder, the times file and its format, all but the last by default."""
     table = flight.table("frames", FRAMES_KEYS, required=False)
     name = table.text("folder") if "folder" in table else "frames"
     if not (folder / name).is_dir():
         raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
-    if "times" in table:
-        return folder / name, table.existing_file("times", folder)
     default = folder / "frames.csv"
-    return folder / name, default if default.is_file() else None
-
-
-def _read_vehicle(flight: TomlTable, folder: Path) -> tuple[VehicleSettings | None, Path | None]:
-    if "vehicle" not in flight:
-        return None, None
-    table = flight.table("vehicle", VEHICLE_KEYS)
-    with table.located():
-        settings = VehicleSettings(
-            lever_arm_m=table.vector("lever_arm_m"),  # a forgotten one would be metres
-            sd_lever_arm_m=table.vector("sd_lever_arm_m", (0.0, 0.0, 0.0)),
-            mount_deg=table.number("mount_deg", 0.0),
-            sd_time_s=table.number("sd_time_s", 0.0),
-            time_offset_s=table.number("time_offset_s", 0.0),
-            level_sd_deg=table.number("level_sd_deg") if "level_sd_deg" in table else None,
-            correlation_s=table.number("correlation_s", 60.0),
-        )
-    return settings, folder / table.text("trajectory")
+    times = default if default.is_file() else None
+    if "times" in table:
+        times = table.existing_file("times", folder)
+    times_format = None
+    if "times_format" in table:
+        if times is None:
+            raise table.error(
+                "times_format", "stands without a file", "give times, too"
+            )
+        times_format = TimesFormat(table.choice("times_format", list(TimesFormat)))
+    return folder / name, times, times_format
 
 
 def _read_reference(flight: TomlTable, folder: Path) -> Path | None:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date, datetime
 from pathlib import Path
 
 from kgcp.errors import KgcpError, SettingError
@@ -113,6 +114,16 @@ class TomlTable:
             if not isinstance(element, str):
                 raise self._wrong_type(key, element, "a text in quotes")
         return tuple(value)
+
+    def day(self, key: str) -> date:
+        """Return a date, in quotes or not."""
+        value = self._required(key, "give it as 2026-05-04")
+        if isinstance(value, date) and not isinstance(value, datetime):
+            return value
+        try:
+            return date.fromisoformat(value if isinstance(value, str) else "")
+        except ValueError:
+            raise self.error(key, f"{value!r} is no date", "give it as 2026-05-04") from None
 
     def existing_file(self, key: str, folder: Path) -> Path:
         """Return a file that lies in the folder or below it."""

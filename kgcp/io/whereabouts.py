@@ -24,7 +24,7 @@ def read_whereabouts(flight: Flight) -> Whereabouts:
             ' for example crs = "EPSG:25831"'
         )
     trajectory = None
-    if flight.trajectory_file is not None:
-        trajectory = read_trajectory(flight.trajectory_file)
+    if flight.trajectory_file is not None and flight.trajectory_notation is not None:
+        trajectory = read_trajectory(flight.trajectory_file, flight.crs, flight.trajectory_notation)
     settings = flight.vehicle or VehicleSettings()
     return Whereabouts.of(flight.crs, flight.targets, trajectory, settings)

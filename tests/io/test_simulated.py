@@ -14,6 +14,7 @@ from kgcp.io.poses import read_reference_poses
 from kgcp.io.simulated import write_simulated_flight
 from kgcp.io.trajectories import read_trajectory
 from kgcp.synthetic.flight import (
+    CRS,
     TARGET_PLATE,
     FlightPlan,
     grow_ground,
@@ -74,7 +75,7 @@ def test_the_folder_is_a_flight(flight: tuple[FlightPlan, Path]) -> None:
     assert poses.frames == tuple(names)
     assert_allclose(poses.position_map, plan.reference.position_map, atol=1e-5)
     assert_allclose(poses.opk_deg, plan.reference.opk_deg, atol=1e-7)
-    trajectory = read_trajectory(read.trajectory_file)
+    trajectory = read_trajectory(read.trajectory_file, CRS)
     assert_allclose(trajectory.position_map, plan.trajectory.position_map, atol=1e-5)
     assert_allclose(trajectory.attitude_deg, plan.trajectory.attitude_deg, atol=1e-6)
     assert trajectory.sd_attitude_deg is not None

@@ -8,6 +8,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.trajectories import read_trajectory
 
+_CRS = "EPSG:25832"
 _HEADER = "time,x,y,z,roll_deg,pitch_deg,heading_deg"
 _ROWS = ("2026-05-04T09:30:00Z,1,2,3,4,5,6", "2026-05-04T09:30:00.5Z,1,2,3,4,5,6")
 
@@ -26,7 +27,7 @@ def test_columns_are_found_by_name_in_any_order(tmp_path: Path) -> None:
         "",
         "16,13,12,11,,15,14,2026-05-04T09:30:00.25Z",
     )
-    trajectory = read_trajectory(path)
+    trajectory = read_trajectory(path, _CRS)
     np.testing.assert_allclose(trajectory.time_s, [1777887000.0, 1777887000.25])
     np.testing.assert_allclose(trajectory.position_map, [[1, 2, 3], [11, 12, 13]])
     np.testing.assert_allclose(trajectory.attitude_deg, [[4, 5, 6], [14, 15, 16]])
@@ -41,7 +42,7 @@ def test_standard_deviations_are_optional_by_group(tmp_path: Path) -> None:
         _ROWS[0] + ",0.3,0.2,0.1",
         _ROWS[1] + ",0.3,0.2,0.1",
     )
-    trajectory = read_trajectory(path)
+    trajectory = read_trajectory(path, _CRS)
     assert trajectory.sd_position_m is not None
     np.testing.assert_allclose(trajectory.sd_position_m, [[0.1, 0.2, 0.3]] * 2)
     assert trajectory.sd_attitude_deg is None
@@ -73,7 +74,7 @@ def test_what_is_wrong_is_said_in_one_line(
 ) -> None:
     path = _write(tmp_path, *lines)
     with pytest.raises(KgcpError) as caught:
-        read_trajectory(path)
+        read_trajectory(path, _CRS)
     message = str(caught.value)
     assert "\n" not in message
     for word in ("vehicle.csv", *words):
@@ -82,11 +83,11 @@ def test_what_is_wrong_is_said_in_one_line(
 
 def test_a_missing_file_names_the_key_that_asked_for_it(tmp_path: Path) -> None:
     with pytest.raises(KgcpError, match=r"vehicle\.csv: does not exist.*\[vehicle\] trajectory"):
-        read_trajectory(tmp_path / "vehicle.csv")
+        read_trajectory(tmp_path / "vehicle.csv", _CRS)
 
 
 def test_binary_rubbish_is_an_error_not_a_traceback(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.csv"
     path.write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF")
-    with pytest.raises(KgcpError, match="not a readable CSV"):
-        read_trajectory(path)
+    with pytest.raises(KgcpError, match="none of the known formats"):
+        read_trajectory(path, _CRS)
