@@ -30,9 +30,7 @@ from kgcp.target.observation import Miss, Outcome
 from kgcp.target.prior import NormalPrior, normal_priors
 from kgcp.workers import ordered_map
 
-_FRAMES_PER_TASK = (
-    4  # small enough to keep the progress bar moving and the workers evenly busy
-)
+_FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,16 +197,11 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     outcomes: tuple[Outcome, ...]
     try:
         grey = read_grey(path, task.camera)
-        measured = measure_frame(
-            grey, task.camera, task.targets, task.settings, note.prior
-        )
-        outcomes = tuple(
-            _with_common_uncertainty(task, outcome) for outcome in measured
-        )
+        measured = measure_frame(grey, task.camera, task.targets, task.settings, note.prior)
+        outcomes = tuple(_with_common_uncertainty(task, outcome) for outcome in measured)
     except Rejection as rejection:
         outcomes = tuple(
-            Miss(target.name, rejection.reason, rejection.detail)
-            for target in task.targets
+            Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
         )
     time_s = exif.time_s if note.time_s is None else note.time_s
     return FrameResult(note.frame, time_s, exif, outcomes)
@@ -218,15 +211,11 @@ def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
     if isinstance(outcome, Miss):
         return outcome
     ring = next(target.ring for target in task.targets if target.name == outcome.target)
-    common = common_uncertainty(
-        task.camera, task.calibration_covariance, ring, outcome.pose
-    )
+    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
     return replace(outcome, common=common)
 
 
-_worker_task: FrameTask | None = (
-    None  # set once per process: sent with every frame it would cost
-)
+_worker_task: FrameTask | None = None  # set once per process: sent with every frame it would cost
 
 
 def _start_worker(task: FrameTask) -> None:
@@ -251,14 +240,10 @@ def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
 
 
 def _summarise(
-    results: Sequence[FrameResult],
-    times: Mapping[str, float],
-    frames_without_attitude: int,
+    results: Sequence[FrameResult], times: Mapping[str, float], frames_without_attitude: int
 ) -> SurveySummary:
     outcomes = [outcome for result in results for outcome in result.outcomes]
-    reasons = Counter(
-        outcome.reason for outcome in outcomes if isinstance(outcome, Miss)
-    )
+    reasons = Counter(outcome.reason for outcome in outcomes if isinstance(outcome, Miss))
     status = Counter(
         outcome.reason.status if isinstance(outcome, Miss) else Status.MEASURED
         for outcome in outcomes

@@ -25,9 +25,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 def section(heading: str) -> str:
     """The text below a heading of docs/conventions.md, up to the next one of any level."""
     match = re.search(
-        rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)",
-        CONVENTIONS,
-        re.MULTILINE | re.DOTALL,
+        rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", CONVENTIONS, re.MULTILINE | re.DOTALL
     )
     assert match, heading
     return match[1]
@@ -61,22 +59,13 @@ def test_exactly_the_columns_that_exist_are_documented(
 
 def test_every_reason_is_documented_in_its_own_words() -> None:
     lines = [line for line in section("Reasons").splitlines() if line.startswith("| `")]
-    assert lines == [
-        f"| `{r.value}` | `{r.status.value}` | {r.description} |" for r in Reason
-    ]
+    assert lines == [f"| `{r.value}` | `{r.status.value}` | {r.description} |" for r in Reason]
 
 
 @pytest.mark.parametrize(
     "key",
     sorted(
-        {
-            *FRAMES_KEYS,
-            *CAMERA_KEYS,
-            *PLATE_KEYS,
-            *REPLICA_KEYS,
-            *VEHICLE_KEYS,
-            *REFERENCE_KEYS,
-        }
+        {*FRAMES_KEYS, *CAMERA_KEYS, *PLATE_KEYS, *REPLICA_KEYS, *VEHICLE_KEYS, *REFERENCE_KEYS}
     ),
 )
 def test_every_key_of_flight_toml_is_documented(key: str) -> None:
@@ -93,30 +82,20 @@ def test_links_lead_somewhere(page: Path) -> None:
         linked = page.parent / path if path else page
         assert linked.exists(), target
         if anchor:
-            headings = re.findall(
-                r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE
-            )
-            assert anchor in {
-                heading.lower().replace(" ", "-") for heading in headings
-            }, target
+            headings = re.findall(r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {heading.lower().replace(" ", "-") for heading in headings}, target
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_command_explains_itself_with_an_example(name: str) -> None:
     result = CliRunner().invoke(main, [name, "--help"])
     assert result.exit_code == 0
-    assert f"kgcp {name} " in result.stdout.partition("\n")[2], (
-        "an example, below the usage line"
-    )
+    assert f"kgcp {name} " in result.stdout.partition("\n")[2], "an example, below the usage line"
     assert main.get_command(click.Context(main), name) is not None
 
 
 def test_the_commands_of_the_readme_exist() -> None:
-    lines = [
-        line.strip().partition("#")[0]
-        for line in README.splitlines()
-        if line[:4] == " " * 4
-    ]
+    lines = [line.strip().partition("#")[0] for line in README.splitlines() if line[:4] == " " * 4]
     calls = [shlex.split(line)[1:] for line in lines if line.startswith("kgcp ")]
     assert {call[0] for call in calls} == set(COMMANDS)
     for name, *arguments in calls:
@@ -128,7 +107,5 @@ def test_the_commands_of_the_readme_exist() -> None:
 
 def test_the_make_targets_of_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in re.findall(
-        r"\bmake ([a-z-]+)", "\n".join(p.read_text() for p in PAGES)
-    ):
+    for target in re.findall(r"\bmake ([a-z-]+)", "\n".join(p.read_text() for p in PAGES)):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target

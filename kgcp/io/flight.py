@@ -103,9 +103,7 @@ def read_flight(folder: Path) -> Flight:
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
     plumb_sd_deg = read_plumb_sd_deg(camera)
-    if plumb_sd_deg is not None and (
-        vehicle is None or vehicle.settings.level_sd_deg is None
-    ):
+    if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
         raise camera.error(
             "plumb_sd_deg", "stands without [vehicle] level_sd_deg", "give both or none"
         )
@@ -130,18 +128,14 @@ def read_flight(folder: Path) -> Flight:
 
 def _read_text(path: Path) -> str:
     if not path.is_file():
-        raise KgcpError(
-            f"{path}: does not exist; name a flight folder, which has a flight.toml"
-        )
+        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
 
 
-def _read_frames(
-    flight: TomlTable, folder: Path
-) -> tuple[Path, Path | None, TimesFormat | None]:
+def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, TimesFormat | None]:
     """Return the frames' folder, the times file and its format, all but the last by default."""
     table = flight.table("frames", FRAMES_KEYS, required=False)
     name = table.text("folder") if "folder" in table else "frames"
@@ -154,9 +148,7 @@ def _read_frames(
     times_format = None
     if "times_format" in table:
         if times is None:
-            raise table.error(
-                "times_format", "stands without a file", "give times, too"
-            )
+            raise table.error("times_format", "stands without a file", "give times, too")
         times_format = TimesFormat(table.choice("times_format", list(TimesFormat)))
     return folder / name, times, times_format
 
