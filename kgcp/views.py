@@ -8,8 +8,11 @@ from typing import Self
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
 from kgcp.geometry.reference import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
 from kgcp.mapframe import MapFrame
+
+_FOLD_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,3 +45,17 @@ class Views:
         # diag(1, -1, -1) is its own inverse
         enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
         return cls(centre, enu_from_camera, cov)
+
+
+def visible_pixel(camera: Camera, point_camera: FloatArray) -> FloatArray:
+    """Project one point (3,) in the camera frame [px].
+
+    NaN behind the camera, and beyond the fold of its distortion.
+    """
+    if point_camera[2] <= 0.0:
+        return np.full(2, np.nan)
+    normalised = point_camera[:2] / point_camera[2]
+    pixel = camera.distort(normalised)
+    if not np.linalg.norm(camera.undistort(pixel[None])[0] - normalised) < _FOLD_TOLERANCE:
+        return np.full(2, np.nan)
+    return pixel

@@ -15,9 +15,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.reference import ReferencePoses
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
-from kgcp.views import Views
-
-_FOLD_TOLERANCE = 1e-6
+from kgcp.views import Views, visible_pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,17 +236,6 @@ def _compare(
         attempt=attempt,
         reference_distance_m=distance,
         sd_reference_m=sd,
-        expected_px=_project(camera, sight @ views.enu_from_camera[row]),
+        expected_px=visible_pixel(camera, sight @ views.enu_from_camera[row]),
         expected_radius_px=0.5 * diameter_m * camera.mean_focal_px / distance,
     )
-
-
-def _project(camera: Camera, point_camera: FloatArray) -> FloatArray:
-    """Project one point (3,); NaN behind the camera, and beyond the fold of its distortion."""
-    if point_camera[2] <= 0.0:
-        return np.full(2, np.nan)
-    normalised = point_camera[:2] / point_camera[2]
-    pixel = camera.distort(normalised)
-    if not np.linalg.norm(camera.undistort(pixel[None])[0] - normalised) < _FOLD_TOLERANCE:
-        return np.full(2, np.nan)
-    return pixel
