@@ -15,6 +15,8 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.mapframe import MapFrame, parse_crs
 
+COMMAND_LINE = "--crs"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapChange:
@@ -31,10 +33,15 @@ class MapChange:
     source: MapFrame
     target: MapFrame
     _between: Transformer
+    _where: str = COMMAND_LINE
 
     @classmethod
-    def to(cls, crs: str, source: MapFrame, near_map: FloatArray) -> Self:
+    def to(
+        cls, crs: str, source: MapFrame, near_map: FloatArray, where: str = COMMAND_LINE
+    ) -> Self:
         """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
+
+        `where` is what an error names as the place that the CRS was given in.
 
         Raises
         ------
@@ -44,12 +51,12 @@ class MapChange:
         """
         between = best_transformer(
             parse_crs(source.crs),
-            parse_crs(crs, "--crs"),
-            f"--crs {crs!r}: the way from {source.crs!r}",
+            parse_crs(crs, where),
+            f"{where} {crs!r}: the way from {source.crs!r}",
         )
-        draft = cls(source, source, between)
-        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], "--crs")
-        return cls(source, target, between)
+        draft = cls(source, source, between, where)
+        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
+        return cls(source, target, between, where)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
         """Bring points (n, 3) of the source map into the other one (n, 3)."""
@@ -59,8 +66,8 @@ class MapChange:
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(
-                f"--crs: {self.source.crs!r} does not lead to the CRS asked for here ({text});"
-                " give one that covers the flight"
+                f"{self._where}: {self.source.crs!r} does not lead to the CRS asked for here"
+                f" ({text}); give one that covers the flight"
             ) from error
         return moved
 

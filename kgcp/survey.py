@@ -20,7 +20,7 @@ from kgcp.io.detections import FrameResult, detection_rows
 from kgcp.io.flight import Flight
 from kgcp.io.frames import list_frames, read_exif, read_grey
 from kgcp.io.frametimes import read_times
-from kgcp.io.poses import read_reference_poses
+from kgcp.io.poses import read_flight_poses
 from kgcp.io.tables import write_table
 from kgcp.settings import DetectSettings
 from kgcp.target.common import common_uncertainty
@@ -166,7 +166,7 @@ def _take_notes(
         path = flight.reference_file
         priors = normal_priors(
             frames,
-            read_reference_poses(path) if path is not None and path.is_file() else None,
+            read_flight_poses(flight) if path is not None and path.is_file() else None,
             level_sd_deg=flight.vehicle.level_sd_deg,
             plumb_sd_deg=flight.plumb_sd_deg,
         )

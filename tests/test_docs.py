@@ -11,8 +11,9 @@ from click.testing import CliRunner
 from kgcp.cli import COMMANDS, main
 from kgcp.errors import Reason
 from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, Column
-from kgcp.io.flight import FRAMES_KEYS, REFERENCE_KEYS
+from kgcp.io.flight import FRAMES_KEYS
 from kgcp.io.flight_camera import CAMERA_KEYS
+from kgcp.io.flight_reference import REFERENCE_KEYS
 from kgcp.io.flight_targets import PLATE_KEYS, REPLICA_KEYS
 from kgcp.io.flight_vehicle import VEHICLE_KEYS
 

@@ -26,7 +26,7 @@ def command(flight: Path, out: Path | None, detections: Path | None, *, as_json:
     from kgcp.bias.study import study_bias
     from kgcp.errors import KgcpError
     from kgcp.io.flight import read_flight
-    from kgcp.io.poses import read_reference_poses
+    from kgcp.io.poses import read_flight_poses
     from kgcp.io.sightings import read_attempts
     from kgcp.io.whereabouts import read_whereabouts
     from kgcp.report.write import write_report
@@ -34,12 +34,12 @@ def command(flight: Path, out: Path | None, detections: Path | None, *, as_json:
     the_flight = read_flight(flight)
     folder = out or the_flight.folder / "kgcp"
     attempts = read_attempts(detections or folder / "detections.parquet", the_flight.targets)
-    if the_flight.reference_file is None:
+    poses = read_flight_poses(the_flight)
+    if poses is None:
         raise KgcpError(
             f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses = 'reference.csv'"
             " with the camera's poses from an adjustment"
         )
-    poses = read_reference_poses(the_flight.reference_file)
     whereabouts = read_whereabouts(the_flight)
     study = study_bias(attempts, poses, whereabouts, the_flight.camera, the_flight.targets)
     report = write_report(study, the_flight, folder)

@@ -15,9 +15,11 @@ from kgcp.io.flight_camera import (
     read_camera,
     read_plumb_sd_deg,
 )
+from kgcp.io.flight_reference import read_reference
 from kgcp.io.flight_targets import read_targets
 from kgcp.io.flight_vehicle import read_vehicle
 from kgcp.io.frametimes import TimesFormat
+from kgcp.io.poses.notation import PoseNotation
 from kgcp.io.toml_values import TomlTable
 from kgcp.io.trajectories.notation import TrajectoryNotation
 from kgcp.settings import VehicleSettings
@@ -25,7 +27,6 @@ from kgcp.target.layout import Target
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format")
-REFERENCE_KEYS = ("poses",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,8 @@ class Flight:
         How that file is to be understood.
     reference_file : Path or None
         Reference poses of the camera; it is not looked for until a command needs it.
+    reference_notation : PoseNotation
+        How that file is to be understood.
     toml_text : str
         flight.toml as it was read.
     """
@@ -79,6 +82,7 @@ class Flight:
     trajectory_file: Path | None
     trajectory_notation: TrajectoryNotation | None
     reference_file: Path | None
+    reference_notation: PoseNotation
     toml_text: str
 
 
@@ -102,6 +106,7 @@ def read_flight(folder: Path) -> Flight:
     frames_folder, times_file, times_format = _read_frames(table, folder)
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
+    reference_file, reference_notation = read_reference(table, folder)
     plumb_sd_deg = read_plumb_sd_deg(camera)
     if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
         raise camera.error(
@@ -121,7 +126,8 @@ def read_flight(folder: Path) -> Flight:
         vehicle=None if vehicle is None else vehicle.settings,
         trajectory_file=None if vehicle is None else vehicle.trajectory_file,
         trajectory_notation=None if vehicle is None else vehicle.notation,
-        reference_file=_read_reference(table, folder),
+        reference_file=reference_file,
+        reference_notation=reference_notation,
         toml_text=text,
     )
 
@@ -151,9 +157,3 @@ def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, Ti
             raise table.error("times_format", "stands without a file", "give times, too")
         times_format = TimesFormat(table.choice("times_format", list(TimesFormat)))
     return folder / name, times, times_format
-
-
-def _read_reference(flight: TomlTable, folder: Path) -> Path | None:
-    if "reference" not in flight:
-        return None
-    return folder / flight.table("reference", REFERENCE_KEYS).text("poses")

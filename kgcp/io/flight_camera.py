@@ -15,6 +15,8 @@ from kgcp.settings import require_range
 DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
 CAMERA_KEYS = (
     "file",
+    "format",
+    "camera",
     "width",
     "height",
     *CALIBRATION_PARAMETERS,
@@ -43,6 +45,9 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
 
 
 def _inline_camera(table: TomlTable) -> Camera:
+    for key in ("format", "camera"):
+        if key in table:
+            raise table.error(key, "stands without a file", "give file, too, or delete it")
     with table.located():
         return Camera(
             width=table.integer("width"),
@@ -63,14 +68,16 @@ def _inline_camera(table: TomlTable) -> Camera:
 
 
 def _file_camera(table: TomlTable, folder: Path) -> Camera:
-    from kgcp.io.calibrations import read_calibration
+    from kgcp.io.calibrations import FORMATS, read_calibration
 
     for key in CALIBRATION_PARAMETERS:
         if key in table:
             raise table.error(key, "stands beside a calibration file", "delete one of the two")
     width = table.integer("width") if "width" in table else None
     height = table.integer("height") if "height" in table else None
-    return read_calibration(table.existing_file("file", folder), (width, height))
+    form = table.choice("format", tuple(FORMATS)) if "format" in table else None
+    camera = table.text("camera") if "camera" in table else None
+    return read_calibration(table.existing_file("file", folder), (width, height), form, camera)
 
 
 def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | None:
