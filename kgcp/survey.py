@@ -14,9 +14,10 @@ import cv2
 from kgcp import __version__
 from kgcp.errors import KgcpError, Rejection, Status
 from kgcp.geometry.calibration import CalibrationCovariance
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.detections import FrameResult, detection_rows
+from kgcp.io.exif import Exif
 from kgcp.io.flight import Flight
 from kgcp.io.frames import list_frames, read_exif, read_grey
 from kgcp.io.frametimes import read_times
@@ -53,7 +54,7 @@ class FrameNote:
     frame : str
         Path relative to the frames folder.
     time_s : float or None
-        Mid-exposure from the times file, Unix UTC [s]; None: EXIF decides.
+        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: EXIF decides.
     prior : NormalPrior or None
         Of the normal of the plate on the vehicle; None: nothing is known of it.
     """
@@ -204,7 +205,25 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
             Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
         )
     time_s = exif.time_s if note.time_s is None else note.time_s
+    reference = task.camera.time_reference
+    if time_s is not None and reference is not TimeReference.MIDDLE:
+        is_readable = not any(_is_unreadable(outcome) for outcome in outcomes)
+        time_s = _mid_exposure_s(time_s, exif, reference, path) if is_readable else None
     return FrameResult(note.frame, time_s, exif, outcomes)
+
+
+def _is_unreadable(outcome: Outcome) -> bool:
+    return isinstance(outcome, Miss) and outcome.reason.status is Status.UNREADABLE
+
+
+def _mid_exposure_s(time_s: float, exif: Exif, reference: TimeReference, path: Path) -> float:
+    if exif.exposure_time_s is None:
+        raise KgcpError(
+            f"{path}: has no exposure time in EXIF, which [camera] time_reference ="
+            f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
+            " of mid-exposure and delete time_reference"
+        )
+    return time_s + reference.to_middle_s(exif.exposure_time_s)
 
 
 def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:

@@ -10,7 +10,13 @@ from click.testing import CliRunner
 
 from kgcp.cli import COMMANDS, main
 from kgcp.errors import Reason
-from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, Column
+from kgcp.io.columns import (
+    BIAS_COLUMNS,
+    CONSISTENCY_COLUMNS,
+    DETECTION_COLUMNS,
+    KGCP_COLUMNS,
+    Column,
+)
 from kgcp.io.flight import FRAMES_KEYS
 from kgcp.io.flight_camera import CAMERA_KEYS
 from kgcp.io.flight_reference import REFERENCE_KEYS
@@ -47,6 +53,7 @@ def first_column(text: str) -> list[str]:
     [
         ("detections.parquet", DETECTION_COLUMNS),
         ("kgcps.parquet", KGCP_COLUMNS),
+        ("consistency.parquet", CONSISTENCY_COLUMNS),
         ("bias.parquet", BIAS_COLUMNS),
     ],
 )

@@ -25,7 +25,7 @@ LAYERS = (
     ("bias", "consistency", "selection"),
     ("workers",),
     ("io",),
-    ("survey", "report"),
+    ("delivery", "survey", "report"),
     ("cli",),
     ("__main__",),
 )

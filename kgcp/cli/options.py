@@ -8,11 +8,15 @@ detections_option : `detections`, Path or None
     The table of `kgcp detect`; None means the one in the results' folder.
 json_option : `as_json`, bool
     Print a machine-readable summary to stdout.
+selection_options : the fields of `kgcp.selection.Selection`
+    Which points to hand over.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -39,3 +43,53 @@ detections_option = click.option(
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print a machine-readable summary to stdout."
 )
+
+_SELECTION = (
+    click.option(
+        "--max-sd",
+        "max_sd_m",
+        metavar="M",
+        type=click.FloatRange(0.0, min_open=True),
+        help="Leave out points whose position may be farther off, along its worst axis [m].",
+    ),
+    click.option(
+        "--min-score",
+        metavar="S",
+        type=click.FloatRange(0.0, 1.0),
+        help="Leave out points whose code was matched less well.",
+    ),
+    click.option(
+        "--min-ambiguity",
+        metavar="A",
+        type=click.FloatRange(0.0),
+        help="Leave out points whose two poses are harder to tell apart.",
+    ),
+    click.option(
+        "--min-spacing",
+        "min_spacing_m",
+        metavar="M",
+        type=click.FloatRange(0.0),
+        default=0.0,
+        help="Of points nearer to each other along the track, keep the best [m].",
+    ),
+    click.option(
+        "--checkpoints",
+        "checkpoint_share",
+        metavar="SHARE",
+        type=click.FloatRange(0.0, 1.0),
+        default=0.0,
+        help="Make this share of the points check points, evenly along the track.",
+    ),
+    click.option(
+        "--keep-flagged",
+        is_flag=True,
+        help="Keep points whose distance or height jumps out of a smooth flight.",
+    ),
+)
+
+
+def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of a `Selection`, in this order."""
+    for option in reversed(_SELECTION):
+        command = option(command)
+    return command

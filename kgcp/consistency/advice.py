@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from kgcp.consistency.corrections import Correction
 from kgcp.consistency.study import Consistency
 
@@ -24,6 +26,13 @@ def advice(found: Consistency) -> tuple[str, ...]:
             " of trajectory and reference poses"
         )
     return tuple(lines)
+
+
+def rms_m(found: Consistency) -> tuple[float, float, float]:
+    """Return the RMS of the offsets along, across and up, outliers left out [m]."""
+    kept = np.array([one.offset_m for one in found.discrepancies if not one.is_outlier])
+    along, across, up = np.sqrt(np.mean(kept**2, axis=0)).tolist()
+    return along, across, up
 
 
 def _line(correction: Correction) -> str:

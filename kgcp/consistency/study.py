@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -289,10 +288,3 @@ def _discrepancies(
         )
         for index, one in enumerate(meetings)
     )
-
-
-def rms_m(discrepancies: Sequence[Discrepancy]) -> tuple[float, float, float]:
-    """Return the RMS of the offsets along, across and up, outliers left out [m]."""
-    kept = np.array([one.offset_m for one in discrepancies if not one.is_outlier])
-    along, across, up = (math.sqrt(value) for value in np.mean(kept**2, axis=0))
-    return along, across, up

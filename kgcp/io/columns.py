@@ -130,3 +130,22 @@ BIAS_COLUMNS = (
     Column("residual_percent", _NUMBER, "residual in percent of the reference distance"),
     *_EXPOSURE,
 )
+
+CONSISTENCY_COLUMNS = (
+    Column("frame", _TEXT, "path relative to the frames folder, with /"),
+    Column("target", _TEXT, "name in flight.toml"),
+    Column("time", _TIME, "when the target was seen, by the trajectory's clock, UTC"),
+    *(
+        Column(f"{axis}_m", _NUMBER, f"place by the vehicle minus by the camera, {axis} [m]")
+        for axis in ("along", "across", "up")
+    ),
+    *(
+        Column(f"sd_{axis}_m", _NUMBER, "its standard deviation [m]")
+        for axis in ("along", "across", "up")
+    ),
+    *(
+        Column(f"residual_{axis}_m", _NUMBER, "what the corrections leave of it [m]")
+        for axis in ("along", "across", "up")
+    ),
+    Column("outlier", _BOOLEAN, "whether it fits no correction and had no part in them"),
+)

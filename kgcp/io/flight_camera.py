@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
-from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.toml_values import TomlTable
 from kgcp.settings import require_range
 
@@ -26,6 +26,7 @@ CAMERA_KEYS = (
     "plumb_sd_deg",
     "response",
     "readout_s",
+    "time_reference",
 )
 
 
@@ -39,9 +40,17 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
     """
     response = table.choice("response", tuple(Response)) if "response" in table else "unknown"
     readout_s = table.number("readout_s", 0.0)
+    moment = "middle"
+    if "time_reference" in table:
+        moment = table.choice("time_reference", tuple(TimeReference))
     camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
     with table.located():
-        return replace(camera, response=Response(response), readout_s=readout_s)
+        return replace(
+            camera,
+            response=Response(response),
+            readout_s=readout_s,
+            time_reference=TimeReference(moment),
+        )
 
 
 def _inline_camera(table: TomlTable) -> Camera:

@@ -1,0 +1,89 @@
+"""From a flight and its detections to what `kgcp export-gcp` hands over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.carrier import Carrier
+from kgcp.consistency.study import Consistency, study_consistency
+from kgcp.errors import KgcpError
+from kgcp.io.flight import Flight
+from kgcp.io.poses import read_reference_poses
+from kgcp.io.sightings import read_attempts
+from kgcp.io.whereabouts import read_whereabouts
+from kgcp.kgcps import Kgcp, Skip, build_kgcps, on_map
+from kgcp.mapchange import MapChange
+from kgcp.orientation import CameraPrior, camera_priors
+from kgcp.selection import Selection, select
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delivery:
+    """Everything that is handed over, on one map.
+
+    Attributes
+    ----------
+    crs : str
+        Of all coordinates.
+    kgcps : tuple of Kgcp
+    skipped : tuple of Skip
+        Sightings that made no point, or one that was not wanted.
+    priors : tuple of CameraPrior
+    carrier : Carrier or None
+        The vehicle.
+    consistency : Consistency or None
+        None where there are no reference poses, or too few frames to compare.
+    """
+
+    crs: str
+    kgcps: tuple[Kgcp, ...]
+    skipped: tuple[Skip, ...]
+    priors: tuple[CameraPrior, ...]
+    carrier: Carrier | None
+    consistency: Consistency | None
+
+
+def prepare(flight: Flight, detections: Path, wanted: Selection, crs: str | None) -> Delivery:
+    """Place, select and bring onto the map `crs` (None: the flight's) what was measured.
+
+    Reference poses are mostly made after the points: a file that is not there yet is no error.
+
+    Raises
+    ------
+    KgcpError
+        If nothing was measured, it cannot be placed, a file is unreadable, or a CRS unusable.
+    """
+    attempts = read_attempts(detections, flight.targets)
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    if not sightings:
+        raise KgcpError(
+            f"{detections}: no target was measured in any frame;"
+            " see the reasons that 'kgcp detect' gives"
+        )
+    whereabouts = read_whereabouts(flight)
+    frame = whereabouts.frame
+    placed, absent = build_kgcps(sightings, whereabouts, flight.camera)
+    kgcps, unwanted = select(placed, sightings, frame, flight.camera, wanted)
+    consistency = None
+    if flight.reference_file is not None and flight.reference_file.exists():
+        poses = read_reference_poses(
+            flight.reference_file,
+            flight.reference_notation,
+            crs=flight.crs,
+            frames=sorted({attempt.frame for attempt in attempts}),
+        )
+        consistency = study_consistency(sightings, whereabouts, poses, flight.camera)
+    if crs is not None and kgcps:
+        change = MapChange.to(crs, frame, np.asarray(kgcps[0].position_map))
+        kgcps, frame = on_map(kgcps, change), change.target
+    return Delivery(
+        frame.crs,
+        kgcps,
+        (*absent, *unwanted),
+        camera_priors(kgcps, sightings, whereabouts, frame),
+        whereabouts.carrier,
+        consistency,
+    )
