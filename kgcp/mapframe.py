@@ -101,6 +101,22 @@ class MapFrame:
         geodetic[:, :2] /= self._radians_per_unit
         return self._transform(self._geodetic_from_map, geodetic, TransformDirection.INVERSE)
 
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Semi-major and semi-minor axis of the ellipsoid [m]."""
+        axes = np.array([[0.0, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
+        equator, pole = self._ecef(axes)
+        return float(equator[0]), float(pole[2])
+
+    def geodetic_deg(self, enu: FloatArray) -> FloatArray:
+        """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of ENU points.
+
+        They belong to the datum of the map.
+        """
+        geodetic = self._geodetic_from_enu(enu)
+        geodetic[:, :2] = np.degrees(geodetic[:, :2])
+        return geodetic
+
     def map_axes_enu(self, enu: FloatArray) -> FloatArray:
         """Return the Jacobian (3, 3) d(map)/d(enu) at one point (3,) of the ENU frame.
 

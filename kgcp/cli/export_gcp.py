@@ -3,16 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from kgcp.cli.options import detections_option, flight_argument, json_option, out_option
-from kgcp.io.exporters import FORMATS, export
+from kgcp.cli.options import (
+    detections_option,
+    flight_argument,
+    json_option,
+    out_option,
+    selection_options,
+)
+from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export
 
 if TYPE_CHECKING:
     from kgcp.carrier import Carrier
-    from kgcp.kgcps import Kgcp, Skip
+    from kgcp.consistency.study import Consistency
+    from kgcp.delivery import Delivery
+    from kgcp.io.exporters.points import MapPoints
+
+ALL = "all"
+
+
+def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> None:  # noqa: FBT001 - click's signature
+    if not asked or context.resilient_parsing:
+        return
+    for name, form in FORMATS.items():
+        click.echo(f"{name:14s} {form.description}")
+        for file in form.files:
+            click.echo(f"{'':16s} {file}")
+    context.exit()
 
 
 @click.command()
@@ -21,80 +41,118 @@ if TYPE_CHECKING:
 @click.option(
     "--format",
     "formats",
-    type=click.Choice(list(FORMATS)),
+    type=click.Choice([*FORMATS, ALL]),
     multiple=True,
-    default=list(FORMATS),
-    help="What to write besides kgcps.parquet; may be repeated.  [default: all]",
+    default=DEFAULT_FORMATS,
+    help="What to write besides kgcps.parquet; may be repeated; 'all' leaves out what these points"
+    " do not fit.  [default: csv, odm]",
 )
+@click.option(
+    "--list-formats",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_formats,
+    help="Print the formats and their files.",
+)
+@click.option(
+    "--crs",
+    metavar="CRS",
+    default=None,
+    help="Of the points, for example EPSG:25832.  [default: the flight's]",
+)
+@selection_options
 @detections_option
 @json_option
 def command(
     flight: Path,
     out: Path | None,
     formats: tuple[str, ...],
+    crs: str | None,
     detections: Path | None,
     *,
     as_json: bool,
+    **selection: Any,  # noqa: ANN401 - the fields of a Selection
 ) -> None:
     """Make kinematic ground control points of the detections of FLIGHT.
 
     Interpolates the vehicle's trajectory at every frame's time, adds the lever arm, and writes
     FLIGHT/kgcp/kgcps.parquet, kgcps.csv and OpenDroneMap's gcp_list.txt. Needs 'kgcp detect'
-    before it, and in flight.toml a crs and a [vehicle], or targets with position_m.
+    before it, and in flight.toml a crs and a [vehicle], or targets with position_m. Where there
+    are reference poses, it says how well they agree with the vehicle, and what to correct.
 
     Example: kgcp export-gcp sample_flight --format odm
     """
-    from kgcp.errors import KgcpError
+    from kgcp.delivery import prepare
     from kgcp.io.columns import KGCP_COLUMNS
+    from kgcp.io.consistency_files import write_consistency
     from kgcp.io.exporters.points import MapPoints
     from kgcp.io.flight import read_flight
     from kgcp.io.kgcp_table import kgcp_row
     from kgcp.io.provenance import provenance
-    from kgcp.io.sightings import read_attempts
     from kgcp.io.tables import write_table
-    from kgcp.io.whereabouts import read_whereabouts
-    from kgcp.kgcps import build_kgcps
+    from kgcp.selection import Selection
 
     the_flight = read_flight(flight)
     folder = out or the_flight.folder / "kgcp"
     source = detections or folder / "detections.parquet"
-    attempts = read_attempts(source, the_flight.targets)
-    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    if not sightings:
-        raise KgcpError(
-            f"{source}: no target was measured in any frame;"
-            " see the reasons that 'kgcp detect' gives"
-        )
-    whereabouts = read_whereabouts(the_flight)
-    kgcps, skipped = build_kgcps(sightings, whereabouts, the_flight.camera)
+    made = prepare(the_flight, source, Selection(**selection), crs)
     table = folder / "kgcps.parquet"
-    write_table(table, KGCP_COLUMNS, map(kgcp_row, kgcps), provenance(the_flight))
-    points = MapPoints(whereabouts.frame.crs, kgcps)
+    metadata = {**provenance(the_flight), "crs": made.crs}
+    write_table(table, KGCP_COLUMNS, map(kgcp_row, made.kgcps), metadata)
     written = [table]
-    for name in dict.fromkeys(formats):
-        written += export(points, name, folder)
-    _report(kgcps, skipped, whereabouts.carrier, written, as_json=as_json)
+    if made.consistency is not None:
+        written += write_consistency(folder, made.consistency, provenance(the_flight))
+    points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
+    written += _export(points, formats, folder)
+    _report(made, written, as_json=as_json)
 
 
-def _report(
-    kgcps: tuple[Kgcp, ...],
-    skipped: tuple[Skip, ...],
-    carrier: Carrier | None,
-    written: list[Path],
-    *,
-    as_json: bool,
-) -> None:
+def _export(points: MapPoints, formats: tuple[str, ...], folder: Path) -> list[Path]:
+    """Write the named formats; of those that only `all` names, the ones that can be written."""
+    from kgcp.errors import KgcpError
+
+    written = []
+    for name in FORMATS if ALL in formats else dict.fromkeys(formats):
+        try:
+            written += export(points, name, folder)
+        except KgcpError as error:
+            if name in formats:
+                raise
+            click.echo(f"left out {error}", err=True)
+    return written
+
+
+def _report(made: Delivery, written: list[Path], *, as_json: bool) -> None:
     from collections import Counter
 
-    reasons = Counter(skip.reason.value for skip in skipped)
+    reasons = Counter(skip.reason.value for skip in made.skipped)
+    checks = sum(point.is_checkpoint for point in made.kgcps)
     if as_json:
         import json
 
-        summary = {"kgcps": len(kgcps), "skipped": dict(reasons), "files": [*map(str, written)]}
+        summary = {
+            "kgcps": len(made.kgcps),
+            "checkpoints": checks,
+            "skipped": dict(reasons),
+            "advice": _advice(made.consistency),
+            "files": [*map(str, written)],
+        }
         click.echo(json.dumps(summary))
-    click.echo(f"{len(kgcps)} KGCPs, {len(skipped)} sightings left out", err=True)
-    for reason, count in reasons.most_common():
-        click.echo(f"  {count:6d} {reason}", err=True)
+    of_these = f" ({checks} to check)" if checks else ""
+    click.echo(
+        f"{len(made.kgcps)} KGCPs{of_these}, {len(made.skipped)} sightings left out", err=True
+    )
+    for reason, times in reasons.most_common():
+        click.echo(f"  {times:6d} {reason}", err=True)
+    _report_deviations(made.carrier)
+    if made.consistency is not None:
+        _report_consistency(made.consistency)
+    for path in written:
+        click.echo(f"wrote {path}", err=True)
+
+
+def _report_deviations(carrier: Carrier | None) -> None:
     if carrier is not None and carrier.motion.sd_position_m is None:
         click.echo("the trajectory has no sd_x, sd_y, sd_z: KGCPs have no deviations", err=True)
     elif carrier is not None and carrier.motion.sd_attitude_deg is None:
@@ -103,5 +161,23 @@ def _report(
             " attitude counts as free of error",
             err=True,
         )
-    for path in written:
-        click.echo(f"wrote {path}", err=True)
+
+
+def _report_consistency(found: Consistency) -> None:
+    from kgcp.consistency.advice import rms_m
+
+    along, across, up = rms_m(found)
+    outliers = sum(one.is_outlier for one in found.discrepancies)
+    click.echo(
+        f"{len(found.discrepancies)} frames with reference pose: vehicle and camera differ by"
+        f" {along:.3f} m along, {across:.3f} m across, {up:.3f} m up (RMS), {outliers} outliers",
+        err=True,
+    )
+    for line in _advice(found):
+        click.echo(f"warning: {line}", err=True)
+
+
+def _advice(found: Consistency | None) -> tuple[str, ...]:
+    from kgcp.consistency.advice import advice
+
+    return () if found is None else advice(found)

@@ -138,6 +138,7 @@ def test_export_writes_the_contracts_table_and_the_formats(flight: FlightFolder)
         "kgcps.parquet",
         "kgcps.csv",
         "gcp_list.txt",
+        "HOWTO.txt",
     ]
     table = read_table(flight.out / "kgcps.parquet", KGCP_COLUMNS)
     assert list(table["id"]) == ["K0001", "K0002", "K0003", "K0004", "K0006"]  # by frame number
@@ -201,7 +202,7 @@ def test_a_static_target_is_one_point_with_many_rays(flight: FlightFolder) -> No
     assert result.exit_code == 0, result.output
     lines = (flight.out / "gcp_list.txt").read_text(encoding="utf-8").splitlines()[2:]
     assert {tuple(line.split()[:3]) for line in lines} == {
-        ("430606.10000", "4583523.00000", "122.00000")
+        ("430606.1000000", "4583523.0000000", "122.0000000")
     }
     assert {line.split()[6] for line in lines} == {"A"}
 
@@ -264,8 +265,9 @@ def test_the_same_input_makes_the_same_bytes(flight: FlightFolder, tmp_path: Pat
         for command in ("export-gcp", "bias-report"):
             result = flight.run(command, "--out", str(tmp_path / name), "--detections", source)
             assert result.exit_code == 0, result.output
-    names = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert len(names) == 8
+    one = tmp_path / "one"
+    names = sorted(str(path.relative_to(one)) for path in one.rglob("*") if path.is_file())
+    assert len(names) == 9
     for name in names:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 

@@ -1,29 +1,66 @@
-"""OpenDroneMap's gcp_list.txt.
+"""OpenDroneMap's gcp_list.txt and geo.txt.
 
-Grammar and behaviour by ODM's opendm/gcp.py and OpenSfM's geometry.rst: the header names the
-horizontal CRS; columns x y z im_x im_y image_name gcp_name, separated by white space; points are
-grouped by equal x, y, z; heights are metres and are never transformed; (0, 0) px is the centre of
-the top-left pixel, as in kgcp; images are known by file name, without their folder.
+Grammar and behaviour by ODM's opendm/gcp.py, geo.py and photo.py, and OpenSfM's geometry.rst: the
+header names the horizontal CRS; columns x y z im_x im_y image_name gcp_name, separated by white
+space; points are grouped by equal x, y, z; heights are metres and are never transformed; (0, 0) px
+is the centre of the top-left pixel, as in kgcp; images are known by file name, without their
+folder. geo.txt: image_name x y z yaw pitch roll horizontal_accuracy vertical_accuracy.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from pathlib import PurePosixPath
+from collections.abc import Mapping
 
+import numpy as np
 from pyproj import CRS
+from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
-from kgcp.io.exporters.points import MapPoints
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.trajectory import ENU_FROM_NED
+from kgcp.io.exporters.local import LocalPoints, local_points
+from kgcp.io.exporters.points import (
+    METRE_DECIMALS,
+    MapPoints,
+    decimals,
+    deviations,
+    image_names,
+    labels,
+    largest_sd,
+    pixel,
+)
+from kgcp.orientation import CameraPrior
 
 FILE_NAME = "gcp_list.txt"
 _WGS84_UTM = re.compile(r"32([67])(\d\d)")
 _NOTE = "# from kgcp: each moving point is seen in one image only; run ODM with --force-gps"
+_CAMERA_FROM_BODY: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""ODM's body: x towards the top of the image, y to its right, z along the view."""
+
+_HOWTO = """\
+OpenDroneMap
+
+Copy gcp_list.txt, which lies one folder up, into the project's folder; ODM finds it there.
+Or name it: --gcp PATH/gcp_list.txt
+
+  --force-gps        needed. Each moving point is seen in one image only. ODM aligns the block
+                     by points that are seen in two or more images; without them and without
+                     --force-gps the block has no place and no scale before the adjustment.
+  --gps-accuracy M   how well the positions in the images' EXIF are known [m]; 3 by default.
+
+geo.txt, if it is here, has camera positions from the plate and its vehicle's attitude, for
+the images that show the target. They are weak: read the accuracies. Use it with --geo PATH
+only where the images' own positions are worse; other images keep their own.
+
+ODM ignores: standard deviations of points and of marks (all points weigh the same), distances,
+the CRS's vertical part. Heights are used as they are, in metres. Of the two accuracies in geo.txt
+it takes the larger one for all three axes. Points kept for checking are not in the list.
+"""
 
 
 def files(points: MapPoints) -> Mapping[str, str]:
-    """Return `gcp_list.txt`.
+    """Return `gcp_list.txt`, and a folder with HOWTO.txt and geo.txt, if there are priors.
 
     Raises
     ------
@@ -31,22 +68,64 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If the CRS has no form that ODM reads, an image's name has white space, or two images in
         different folders have the same name.
     """
-    crs = points.parsed_crs
-    names = _image_names(point.frame for point in points.kgcps)
-    height_factor = _metres_per_height_unit(crs)
-    lines = [_header(points.crs, crs), _NOTE]
-    for point in points.kgcps:
-        x, y, z = points.coordinates(point, height_factor=height_factor)
-        pixel_x, pixel_y = point.centre_px
-        label = re.sub(r"\s+", "_", point.id)
-        lines.append(f"{x} {y} {z} {pixel_x:.4f} {pixel_y:.4f} {names[point.frame]} {label}")
-    return {FILE_NAME: "\n".join(lines) + "\n"}
+    texts = {FILE_NAME: _gcp_list(points), "odm/HOWTO.txt": _HOWTO}
+    if points.priors:
+        texts["odm/geo.txt"] = _geo(points)
+    return texts
+
+
+def _gcp_list(points: MapPoints) -> str:
+    names = image_names((point.frame for point in points.kgcps), FILE_NAME, r"\s")
+    label = labels(points.kgcps, FILE_NAME)
+    height_factor = _metres_per_height_unit(points.parsed_crs)
+    lines = [_header(points.crs, points.parsed_crs), _NOTE]
+    owners: dict[tuple[str, str, str], str] = {}
+    for point in points.controls:
+        xyz = points.xyz(point.position_map, height_factor=height_factor)
+        while owners.setdefault(xyz, point.id) != point.id:
+            xyz = (xyz[0], xyz[1], _next_above(xyz[2]))  # ODM would merge the two points
+        lines.append(" ".join((*xyz, *pixel(point), names[point.frame], label[point.id])))
+    return "\n".join(lines) + "\n"
+
+
+def _next_above(text: str) -> str:
+    return f"{float(text) + 10.0**-METRE_DECIMALS:.{METRE_DECIMALS}f}"
+
+
+def _geo(points: MapPoints) -> str:
+    names = image_names((prior.frame for prior in points.priors), "geo.txt", r"\s")
+    height_factor = _metres_per_height_unit(points.parsed_crs)
+    local = local_points(points)
+    lines = [_header(points.crs, points.parsed_crs)]
+    for prior in points.priors:
+        xyz = points.xyz(prior.position_map, height_factor=height_factor)
+        angles = (decimals(angle) for angle in yaw_pitch_roll_deg(prior, local))
+        lines.append(" ".join((names[prior.frame], *xyz, *angles, *_accuracies(prior))))
+    return "\n".join(lines) + "\n"
+
+
+def _accuracies(prior: CameraPrior) -> tuple[str, ...]:
+    if prior.cov is None:
+        return ()
+    return decimals(largest_sd(prior.cov[:2, :2])), decimals(float(deviations(prior.cov)[2]))
+
+
+def yaw_pitch_roll_deg(prior: CameraPrior, local: LocalPoints) -> FloatArray:
+    """Return yaw, pitch, roll (3,) [deg] against true north and the level, as ODM takes them.
+
+    R(body → NED) = Rz(yaw) Ry(pitch) Rx(roll) with the body's x towards the image's top: yaw 0 has
+    north there, pitch 0 looks straight down (opendm/photo.py, after Bäumker).
+    """
+    position = local.frame.enu_from_map(prior.position_map[None])
+    enu_from_camera = local.frame.grid_rotation(position[0]) @ prior.map_from_camera
+    level = local.frame.level_rotations(position)[0]
+    ned_from_body = ENU_FROM_NED.T @ level.T @ enu_from_camera @ _CAMERA_FROM_BODY
+    angles: FloatArray = Rotation.from_matrix(ned_from_body).as_euler("ZYX", degrees=True)
+    return angles
 
 
 def _header(text: str, crs: CRS) -> str:
     """Return the first line; `WGS84 UTM` where it applies, since no reader mistakes its axes."""
-    while crs.is_bound and crs.source_crs is not None:
-        crs = crs.source_crs
     horizontal = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
     code = horizontal.to_epsg()
     if code is None:
@@ -65,22 +144,3 @@ def _header(text: str, crs: CRS) -> str:
 def _metres_per_height_unit(crs: CRS) -> float:
     """ODM takes z as metres, whatever unit the CRS has."""
     return float(crs.axis_info[2].unit_conversion_factor) if len(crs.axis_info) > 2 else 1.0
-
-
-def _image_names(frames: Iterable[str]) -> dict[str, str]:
-    names: dict[str, str] = {}
-    owners: dict[str, str] = {}
-    for frame in frames:
-        name = PurePosixPath(frame).name
-        if re.search(r"\s", name):
-            raise KgcpError(
-                f"{FILE_NAME}: frame {frame!r} has white space in its name, which separates the"
-                " columns; rename the frames or leave out --format odm"
-            )
-        if owners.setdefault(name, frame) != frame:
-            raise KgcpError(
-                f"{FILE_NAME}: frames {owners[name]!r} and {frame!r} have the same file name, and"
-                " ODM knows images by that; rename one or leave out --format odm"
-            )
-        names[frame] = name
-    return names

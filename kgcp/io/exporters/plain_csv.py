@@ -31,9 +31,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
             (
                 *(point.id, point.frame, point.target),
                 "" if point.time_s is None else format_time(point.time_s),
-                *points.coordinates(point),
+                *points.xyz(point.position_map),
                 *_covariance(point.cov_m2, 3),
-                *(f"{value:.4f}" for value in point.centre_px),
+                *(f"{value:.7f}" for value in point.centre_px),
                 *_covariance(point.centre_cov_px2, 2),
                 f"{point.distance_m:.5f}",
                 _text(point.sd_distance_m),

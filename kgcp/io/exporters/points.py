@@ -1,38 +1,211 @@
-"""What every exporter starts from: the points, and how their map is written down."""
+"""What every exporter starts from: the points, and how their map and frames are written down."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import PurePosixPath
 
+import numpy as np
 from pyproj import CRS
 
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
 from kgcp.kgcps import Kgcp
+from kgcp.orientation import CameraPrior
 
-_METRE_DECIMALS = 5  # 0.01 mm: points that differ never look the same
-_DEGREE_DECIMALS = 10
+METRE_DECIMALS = 7  # points that differ never look the same
+DEGREE_DECIMALS = 12
+PIXEL_DECIMALS = 7
+
+CORNER_PX = 0.5
+"""Added to pixel coordinates for formats whose (0, 0) is the corner of the top-left pixel."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
-    """KGCPs and the map of their coordinates.
+    """KGCPs, the map of their coordinates and the camera that saw them.
 
     Attributes
     ----------
     crs : str
-        As in flight.toml.
+        Of the points and the priors.
     kgcps : tuple of Kgcp
+    camera : Camera
+    priors : tuple of CameraPrior
+        Of the frames for which there is one.
     """
 
     crs: str
     kgcps: tuple[Kgcp, ...]
+    camera: Camera
+    priors: tuple[CameraPrior, ...] = ()
 
     @property
     def parsed_crs(self) -> CRS:
         """The CRS of the coordinates."""
-        return CRS.from_user_input(self.crs)
+        return _parsed(self.crs)
 
-    def coordinates(self, point: Kgcp, *, height_factor: float = 1.0) -> tuple[str, str, str]:
-        """Return x, y, z of a point as text, to 0.01 mm; z times `height_factor`."""
-        decimals = _DEGREE_DECIMALS if self.parsed_crs.is_geographic else _METRE_DECIMALS
-        x, y, z = point.position_map
-        return f"{x:.{decimals}f}", f"{y:.{decimals}f}", f"{z * height_factor:.{_METRE_DECIMALS}f}"
+    @property
+    def controls(self) -> tuple[Kgcp, ...]:
+        """The points that are not kept for checking."""
+        return tuple(point for point in self.kgcps if not point.is_checkpoint)
+
+    def xyz(self, position_map: FloatArray, *, height_factor: float = 1.0) -> tuple[str, str, str]:
+        """Return map coordinates as text, to 0.1 µm; z times `height_factor`."""
+        decimals = DEGREE_DECIMALS if self.parsed_crs.is_geographic else METRE_DECIMALS
+        x, y, z = position_map
+        return f"{x:.{decimals}f}", f"{y:.{decimals}f}", f"{z * height_factor:.{METRE_DECIMALS}f}"
+
+    def own_axes(self, xyz: Sequence[str]) -> tuple[str, str, str]:
+        """Bring x, y, z into the order of the CRS's own definition."""
+        x, y, z = xyz
+        return (y, x, z) if self.is_north_first else (x, y, z)
+
+    @property
+    def is_north_first(self) -> bool:
+        """Whether the CRS's own definition has latitude or northing first."""
+        first, second = (axis.direction for axis in self.parsed_crs.axis_info[:2])
+        return first in {"north", "south"} and second in {"east", "west"}
+
+
+@lru_cache(maxsize=8)
+def _parsed(crs: str) -> CRS:
+    """Parse a CRS without its way to WGS 84, which is no part of its axes."""
+    parsed = CRS.from_user_input(crs)
+    while parsed.is_bound and parsed.source_crs is not None:
+        parsed = parsed.source_crs
+    return parsed
+
+
+def decimals(value: float, places: int = 9) -> str:
+    """Return a number with a fixed number of places, without exponent."""
+    return f"{value:.{places}f}"
+
+
+def pixel(point: Kgcp, shift_px: float = 0.0) -> tuple[str, str]:
+    """Return image coordinates as text, moved by `shift_px`."""
+    x, y = point.centre_px + shift_px
+    return decimals(x, PIXEL_DECIMALS), decimals(y, PIXEL_DECIMALS)
+
+
+def by_id(kgcps: Iterable[Kgcp]) -> Mapping[str, list[Kgcp]]:
+    """Group observations by point: many for a static target, one for each kinematic point."""
+    groups: dict[str, list[Kgcp]] = {}
+    for point in kgcps:
+        groups.setdefault(point.id, []).append(point)
+    return groups
+
+
+def by_frame(kgcps: Iterable[Kgcp]) -> Mapping[str, list[Kgcp]]:
+    """Group points by the frame that saw them."""
+    groups: dict[str, list[Kgcp]] = {}
+    for point in kgcps:
+        groups.setdefault(point.frame, []).append(point)
+    return groups
+
+
+def labels(kgcps: Iterable[Kgcp], where: str) -> Mapping[str, str]:
+    """Return the points' ids without what separates or quotes in a text file.
+
+    Raises
+    ------
+    KgcpError
+        If two ids would be the same.
+    """
+    owners: dict[str, str] = {}
+    names: dict[str, str] = {}
+    for point in kgcps:
+        label = re.sub(r"[\s,;\"*#]+", "_", point.id)
+        if owners.setdefault(label, point.id) != point.id:
+            raise KgcpError(
+                f"{where}: targets {owners[label]!r} and {point.id!r} would have the same name"
+                f" {label!r}; rename one in flight.toml"
+            )
+        names[point.id] = label
+    return names
+
+
+def image_names(
+    frames: Iterable[str], where: str, refused: str, *, keep_folder: bool = False
+) -> Mapping[str, str]:
+    r"""Return the names by which a package knows frames: by default the files', without folder.
+
+    Parameters
+    ----------
+    frames : iterable of str
+    where : str
+        What an error names: the format.
+    refused : str
+        Characters that the file cannot hold, for a regular expression's set: `\s,`.
+    keep_folder : bool
+        Whether the package knows images by their path below the frames folder.
+
+    Raises
+    ------
+    KgcpError
+        If a name has one of these characters, or two frames have the same name.
+    """
+    names: dict[str, str] = {}
+    owners: dict[str, str] = {}
+    for frame in frames:
+        name = frame if keep_folder else PurePosixPath(frame).name
+        if refused and re.search(f"[{refused}]", name):
+            what = "white space" if re.search(r"\s", name) else "a character"
+            raise KgcpError(
+                f"{where}: frame {frame!r} has {what} in its name, which separates the columns;"
+                " rename the frames or leave this format out"
+            )
+        if owners.setdefault(name, frame) != frame:
+            raise KgcpError(
+                f"{where}: frames {owners[name]!r} and {frame!r} have the same file name, and"
+                " images are known by that; rename one or leave this format out"
+            )
+        names[frame] = name
+    return names
+
+
+def known_cov(point: Kgcp, where: str) -> FloatArray:
+    """Return a point's covariance (3, 3) in map axes [m²].
+
+    Raises
+    ------
+    KgcpError
+        If it has none.
+    """
+    if point.cov_m2 is None:
+        raise KgcpError(
+            f"{where}: point {point.id} has no standard deviations, which the format needs; give"
+            " the trajectory sd_x, sd_y, sd_z (a static target sd_position_m) or leave it out"
+        )
+    return point.cov_m2
+
+
+def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
+    """Return the covariance (2, 2) of an image point [px²].
+
+    Raises
+    ------
+    KgcpError
+        If it has none.
+    """
+    if point.centre_cov_px2 is None:
+        raise KgcpError(
+            f"{where}: the image point of {point.id} has no standard deviations, which the format"
+            " needs; run 'kgcp detect' with --method model or leave it out"
+        )
+    return point.centre_cov_px2
+
+
+def largest_sd(cov: FloatArray) -> float:
+    """Return the standard deviation along the worst direction of a covariance."""
+    return float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+
+
+def deviations(cov: FloatArray) -> FloatArray:
+    """Return the standard deviations of a covariance's diagonal."""
+    sds: FloatArray = np.sqrt(np.diag(cov))
+    return sds

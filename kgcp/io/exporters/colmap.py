@@ -1,0 +1,75 @@
+"""COLMAP's pose priors: camera positions with covariance, and a script that stores them.
+
+By COLMAP's geometry/pose_prior.h and doc/faq.rst. COLMAP has no control points. Its prior is the
+position of the camera in a Cartesian world with a covariance, in the database's own table, by
+image; ids of images are those of the user's database, hence the script.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files as resources
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.io.exporters.local import describe_frame, local_points
+from kgcp.io.exporters.points import MapPoints, decimals, image_names
+
+_FOLDER = "colmap"
+_COLUMNS = "image,x,y,z,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
+_HOWTO = """\
+COLMAP
+
+COLMAP takes no control points and no distances. What it takes are camera positions with their
+covariance, here from the plate and its vehicle's attitude, for the images that show the target.
+
+1. colmap feature_extractor --database_path database.db --image_path frames
+   (images go by their path below that folder, as in pose_priors.csv)
+2. python add_pose_priors.py database.db        needs pycolmap (pip install pycolmap)
+   It replaces priors of these images, and leaves those of others, such as GPS from EXIF: those are
+   WGS 84 and cannot be mixed with these Cartesian ones. Add --only to remove them.
+3. colmap pose_prior_mapper --database_path database.db --image_path frames --output_path sparse
+   without --overwrite_priors_covariance, which would discard the covariances.
+
+Or, after an ordinary reconstruction: colmap model_aligner --ref_images_path reference.txt
+--ref_is_gps 0 (positions alone, all with the same weight).
+
+{frame}
+The covariances of pose_priors.csv are in these axes [m²].
+"""
+
+
+def files(points: MapPoints) -> Mapping[str, str]:
+    """Return the priors, a script that writes them, and a list for `model_aligner`.
+
+    Raises
+    ------
+    KgcpError
+        If there is no prior with a covariance, or an image's path has white space or a comma.
+    """
+    local = local_points(points)
+    known = [(prior.frame, *local.prior(prior)) for prior in points.priors]
+    names = image_names((frame for frame, _, _ in known), _FOLDER, r"\s,", keep_folder=True)
+    table, reference = [_COLUMNS], []
+    for frame, position, cov in known:
+        if cov is None:
+            continue
+        xyz = [decimals(value) for value in position]
+        upper = (f"{value:.12e}" for value in cov[np.triu_indices(3)])
+        table.append(",".join((names[frame], *xyz, *upper)))
+        reference.append(" ".join((names[frame], *xyz)))
+    if not reference:
+        raise KgcpError(
+            f"{_FOLDER}: there is no camera position with a covariance, and COLMAP takes nothing"
+            " else; that needs poses of a plate on a vehicle that are told apart (ambiguity), and"
+            " sd_roll_deg, sd_pitch_deg, sd_heading_deg and sd_x, sd_y, sd_z in its trajectory"
+        )
+    script = resources("kgcp.io.exporters").joinpath("scripts/colmap_pose_priors.txt")
+    texts = {
+        "HOWTO.txt": _HOWTO.format(frame=describe_frame(points)),
+        "pose_priors.csv": "\n".join(table) + "\n",
+        "reference.txt": "\n".join(reference) + "\n",
+        "add_pose_priors.py": script.read_text(encoding="utf-8"),
+    }
+    return {f"{_FOLDER}/{name}": text for name, text in texts.items()}

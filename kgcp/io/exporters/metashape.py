@@ -1,0 +1,147 @@
+"""Agisoft Metashape: reference of markers and cameras, markers XML, scale bars to the cameras.
+
+By the Python API's reference (importReference, importMarkers, addScalebar): the CSV's columns are
+chosen on import, x is easting or longitude; (0, 0) px is the corner of the top-left pixel, since a
+centred principal point is half the width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from importlib.resources import files as resources
+from xml.etree import ElementTree as ET
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.exporters.points import (
+    CORNER_PX,
+    MapPoints,
+    by_frame,
+    by_id,
+    decimals,
+    deviations,
+    image_names,
+    labels,
+    pixel,
+)
+from kgcp.io.exporters.xml_text import xml_text
+from kgcp.kgcps import Kgcp
+from kgcp.orientation import CameraPrior
+
+_FOLDER = "metashape"
+_HOWTO = """\
+Agisoft Metashape (Professional)
+
+With the photos added to a chunk, before or after their alignment:
+
+1. File > Import > Import Markers: markers.xml (places in the images, and coordinates).
+2. Reference > Import Reference: markers.csv. Comma, first row 2, columns label, x, y, z and the
+   three accuracies [m]; the coordinate system is {crs}, x is easting or
+   longitude. The accuracies come only by this file. Points kept for checking have enabled = 0.
+3. Tools > Run Script: add_scale_bars.py, which reads scale_bars.csv beside it and adds a scale bar
+   from every marker to the camera that saw it, with its length and accuracy [m].
+4. cameras.csv, if it is here, has the cameras' positions [m] and angles from the plate and its
+   vehicle's attitude, for the images that show the target: omega, phi, kappa (set this in
+   Reference > Settings). They are weak; import it only where the photos' own reference is worse.
+
+Optimise the cameras afterwards. Metashape has one accuracy for all marker projections (Reference >
+Settings, marker accuracy): {mark_px} px is the RMS of these. It ignores correlations, and
+the errors that all distances share (calibration and print: see kgcps.csv).
+"""
+
+
+def files(points: MapPoints) -> Mapping[str, str]:
+    """Return the files of Metashape.
+
+    Raises
+    ------
+    KgcpError
+        If an image's name has a comma or quote, or two images have the same name.
+    """
+    names = image_names((point.frame for point in points.kgcps), _FOLDER, ',"')
+    label = labels(points.kgcps, _FOLDER)
+    script = resources("kgcp.io.exporters").joinpath("scripts/metashape_scale_bars.txt")
+    texts = {
+        "HOWTO.txt": _HOWTO.format(crs=points.crs, mark_px=_rms_mark_px(points.kgcps)),
+        "markers.csv": _markers(points, label),
+        "markers.xml": _markers_xml(points, names, label),
+        "scale_bars.csv": _scale_bars(points.controls, names, label),
+        "add_scale_bars.py": script.read_text(encoding="utf-8"),
+    }
+    if points.priors:
+        texts["cameras.csv"] = _cameras(points, names)
+    return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
+
+
+def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
+    return "".join(f"{line}\n" for line in (columns, *map(",".join, rows)))
+
+
+def _rms_mark_px(kgcps: Iterable[Kgcp]) -> str:
+    traces = [point.centre_cov_px2.trace() for point in kgcps if point.centre_cov_px2 is not None]
+    return f"{(0.5 * sum(traces) / len(traces)) ** 0.5:.3f}" if traces else "unknown"
+
+
+def _markers(points: MapPoints, label: Mapping[str, str]) -> str:
+    def row(point: Kgcp) -> tuple[str, ...]:
+        sds = ("",) * 3 if point.cov_m2 is None else map(decimals, deviations(point.cov_m2))
+        enabled = "0" if point.is_checkpoint else "1"
+        return (label[point.id], *points.xyz(point.position_map), *sds, enabled)
+
+    rows = [row(group[0]) for group in by_id(points.kgcps).values()]
+    return _table("label,x,y,z,accuracy_x_m,accuracy_y_m,accuracy_z_m,enabled", rows)
+
+
+def _cameras(points: MapPoints, names: Mapping[str, str]) -> str:
+    def row(prior: CameraPrior) -> tuple[str, ...]:
+        cov = prior.opk_cov
+        sds = ("",) * 6 if cov is None else tuple(map(decimals, deviations(cov)))
+        angles = map(decimals, prior.opk_deg)
+        return (names[prior.frame], *points.xyz(prior.position_map), *sds[:3], *angles, *sds[3:])
+
+    return _table(
+        "label,x,y,z,accuracy_x_m,accuracy_y_m,accuracy_z_m,omega_deg,phi_deg,kappa_deg,"
+        "accuracy_omega_deg,accuracy_phi_deg,accuracy_kappa_deg",
+        map(row, points.priors),
+    )
+
+
+def _scale_bars(kgcps: Iterable[Kgcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
+    rows = (
+        (
+            label[point.id],
+            names[point.frame],
+            decimals(point.distance_m),
+            "" if point.sd_distance_m is None else decimals(point.sd_distance_m),
+        )
+        for point in kgcps
+    )
+    return _table("marker,camera,distance_m,accuracy_m", rows)
+
+
+def _markers_xml(points: MapPoints, names: Mapping[str, str], label: Mapping[str, str]) -> str:
+    document = ET.Element("document", version="1.2.0")
+    chunk = ET.SubElement(document, "chunk")
+    _add_sensor(ET.SubElement(chunk, "sensors"), points.camera)
+    cameras = ET.SubElement(chunk, "cameras")
+    camera_ids = {frame: str(number) for number, frame in enumerate(by_frame(points.kgcps))}
+    for frame, camera_id in camera_ids.items():
+        ET.SubElement(cameras, "camera", id=camera_id, label=names[frame], sensor_id="0")
+    markers = ET.SubElement(chunk, "markers")
+    frames = ET.SubElement(chunk, "frames")
+    seen = ET.SubElement(ET.SubElement(frames, "frame", id="0"), "markers")
+    for number, (point_id, group) in enumerate(by_id(points.kgcps).items()):
+        marker = ET.SubElement(markers, "marker", id=str(number), label=label[point_id])
+        x, y, z = points.xyz(group[0].position_map)
+        enabled = "false" if group[0].is_checkpoint else "true"
+        ET.SubElement(marker, "reference", x=x, y=y, z=z, enabled=enabled)
+        rays = ET.SubElement(seen, "marker", marker_id=str(number))
+        for point in group:
+            x, y = pixel(point, CORNER_PX)
+            camera_id = camera_ids[point.frame]
+            ET.SubElement(rays, "location", camera_id=camera_id, pinned="true", x=x, y=y)
+    return xml_text(document)
+
+
+def _add_sensor(sensors: ET.Element, camera: Camera) -> None:
+    sensor = ET.SubElement(sensors, "sensor", id="0", type="frame")
+    ET.SubElement(sensor, "resolution", width=str(camera.width), height=str(camera.height))

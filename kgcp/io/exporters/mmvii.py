@@ -1,0 +1,126 @@
+"""MMVII (MicMac v2): points and measures with covariances, and distances to the cameras.
+
+By MMVII's Bundle_GCP.cpp, ctopodata.cpp and test data: XML of its serialisation, covariances as
+their upper triangle, row by row; topographic observations as lines `code from to value sigma`, code
+3 a distance, where a name that is no point is looked up among the cameras. MMVII adjusts in
+Cartesian coordinates, so the points are in a local frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.exporters.local import describe_frame, local_points
+from kgcp.io.exporters.points import (
+    MapPoints,
+    by_frame,
+    decimals,
+    image_names,
+    known_centre_cov,
+    known_cov,
+    labels,
+    pixel,
+)
+from kgcp.io.exporters.xml_text import add_text, xml_text
+from kgcp.kgcps import Kgcp
+
+_FOLDER = "mmvii"
+_DISTANCE = 3
+_HOWTO = """\
+MMVII (MicMac v2)
+
+Copy MesGCP-kgcp.xml and the MesIm files into MMVII-PhgrProj/ObjCoordWorld/kgcp and
+MMVII-PhgrProj/ObjMesInstr/kgcp (older versions: both into PointsMeasure/kgcp), kgcp.obs into
+MMVII-PhgrProj/Topo/kgcp. The bundle adjustment (OriBundleAdj) takes them by
+
+  GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]] Topo=[kgcp]
+
+with a positive factor for the points: only then may the distances refer to them. kgcp.obs has
+one line per point: 3 (distance), image, point, metres, standard deviation. Pixel (0, 0) is the
+centre of the top-left pixel. The block must be in the points' frame before:
+
+{frame}
+MMVII reads the covariances, and of the points uses the three standard deviations. It does not
+know of errors that all distances share (calibration and print: see kgcps.csv). Points kept for
+checking are not in the files.
+"""
+
+
+def files(points: MapPoints) -> Mapping[str, str]:
+    """Return the points, one file of measures per image, and the distances.
+
+    Raises
+    ------
+    KgcpError
+        If an image's name has white space, a quote or an asterisk, two images have the same name,
+        or a point or image point has no standard deviations.
+    """
+    label = labels(points.kgcps, _FOLDER)
+    names = image_names((point.frame for point in points.kgcps), _FOLDER, r'\s*"')
+    texts = {
+        "HOWTO.txt": _HOWTO.format(frame=describe_frame(points)),
+        "MesGCP-kgcp.xml": _gcps(points, label),
+        "kgcp.obs": _distances(points.controls, names, label),
+    }
+    for frame, group in by_frame(points.controls).items():
+        texts[f"MesIm-{names[frame]}.xml"] = _measures(names[frame], group, label)
+    return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
+
+
+def _document(root: ET.Element) -> str:
+    wrapper = ET.Element("Root")
+    add_text(wrapper, "Type", '"MMVII_Serialization"')
+    add_text(wrapper, "Version", '"0.0.0"')
+    ET.SubElement(wrapper, "Data").append(root)
+    return xml_text(wrapper)
+
+
+def _triangle(cov: FloatArray) -> str:
+    """Return the upper triangle, row by row; variances of micrometres must not vanish."""
+    return " ".join(f"{value:.12e}" for value in cov[np.triu_indices(len(cov))])
+
+
+def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:
+    local = local_points(points)
+    root = ET.Element("SetGCP")
+    add_text(root, "NameSet", '"kgcp"')
+    measures = ET.SubElement(root, "Measures")
+    done = set()
+    for index, point in enumerate(points.kgcps):
+        if point.is_checkpoint or point.id in done:
+            continue
+        done.add(point.id)
+        entry = ET.SubElement(measures, "el")
+        add_text(entry, "Name", f'"{label[point.id]}"')
+        add_text(entry, "Pt", " ".join(decimals(value) for value in local.position_m[index]))
+        add_text(entry, "AdditionalInfo", '""')
+        cov = local.cov_m2(index, known_cov(point, _FOLDER))
+        add_text(entry, "__Opt__Sigma2", _triangle(cov))
+    return _document(root)
+
+
+def _measures(image: str, group: Iterable[Kgcp], label: Mapping[str, str]) -> str:
+    root = ET.Element("SetMesIm")
+    add_text(root, "NameIm", f'"{image}"')
+    measures = ET.SubElement(root, "Measures")
+    for point in group:
+        entry = ET.SubElement(measures, "el")
+        add_text(entry, "Name", f'"{label[point.id]}"')
+        add_text(entry, "Pt", " ".join(pixel(point)))
+        add_text(entry, "Sigma2", _triangle(known_centre_cov(point, _FOLDER)))
+    return _document(root)
+
+
+def _distances(kgcps: Iterable[Kgcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
+    lines = ["* distances from projection centres to points: code, image, point, metres, sigma"]
+    lines += [
+        f"{_DISTANCE} {names[point.frame]} {label[point.id]}"
+        f" {decimals(point.distance_m)} {decimals(point.sd_distance_m)}"
+        for point in kgcps
+        if point.sd_distance_m is not None
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,85 @@
+"""Pix4D's CSV of ground control points and of their marks in the images.
+
+By support.pix4d.com 360038397752 and 360035474951: label, two coordinates in the order of the CRS's
+own definition, height, horizontal and vertical accuracy; image, label, x, y, accuracy [px], with
+(0, 0) px in the corner of the top-left pixel. Neither has a header line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from kgcp.io.exporters.points import (
+    CORNER_PX,
+    MapPoints,
+    by_id,
+    decimals,
+    deviations,
+    image_names,
+    known_centre_cov,
+    labels,
+    largest_sd,
+    pixel,
+)
+from kgcp.kgcps import Kgcp
+
+_FOLDER = "pix4d"
+_HOWTO = """\
+PIX4Dmatic, PIX4Dmapper
+
+1. Import ground control points: gcps.csv, coordinate system {crs}
+   with heights as it defines them (ellipsoidal, unless it is compound). The columns have the axis
+   order of the CRS's own definition: {order} first.
+   checkpoints.csv, if it is here, has the points kept for checking: import it as check points.
+2. Import marks: marks.csv. Image name, label, x, y, accuracy [px]; image directory off or the
+   folder that holds the images, zoom level off.
+
+Pix4D takes one horizontal accuracy, which here is that of the worst direction, and a vertical one.
+It ignores correlations and distances. Whether it uses points with a mark in a single image is not
+documented for this route; OPF (--format opf) is the better one for PIX4Dmatic.
+"""
+
+
+def files(points: MapPoints) -> Mapping[str, str]:
+    """Return the files of Pix4D.
+
+    Raises
+    ------
+    KgcpError
+        If an image's name has a comma or quote, two images have the same name, or an image point
+        has no deviations.
+    """
+    checks = [point for point in points.kgcps if point.is_checkpoint]
+    order = "latitude or northing" if points.is_north_first else "longitude or easting"
+    texts = {
+        "HOWTO.txt": _HOWTO.format(crs=points.crs, order=order),
+        "gcps.csv": _points(points, points.controls),
+        "marks.csv": _marks(points),
+    }
+    if checks:
+        texts["checkpoints.csv"] = _points(points, checks)
+    return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
+
+
+def _points(points: MapPoints, kgcps: Iterable[Kgcp]) -> str:
+    label = labels(points.kgcps, _FOLDER)
+    lines = []
+    for point_id, group in by_id(kgcps).items():
+        cells = [label[point_id], *points.own_axes(points.xyz(group[0].position_map))]
+        cov = group[0].cov_m2
+        if cov is not None:
+            accuracies = largest_sd(cov[:2, :2]), float(deviations(cov)[2])
+            cells += map(decimals, accuracies)
+        lines.append(",".join(cells) + "\n")
+    return "".join(lines)
+
+
+def _marks(points: MapPoints) -> str:
+    names = image_names((point.frame for point in points.kgcps), _FOLDER, ',"')
+    label = labels(points.kgcps, _FOLDER)
+    lines = []
+    for point in points.kgcps:
+        accuracy = decimals(largest_sd(known_centre_cov(point, _FOLDER)))
+        cells = (names[point.frame], label[point.id], *pixel(point, CORNER_PX), accuracy)
+        lines.append(",".join(cells) + "\n")
+    return "".join(lines)
