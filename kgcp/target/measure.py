@@ -19,9 +19,10 @@ from kgcp.target.explain import explain
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Considered, Miss, Observation, Outcome
-from kgcp.target.paper import measure_ring, points_of_code
+from kgcp.target.paper import points_of_code
 from kgcp.target.prior import NormalPrior
 from kgcp.target.search import find_code, find_rings, verify
+from kgcp.target.start import start_pose
 
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75
@@ -70,6 +71,7 @@ def examine(
     targets: tuple[Target, ...],
     settings: DetectSettings,
     prior: NormalPrior | None = None,
+    known: Sequence[Observation] = (),
 ) -> Examination:
     """Look for every target in a frame and measure what is found.
 
@@ -85,6 +87,8 @@ def examine(
         Of the search.
     prior : NormalPrior, optional
         Of the normal of the plate on the vehicle: of all targets without a position of their own.
+    known : sequence of Observation
+        Other targets that are in this frame.
     """
     search = paper_outlines if settings.method is Method.PAPER else find_rings
     outlines = search(grey, settings)
@@ -97,7 +101,8 @@ def examine(
     outcomes: list[Outcome] = []
     considered: list[Considered] = []
     for trial in trials:
-        rivals = [seen for other in trials if other is not trial for seen in other.found]
+        others = (other for other in trials if other is not trial)
+        rivals = [*known, *(seen for other in others for seen in other.found)]
         own = _undisputed(trial.found, rivals)
         free = [one for one in trial.considered if not any(map(one.is_on_plate_of, rivals))]
         outcomes += own or (miss_of(grey, trial.target, free, settings),)
@@ -150,7 +155,7 @@ def _try_target(
             if any(map(candidate.is_on_plate_of, found)):
                 continue
             try:
-                start = measure_ring(grey, camera, target, match)
+                start = start_pose(grey, camera, target, match, settings.method)
                 found.append(confirm(grey, camera, target, start, settings, prior))
             except Rejection as rejection:
                 candidate = replace(candidate, reason=rejection.reason, detail=rejection.detail)
