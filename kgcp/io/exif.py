@@ -41,9 +41,10 @@ def read_exif(path: Path) -> Exif:
     """Read exposure and time of a frame without decoding its pixels.
 
     The time is DateTimeOriginal with SubSecTimeOriginal, a decimal fraction ("05" is 0.05 s), and
-    OffsetTimeOriginal. Without an offset it is the local time of an unknown place and is left
-    out. So are the GPS stamps: they are UTC, but of the receiver's last fix and mostly in whole
-    seconds, in which a vehicle goes metres.
+    OffsetTimeOriginal. Where that is absent, OffsetTime serves, which is DateTime's, if DateTime
+    is the same moment (in a file that nobody changed). Without an offset it is the local time of
+    an unknown place and is left out. So are the GPS stamps: they are UTC, but of the receiver's
+    last fix and mostly in whole seconds, in which a vehicle goes metres.
 
     Whatever is damaged or absent is None; nothing is raised.
     """
@@ -65,7 +66,8 @@ def _exif_tags(path: Path) -> Mapping[int, Any]:
     try:
         with Image.open(path) as image:
             # The method of the base class: that of PNG would decode all pixels.
-            return Image.Image.getexif(image).get_ifd(IFD.Exif)
+            exif = Image.Image.getexif(image)
+            return {**exif, **exif.get_ifd(IFD.Exif)}
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
@@ -83,6 +85,8 @@ def _time_s(tags: Mapping[int, Any]) -> float | None:
     day, _, clock = _text(tags, Base.DateTimeOriginal).partition(" ")
     fraction = _text(tags, Base.SubsecTimeOriginal)
     offset = _text(tags, Base.OffsetTimeOriginal)
+    if not offset and _text(tags, Base.DateTime) == _text(tags, Base.DateTimeOriginal):
+        offset = _text(tags, Base.OffsetTime)
     if not offset:
         return None
     seconds = f"{clock}.{fraction}" if fraction else clock

@@ -11,7 +11,7 @@ from PIL import Image, TiffImagePlugin
 from kgcp.io.exif import Exif, read_exif
 
 EXPOSURE_TIME, F_NUMBER, ISO, EXIF_IFD, GPS_IFD = 0x829A, 0x829D, 0x8827, 0x8769, 0x8825
-DATE_TIME, OFFSET, SUBSEC = 0x9003, 0x9011, 0x9291
+DATE_TIME, OFFSET, SUBSEC, OFFSET_OF_CHANGE = 0x9003, 0x9011, 0x9291, 0x9010
 ON_2026_05_04_AT_9_30 = 1777887000.0
 WHOLE = {
     EXPOSURE_TIME: TiffImagePlugin.IFDRational(1, 1250),
@@ -57,6 +57,39 @@ def test_local_time_of_an_unknown_zone_is_no_time(tmp_path: Path, offset: str | 
     )
     assert exif.time_s is None
     assert exif.iso == 200.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [("2026:05:04 11:30:05", ON_2026_05_04_AT_9_30 + 5.05), ("2026:05:11 20:00:00", None)],
+)
+def test_the_zone_of_the_last_change_serves_if_nothing_was_changed(
+    tmp_path: Path, changed: str, expected: float | None
+) -> None:
+    exif = Image.Exif()
+    exif[0x0132] = changed  # DateTime, in the first directory
+    exif.get_ifd(EXIF_IFD).update(
+        {DATE_TIME: "2026:05:04 11:30:05", SUBSEC: "05", OFFSET_OF_CHANGE: "+02:00"}
+    )
+    Image.new("L", (40, 30)).save(tmp_path / "frame.jpg", exif=exif.tobytes())
+    time_s = read_exif(tmp_path / "frame.jpg").time_s
+    assert time_s == (None if expected is None else pytest.approx(expected, abs=1e-6))
+
+
+def test_offsets_may_lie_before_utc_and_between_hours(tmp_path: Path) -> None:
+    for offset, hours in (("-03:30", 3.5), ("+05:45", -5.75), ("Z", 0.0), ("+00:00", 0.0)):
+        tags = {**WHOLE, DATE_TIME: "2026:05:04 09:30:05", OFFSET: offset}
+        time_s = read_exif(tagged(tmp_path / "frame.jpg", tags)).time_s
+        expected = ON_2026_05_04_AT_9_30 + 5.05 + 3600.0 * hours
+        assert time_s == pytest.approx(expected, abs=1e-6)
+
+
+def test_stamps_of_gps_are_not_taken_for_the_exposure(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(EXIF_IFD)[DATE_TIME] = "2026:05:04 11:30:05"
+    exif.get_ifd(GPS_IFD).update({0x001D: "2026:05:04", 0x0007: (9.0, 30.0, 4.0)})
+    Image.new("L", (40, 30)).save(tmp_path / "frame.jpg", exif=exif.tobytes())
+    assert read_exif(tmp_path / "frame.jpg").time_s is None
 
 
 @pytest.mark.parametrize(
