@@ -18,6 +18,7 @@ _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, he
 _ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
 _DOUBLE = 8
 _MAX_WANDER_RAD = 1e-6
+_TINY = 1e-12  # zeros, and what other bytes are as doubles
 
 
 def looks_like_sbet(head: bytes, size: int) -> bool:
@@ -29,7 +30,8 @@ def looks_like_sbet(head: bytes, size: int) -> bool:
         return False
     seconds, latitude, longitude, height = values[:4]
     sound = -86400.0 < seconds < 3e6 and abs(height) < 1e5
-    return bool(sound and abs(latitude) <= np.pi / 2.0 and 0.0 < abs(longitude) <= 2.0 * np.pi)
+    on_earth = _TINY < abs(latitude) <= np.pi / 2.0 and _TINY < abs(longitude) <= 2.0 * np.pi
+    return bool(sound and on_earth)
 
 
 def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
