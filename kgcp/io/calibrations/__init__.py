@@ -20,9 +20,9 @@ FORMATS: Mapping[str, str] = {
     "opf": "kgcp.io.calibrations.opf",
     "opensfm": "kgcp.io.calibrations.opensfm",
     "metashape": "kgcp.io.calibrations.metashape",
+    "dji": "kgcp.io.calibrations.dji",
     "pix4d": "kgcp.io.calibrations.pix4d",
     "colmap": "kgcp.io.calibrations.colmap",
-    "dji": "kgcp.io.calibrations.dji",
     "opencv": "kgcp.io.calibrations.opencv",
     "ros": "kgcp.io.calibrations.ros",
 }
