@@ -118,19 +118,21 @@ class MapFrame:
         return geodetic
 
     def map_axes_enu(self, enu: FloatArray) -> FloatArray:
-        """Return the Jacobian (3, 3) d(map)/d(enu) at one point (3,) of the ENU frame.
+        """Return the Jacobians (..., 3, 3) d(map)/d(enu) at points (..., 3) of the ENU frame.
 
         Rows are map x, y, z in the CRS's units, columns metres east, north, up of the origin.
         """
         steps = _JACOBIAN_STEP_M * np.vstack((np.eye(3), -np.eye(3)))
-        moved = self.map_from_enu(np.asarray(enu, dtype=np.float64) + steps)
-        jacobian: FloatArray = (moved[:3] - moved[3:]).T / (2.0 * _JACOBIAN_STEP_M)
-        return jacobian
+        around = np.asarray(enu, dtype=np.float64)[..., None, :] + steps
+        moved = self.map_from_enu(around.reshape(-1, 3)).reshape(around.shape)
+        differences = (moved[..., :3, :] - moved[..., 3:, :]) / (2.0 * _JACOBIAN_STEP_M)
+        jacobians: FloatArray = np.swapaxes(differences, -1, -2)
+        return jacobians
 
     def grid_rotation(self, enu: FloatArray) -> FloatArray:
-        """Return the rotation (3, 3) from the map's axes to ENU at one point (3,) of the frame.
+        """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).
 
-        Its columns are the directions of map x, y and z there, made orthonormal by the polar
+        Their columns are the directions of map x, y and z there, made orthonormal by the polar
         decomposition: meridian convergence and the change of the vertical, without the scale.
 
         Raises
@@ -139,9 +141,10 @@ class MapFrame:
             If the map's axes are left-handed.
         """
         jacobian = self.map_axes_enu(enu)
-        left, _, right = np.linalg.svd(jacobian / np.linalg.norm(jacobian, axis=1, keepdims=True))
-        enu_from_grid: FloatArray = (left @ right).T
-        if np.linalg.det(enu_from_grid) < 0.0:
+        rows = jacobian / np.linalg.norm(jacobian, axis=-1, keepdims=True)
+        left, _, right = np.linalg.svd(rows)
+        enu_from_grid: FloatArray = np.swapaxes(left @ right, -1, -2)
+        if np.any(np.linalg.det(enu_from_grid) < 0.0):
             raise KgcpError(
                 f"{self._where} {self.crs!r} has left-handed axes;"
                 " give a CRS whose axes are east and north (or west and south)"

@@ -20,10 +20,11 @@ import numpy as np
 
 from kgcp.carrier import Carrier, Whereabouts
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.geometry.pose import rotation_about
 from kgcp.geometry.reference import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.kgcps import Kgcp
 from kgcp.mapframe import MapFrame
+from kgcp.settings import VehicleSettings
 from kgcp.target.sighting import Sighting
 
 MIN_AMBIGUITY = 2.0 * math.log(100.0)
@@ -56,25 +57,30 @@ class CameraPrior:
     map_from_camera: FloatArray
     cov: FloatArray | None
 
-    @property
-    def opk_deg(self) -> FloatArray:
-        """Omega, phi, kappa (3,) [deg] as docs/conventions.md defines them."""
-        opk: FloatArray = opk_from_rotation((self.map_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
-        return opk
 
-    @property
-    def opk_cov(self) -> FloatArray | None:
-        """Covariance (6, 6) of x, y, z [m], omega, phi, kappa [deg]."""
-        if self.cov is None:
-            return None
-        omega, phi, _ = np.radians(self.opk_deg)
-        about_x = rotation_about(np.array([omega, 0.0, 0.0]))
-        about_y = rotation_about(np.array([0.0, phi, 0.0]))
-        axes = np.column_stack((np.eye(3)[0], about_x[:, 1], (about_x @ about_y)[:, 2]))
-        change = np.eye(6)
-        change[3:, 3:] = np.degrees(np.linalg.inv(axes))
-        turned: FloatArray = change @ self.cov @ change.T
-        return turned
+def opk_deg(priors: Sequence[CameraPrior]) -> FloatArray:
+    """Return omega, phi, kappa (n, 3) [deg] as docs/conventions.md defines them."""
+    rotations = np.array([prior.map_from_camera for prior in priors]).reshape(-1, 3, 3)
+    return opk_from_rotation(rotations @ CAMERA_FROM_PHOTO)
+
+
+def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
+    """Return the covariances (6, 6) of x, y, z [m], omega, phi, kappa [deg]; None: not known.
+
+    R = Rx(ω) Ry(φ) Rz(κ) turns about x, then the y that ω has turned, then the z that both have.
+    """
+    omega, phi, _ = np.radians(opk_deg(priors)).T
+    zero, one = np.zeros_like(omega), np.ones_like(omega)
+    sin, cos = np.sin(omega), np.cos(omega)
+    about_y = np.stack((zero, cos, sin), axis=-1)
+    about_z = np.stack((np.sin(phi), -sin * np.cos(phi), cos * np.cos(phi)), axis=-1)
+    axes = np.stack((np.stack((one, zero, zero), axis=-1), about_y, about_z), axis=-1)
+    change = np.tile(np.eye(6), (len(priors), 1, 1))
+    change[:, 3:, 3:] = np.degrees(np.linalg.inv(axes))
+    return [
+        None if prior.cov is None else matrix @ prior.cov @ matrix.T
+        for prior, matrix in zip(priors, change, strict=True)
+    ]
 
 
 def body_from_plate(mount_deg: float) -> FloatArray:
@@ -118,58 +124,64 @@ def camera_priors(
     ]
     if not chosen:
         return ()
-    states = carrier.motion.states(np.array([time_s for _, _, time_s in chosen]))
-    attitudes = _level_from_body(carrier, states.position_m, states.frame_from_body)
-    sds = states.sd_attitude_deg
-    return tuple(
-        _prior(point, one, one.pose, attitudes[i], None if sds is None else sds[i], carrier, frame)
-        for i, (point, one, _) in enumerate(chosen)
-        if one.pose is not None
-    )
+    times = np.array([time_s for _, _, time_s in chosen])
+    return _oriented([(point, one) for point, one, _ in chosen], times, carrier, frame)
 
 
 def _is_told_apart(seen: Sighting) -> bool:
-    return seen.ambiguity is None or seen.ambiguity >= MIN_AMBIGUITY
+    is_clear = seen.ambiguity is None or seen.ambiguity >= MIN_AMBIGUITY
+    return seen.pose is not None and is_clear
 
 
-def _level_from_body(carrier: Carrier, position: FloatArray, attitude: FloatArray) -> FloatArray:
-    """Return the rotations (n, 3, 3) from body axes to east, north, up at the vehicle."""
-    level = carrier.frame.level_rotations(position)
-    turned: FloatArray = np.swapaxes(level, -1, -2) @ attitude
-    return turned
-
-
-def _prior(
-    point: Kgcp,
-    seen: Sighting,
-    pose: Pose,
-    level_from_body: FloatArray,
-    sd_attitude_deg: FloatArray | None,
-    carrier: Carrier,
-    frame: MapFrame,
-) -> CameraPrior:
-    plate = frame.enu_from_map(point.position_map[None])[0]
-    enu_from_body = frame.level_rotations(plate[None])[0] @ level_from_body
+def _oriented(
+    pairs: Sequence[tuple[Kgcp, Sighting]], time_s: FloatArray, carrier: Carrier, frame: MapFrame
+) -> tuple[CameraPrior, ...]:
+    """Orient the camera in frames with a pose, at times (n,) by the trajectory's clock."""
+    states = carrier.motion.states(time_s)
+    level = carrier.frame.level_rotations(states.position_m)
+    plate = frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
+    # East, north and up are those of the plate, whatever datum the points' CRS has.
+    level_from_body = np.swapaxes(level, -1, -2) @ states.frame_from_body
+    enu_from_body = frame.level_rotations(plate) @ level_from_body
+    poses = [seen.pose for _, seen in pairs if seen.pose is not None]
+    plate_from_camera = np.swapaxes(np.array([pose.rotation for pose in poses]), -1, -2)
     mount = body_from_plate(carrier.settings.mount_deg)
-    enu_from_camera = enu_from_body @ mount @ pose.rotation.T
-    camera = plate - enu_from_camera @ pose.translation_m
-    map_from_enu = frame.grid_rotation(camera).T
-    cov = None
-    if point.cov_m2 is not None and seen.pose_cov is not None and sd_attitude_deg is not None:
-        to_enu = frame.grid_rotation(plate)
-        cov_enu = _cov(
-            to_enu @ point.cov_m2 @ to_enu.T,
-            seen.pose_cov if seen.common_pose_cov is None else seen.pose_cov + seen.common_pose_cov,
-            _attitude_cov(enu_from_body, sd_attitude_deg),
-            _mount_cov(enu_from_body, carrier.settings.level_sd_deg),
-            enu_from_body @ np.array(carrier.settings.lever_arm_m),
-            enu_from_camera,
-            pose.translation_m,
-        )
-        turn = np.kron(np.eye(2), map_from_enu)
-        cov = turn @ cov_enu @ turn.T
-    position = frame.map_from_enu(camera[None])[0]
-    return CameraPrior(point.frame, position, map_from_enu @ enu_from_camera, cov)
+    enu_from_camera = enu_from_body @ mount @ plate_from_camera
+    rays = np.array([pose.translation_m for pose in poses])
+    camera = plate - np.einsum("nij,nj->ni", enu_from_camera, rays)
+    map_from_enu = np.swapaxes(frame.grid_rotation(camera), -1, -2)
+    to_enu = frame.grid_rotation(plate)
+    positions = frame.map_from_enu(camera)
+    sds = states.sd_attitude_deg
+    priors = []
+    for i, (point, seen) in enumerate(pairs):
+        cov = None
+        cov_pose = _whole_pose_cov(seen)
+        if point.cov_m2 is not None and cov_pose is not None and sds is not None:
+            cov_plate = to_enu[i] @ point.cov_m2 @ to_enu[i].T
+            attitude = _Attitude(enu_from_body[i], sds[i], carrier.settings)
+            turn = np.kron(np.eye(2), map_from_enu[i])
+            cov = turn @ _cov(cov_plate, cov_pose, attitude, enu_from_camera[i], rays[i]) @ turn.T
+        attitude_map = map_from_enu[i] @ enu_from_camera[i]
+        priors.append(CameraPrior(point.frame, positions[i], attitude_map, cov))
+    return tuple(priors)
+
+
+def _whole_pose_cov(seen: Sighting) -> FloatArray | None:
+    """Return the pose's covariance with the errors that all frames share; None: not known."""
+    if seen.pose_cov is None or seen.common_pose_cov is None:
+        return seen.pose_cov
+    whole: FloatArray = seen.pose_cov + seen.common_pose_cov
+    return whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attitude:
+    """The vehicle's attitude at one time, in ENU, and how well it is known [deg]."""
+
+    enu_from_body: FloatArray
+    sd_deg: FloatArray
+    settings: VehicleSettings
 
 
 def _attitude_cov(enu_from_body: FloatArray, sd_deg: FloatArray) -> FloatArray:
@@ -200,9 +212,7 @@ def _mount_cov(enu_from_body: FloatArray, level_sd_deg: float | None) -> FloatAr
 def _cov(
     cov_plate: FloatArray,
     cov_pose: FloatArray,
-    cov_attitude: FloatArray,
-    cov_mount: FloatArray,
-    lever: FloatArray,
+    vehicle: _Attitude,
     enu_from_camera: FloatArray,
     translation: FloatArray,
 ) -> FloatArray:
@@ -216,6 +226,10 @@ def _cov(
 
     ρ holds the attitude's effect on the lever arm, α × lever, from which it correlates with α.
     """
+    body = vehicle.enu_from_body
+    cov_attitude = _attitude_cov(body, vehicle.sd_deg)
+    cov_mount = _mount_cov(body, vehicle.settings.level_sd_deg)
+    lever = body @ np.array(vehicle.settings.lever_arm_m)
     arm = _cross_matrix(enu_from_camera @ translation)
     from_pose = np.block(
         [

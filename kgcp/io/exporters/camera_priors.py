@@ -10,8 +10,9 @@ from itertools import combinations
 import numpy as np
 
 from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, decimals, deviations
-from kgcp.orientation import CameraPrior
+from kgcp.orientation import opk_covs, opk_deg
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
 COLUMNS = (
@@ -58,19 +59,19 @@ def files(points: MapPoints) -> Mapping[str, str]:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for prior in points.priors:
-        angles = (decimals(angle, DEGREE_DECIMALS) for angle in prior.opk_deg)
+    every = zip(points.priors, opk_deg(points.priors), opk_covs(points.priors), strict=True)
+    for prior, opk, cov in every:
+        angles = (decimals(angle, DEGREE_DECIMALS) for angle in opk)
         xyz = points.xyz(prior.position_map)
-        writer.writerow((prior.frame, *xyz, *angles, *_covariance(prior), points.crs))
+        writer.writerow((prior.frame, *xyz, *angles, *_covariance(cov), points.crs))
     return {
         "camera_priors/camera_priors.csv": stream.getvalue(),
         "camera_priors/HOWTO.txt": _HOWTO.format(crs=points.crs),
     }
 
 
-def _covariance(prior: CameraPrior) -> tuple[str, ...]:
+def _covariance(cov: FloatArray | None) -> tuple[str, ...]:
     """Return deviations, then the covariances above the diagonal, row by row."""
-    cov = prior.opk_cov
     if cov is None:
         return ("",) * 21
     values = (*deviations(cov), *cov[np.triu_indices(6, k=1)])

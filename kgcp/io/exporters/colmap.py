@@ -13,7 +13,7 @@ from importlib.resources import files as resources
 import numpy as np
 
 from kgcp.errors import KgcpError
-from kgcp.io.exporters.local import describe_frame, local_points
+from kgcp.io.exporters.local import describe_frame, local_cameras
 from kgcp.io.exporters.points import MapPoints, decimals, image_names
 
 _FOLDER = "colmap"
@@ -48,17 +48,16 @@ def files(points: MapPoints) -> Mapping[str, str]:
     KgcpError
         If there is no prior with a covariance, or an image's path has white space or a comma.
     """
-    local = local_points(points)
-    known = [(prior.frame, *local.prior(prior)) for prior in points.priors]
-    names = image_names((frame for frame, _, _ in known), _FOLDER, r"\s,", keep_folder=True)
+    names = image_names((one.frame for one in points.priors), _FOLDER, r"\s,", keep_folder=True)
     table, reference = [_COLUMNS], []
-    for frame, position, cov in known:
-        if cov is None:
+    for prior, position, axes in zip(points.priors, *local_cameras(points), strict=True):
+        if prior.cov is None:
             continue
+        cov = axes @ prior.cov[:3, :3] @ axes.T
         xyz = [decimals(value) for value in position]
         upper = (f"{value:.12e}" for value in cov[np.triu_indices(3)])
-        table.append(",".join((names[frame], *xyz, *upper)))
-        reference.append(" ".join((names[frame], *xyz)))
+        table.append(",".join((names[prior.frame], *xyz, *upper)))
+        reference.append(" ".join((names[prior.frame], *xyz)))
     if not reference:
         raise KgcpError(
             f"{_FOLDER}: there is no camera position with a covariance, and COLMAP takes nothing"

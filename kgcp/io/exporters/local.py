@@ -16,7 +16,6 @@ from pyproj.enums import WktVersion
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters.points import MapPoints
 from kgcp.mapframe import MapFrame
-from kgcp.orientation import CameraPrior
 
 _ROUND_MAP, _ROUND_DEGREES, _ROUND_HEIGHT = 100.0, 0.001, 10.0
 
@@ -47,14 +46,6 @@ class LocalPoints:
         turned: FloatArray = axes @ cov_map @ axes.T
         return turned
 
-    def prior(self, prior: CameraPrior) -> tuple[FloatArray, FloatArray | None]:
-        """Return a camera's position (3,) [m] and its covariance (3, 3) in the frame."""
-        position = self.frame.enu_from_map(prior.position_map[None])[0]
-        if prior.cov is None:
-            return position, None
-        axes = self.frame.grid_rotation(position)
-        return position, axes @ prior.cov[:3, :3] @ axes.T
-
 
 @lru_cache(maxsize=1)
 def local_points(points: MapPoints) -> LocalPoints:
@@ -71,8 +62,15 @@ def local_points(points: MapPoints) -> LocalPoints:
     origin = np.round(positions[0] / steps) * steps
     frame = MapFrame.at(points.crs, origin)
     position_m = frame.enu_from_map(positions)
-    axes = np.array([frame.grid_rotation(point) for point in position_m])
-    return LocalPoints(frame, origin, position_m, axes)
+    return LocalPoints(frame, origin, position_m, frame.grid_rotation(position_m))
+
+
+def local_cameras(points: MapPoints) -> tuple[FloatArray, FloatArray]:
+    """Return the priors' positions (n, 3) [m] and map axes (n, 3, 3) there, in the local frame."""
+    frame = local_points(points).frame
+    positions = np.array([prior.position_map for prior in points.priors]).reshape(-1, 3)
+    position_m = frame.enu_from_map(positions)
+    return position_m, frame.grid_rotation(position_m)
 
 
 def describe_frame(points: MapPoints) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from importlib.resources import files as resources
 from xml.etree import ElementTree as ET
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.exporters.points import (
     CORNER_PX,
@@ -25,7 +26,7 @@ from kgcp.io.exporters.points import (
 )
 from kgcp.io.exporters.xml_text import xml_text
 from kgcp.kgcps import Kgcp
-from kgcp.orientation import CameraPrior
+from kgcp.orientation import CameraPrior, opk_covs, opk_deg
 
 _FOLDER = "metashape"
 _HOWTO = """\
@@ -92,16 +93,15 @@ def _markers(points: MapPoints, label: Mapping[str, str]) -> str:
 
 
 def _cameras(points: MapPoints, names: Mapping[str, str]) -> str:
-    def row(prior: CameraPrior) -> tuple[str, ...]:
-        cov = prior.opk_cov
+    def row(prior: CameraPrior, opk: FloatArray, cov: FloatArray | None) -> tuple[str, ...]:
         sds = ("",) * 6 if cov is None else tuple(map(decimals, deviations(cov)))
-        angles = map(decimals, prior.opk_deg)
-        return (names[prior.frame], *points.xyz(prior.position_map), *sds[:3], *angles, *sds[3:])
+        xyz, angles = points.xyz(prior.position_map), map(decimals, opk)
+        return (names[prior.frame], *xyz, *sds[:3], *angles, *sds[3:])
 
     return _table(
         "label,x,y,z,accuracy_x_m,accuracy_y_m,accuracy_z_m,omega_deg,phi_deg,kappa_deg,"
         "accuracy_omega_deg,accuracy_phi_deg,accuracy_kappa_deg",
-        map(row, points.priors),
+        map(row, points.priors, opk_deg(points.priors), opk_covs(points.priors)),
     )
 
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.trajectory import ENU_FROM_NED
-from kgcp.io.exporters.local import LocalPoints, local_points
+from kgcp.io.exporters.local import local_cameras, local_points
 from kgcp.io.exporters.points import (
     METRE_DECIMALS,
     MapPoints,
@@ -95,12 +95,11 @@ def _next_above(text: str) -> str:
 def _geo(points: MapPoints) -> str:
     names = image_names((prior.frame for prior in points.priors), "geo.txt", r"\s")
     height_factor = _metres_per_height_unit(points.parsed_crs)
-    local = local_points(points)
     lines = [_header(points.crs, points.parsed_crs)]
-    for prior in points.priors:
+    for prior, angles in zip(points.priors, _yaw_pitch_roll_deg(points), strict=True):
         xyz = points.xyz(prior.position_map, height_factor=height_factor)
-        angles = (decimals(angle) for angle in yaw_pitch_roll_deg(prior, local))
-        lines.append(" ".join((names[prior.frame], *xyz, *angles, *_accuracies(prior))))
+        cells = (names[prior.frame], *xyz, *map(decimals, angles), *_accuracies(prior))
+        lines.append(" ".join(cells))
     return "\n".join(lines) + "\n"
 
 
@@ -110,16 +109,17 @@ def _accuracies(prior: CameraPrior) -> tuple[str, ...]:
     return decimals(largest_sd(prior.cov[:2, :2])), decimals(float(deviations(prior.cov)[2]))
 
 
-def yaw_pitch_roll_deg(prior: CameraPrior, local: LocalPoints) -> FloatArray:
-    """Return yaw, pitch, roll (3,) [deg] against true north and the level, as ODM takes them.
+def _yaw_pitch_roll_deg(points: MapPoints) -> FloatArray:
+    """Return yaw, pitch, roll (n, 3) [deg] against true north and the level, as ODM takes them.
 
     R(body → NED) = Rz(yaw) Ry(pitch) Rx(roll) with the body's x towards the image's top: yaw 0 has
     north there, pitch 0 looks straight down (opendm/photo.py, after Bäumker).
     """
-    position = local.frame.enu_from_map(prior.position_map[None])
-    enu_from_camera = local.frame.grid_rotation(position[0]) @ prior.map_from_camera
-    level = local.frame.level_rotations(position)[0]
-    ned_from_body = ENU_FROM_NED.T @ level.T @ enu_from_camera @ _CAMERA_FROM_BODY
+    position_m, enu_from_map = local_cameras(points)
+    map_from_camera = np.array([prior.map_from_camera for prior in points.priors])
+    level = local_points(points).frame.level_rotations(position_m)
+    level_from_camera = np.swapaxes(level, -1, -2) @ enu_from_map @ map_from_camera
+    ned_from_body = ENU_FROM_NED.T @ level_from_camera @ _CAMERA_FROM_BODY
     angles: FloatArray = Rotation.from_matrix(ned_from_body).as_euler("ZYX", degrees=True)
     return angles
 

@@ -56,7 +56,7 @@ class MapPoints:
 
     def xyz(self, position_map: FloatArray, *, height_factor: float = 1.0) -> tuple[str, str, str]:
         """Return map coordinates as text, to 0.1 µm; z times `height_factor`."""
-        decimals = DEGREE_DECIMALS if self.parsed_crs.is_geographic else METRE_DECIMALS
+        decimals = DEGREE_DECIMALS if _is_geographic(self.crs) else METRE_DECIMALS
         x, y, z = position_map
         return f"{x:.{decimals}f}", f"{y:.{decimals}f}", f"{z * height_factor:.{METRE_DECIMALS}f}"
 
@@ -68,8 +68,7 @@ class MapPoints:
     @property
     def is_north_first(self) -> bool:
         """Whether the CRS's own definition has latitude or northing first."""
-        first, second = (axis.direction for axis in self.parsed_crs.axis_info[:2])
-        return first in {"north", "south"} and second in {"east", "west"}
+        return _is_north_first(self.crs)
 
 
 @lru_cache(maxsize=8)
@@ -79,6 +78,17 @@ def _parsed(crs: str) -> CRS:
     while parsed.is_bound and parsed.source_crs is not None:
         parsed = parsed.source_crs
     return parsed
+
+
+@lru_cache(maxsize=8)
+def _is_geographic(crs: str) -> bool:
+    return bool(_parsed(crs).is_geographic)
+
+
+@lru_cache(maxsize=8)
+def _is_north_first(crs: str) -> bool:
+    first, second = (axis.direction for axis in _parsed(crs).axis_info[:2])
+    return first in {"north", "south"} and second in {"east", "west"}
 
 
 def decimals(value: float, places: int = 9) -> str:

@@ -19,6 +19,7 @@ from pyproj import Transformer
 from kgcp.errors import KgcpError
 from kgcp.io.exporters import camera_priors, export, metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
+from kgcp.orientation import opk_covs, opk_deg
 
 Factory = Callable[..., MapPoints]
 
@@ -86,7 +87,7 @@ def test_metashape_cameras_have_angles_and_accuracies(points: MapPoints) -> None
     for row, prior in zip(rows, points.priors, strict=True):
         np.testing.assert_allclose(_xyz(row), prior.position_map, atol=1e-6, rtol=0)
         angles = [float(row[f"{name}_deg"]) for name in ("omega", "phi", "kappa")]
-        np.testing.assert_allclose(angles, prior.opk_deg, atol=1e-6)
+        np.testing.assert_allclose(angles, opk_deg([prior])[0], atol=1e-6)
         assert float(row["accuracy_x_m"]) == pytest.approx(0.3, rel=1e-3)
         assert 0.2 < float(row["accuracy_kappa_deg"]) < 0.5
 
@@ -292,13 +293,14 @@ def test_camera_priors_have_position_angles_and_covariance(points: MapPoints) ->
     for row, prior in zip(rows, points.priors, strict=True):
         np.testing.assert_allclose(_xyz(row), prior.position_map, atol=1e-6, rtol=0)
         angles = [float(row[name]) for name in names[3:]]
-        np.testing.assert_allclose(angles, prior.opk_deg, atol=1e-6)
+        np.testing.assert_allclose(angles, opk_deg([prior])[0], atol=1e-6)
         cov = np.diag([float(row[f"sd_{name}"]) ** 2 for name in names])
         for i, first in enumerate(names):
             for j, second in enumerate(names[i + 1 :], start=i + 1):
                 cov[i, j] = cov[j, i] = float(row[f"cov_{first}_{second}"])
-        assert prior.opk_cov is not None
-        np.testing.assert_allclose(cov, prior.opk_cov, rtol=1e-7, atol=1e-12)
+        (expected,) = opk_covs([prior])
+        assert expected is not None
+        np.testing.assert_allclose(cov, expected, rtol=1e-7, atol=1e-12)
         assert row["crs"] == "EPSG:25831"
 
 
