@@ -20,7 +20,7 @@ from kgcp.io.trajectories.rtklib import read_rtklib
 from kgcp.io.trajectories.sbet import looks_like_sbet, read_sbet
 from kgcp.io.trajectories.tum import read_tum
 
-__all__ = ["TrajectoryFormat", "TrajectoryNotation", "read_trajectory"]
+__all__ = ["TrajectoryFormat", "TrajectoryNotation", "read_trajectory", "recognise"]
 
 _HEAD = 4096
 _CONTRACT = TrajectoryNotation()
