@@ -85,6 +85,8 @@ def read_reference_poses(
     file = ForeignFile.read(path, "[reference] poses")
     module = import_module(FORMATS[notation.form or _recognised(file)])
     source: SourcePoses = module.poses(file)
+    if not source.names:
+        raise file.error("", "holds no pose", "export the aligned frames")
     names = frames_of(file, source.names, frames)
     return on_the_map(file, source, names, notation, crs)
 

@@ -52,7 +52,7 @@ def on_the_map(
     placed = _placed(file, _shifted(file, source, notation), notation.crs)
     if placed.crs is not None and not _is_same(placed.crs, crs):
         where = f"{file.path}: crs" if notation.crs is None else REFERENCE_CRS
-        placed = _moved(file, placed, where, crs)
+        placed = _moved(file, placed, MapFrame.at(placed.crs, placed.position[0], where), crs)
     return ReferencePoses(
         frames=frames,
         position_map=placed.position,
@@ -131,17 +131,14 @@ def _is_same(crs: str, flight_crs: str | None) -> bool:
     )
 
 
-def _moved(file: ForeignFile, source: SourcePoses, where: str, crs: str | None) -> SourcePoses:
-    """Bring poses from their CRS, which `where` states, to the flight's."""
+def _moved(file: ForeignFile, source: SourcePoses, here: MapFrame, crs: str | None) -> SourcePoses:
+    """Bring poses from their map, that of `here`, to the flight's."""
     if crs is None:
         raise file.error(
             "",
             "has coordinates of its own CRS, but flight.toml has none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )
-    if source.crs is None or not source.names:
-        return source
-    here = MapFrame.at(source.crs, source.position[0], where)
     change = MapChange.to(crs, here, source.position[0], FLIGHT_TOML)
     turn = np.array([change.axes(point) for point in source.position])
     sd = source.sd_position_m

@@ -35,8 +35,9 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
         path = PurePosixPath(frame)
         for key in {path.name, path.stem}:
             by_name[key].append(frame)
+    known = set(frames)
     for name in names:
-        frame = _frame_of(file, name.replace("\\", "/"), set(frames), by_name)
+        frame = _frame_of(file, name.replace("\\", "/"), known, by_name)
         if frame in owners:
             raise file.error(
                 "", f"images {owners[frame]!r} and {name!r} are both {frame!r}", "keep one of them"

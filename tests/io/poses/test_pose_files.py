@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.io.poses import read_reference_poses
+from kgcp.io.flight import read_flight
+from kgcp.io.poses import FORMATS, read_flight_poses, read_reference_poses
 from kgcp.io.poses.notation import PoseNotation
 
 SAMPLES: dict[str, Any] = {
@@ -100,3 +101,61 @@ def test_a_missing_grid_is_named(tmp_path: Path) -> None:
         read_reference_poses(path, crs="EPSG:25831+5773")
     with pytest.raises(KgcpError, match=r"has coordinates of its own CRS, but flight.toml has no"):
         read_reference_poses(path)
+
+
+@pytest.mark.parametrize("form", sorted(FORMATS))
+@pytest.mark.parametrize(
+    "content", ["", "no such thing\n", "[1, 2]", "{}", "<a/>", "\x00\x01", "a,b\n1,2\n", "[]"]
+)
+def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
+    tmp_path: Path, form: str, content: str
+) -> None:
+    path = tmp_path / "poses"
+    path.write_text(content)
+    with pytest.raises(KgcpError) as caught:
+        read_reference_poses(path, PoseNotation(form), crs="EPSG:32631")
+    assert str(caught.value).startswith(f"{path}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "frame,x,y,z,omega_deg,phi_deg,kappa_deg\n",
+        "imageName X Y Z Omega Phi Kappa\n",
+        '[{"shots": {}}]',
+        '<document><chunk><cameras><camera label="unaligned"/></cameras></chunk></document>',
+    ],
+)
+def test_a_file_without_poses_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "poses"
+    path.write_text(content)
+    with pytest.raises(KgcpError, match="holds no pose; export the aligned frames"):
+        read_reference_poses(path)
+
+
+def test_flight_toml_describes_the_file(tmp_path: Path) -> None:
+    (tmp_path / "frames" / "b").mkdir(parents=True)
+    (tmp_path / "frames" / "b" / "a.jpg").touch()
+    (tmp_path / "poses.txt").write_text("1 1 0 0 0 1 2 3 1 a.jpg\n\n")
+    (tmp_path / "shift.xyz").write_text("400000 4500000 0\n")
+    toml = tmp_path / "flight.toml"
+    flight = (
+        'crs = "EPSG:32631"\n[camera]\nwidth = 9\nheight = 9\nfx = 9\nfy = 9\ncx = 4\ncy = 4\n'
+        '[[target]]\nname = "A"\nouter_diameter_m = 0.9\ninner_diameter_m = 0.45\n'
+        "code_diameter_m = 0.642857143\ndot_diameter_m = 0.128571429\ncode_deg = [0, 43, 78]\n"
+    )
+    toml.write_text(flight)
+    assert read_flight_poses(read_flight(tmp_path)) is None
+    reference = '[reference]\nposes = "poses.txt"\ncrs = "EPSG:32631"\noffset = "shift.xyz"\n'
+    toml.write_text(f'{flight}{reference}format = "colmap"\n')
+    poses = read_flight_poses(read_flight(tmp_path))
+    assert poses is not None
+    assert poses.frames == ("b/a.jpg",)
+    np.testing.assert_allclose(poses.position_map, [[399_999.0, 4_499_998.0, -3.0]])
+    toml.write_text(f'{flight}{reference}format = "bundler"\n')
+    with pytest.raises(KgcpError, match=r"\[reference\] format: 'bundler' is not known; give one"):
+        read_flight(tmp_path)
+    toml.write_text(f"{flight}{reference.replace('shift', 'none')}")
+    with pytest.raises(KgcpError, match=r"\[reference\] offset: 'none.xyz' does not exist"):
+        read_flight(tmp_path)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
@@ -257,3 +258,24 @@ def test_shots_are_centres_in_the_utm_zone_that_fits(
     path.write_text(json.dumps(collection))
     with pytest.raises(KgcpError, match=r"has translations of no UTM zone about 0\.6"):
         read_reference_poses(path, crs="EPSG:32631")
+
+
+@pytest.mark.parametrize(
+    ("crs", "longitude", "latitude"),
+    [
+        ("EPSG:32731", 2.5, -23.4),  # south
+        ("EPSG:32631", 6.01, 41.4),  # the zone of most frames, though not of this one
+        ("EPSG:32660", -179.99, 10.0),  # across the date line
+        ("EPSG:32632", 5.3, 60.4),  # Bergen's zone is wider
+    ],
+)
+def test_the_zone_of_shots_is_found(
+    tmp_path: Path, crs: str, longitude: float, latitude: float
+) -> None:
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+    path = tmp_path / "shots.geojson"
+    properties = {"filename": "a.jpg", "rotation": [0, 0, 0], "translation": [x, y, 70.0]}
+    geometry = {"type": "Point", "coordinates": [longitude, latitude, 70.0]}
+    features = [{"type": "Feature", "properties": properties, "geometry": geometry}]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    np.testing.assert_array_equal(read_reference_poses(path, crs=crs).position_map, [[x, y, 70.0]])
