@@ -7,22 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.jumps import find_jumps
 from kgcp.kgcps import Flag, Kgcp, Omission, Skip
 from kgcp.mapframe import MapFrame
 from kgcp.target.sighting import Sighting
-
-_SIDE = 4  # neighbours in time on either side, at most
-_LEAST_ON_A_SIDE = 2  # a parabola does not foresee, it interpolates
-_REACH_INTERVALS = 6.0  # neighbours within this many usual intervals
-_LIMIT = 5.0
-_SD_OF_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median deviation
-_MAX_ROUNDS = 1000
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,70 +115,6 @@ def _height(seen: Sighting, up_m: float) -> tuple[float, float]:
     normal, sight = seen.pose.normal, seen.pose.translation_m
     effect = np.concatenate((normal, np.cross(normal, sight)))
     return up_m + float(normal @ sight), float(np.sqrt(effect @ seen.pose_cov @ effect))
-
-
-def find_jumps(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> BoolArray:
-    """Return which of n values do not continue the parabola through their neighbours.
-
-    A value is compared with the least-squares parabola through up to four neighbours on either
-    side, itself left out. Five deviations are too many, where a deviation holds the values' own
-    and the scatter of all residuals about parabolas (1.4826 times the median), which is the
-    flight's own unrest. The worst of a neighbourhood is taken out, then the others are looked at
-    again without it.
-
-    Parameters
-    ----------
-    time_s : (n,) array
-        Ascending [s].
-    value, sd : (n,) array
-        Of the same unit.
-    """
-    jumps = np.zeros(len(time_s), dtype=bool)
-    if not len(time_s):
-        return jumps
-    for _ in range(_MAX_ROUNDS):
-        good = np.flatnonzero(~jumps)
-        ratio = _departures(time_s[good], value[good], sd[good])
-        worst = (ratio > _LIMIT) & (ratio >= _neighbourhood_maximum(ratio))
-        if not worst.any():
-            break
-        jumps[good[worst]] = True
-    return jumps
-
-
-def _departures(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> FloatArray:
-    """Return |value − parabola| over its deviation (n,); 0 where there are too few neighbours."""
-    count = len(time_s)
-    if count < 2 * _LEAST_ON_A_SIDE + 1:
-        return np.zeros(count)
-    usual_s = float(np.median(np.diff(time_s)))
-    steps = np.array([step for step in range(-_SIDE, _SIDE + 1) if step])
-    places = np.arange(count)[:, None] + steps
-    exists = (places >= 0) & (places < count)
-    places = np.clip(places, 0, count - 1)
-    since = time_s[places] - time_s[:, None]
-    near = exists & (np.abs(since) <= _REACH_INTERVALS * usual_s) & (since != 0.0)
-    enough = (near[:, :_SIDE].sum(1) >= _LEAST_ON_A_SIDE) & (
-        near[:, _SIDE:].sum(1) >= _LEAST_ON_A_SIDE
-    )
-    unit = since / max(usual_s, 1e-9)
-    powers = np.stack((np.ones_like(unit), unit, unit**2), axis=2) * near[:, :, None]
-    share = np.zeros_like(since)  # of each neighbour in the parabola's value at the point
-    share[enough] = np.linalg.pinv(powers[enough])[:, 0, :]
-    residual = value - np.sum(share * value[places], axis=1)
-    spread = 1.0 + np.sum(share**2, axis=1)
-    if not enough.any():
-        return np.zeros(count)
-    unrest = _SD_OF_MEDIAN * np.median(np.abs(residual[enough]) / np.sqrt(spread[enough]))
-    variance = unrest**2 * spread + sd**2 + np.sum((share * sd[places]) ** 2, axis=1)
-    ratio = np.abs(residual) / np.sqrt(np.maximum(variance, 1e-18))
-    return np.where(enough, ratio, 0.0)
-
-
-def _neighbourhood_maximum(ratio: FloatArray) -> FloatArray:
-    padded = np.pad(ratio, _SIDE, constant_values=0.0)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE + 1)
-    return np.asarray(windows.max(axis=1))
 
 
 def pass_gates(
