@@ -207,6 +207,26 @@ def test_a_static_target_is_one_point_with_many_rays(flight: FlightFolder) -> No
     assert {line.split()[6] for line in lines} == {"A"}
 
 
+def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder) -> None:
+    result = flight.run("export-gcp", "--format", "all")
+    assert result.exit_code == 0, result.output
+    assert "left out colmap: there is no camera position" in result.stderr
+    for name in ("kgcps.csv", "gcp_list.txt", "opf/project.opf", "mmvii/kgcp.obs"):
+        assert (flight.out / name).is_file()
+    assert "camera position" in flight.fails("export-gcp", "--format", "colmap")
+    flight.detect(lambda row: row.update(frame=f"my {row['frame']}"))
+    result = flight.run("export-gcp", "--format", "all")
+    assert "left out gcp_list.txt" in result.stderr
+    assert '"my%20f_0.jpg"' in (flight.out / "opf/camera_list.json").read_text(encoding="utf-8")
+
+
+def test_formats_are_listed_with_their_files() -> None:
+    result = CliRunner().invoke(main, ["export-gcp", "--list-formats"])
+    assert result.exit_code == 0
+    assert "metashape      Agisoft Metashape" in result.stdout
+    assert "metashape/scale_bars.csv" in result.stdout
+
+
 def test_frames_outside_the_trajectory_are_counted(flight: FlightFolder) -> None:
     flight.edit("lever_arm_m", "time_offset_s = -0.5\nlever_arm_m")
     result = flight.run("export-gcp", "--json")

@@ -7,11 +7,9 @@ import io
 from collections.abc import Mapping
 from itertools import combinations
 
-import numpy as np
-
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, decimals, deviations
+from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, decimals, deviations, upper
 from kgcp.orientation import opk_covs, opk_deg
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
@@ -74,5 +72,5 @@ def _covariance(cov: FloatArray | None) -> tuple[str, ...]:
     """Return deviations, then the covariances above the diagonal, row by row."""
     if cov is None:
         return ("",) * 21
-    values = (*deviations(cov), *cov[np.triu_indices(6, k=1)])
+    values = (*deviations(cov), *upper(cov, 1))
     return tuple(f"{value:.9g}" for value in values)

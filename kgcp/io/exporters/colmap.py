@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.resources import files as resources
 
-import numpy as np
-
 from kgcp.errors import KgcpError
 from kgcp.io.exporters.local import describe_frame, local_cameras
-from kgcp.io.exporters.points import MapPoints, decimals, image_names
+from kgcp.io.exporters.points import MapPoints, decimals, image_names, upper
 
 _FOLDER = "colmap"
 _COLUMNS = "image,x,y,z,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
@@ -55,8 +53,8 @@ def files(points: MapPoints) -> Mapping[str, str]:
             continue
         cov = axes @ prior.cov[:3, :3] @ axes.T
         xyz = [decimals(value) for value in position]
-        upper = (f"{value:.12e}" for value in cov[np.triu_indices(3)])
-        table.append(",".join((names[prior.frame], *xyz, *upper)))
+        triangle = (f"{value:.12e}" for value in upper(cov))
+        table.append(",".join((names[prior.frame], *xyz, *triangle)))
         reference.append(" ".join((names[prior.frame], *xyz)))
     if not reference:
         raise KgcpError(

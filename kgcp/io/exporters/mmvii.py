@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters.local import describe_frame, local_points
 from kgcp.io.exporters.points import (
@@ -24,6 +22,7 @@ from kgcp.io.exporters.points import (
     known_cov,
     labels,
     pixel,
+    upper,
 )
 from kgcp.io.exporters.xml_text import add_text, xml_text
 from kgcp.kgcps import Kgcp
@@ -81,7 +80,7 @@ def _document(root: ET.Element) -> str:
 
 def _triangle(cov: FloatArray) -> str:
     """Return the upper triangle, row by row; variances of micrometres must not vanish."""
-    return " ".join(f"{value:.12e}" for value in cov[np.triu_indices(len(cov))])
+    return " ".join(f"{value:.12e}" for value in upper(cov))
 
 
 def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:

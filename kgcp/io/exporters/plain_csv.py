@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.points import MapPoints, upper
 from kgcp.io.times import format_time
 
 COLUMNS = (
@@ -48,7 +48,7 @@ def _covariance(cov: FloatArray | None, size: int) -> tuple[str, ...]:
     """Return deviations, then the covariances above the diagonal, row by row."""
     if cov is None:
         return ("",) * (size * (size + 1) // 2)
-    values = (*np.sqrt(np.diag(cov)), *cov[np.triu_indices(size, k=1)])
+    values = (*np.sqrt(np.diag(cov)), *upper(cov, 1))
     return tuple(_text(float(value)) for value in values)
 
 

@@ -14,6 +14,7 @@ from pyproj import CRS
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.trajectory import IndexArray
 from kgcp.kgcps import Kgcp
 from kgcp.orientation import CameraPrior
 
@@ -213,6 +214,17 @@ def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
 def largest_sd(cov: FloatArray) -> float:
     """Return the standard deviation along the worst direction of a covariance."""
     return float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+
+
+def upper(cov: FloatArray, above: int = 0) -> FloatArray:
+    """Return what a covariance has on its diagonal and above, row by row; `above` 1: without it."""
+    return cov[_upper_indices(len(cov), above)]
+
+
+@lru_cache(maxsize=8)
+def _upper_indices(size: int, above: int) -> tuple[IndexArray, IndexArray]:
+    rows, columns = np.triu_indices(size, k=above)
+    return rows, columns
 
 
 def deviations(cov: FloatArray) -> FloatArray:

@@ -1,0 +1,126 @@
+"""All formats together: what they write, how fast, and that it fits together again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.reference import CAMERA_FROM_PHOTO, rotation_from_opk
+from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, camera_priors, export, opf
+from kgcp.io.exporters.points import MapPoints
+from kgcp.mapframe import MapFrame
+from kgcp.orientation import CameraPrior
+
+ROOT = Path(__file__).resolve().parents[3]
+Factory = Callable[..., MapPoints]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_format_writes_the_files_it_declares(
+    points: MapPoints, make_points: Factory, tmp_path: Path, name: str
+) -> None:
+    written = [str(path.relative_to(tmp_path)) for path in export(points, name, tmp_path)]
+    declared = [pattern.strip("[]") for pattern in FORMATS[name].files]
+    assert all(any(fnmatch(path, pattern) for pattern in declared) for path in written)
+    assert all(any(fnmatch(path, pattern) for path in written) for pattern in declared)
+    assert name == "csv" or any(path.endswith("HOWTO.txt") for path in written)
+    assert not [path for path in tmp_path.rglob("*") if path.suffix == ".part"]
+    if name not in {"colmap", "camera-priors"}:
+        always = [pattern for pattern in FORMATS[name].files if pattern[0] != "["]
+        plain = make_points(kgcps=points.controls)
+        left = {str(path.relative_to(tmp_path)) for path in export(plain, name, tmp_path)}
+        assert all(any(fnmatch(path, pattern) for pattern in always) for path in left)
+        files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+        assert files == left  # nothing old remains
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_no_points_are_an_error(make_points: Factory, tmp_path: Path, name: str) -> None:
+    with pytest.raises(KgcpError, match="no point is left"):
+        export(make_points(kgcps=()), name, tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_how_tos_say_what_is_ignored(points: MapPoints, tmp_path: Path) -> None:
+    for name in set(FORMATS) - {"csv", "geojson", "geopackage", "camera-priors"}:
+        (how_to,) = [p for p in export(points, name, tmp_path) if p.name == "HOWTO.txt"]
+        text = how_to.read_text(encoding="utf-8")
+        assert re.search(r"ignore|no place|does not\s+know|takes no", text), name
+        assert "{" not in text, name  # every blank is filled
+        assert max(map(len, text.splitlines())) <= 200
+
+
+def test_the_page_has_every_format_and_default() -> None:
+    page = (ROOT / "docs" / "exporting.md").read_text(encoding="utf-8")
+    names = [name for line in page.splitlines() for name in re.findall(r"^\| `([a-z0-9-]+)`", line)]
+    assert sorted(set(names)) == sorted(FORMATS)
+    assert set(DEFAULT_FORMATS) <= set(FORMATS)
+
+
+def test_a_thousand_points_take_no_time(make_points: Factory, tmp_path: Path) -> None:
+    """A coarse guard: CPU time, ten times what it should be."""
+    one = make_points().kgcps[0]
+    kgcps = tuple(
+        replace(one, id=f"K{n:04d}", frame=f"{n}.JPG", position_map=one.position_map + 0.5 * n)
+        for n in range(1000)
+    )
+    points = make_points(kgcps=kgcps)
+    begin_s = time.process_time()
+    for name in set(FORMATS) - {"colmap", "camera-priors"}:
+        export(points, name, tmp_path)
+    assert time.process_time() - begin_s < 15.0
+
+
+def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> None:
+    """Project by OpenCV what a reader of OPF and of camera_priors.csv gets: the same pixels."""
+    template = make_points()
+    frame = MapFrame.at(template.crs, template.kgcps[0].position_map)
+    camera_enu = np.array([12.0, -7.0, 76.0])
+    opk = np.array([[3.0, -6.0, 41.0]])
+    enu_from_camera = (
+        frame.grid_rotation(camera_enu) @ rotation_from_opk(opk)[0] @ CAMERA_FROM_PHOTO
+    )
+    camera = template.camera
+    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
+    ground = np.array([[5.0, -9.0, 1.0], [-11.0, 3.0, -2.0], [30.0, 12.0, 0.5]])
+    inside = (ground - camera_enu) @ enu_from_camera
+    pixels = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
+    kgcps = tuple(
+        replace(
+            template.kgcps[0],
+            id=f"K{number}",
+            frame="one.jpg",
+            position_map=frame.map_from_enu(place[None])[0],
+            centre_px=pixel,
+            distance_m=float(np.linalg.norm(ray)),
+        )
+        for number, (place, pixel, ray) in enumerate(zip(ground, pixels, inside, strict=True))
+    )
+    map_from_camera = frame.grid_rotation(camera_enu).T @ enu_from_camera
+    prior = CameraPrior("one.jpg", frame.map_from_enu(camera_enu[None])[0], map_from_camera, None)
+    points = make_points(kgcps=kgcps, priors=(prior,))
+
+    (row,) = csv.DictReader(
+        camera_priors.files(points)["camera_priors/camera_priors.csv"].splitlines()
+    )
+    centre = frame.enu_from_map(np.array([[float(row[name]) for name in "xyz"]]))[0]
+    angles = np.array([[float(row[f"{name}_deg"]) for name in ("omega", "phi", "kappa")]])
+    attitude = frame.grid_rotation(centre) @ rotation_from_opk(angles)[0] @ CAMERA_FROM_PHOTO
+    for gcp in json.loads(opf.files(points)["opf/input_control_points.json"])["gcps"]:
+        place = frame.enu_from_map(np.array([gcp["geolocation"]["coordinates"]]))
+        ray = (place - centre) @ attitude
+        got = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, distortion)[0][0, 0]
+        (mark,) = gcp["marks"]
+        np.testing.assert_allclose(got + 0.5, mark["position_px"], atol=1e-5)  # 0.1 µm at 76 m
