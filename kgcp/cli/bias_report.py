@@ -34,7 +34,7 @@ def command(flight: Path, out: Path | None, detections: Path | None, *, as_json:
     the_flight = read_flight(flight)
     folder = out or the_flight.folder / "kgcp"
     attempts = read_attempts(detections or folder / "detections.parquet", the_flight.targets)
-    poses = read_flight_poses(the_flight)
+    poses = read_flight_poses(the_flight, [attempt.frame for attempt in attempts])
     if poses is None:
         raise KgcpError(
             f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses = 'reference.csv'"

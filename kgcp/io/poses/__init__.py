@@ -32,8 +32,14 @@ FORMATS: Mapping[str, str] = {
 """Name in flight.toml → module, in the order in which they are tried."""
 
 
-def read_flight_poses(flight: Flight) -> ReferencePoses | None:
+def read_flight_poses(flight: Flight, frames: Sequence[str] | None = None) -> ReferencePoses | None:
     """Read the reference poses of a flight, in its CRS; None where flight.toml names none.
+
+    Parameters
+    ----------
+    flight : Flight
+    frames : sequence of str or None
+        Its frames, by which the file's images are known; None: those in the frames folder.
 
     Raises
     ------
@@ -48,7 +54,7 @@ def read_flight_poses(flight: Flight) -> ReferencePoses | None:
         flight.reference_file,
         flight.reference_notation,
         crs=flight.crs,
-        frames=list_frames(flight.frames_folder),
+        frames=list_frames(flight.frames_folder) if frames is None else frames,
     )
 
 

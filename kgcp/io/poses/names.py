@@ -22,7 +22,7 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
     names : sequence of str
         Of images.
     frames : sequence of str
-        Of the flight, relative to the frames folder.
+        Of the flight, relative to the frames folder; each may stand there repeatedly.
 
     Raises
     ------
@@ -31,11 +31,11 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
     """
     owners: dict[str, str] = {}
     by_name: dict[str, list[str]] = defaultdict(list)
-    for frame in frames:
+    known = set(frames)
+    for frame in sorted(known):
         path = PurePosixPath(frame)
         for key in {path.name, path.stem}:
             by_name[key].append(frame)
-    known = set(frames)
     for name in names:
         frame = _frame_of(file, name.replace("\\", "/"), known, by_name)
         if frame in owners:

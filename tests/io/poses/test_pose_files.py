@@ -50,6 +50,7 @@ def test_a_file_of_no_format_is_refused(tmp_path: Path, content: str) -> None:
     ("names", "frames", "expected"),
     [
         ("a.jpg", "x/a.jpg y/b.jpg", "x/a.jpg"),
+        ("a.jpg", "x/a.jpg x/a.jpg", "x/a.jpg"),  # two targets in one frame
         ("a", "x/a.jpg y/b.jpg", "x/a.jpg"),
         ("C:\\flight\\y\\a.jpg", "x/a.jpg y/a.jpg", "y/a.jpg"),
         ("y/a", "x/a.jpg y/a.jpg", "y/a.jpg"),
