@@ -6,22 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from kgcp.carrier import Place, Ride, Whereabouts
+from kgcp.carrier import Place, Whereabouts
 from kgcp.consistency.corrections import BoolArray, Estimate, estimate, find_outliers
+from kgcp.consistency.system import Meeting, System
 from kgcp.consistency.whitening import whiten
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.pose import Pose
 from kgcp.geometry.reference import ReferencePoses
 from kgcp.target.sighting import Sighting
 from kgcp.views import Views
 
 MIN_POINTS = 10
-_MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
-_STANDING_M_S = 0.2  # below, the track is where the vehicle points
-_NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
+_CORRELATIONS_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,22 +60,13 @@ class Consistency:
         Ascending in time.
     estimate : Estimate
         Corrections that explain them.
+    correlation_s : float
+        Over which the trajectory's errors seem to fade: the likeliest of a few times [s].
     """
 
     discrepancies: tuple[Discrepancy, ...]
     estimate: Estimate
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Meeting:
-    """One frame with both places: sighting, its time, pose and covariance, and its ride."""
-
-    seen: Sighting
-    pose: Pose
-    time_s: float
-    place: Place
-    ride: Ride
-    row: int
+    correlation_s: float
 
 
 def study_consistency(
@@ -116,22 +104,34 @@ def study_consistency(
     if len(meetings) < MIN_POINTS or whereabouts.carrier is None:
         return None
     views = Views.of(poses, whereabouts.frame)
-    system = _System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
+    system = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
     outlier = find_outliers(system.design, system.offset, system.fading + system.white)
+    found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), system, ~outlier)
+    offset_s = whereabouts.carrier.settings.time_offset_s
+    return Consistency(
+        _discrepancies(meetings, system, outlier, found, offset_s), found, correlation_s
+    )
+
+
+def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estimate, float]:
+    """Return the corrections by the points that are kept, and the likeliest correlation time.
+
+    A time that is believed but wrong would weigh neighbouring frames against each other as if
+    their trajectory were far better, or worse, than it is.
+    """
     columns = np.concatenate(
         (system.design, system.offset[:, :, None], system.common[:, :, None]), axis=2
-    )
-    kept = ~outlier
-    whitened = whiten(
-        np.array([one.time_s for one in meetings])[kept],
-        system.fading[kept],
-        system.white[kept],
-        whereabouts.carrier.settings.correlation_s,
-        columns[kept],
-    )
-    found = estimate(whitened.reshape(-1, columns.shape[2]), has_deviations=system.has_deviations)
-    offset_s = whereabouts.carrier.settings.time_offset_s
-    return Consistency(_discrepancies(meetings, system, outlier, found, offset_s), found)
+    )[kept]
+    trials = []
+    for correlation_s in _CORRELATIONS_S if system.fading.any() else (0.0,):
+        whitened, log_det = whiten(
+            time_s[kept], system.fading[kept], system.white[kept], correlation_s, columns
+        )
+        rows = whitened.reshape(-1, columns.shape[2])
+        found = estimate(rows, has_deviations=system.has_deviations)
+        trials.append((found.chi2_after + log_det, correlation_s, found))
+    _, correlation_s, found = min(trials, key=lambda trial: trial[0])
+    return found, correlation_s
 
 
 def _meet(
@@ -139,7 +139,7 @@ def _meet(
     whereabouts: Whereabouts,
     poses: ReferencePoses,
     camera: Camera,
-) -> list[_Meeting]:
+) -> list[Meeting]:
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     moving = [
         seen
@@ -151,123 +151,16 @@ def _meet(
     times = [seen.row_time_s(camera) for seen in moving]
     places = whereabouts.places([seen.target for seen in moving], times)
     meetings = [
-        _Meeting(seen, seen.pose, time_s, place, place.ride, rows[seen.frame])
+        Meeting(seen, seen.pose, time_s, place, place.ride, rows[seen.frame])
         for seen, time_s, place in zip(moving, times, places, strict=True)
         if isinstance(place, Place) and place.ride and seen.pose and time_s is not None
     ]
     return sorted(meetings, key=lambda one: (one.time_s, one.seen.frame))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """Discrepancies (n, 3) in ENU axes, what moves them (n, 3, 8), and their covariances.
-
-    `fading` is the share of the trajectory, `white` that of all that is independent from frame to
-    frame; `common` (n, 3) is one deviation of the distances by calibration and diameter.
-    """
-
-    offset: FloatArray
-    design: FloatArray
-    fading: FloatArray
-    white: FloatArray
-    common: FloatArray
-    has_deviations: bool
-    track: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        meetings: Sequence[_Meeting],
-        views: Views,
-        poses: ReferencePoses,
-        camera: Camera,
-        sd_time_s: float,
-    ) -> _System:
-        rows = [one.row for one in meetings]
-        attitude = views.enu_from_camera[rows]
-        in_camera = np.array([one.pose.translation_m for one in meetings])
-        sight = np.einsum("nij,nj->ni", attitude, in_camera)
-        velocity = np.array([one.ride.velocity_m_s for one in meetings])
-        body = np.array([one.ride.frame_from_body for one in meetings])
-        since_middle = np.array([one.seen.rows_since_middle(camera) for one in meetings])[:, None]
-        moved = _camera_velocity(meetings, views.centre_m[rows], velocity)
-        centre = views.centre_m[rows] + moved * since_middle * camera.readout_s
-        offset = np.array([one.place.position_m for one in meetings]) - centre - sight
-        columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
-        design = np.concatenate((*columns, attitude @ _cross(in_camera)), axis=2)
-        fading = np.array([_fading_m2(one.place) for one in meetings])
-        white = _white_m2(meetings, views, poses, sight)
-        shift = sd_time_s * velocity
-        white = white + shift[:, :, None] * shift[:, None, :]
-        common_m = np.array([one.seen.sd_common_distance_m or 0.0 for one in meetings])
-        unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-        stated = all(one.place.cov_m2 is not None for one in meetings) and views.cov_m2 is not None
-        return cls(
-            offset, design, fading, white, unit * common_m[:, None], stated, _track(velocity, body)
-        )
-
-
-def _fading_m2(place: Place) -> FloatArray:
-    if place.cov_m2 is None or place.common_m is None:
-        return np.zeros((3, 3))
-    return place.cov_m2 - place.common_m @ place.common_m.T
-
-
-def _white_m2(
-    meetings: Sequence[_Meeting], views: Views, poses: ReferencePoses, sight: FloatArray
-) -> FloatArray:
-    """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
-    rows = [one.row for one in meetings]
-    attitude = views.enu_from_camera[rows]
-    total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
-    measured = [one.seen.pose_cov for one in meetings]
-    of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
-    total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
-    if views.cov_m2 is not None:
-        total = total + views.cov_m2[rows]
-    if poses.sd_angle_deg is not None:
-        effect = _cross(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
-        total = total + effect @ np.swapaxes(effect, 1, 2)
-    return np.asarray(total)
-
-
-def _camera_velocity(
-    meetings: Sequence[_Meeting], centre: FloatArray, otherwise: FloatArray
-) -> FloatArray:
-    """Return the camera's velocity (n, 3) by splines through its positions, not across gaps.
-
-    Where there is nothing to interpolate it is taken to follow the vehicle.
-    """
-    time_s = np.array([one.time_s for one in meetings])
-    velocity = otherwise.copy()
-    breaks = np.flatnonzero(np.diff(time_s) > _NEIGHBOUR_S) + 1
-    for run in np.split(np.arange(len(time_s)), breaks):
-        if len(run) > 1 and np.all(np.diff(time_s[run]) > 0.0):
-            velocity[run] = CubicSpline(time_s[run], centre[run])(time_s[run], 1)
-    return velocity
-
-
-def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:
-    """Return along track, across to the right and up (n, 3, 3), as rows in ENU axes."""
-    ahead = np.where(
-        np.linalg.norm(velocity[:, :2], axis=1, keepdims=True) > _STANDING_M_S,
-        velocity,
-        body[:, :, 0],
-    )
-    east, north = (ahead[:, :2] / np.linalg.norm(ahead[:, :2], axis=1, keepdims=True)).T
-    none, one = np.zeros_like(east), np.ones_like(east)
-    rows = ((east, north, none), (north, -east, none), (none, none, one))
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _cross(vectors: FloatArray) -> FloatArray:
-    """Return the matrices [v]× (n, 3, 3) of vectors (n, 3)."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None], axis=2).swapaxes(1, 2))
-
-
 def _discrepancies(
-    meetings: Sequence[_Meeting],
-    system: _System,
+    meetings: Sequence[Meeting],
+    system: System,
     outlier: BoolArray,
     found: Estimate,
     time_offset_s: float,

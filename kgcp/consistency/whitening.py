@@ -15,7 +15,7 @@ def whiten(
     white_m2: FloatArray,
     correlation_s: float,
     columns: FloatArray,
-) -> FloatArray:
+) -> tuple[FloatArray, float]:
     """Return observations and design as if all errors were independent and of variance one.
 
     The error of observation i is the sum of a white one and of a first-order Gauss-Markov process,
@@ -34,14 +34,21 @@ def whiten(
         τ [s]; 0: both shares are white.
     columns : (n, 3, k) array
         Observations and columns of the design.
+
+    Returns
+    -------
+    whitened : (n, 3, k) array
+    log_det : float
+        Logarithm of the full covariance's determinant: -2 log L = χ² + log_det + constant.
     """
     if correlation_s == 0.0:
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(fading_m2 + white_m2), columns))
+        half = np.asarray(np.linalg.cholesky(fading_m2 + white_m2), dtype=np.float64)
+        return np.asarray(np.linalg.solve(half, columns)), _log_det(half)
     process = fading_m2 + _FLOOR_M2 * np.eye(3)
     factors = np.linalg.cholesky(process)
     keep = np.exp(-np.diff(time_s) / correlation_s)
     moves = keep[:, None, None] * factors[1:] @ np.linalg.inv(factors[:-1])
-    whitened = np.empty_like(columns)
+    whitened, halves = np.empty_like(columns), np.empty_like(process)
     state, spread = np.zeros(columns.shape[1:]), process[0]
     for index in range(len(time_s)):
         if index:
@@ -49,10 +56,14 @@ def whiten(
             state = move @ state
             spread = move @ spread @ move.T + (1.0 - kept) * process[index]
         innovation = columns[index] - state
-        total = spread + white_m2[index]
-        whitened[index] = np.linalg.solve(np.linalg.cholesky(total), innovation)
-        gain = np.linalg.solve(total, spread).T
-        state = state + gain @ innovation
-        spread = spread - gain @ spread
-        spread = 0.5 * (spread + spread.T)
-    return whitened
+        halves[index] = np.linalg.cholesky(spread + white_m2[index])
+        root = np.linalg.inv(halves[index])
+        whitened[index] = root @ innovation
+        gain = spread @ root.T
+        state = state + gain @ whitened[index]
+        spread = spread - gain @ gain.T
+    return whitened, _log_det(halves)
+
+
+def _log_det(halves: FloatArray) -> float:
+    return 2.0 * float(np.log(np.diagonal(halves, axis1=1, axis2=2)).sum())

@@ -47,6 +47,7 @@ def _summary(found: Consistency) -> dict[str, object]:
         "chi2_before": estimate.chi2_before,
         "chi2_after": estimate.chi2_after,
         "degrees_of_freedom": estimate.degrees_of_freedom,
+        "correlation_s": found.correlation_s,
         "advice": advice(found),
     }
 

@@ -201,7 +201,7 @@ _INJECTED = {
 def test_what_is_injected_comes_back_within_its_sigma_and_nothing_else_does(name: str) -> None:
     flight, value = _INJECTED[name]
     truth = np.array([value if unknown.name == name else 0.0 for unknown in UNKNOWNS])
-    found = [replace(flight, seed=seed).study() for seed in range(8)]
+    found = [replace(flight, seed=seed).study() for seed in range(5)]
     tables = np.array([_corrections(one) for one in found])
     standardised = (tables[:, :, 0] - truth) / tables[:, :, 1]
     assert np.abs(standardised).max() < 4.0
@@ -218,12 +218,12 @@ def test_what_is_injected_comes_back_within_its_sigma_and_nothing_else_does(name
 def test_scatter_over_flights_is_the_reported_sigma() -> None:
     flight = Flight(time_offset_s=0.025, lever_m=_LEVER + _TO_THE_RIGHT, readout_s=0.03)
     truth = np.array([0.025, 0.0, 0.08, 0.0, 0.03, 0.0, 0.0, 0.0])
-    tables = np.array([_corrections(replace(flight, seed=100 + k).study()) for k in range(40)])
+    tables = np.array([_corrections(replace(flight, seed=100 + k).study()) for k in range(24)])
     standardised = (tables[:, :, 0] - truth) / tables[:, :, 1]
     scatter = np.sqrt(np.mean(standardised**2, axis=0))
-    assert np.all((scatter > 0.7) & (scatter < 1.35))  # of 40: ± 0.11 each, at three sigma
+    assert np.all((scatter > 0.6) & (scatter < 1.45))  # of 24: ± 0.14 each
     assert 0.88 < math.sqrt(np.mean(scatter**2)) < 1.12
-    assert np.abs(standardised.mean(axis=0)).max() < 0.6
+    assert np.abs(standardised.mean(axis=0)).max() < 0.8
 
 
 def test_at_constant_speed_straight_on_time_and_lever_arm_are_not_told_apart() -> None:
@@ -281,6 +281,11 @@ def test_wrong_points_are_named_and_take_no_part() -> None:
     assert abs(time.value - 0.025) < 4.0 * time.sd
 
 
+def test_the_trajectorys_correlation_time_is_found_to_within_its_neighbours() -> None:
+    times = [Flight(seed=seed).study().correlation_s for seed in range(3)]
+    assert set(times) <= {10.0, 30.0}  # 20 s, of 0, 1, 3, 10, 30, 100, 300
+
+
 def test_a_few_frames_are_not_enough() -> None:
     assert Flight(frames=9).study_if_enough() is None
 
@@ -298,12 +303,15 @@ def test_whitening_is_the_inverse_root_of_the_full_covariance() -> None:
         for j in range(n):
             share = math.exp(-abs(time_s[i] - time_s[j]) / tau) * factors[i] @ factors[j].T
             full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = share + (white[i] if i == j else 0.0)
-    whitened = whiten(time_s, fading, white, tau, columns).reshape(3 * n, 4)
+    result, log_det = whiten(time_s, fading, white, tau, columns)
+    whitened = result.reshape(3 * n, 4)
+    assert log_det == pytest.approx(np.linalg.slogdet(full)[1])
     flat = columns.reshape(3 * n, 4)
     np.testing.assert_allclose(
         whitened.T @ whitened, flat.T @ np.linalg.solve(full, flat), rtol=1e-8
     )
-    white_only = whiten(time_s, fading, white, 0.0, columns).reshape(3 * n, 4)
+    result, log_det = whiten(time_s, fading, white, 0.0, columns)
+    white_only = result.reshape(3 * n, 4)
     own = np.zeros_like(full)
     for i in range(n):
         own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = fading[i] + white[i]
