@@ -107,7 +107,7 @@ def _split(
     """Return clock times (n,) and cells (n, width); what stands in further cells is dropped."""
     separator = next((mark for mark in ",;\t" if data and mark in data[0][1]), None)
     clocks, cells = np.empty(len(data)), np.empty((len(data), width))
-    weeks = np.zeros(len(data), dtype=bool)
+    weeks = np.full(len(data), np.nan)
     for index, (line, row) in enumerate(data):
         try:
             if match := _DATE.match(row):
@@ -115,8 +115,7 @@ def _split(
                 texts = _cells(rest.removeprefix(separator or ""), separator)
             else:
                 week, seconds, *texts = _cells(row, separator)
-                clocks[index] = clock_from_week(np.array(int(week)), np.array(float(seconds)))
-                weeks[index] = True
+                weeks[index], clocks[index] = int(week), float(seconds)
             if len(texts) < width:
                 raise KgcpError(
                     f"{path}, line {line}: has {len(texts)} cells after the time, the header names"
@@ -127,9 +126,14 @@ def _split(
             raise KgcpError(
                 f"{path}, line {line}: is not a time and numbers ({error}); repair the line"
             ) from error
-        if not np.isfinite(cells[index]).all():
-            raise KgcpError(f"{path}, line {line}: holds a number that is not finite; delete it")
-    return (unwrap_week(clocks) if weeks.any() else clocks), cells
+    lost = np.flatnonzero(~np.isfinite(np.column_stack((clocks, cells))).all(axis=1))
+    if lost.size:
+        line = data[lost[0]][0]
+        raise KgcpError(f"{path}, line {line}: holds a number that is not finite; delete it")
+    in_weeks = np.isfinite(weeks)
+    if in_weeks.any():
+        clocks = unwrap_week(np.where(in_weeks, clock_from_week(weeks, clocks), clocks))
+    return clocks, cells
 
 
 def _cells(text: str, separator: str | None) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj.datadir import get_data_dir
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
@@ -189,6 +190,15 @@ def test_a_grid_that_is_not_installed_is_named(tmp_path: Path) -> None:
     assert "\n" not in str(e.value)
     with pytest.raises(KgcpError, match=r"\[vehicle\] crs 'EPSG:0' cannot be used"):
         read_trajectory(path, _CRS, TrajectoryNotation(crs="EPSG:0"))
+
+
+def test_heights_above_a_geoid_need_its_grid(tmp_path: Path) -> None:
+    # 4979 → 4326+5773 with a ballpark would leave 100 m at Barcelona as they are, 49 m off.
+    if (Path(get_data_dir()) / "us_nga_egm96_15.tif").exists():
+        pytest.skip("the grid of EGM96 is installed")
+    path = _write(tmp_path, _HEADER, "0,2.17,41.4,100,1,2,3", "1,2.17,41.4,100,1,2,3")
+    with pytest.raises(KgcpError, match="needs the grid us_nga_egm96"):
+        read_trajectory(path, "EPSG:4326+5773", TrajectoryNotation(crs="EPSG:4979"))
 
 
 def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
