@@ -93,7 +93,9 @@ def read_reference_poses(
     source: SourcePoses = module.poses(file)
     if not source.names:
         raise file.error("", "holds no pose", "export the aligned frames")
-    names = frames_of(file, source.names, frames)
+    names = source.names
+    if not source.has_our_names:
+        names = frames_of(file, names, frames)
     return on_the_map(file, source, names, notation, crs)
 
 

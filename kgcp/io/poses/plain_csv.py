@@ -50,4 +50,5 @@ def poses(file: ForeignFile) -> SourcePoses:
         frame_from_photo=rotation_from_opk(columns.block(_ANGLES)),
         sd_position_m=columns.deviations(_SD_POSITION),
         sd_angle_deg=None if sd_angle is None else sd_angle[:, 0],
+        has_our_names=True,
     )

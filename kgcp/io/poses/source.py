@@ -39,6 +39,8 @@ class SourcePoses:
         Standard deviations along the map's axes [m]; None: not given.
     sd_angle_deg : (n,) array or None
         Of each of the three angles [deg]; None: not given.
+    has_our_names : bool
+        Whether the names are those of the flight's frames already, and no other program's.
     """
 
     names: tuple[str, ...]
@@ -49,6 +51,7 @@ class SourcePoses:
     unreferenced: str | None = None
     sd_position_m: FloatArray | None = None
     sd_angle_deg: FloatArray | None = None
+    has_our_names: bool = False
 
 
 def photo_rotation(file: ForeignFile, where: str, frame_from_camera: FloatArray) -> FloatArray:

@@ -66,6 +66,12 @@ def test_other_programs_know_frames_by_less_than_their_path(
     assert read_reference_poses(path, frames=frames.split()).frames == (expected,)
 
 
+def test_the_csv_file_names_frames_by_their_whole_path(tmp_path: Path) -> None:
+    path = tmp_path / "reference.csv"
+    path.write_text("frame,x,y,z,omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0\n")
+    assert read_reference_poses(path, frames=("x/a.jpg", "y/a.jpg")).frames == ("a.jpg",)
+
+
 def test_names_that_fit_twice_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "external.txt"
     path.write_text("imageName X Y Z Omega Phi Kappa\na.jpg 1 2 3 0 0 0\n")
