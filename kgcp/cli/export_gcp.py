@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from kgcp.io.exporters.points import MapPoints
 
 ALL = "all"
+MANY = 12
 
 
 def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> None:  # noqa: FBT001 - click's signature
@@ -104,26 +105,33 @@ def command(
     if made.consistency is not None:
         written += write_consistency(folder, made.consistency, provenance(the_flight))
     points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
-    written += _export(points, formats, folder)
-    _report(made, written, as_json=as_json)
+    more, left_out = _export(points, formats, folder)
+    _report(made, [*written, *more], left_out, as_json=as_json)
 
 
-def _export(points: MapPoints, formats: tuple[str, ...], folder: Path) -> list[Path]:
-    """Write the named formats; of those that only `all` names, the ones that can be written."""
+def _export(
+    points: MapPoints, formats: tuple[str, ...], folder: Path
+) -> tuple[list[Path], dict[str, str]]:
+    """Write the named formats; of those that only `all` names, the ones that can be written.
+
+    Returns paths, and why formats were left out.
+    """
     from kgcp.errors import KgcpError
 
-    written = []
+    written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):
         try:
             written += export(points, name, folder)
         except KgcpError as error:
             if name in formats:
                 raise
-            click.echo(f"left out {error}", err=True)
-    return written
+            left_out[name] = str(error)
+    return written, left_out
 
 
-def _report(made: Delivery, written: list[Path], *, as_json: bool) -> None:
+def _report(
+    made: Delivery, written: list[Path], left_out: dict[str, str], *, as_json: bool
+) -> None:
     from collections import Counter
 
     reasons = Counter(skip.reason.value for skip in made.skipped)
@@ -137,6 +145,7 @@ def _report(made: Delivery, written: list[Path], *, as_json: bool) -> None:
             "skipped": dict(reasons),
             "advice": _advice(made.consistency),
             "files": [*map(str, written)],
+            "left_out": left_out,
         }
         click.echo(json.dumps(summary))
     of_these = f" ({checks} to check)" if checks else ""
@@ -148,8 +157,22 @@ def _report(made: Delivery, written: list[Path], *, as_json: bool) -> None:
     _report_deviations(made.carrier)
     if made.consistency is not None:
         _report_consistency(made.consistency)
-    for path in written:
+    for path in _named(written):
         click.echo(f"wrote {path}", err=True)
+    for name, reason in left_out.items():
+        click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
+
+
+def _named(written: list[Path]) -> list[str]:
+    """Name files; of many in one folder, the folder."""
+    from collections import Counter
+
+    counts = Counter(path.parent for path in written)
+    names = (
+        f"{counts[path.parent]} files in {path.parent}" if counts[path.parent] > MANY else str(path)
+        for path in written
+    )
+    return [*dict.fromkeys(names)]
 
 
 def _report_deviations(carrier: Carrier | None) -> None:

@@ -216,7 +216,7 @@ def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder
     assert "camera position" in flight.fails("export-gcp", "--format", "colmap")
     flight.detect(lambda row: row.update(frame=f"my {row['frame']}"))
     result = flight.run("export-gcp", "--format", "all")
-    assert "left out gcp_list.txt" in result.stderr
+    assert "left out odm: gcp_list.txt" in result.stderr
     assert '"my%20f_0.jpg"' in (flight.out / "opf/camera_list.json").read_text(encoding="utf-8")
 
 

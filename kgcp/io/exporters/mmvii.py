@@ -34,11 +34,12 @@ MMVII (MicMac v2)
 
 Copy MesGCP-kgcp.xml and the MesIm files into MMVII-PhgrProj/ObjCoordWorld/kgcp and
 MMVII-PhgrProj/ObjMesInstr/kgcp (older versions: both into PointsMeasure/kgcp), kgcp.obs into
-MMVII-PhgrProj/Topo/kgcp. The bundle adjustment (OriBundleAdj) takes them by
+MMVII-PhgrProj/Topo/kgcp. The bundle adjustment takes points and marks by
 
-  GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]] Topo=[kgcp]
+  MMVII OriBundleAdj ".*JPG" In Out GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]]
 
-with a positive factor for the points: only then may the distances refer to them. kgcp.obs has
+and the distances by its option for topographic surveys (MMVII OriBundleAdj help). The factor of the
+points must be positive: only then may distances refer to them. kgcp.obs has
 one line per point: 3 (distance), image, point, metres, standard deviation. Pixel (0, 0) is the
 centre of the top-left pixel. The block must be in the points' frame before:
 

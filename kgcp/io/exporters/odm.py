@@ -50,7 +50,7 @@ Or name it: --gcp PATH/gcp_list.txt
   --gps-accuracy M   how well the positions in the images' EXIF are known [m]; 3 by default.
 
 geo.txt, if it is here, has camera positions from the plate and its vehicle's attitude, for
-the images that show the target. They are weak: read the accuracies. Use it with --geo PATH
+the images that show the target. How good they are, their accuracies say. Use it with --geo PATH
 only where the images' own positions are worse; other images keep their own.
 
 ODM ignores: standard deviations of points and of marks (all points weigh the same), distances,

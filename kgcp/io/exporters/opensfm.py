@@ -33,6 +33,9 @@ exif_overrides.json, if it is here, has camera positions from the plate and its 
 for the images that show the target. They are weak (dop is their standard deviation in metres, the
 same for all axes); copy it only where the images' own positions are worse.
 
+Do not give OpenSfM the gcp_list.txt of OpenDroneMap: with an EPSG code in its first line the two
+programs disagree about the order of the axes. This file says latitude and longitude by name.
+
 OpenSfM ignores: standard deviations of single points and marks, distances. Points kept for checking
 are not in the file. Coordinates are WGS 84, longitude and latitude in degrees, height above
 the ellipsoid in metres.
