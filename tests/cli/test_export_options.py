@@ -1,0 +1,213 @@
+"""`kgcp export-gcp` on a flight in bends, whose frames' clock is 25 ms late."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
+from kgcp.io.tables import read_table, time_cell, write_table
+from kgcp.mapframe import MapFrame
+
+_TOML = """\
+crs = "EPSG:25831"
+
+[camera]
+width = 1600
+height = 1200
+fx = 2300.0
+fy = 2300.0
+cx = 800.0
+cy = 600.0
+
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+
+[vehicle]
+trajectory = "vehicle.csv"
+lever_arm_m = [0.0, 0.0, -2.0]
+
+[reference]
+poses = "reference.csv"
+"""
+_ORIGIN = np.array([430606.1, 4583523.0, 120.0])
+_FRAME = MapFrame.at("EPSG:25831", _ORIGIN)
+_UNIX_S, _LATE_S, _FRAMES = 1777887000.0, 0.025, 40
+_NULL_ROW: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
+
+
+def _drive(time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 3) in the map and headings [deg], with some 12 m/s."""
+    angle = (12.0 * time_s + 10.0 * np.sin(0.3 * time_s)) / 60.0
+    enu = 60.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
+    return _FRAME.map_from_enu(enu), -np.degrees(angle)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "flight.toml").write_text(_TOML, encoding="utf-8")
+    rng = np.random.default_rng(4)
+    times = np.arange(0.0, 1.5 * _FRAMES + 4.0, 0.1)
+    lines = ["time,x,y,z,roll_deg,pitch_deg,heading_deg,sd_x,sd_y,sd_z"]
+    for t, xyz, heading in zip(times, *_drive(times), strict=True):
+        place = ",".join(f"{value:.5f}" for value in xyz)
+        lines.append(f"{_UNIX_S + t:.1f},{place},0,0,{heading:.6f},0.01,0.01,0.01")
+    (tmp_path / "vehicle.csv").write_text("\n".join(lines), encoding="utf-8")
+    rows, reference = [], ["frame,x,y,z,omega_deg,phi_deg,kappa_deg,sd_x,sd_y,sd_z,sd_angle_deg"]
+    for index in range(_FRAMES):
+        t = 2.0 + 1.5 * index
+        target = _drive(np.array([t]))[0][0] + [0.0, 0.0, 2.0]
+        camera = target + np.array([3.0, -2.0, 50.0 + 5.0 * math.sin(0.1 * t)])
+        place = ",".join(f"{value:.5f}" for value in camera + 0.01 * rng.standard_normal(3))
+        reference.append(f"f_{index:02d}.jpg,{place},0,0,0,0.01,0.01,0.01,0.002")
+        rows.append(_detection(index, t - _LATE_S, _in_camera(camera, target)))
+    (tmp_path / "reference.csv").write_text("\n".join(reference), encoding="utf-8")
+    rows[20] |= {"distance_m": float(str(rows[20]["distance_m"])) + 2.0}
+    rows[5] |= {"score": 0.88}
+    rows[7] |= {"ambiguity": 3.0}
+    write_table(tmp_path / "kgcp" / "detections.parquet", DETECTION_COLUMNS, rows, {})
+    return tmp_path
+
+
+def _in_camera(camera: FloatArray, target: FloatArray) -> FloatArray:
+    """The target in a camera that looks down with the grid's north up."""
+    ends = _FRAME.enu_from_map(np.array([camera, target]))
+    grid = _FRAME.grid_rotation(ends[0])
+    sight: FloatArray = np.diag([1.0, -1.0, -1.0]) @ grid.T @ (ends[1] - ends[0])
+    return sight
+
+
+def _detection(index: int, time_s: float, sight: FloatArray) -> dict[str, object]:
+    pixel = 2300.0 * sight[:2] / sight[2] + [800.0, 600.0]
+    text = dict.fromkeys(("reason", "detail"), "")
+    return (
+        _NULL_ROW
+        | text
+        | {
+            "frame": f"f_{index:02d}.jpg",
+            "target": "A",
+            "time": time_cell(_UNIX_S + time_s),
+            "instance": 0,
+            "status": "measured",
+            "candidates": 0,
+            "guided": False,
+            "scale_used": "A",
+            "x_px": pixel[0],
+            "y_px": pixel[1],
+            "sd_x_px": 0.05,
+            "sd_y_px": 0.05,
+            "cov_xy_px2": 0.0,
+            "distance_m": float(np.linalg.norm(sight)),
+            "sd_distance_m": 0.01,
+            **dict(zip(("tx_m", "ty_m", "tz_m"), sight.tolist(), strict=True)),
+            **dict(zip(("qw", "qx", "qy", "qz"), (1.0, 0.0, 0.0, 0.0), strict=True)),
+            "pose_cov": np.diag([1e-6, 1e-6, 1e-4, 1e-6, 1e-6, 1e-6]).ravel().tolist(),
+            "ambiguity": 30.0,
+            "score": 0.97,
+        }
+    )
+
+
+def _export(folder: Path, *options: str) -> Result:
+    result = CliRunner().invoke(main, ["export-gcp", str(folder), "--format", "csv", *options])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) -> None:
+    result = _export(folder, "--json")
+    (line,) = json.loads(result.stdout)["advice"]
+    assert f"warning: {line}" in result.stderr
+    value = float(line.split()[1])
+    assert line.startswith("add 0.02")
+    assert "to [vehicle] time_offset_s in flight.toml" in line
+    summary = json.loads((folder / "kgcp" / "consistency.json").read_text(encoding="utf-8"))
+    offset = summary["corrections"][0]
+    assert offset["name"] == "time_offset_s"
+    assert abs(offset["value"] - _LATE_S) < 4.0 * offset["sd"]
+    assert offset["is_significant"]
+    table = read_table(folder / "kgcp" / "consistency.parquet", CONSISTENCY_COLUMNS)
+    assert len(table) == _FRAMES
+    assert np.median(table["along_m"]) == pytest.approx(-12.0 * _LATE_S, abs=0.08)
+    toml = (folder / "flight.toml").read_text(encoding="utf-8")
+    heeded = toml.replace("lever_arm_m", f"time_offset_s = {value}\nlever_arm_m")
+    (folder / "flight.toml").write_text(heeded, encoding="utf-8")
+    assert json.loads(_export(folder, "--json").stdout)["advice"] == []
+
+
+def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
+    summary = json.loads(_export(folder, "--json").stdout)
+    assert summary["skipped"] == {"distance_jump": 1}
+    assert summary["kgcps"] == _FRAMES - 1
+    result = _export(folder, "--keep-flagged")
+    assert f"{_FRAMES} KGCPs, 0 sightings left out" in result.stderr
+    table = read_table(folder / "kgcp" / "kgcps.parquet", KGCP_COLUMNS)
+    assert list(table.loc[table["flag"] != "", "frame"]) == ["f_20.jpg"]
+
+
+def test_gates_spacing_and_check_points(folder: Path) -> None:
+    options = ("--min-score", "0.9", "--min-spacing", "30", "--checkpoints", "0.25", "--json")
+    summary = json.loads(_export(folder, *options).stdout)
+    assert summary["skipped"]["low_score"] == 1
+    assert summary["skipped"]["too_close"] > 10
+    table = read_table(folder / "kgcp" / "kgcps.parquet", KGCP_COLUMNS)
+    assert len(table) == summary["kgcps"]
+    assert (table["role"] == "check").sum() == round(0.25 * len(table)) == summary["checkpoints"]
+    steps = np.linalg.norm(np.diff(table[["x", "y"]].to_numpy(), axis=0), axis=1)
+    assert steps.min() > 25.0  # chords of 30 m and more on a circle of 60 m
+    summary = json.loads(_export(folder, "--max-sd", "0.011", "--json").stdout)
+    assert "uncertain" not in summary["skipped"]
+    summary = json.loads(_export(folder, "--min-ambiguity", "9", "--json").stdout)
+    assert summary["skipped"]["ambiguous"] == 1
+    strict = CliRunner().invoke(main, ["export-gcp", str(folder), "--max-sd", "0.009"])
+    assert strict.exit_code == 1
+    assert "no point is left" in strict.stderr
+
+
+def test_points_in_another_crs_are_the_same_places(folder: Path) -> None:
+    _export(folder)
+    path = folder / "kgcp" / "kgcps.parquet"
+    here = read_table(path, KGCP_COLUMNS)
+    _export(folder, "--crs", "EPSG:4326")
+    there = read_table(path, KGCP_COLUMNS)
+    assert pq.read_schema(path).metadata[b"kgcp.crs"] == b"EPSG:4326"
+    assert there["x"].between(2.16, 2.18).all()  # longitude first
+    degrees = there[["x", "y", "z"]].to_numpy()
+    world = MapFrame.at("EPSG:4326", degrees[0])
+    local = MapFrame.at("EPSG:25831", here[["x", "y", "z"]].to_numpy()[0])
+    np.testing.assert_allclose(
+        world.enu_from_map(degrees),
+        local.enu_from_map(here[["x", "y", "z"]].to_numpy()),
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(there[["sd_x", "sd_y", "sd_z"]], 0.01, rtol=1e-6)
+    with (folder / "kgcp" / "kgcps.csv").open(encoding="utf-8") as stream:
+        assert stream.read().count("EPSG:4326") == _FRAMES - 1
+
+
+def test_a_crs_that_cannot_be_used_is_one_line(folder: Path) -> None:
+    for crs in ("nonsense", "EPSG:2263", "EPSG:4978"):
+        result = CliRunner().invoke(main, ["export-gcp", str(folder), "--crs", crs])
+        assert result.exit_code == 1
+        assert f"--crs '{crs}'" in result.stderr
+        assert result.stderr.count("\n") == 1
+
+
+def test_without_the_reference_file_there_is_no_comparison(folder: Path) -> None:
+    (folder / "reference.csv").unlink()
+    assert json.loads(_export(folder, "--json").stdout)["advice"] == []
+    assert not (folder / "kgcp" / "consistency.json").exists()
