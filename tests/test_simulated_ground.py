@@ -7,8 +7,11 @@ import pytest
 
 from kgcp.carrier import Place, Whereabouts
 from kgcp.geometry.arrays import FloatArray
-from kgcp.synthetic.flight import CRS, plan_flight
+from kgcp.kgcps import build_kgcps
+from kgcp.orientation import camera_priors, opk_deg
+from kgcp.synthetic.flight import CRS, frame_name, plan_flight
 from kgcp.synthetic.presets import SimulationSettings, preset
+from kgcp.target.sighting import Sighting
 
 
 def _errors(settings: SimulationSettings, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -39,3 +42,34 @@ def test_with_survey_errors_deviations_are_honest() -> None:
     scatter = np.concatenate(standardised).std(axis=0)
     assert ((scatter > 0.75) & (scatter < 1.3)).all(), scatter
     assert np.concatenate(distances).mean() == pytest.approx(3.0, rel=0.3)
+
+
+def test_the_camera_is_oriented_as_it_was_simulated() -> None:
+    """The simulator turns the plate onto its vehicle on its own."""
+    plan = plan_flight(preset("clean").without_survey_errors(), seed=1)
+    whereabouts = Whereabouts.of(CRS, [], plan.trajectory, plan.vehicle)
+    chosen = [frame for frame in plan.frames if frame.present][::8]
+    sightings = [
+        Sighting(
+            frame=frame_name(plan.settings, frame.index),
+            number=frame.index + 1,
+            target="A",
+            instance=0,
+            time_s=float(plan.recorded_times_s[frame.index]),
+            centre_px=np.array([0.0, 0.0]),
+            centre_cov_px2=None,
+            distance_m=frame.target.distance_m,
+            sd_distance_m=None,
+            sd_common_distance_m=None,
+            pose=frame.target,
+        )
+        for frame in chosen
+    ]
+    kgcps, _ = build_kgcps(sightings, whereabouts, plan.settings.camera)
+    priors = camera_priors(kgcps, sightings, whereabouts, whereabouts.frame)
+    assert len(priors) == len(chosen) > 5
+    rows = [frame.index for frame in chosen]
+    positions = np.array([prior.position_map for prior in priors])
+    np.testing.assert_allclose(positions, plan.reference.position_map[rows], atol=2e-3)
+    turns = (opk_deg(priors) - plan.reference.opk_deg[rows] + 180.0) % 360.0 - 180.0
+    np.testing.assert_allclose(turns, 0.0, atol=2e-3)
