@@ -2,8 +2,9 @@
 
 By COLMAP's doc/format.rst: two lines per image, `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME` and
 its points, which may be an empty line. The quaternion (Hamilton, w first) and the translation lead
-from the world to the camera (x right, y down, z forward), whose centre is −Rᵀ t. The world is
-nobody's map; after aligning it, flight.toml may say of which one it is.
+from the world to the camera (x right, y down, z forward), whose centre is −Rᵀ t; of rigs, too,
+each image has its own. The world is nobody's map; after aligning it, flight.toml may say of which
+one it is.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Poses that lead from the world to the camera: COLMAP, OpenSfM, OpenDroneMap."""
+"""Poses of OpenSfM and OpenDroneMap, in worlds over a point and in UTM."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
@@ -27,97 +26,6 @@ Part = dict[str, Any]
 
 UTM = PoseNotation(crs="EPSG:32631")
 OFFSET = np.array([299_000.0, 4_585_000.0, 0.0])
-
-
-def colmap_folder(folder: Path, rotation: FloatArray, shift: FloatArray) -> Path:
-    """Write a model with pycolmap, whose writer is COLMAP's own."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="PINHOLE", width=1600, height=1100, params=[1700, 1700, 800, 550], camera_id=1
-        )
-    )
-    for number, (name, matrix, vector) in enumerate(zip(NAMES, rotation, shift, strict=True), 1):
-        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(matrix), vector)
-        model.add_image_with_trivial_frame(image, pose)
-    model.write_text(str(folder))
-    return folder / "images.txt"
-
-
-def test_colmap_s_own_files_in_map_coordinates(
-    tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert
-) -> None:
-    rotation, shift = world_to_camera(truth["utm"] - OFFSET, truth["utm_from_photo"])
-    path = colmap_folder(tmp_path, rotation, shift)
-    offset = tmp_path / "offset.xyz"
-    offset.write_text("299000.000 4585000.000 0.000\n")
-    poses = read_reference_poses(
-        path, PoseNotation(crs="EPSG:32631", offset_file=offset), crs="EPSG:32631"
-    )
-    assert poses.frames == NAMES
-    assert (poses.sd_position_m, poses.sd_angle_deg) == (None, None)
-    check(poses, truth["utm"], truth["utm_from_photo"])
-
-
-def test_colmap_in_geocentric_coordinates(
-    tmp_path: Path, truth: Truth, check: Check, world_to_camera: Invert
-) -> None:
-    rotation, shift = world_to_camera(truth["ecef"], truth["ecef_from_photo"])
-    path = colmap_folder(tmp_path, rotation, shift)
-    poses = read_reference_poses(path, PoseNotation(crs="EPSG:4978"), crs="EPSG:32631")
-    check(poses, truth["utm"], truth["utm_from_photo"])
-
-
-def test_the_quaternion_has_w_first_and_the_points_line_may_be_empty(tmp_path: Path) -> None:
-    # A quarter turn about z: the camera's x is the world's −y, its centre −Rᵀ t.
-    half = 0.7071067811865476
-    path = tmp_path / "images.txt"
-    path.write_text(
-        "# Image list with two lines of data per image:\n"
-        f"4 {half} 0 0 {half} 1 2 3 1 sub dir/a b.JPG\n"
-        "\n"
-        f"9 {half} 0 0 {half} 1 2 3 1 c.JPG\n"
-        "612.5 80.25 -1 70 80 5\n"
-    )
-    poses = read_reference_poses(path, UTM, crs="EPSG:32631")
-    assert poses.frames == ("sub dir/a b.JPG", "c.JPG")
-    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(poses.position_map[0], -rotation.T @ [1, 2, 3], atol=1e-12)
-    expected = rotation.T @ np.diag([1.0, -1.0, -1.0])
-    np.testing.assert_allclose(rotation_from_opk(poses.opk_deg)[0], expected, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "notation", "words"),
-    [
-        ("1 1 0 0 0 1 2 3 1 a.JPG\n\n", None, "is in a world of COLMAP's, which is no map; align"),
-        ("1 1 0 0 0 1 2 3 1 a.JPG\nb\nc\n", UTM, "line 3: is not IMAGE_ID QW QX QY QZ"),
-        ("1 0 0 0 0 1 2 3 1 a.JPG\n\n", UTM, "line 1: has a quaternion of zeros"),
-        ("1 1 0 0 0 1 2 e 1 a.JPG\n\n", UTM, "line 1: holds '1 1 0 0 0 1 2 e' instead of 8"),
-        (
-            "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
-            PoseNotation(crs="EPSG:4326"),
-            r"\[reference\] crs 'EPSG:4326' counts degrees, but the poses are in a Cartesian",
-        ),
-        (
-            "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
-            PoseNotation(crs="EPSG:0"),
-            r"flight.toml: \[reference\] crs 'EPSG:0' cannot be used",
-        ),
-    ],
-)
-def test_a_colmap_model_without_a_map_is_refused(
-    tmp_path: Path, text: str, notation: PoseNotation | None, words: str
-) -> None:
-    path = tmp_path / "images.txt"
-    path.write_text(text)
-    with pytest.raises(KgcpError, match=words) as caught:
-        read_reference_poses(path, notation, crs="EPSG:32631")
-    assert "\n" not in str(caught.value)
-
-
-# --- OpenSfM
 
 
 def reconstruction(rotation: FloatArray, shift: FloatArray, lla: FloatArray) -> Part:
@@ -214,9 +122,6 @@ def test_an_incomplete_shot_is_named(tmp_path: Path, shot: Part, words: str) -> 
     path.write_text(json.dumps([{"shots": {"a.JPG": shot}}]))
     with pytest.raises(KgcpError, match=words):
         read_reference_poses(path, UTM, crs="EPSG:32631")
-
-
-# --- OpenDroneMap's shots.geojson
 
 
 def geojson(truth: Truth, world_to_camera: Invert) -> Part:
