@@ -122,7 +122,7 @@ class Carrier:
 
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
-        axes = np.array([self.frame.grid_rotation(point) for point in states.position_m])
+        axes = self.frame.grid_rotation(states.position_m)
         if states.cov_position_m2 is None:
             return _spread(axes, sd_position_m)
         turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)

@@ -137,25 +137,42 @@ def build_kgcps(
     first = [sighting for sighting in sightings if sighting.instance == 0]
     times = [seen.row_time_s(camera) for seen in first]
     places = whereabouts.places([seen.target for seen in first], times)
-    kgcps, skipped = (
-        [],
-        [
-            Skip(seen.frame, seen.target, Omission.SECOND_PLATE)
-            for seen in sightings
-            if seen.instance > 0
-        ],
-    )
+    skipped = [
+        Skip(seen.frame, seen.target, Omission.SECOND_PLATE)
+        for seen in sightings
+        if seen.instance > 0
+    ]
+    placed = []
     for seen, time_s, place in zip(first, times, places, strict=True):
         if isinstance(place, Place):
-            kgcps.append(_kgcp(seen, time_s, place, whereabouts))
+            placed.append((seen, time_s, place))
         else:
             skipped.append(Skip(seen.frame, seen.target, place))
-    return tuple(kgcps), tuple(skipped)
+    return _on_the_map(placed, whereabouts), tuple(skipped)
 
 
-def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Whereabouts) -> Kgcp:
+def _on_the_map(
+    placed: Sequence[tuple[Sighting, float | None, Place]], whereabouts: Whereabouts
+) -> tuple[Kgcp, ...]:
+    if not placed:
+        return ()
     frame = whereabouts.frame
-    axes = frame.grid_rotation(place.position_m)
+    positions = np.array([place.position_m for _, _, place in placed])
+    on_map, axes = frame.map_from_enu(positions), frame.grid_rotation(positions)
+    return tuple(
+        _kgcp(*one, position, turn, whereabouts)
+        for one, position, turn in zip(placed, on_map, axes, strict=True)
+    )
+
+
+def _kgcp(
+    seen: Sighting,
+    time_s: float | None,
+    place: Place,
+    position_map: FloatArray,
+    axes: FloatArray,
+    whereabouts: Whereabouts,
+) -> Kgcp:
     moves = seen.target not in whereabouts.static
     offset_s = whereabouts.carrier.settings.time_offset_s if whereabouts.carrier else 0.0
     return Kgcp(
@@ -163,7 +180,7 @@ def _kgcp(seen: Sighting, time_s: float | None, place: Place, whereabouts: Where
         frame=seen.frame,
         target=seen.target,
         time_s=None if time_s is None else time_s + offset_s,
-        position_map=frame.map_from_enu(place.position_m[None])[0],
+        position_map=position_map,
         cov_m2=None if place.cov_m2 is None else axes.T @ place.cov_m2 @ axes,
         common_m=None if place.common_m is None else axes.T @ place.common_m,
         centre_px=seen.centre_px,

@@ -37,7 +37,7 @@ class Views:
     def of(cls, poses: ReferencePoses, frame: MapFrame) -> Self:
         """Bring reference poses from the map into the ENU frame."""
         centre = frame.enu_from_map(poses.position_map)
-        enu_from_map = np.array([frame.grid_rotation(point) for point in centre])
+        enu_from_map = frame.grid_rotation(centre)
         cov = None
         if poses.sd_position_m is not None:
             scaled = enu_from_map * poses.sd_position_m[:, None, :]

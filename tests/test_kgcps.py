@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kgcp.carrier import Absence, Whereabouts
+from kgcp.carrier import Absence, Place, Whereabouts
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.trajectory import Trajectory
 from kgcp.kgcps import Omission, Skip, build_kgcps
+from kgcp.mapframe import MapFrame
 from kgcp.settings import VehicleSettings
 from kgcp.target.layout import Ring, Target
 from kgcp.target.sighting import Sighting
@@ -105,3 +107,74 @@ def test_time_is_that_of_the_trajectorys_clock() -> None:
     whereabouts = _whereabouts(VehicleSettings(time_offset_s=-18.0))
     (point,), _ = build_kgcps([_sighting(1, "A", 23.0)], whereabouts, _CAMERA)
     assert point.time_s == pytest.approx(5.0)
+
+
+def _bend(settings: VehicleSettings) -> Whereabouts:
+    """15 m/s on a circle of 100 m, level, heading along the track."""
+    time_s = np.arange(0.0, 30.01, 0.05)
+    frame = MapFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
+    angle = 0.15 * time_s
+    enu = 100.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
+    attitude = np.column_stack((0.0 * angle, 0.0 * angle, -np.degrees(angle)))
+    sd = np.full((len(time_s), 3), 0.02)
+    trajectory = Trajectory(time_s, frame.map_from_enu(enu), attitude, sd, None)
+    return Whereabouts.of("EPSG:25831", [Target(_RING)], trajectory, settings)
+
+
+def test_common_effects_are_the_covariance_between_points() -> None:
+    rng = np.random.default_rng(3)
+    settings = VehicleSettings(
+        lever_arm_m=(-0.8, 0.15, -1.95), sd_lever_arm_m=(0.03, 0.01, 0.02), sd_time_s=0.002
+    )
+    sightings = [_sighting(1, "A", 5.0), _sighting(2, "A", 14.0)]
+    right = _bend(settings)
+    reported, _ = build_kgcps(sightings, right, _CAMERA)
+
+    def error() -> FloatArray:
+        arm = settings.lever_arm_m + settings.sd_lever_arm_m * rng.standard_normal(3)
+        wrong = replace(
+            settings,
+            lever_arm_m=(arm[0], arm[1], arm[2]),
+            time_offset_s=settings.sd_time_s * rng.standard_normal(),
+        )
+        assert right.carrier is not None
+        moved = replace(right, carrier=replace(right.carrier, settings=wrong))
+        placed, _ = build_kgcps(sightings, moved, _CAMERA)
+        return np.concatenate(
+            [a.position_map - b.position_map for a, b in zip(placed, reported, strict=True)]
+        )
+
+    scatter = np.cov(np.array([error() for _ in range(300)]).T)
+    factors = np.vstack([point.common_m for point in reported if point.common_m is not None])
+    assert factors.shape == (6, 4)
+    sd = np.sqrt(np.diag(factors @ factors.T))
+    difference = (scatter - factors @ factors.T) / np.outer(sd, sd)
+    assert np.abs(difference).max() < 4.0 * np.sqrt(2.0 / 300.0)
+    for point in reported:
+        assert point.cov_m2 is not None
+        assert point.cov_common_m2 is not None
+        own = point.cov_m2 - point.cov_common_m2
+        np.testing.assert_allclose(own, 0.02**2 * np.eye(3), atol=1e-9)  # the trajectory's
+
+
+def test_a_static_targets_covariance_is_one_error_in_all_frames() -> None:
+    (point,), _ = build_kgcps([_sighting(1, "G", None)], _whereabouts(VehicleSettings()), _CAMERA)
+    assert point.common_m is None
+    assert point.cov_common_m2 is point.cov_m2
+
+
+def test_rows_of_a_rolling_shutter_are_up_to_22_cm_apart_at_15_m_s() -> None:
+    rolling = replace(_CAMERA, readout_s=0.03)
+    truth = _bend(VehicleSettings())
+    for row in (0.0, 120.0, 480.0):
+        seen = replace(_sighting(1, "A", 10.0), centre_px=np.array([320.0, row]))
+        when = 10.0 + (row / 480.0 - 0.5) * 0.03
+        (there,) = truth.places(["A"], [when])
+        assert isinstance(there, Place)
+        (point,), _ = build_kgcps([seen], truth, rolling)
+        expected = truth.frame.map_from_enu(there.position_m[None])[0]
+        np.testing.assert_allclose(point.position_map, expected, atol=1e-6)
+        (still,), _ = build_kgcps([seen], truth, _CAMERA)
+        apart = np.linalg.norm(point.position_map - still.position_map)
+        assert apart == pytest.approx(15.0 * 0.03 * abs(row / 480.0 - 0.5), rel=2e-3)
+    assert apart == pytest.approx(0.225, abs=1e-3)
