@@ -51,7 +51,7 @@ class PaintedPlate(Plate):
 def plate_of(target: Target, rng: np.random.Generator) -> Plate:
     """Return a target on some plate: corners, margin, ink and paint differ."""
     radius_m = 0.5 * target.ring.outer_diameter_m
-    outline = regular_polygon(int(rng.choice((4, 8, 24))), radius_m * rng.uniform(1.24, 1.4))
+    outline = regular_polygon(int(rng.choice((4, 8, 24))), radius_m * rng.uniform(1.28, 1.42))
     white, black = rng.uniform(0.75, 0.9), rng.uniform(0.03, 0.09)
     return Plate(target, outline, float(white), float(black))
 

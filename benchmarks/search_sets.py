@@ -203,9 +203,9 @@ def _burnt(rng: Rng) -> Shot:
 
 
 def _hazy(rng: Rng) -> Shot:
-    """Leave a tenth of the contrast, anywhere between dark grey and nearly white."""
+    """Leave a tenth of the contrast, below where film curves flatten."""
     camera, look, seen = _one_plate(rng, _MIDDLE_PX, _LEANING)
-    veil = Veil(0.1 / (seen.plate.white - seen.plate.black), float(rng.uniform(0.1, 0.7)))
+    veil = Veil(0.1 / (seen.plate.white - seen.plate.black), float(rng.uniform(0.1, 0.5)))
     return _shot(camera, look, [seen], rng, veil=veil, gain=(1.0, 1.0))
 
 

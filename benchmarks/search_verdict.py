@@ -173,10 +173,12 @@ def table_line(frame_set: FrameSet, verdicts: Sequence[Verdict]) -> str:
     )
     goal = f"{100.0 * frame_set.goal:.0f}" if frame_set.goal is not None else "–"
     reasons = Counter(word for v in verdicts for word, _ in v.missed)
-    told = ", ".join(f"{word} {n} ({n / wanted:.1%})" for word, n in reasons.most_common())
+    told = [f"{word} {n} ({n / wanted:.1%})" for word, n in reasons.most_common()]
+    taken = Counter(kind for v in verdicts for kind, _ in v.wrong)
+    told += [f"wrong at {kind} {n}" for kind, n in taken.most_common()]
     return (
         f"{frame_set.name:14s}  {len(verdicts):6d}  {found:6d}/{wanted:<6d} {shares}  {goal:>5s}"
-        f"  {off:3d}  {wrong:5d}  {sum(v.decoys for v in verdicts):6d}  {told}"
+        f"  {off:3d}  {wrong:5d}  {sum(v.decoys for v in verdicts):6d}  {', '.join(told)}"
     ).rstrip()
 
 
