@@ -190,7 +190,8 @@ def known_cov(point: Kgcp, where: str) -> FloatArray:
     if point.cov_m2 is None:
         raise KgcpError(
             f"{where}: point {point.id} has no standard deviations, which the format needs; give"
-            " the trajectory sd_x, sd_y, sd_z (a static target sd_position_m) or leave it out"
+            " the trajectory sd_x, sd_y, sd_z, a static target sd_position_m, or leave this format"
+            " out"
         )
     return point.cov_m2
 
@@ -206,7 +207,7 @@ def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
     if point.centre_cov_px2 is None:
         raise KgcpError(
             f"{where}: the image point of {point.id} has no standard deviations, which the format"
-            " needs; run 'kgcp detect' with --method model or leave it out"
+            " needs; run 'kgcp detect' with --method model or leave this format out"
         )
     return point.centre_cov_px2
 

@@ -17,9 +17,9 @@ import pytest
 from pyproj import Transformer
 
 from kgcp.errors import KgcpError
-from kgcp.io.exporters import camera_priors, export, metashape, opensfm, opf, pix4d
+from kgcp.io.exporters import export, metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
-from kgcp.orientation import opk_covs, opk_deg
+from kgcp.orientation import opk_deg
 
 Factory = Callable[..., MapPoints]
 
@@ -281,29 +281,3 @@ def test_an_unknown_datum_is_an_error_and_no_guess(make_points: Factory) -> None
     points = make_points("+proj=tmerc +lat_0=41 +lon_0=2 +ellps=GRS80")
     with pytest.raises(KgcpError, match=r"opensfm: .*WGS 84"):
         opensfm.files(points)
-
-
-# --- camera priors -----------------------------------------------------------------------------
-
-
-def test_camera_priors_have_position_angles_and_covariance(points: MapPoints) -> None:
-    rows = _table(camera_priors.files(points)["camera_priors/camera_priors.csv"])
-    assert [row["frame"] for row in rows] == ["a/IMG_1.JPG", "a/IMG_3.JPG"]
-    names = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
-    for row, prior in zip(rows, points.priors, strict=True):
-        np.testing.assert_allclose(_xyz(row), prior.position_map, atol=1e-6, rtol=0)
-        angles = [float(row[name]) for name in names[3:]]
-        np.testing.assert_allclose(angles, opk_deg([prior])[0], atol=1e-6)
-        cov = np.diag([float(row[f"sd_{name}"]) ** 2 for name in names])
-        for i, first in enumerate(names):
-            for j, second in enumerate(names[i + 1 :], start=i + 1):
-                cov[i, j] = cov[j, i] = float(row[f"cov_{first}_{second}"])
-        (expected,) = opk_covs([prior])
-        assert expected is not None
-        np.testing.assert_allclose(cov, expected, rtol=1e-7, atol=1e-12)
-        assert row["crs"] == "EPSG:25831"
-
-
-def test_camera_priors_need_priors(make_points: Factory) -> None:
-    with pytest.raises(KgcpError, match="no camera can be oriented"):
-        camera_priors.files(make_points())
