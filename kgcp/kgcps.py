@@ -203,8 +203,8 @@ def on_map(kgcps: Sequence[Kgcp], change: MapChange) -> tuple[Kgcp, ...]:
     """
     if not kgcps:
         return ()
-    positions = change.positions(np.array([point.position_map for point in kgcps]))
-    return tuple(map(_moved, kgcps, positions, (change.axes(p.position_map) for p in kgcps)))
+    here = np.array([point.position_map for point in kgcps])
+    return tuple(map(_moved, kgcps, change.positions(here), change.axes(here)))
 
 
 def _moved(point: Kgcp, position_map: FloatArray, axes: FloatArray) -> Kgcp:

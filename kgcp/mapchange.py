@@ -72,22 +72,22 @@ class MapChange:
         return moved
 
     def axes(self, xyz: FloatArray) -> FloatArray:
-        """Return the rotation (3, 3) from the source map's axes to the other's at a point (3,).
+        """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).
 
         Both maps are compared with east, north and up of the same place: what datums differ
         from each other in direction is some 1e-5, which no standard deviation feels.
         """
-        points = np.reshape(np.asarray(xyz, dtype=np.float64), (1, 3))
+        points = np.reshape(np.asarray(xyz, dtype=np.float64), (-1, 3))
         here = _level_from_grid(self.source, points)
         there = _level_from_grid(self.target, self.positions(points))
-        rotation: FloatArray = there.T @ here
-        return rotation
+        turned: FloatArray = np.swapaxes(there, 1, 2) @ here
+        return turned.reshape(*np.shape(xyz), 3)
 
 
 def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
     enu = frame.enu_from_map(xyz)
-    rotation: FloatArray = frame.level_rotations(enu)[0].T @ frame.grid_rotation(enu[0])
-    return rotation
+    rotations: FloatArray = np.swapaxes(frame.level_rotations(enu), 1, 2) @ frame.grid_rotation(enu)
+    return rotations
 
 
 def best_transformer(source: CRS, target: CRS, where: str) -> Transformer:
