@@ -4,64 +4,33 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
 
-import cv2
-
 from kgcp import __version__
-from kgcp.errors import KgcpError, Rejection, Status
-from kgcp.geometry.calibration import CalibrationCovariance
-from kgcp.geometry.camera import Camera, TimeReference
+from kgcp.errors import KgcpError, Status
+from kgcp.examine import (
+    Debug,
+    FrameNote,
+    FrameTask,
+    SecondLook,
+    examine_again,
+    examine_frames,
+)
+from kgcp.expectations import expectations, with_expectations
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.detections import FrameResult, detection_rows
-from kgcp.io.exif import Exif
 from kgcp.io.flight import Flight
-from kgcp.io.frames import list_frames, read_exif, read_grey
+from kgcp.io.frames import list_frames
 from kgcp.io.frametimes import read_times
 from kgcp.io.poses import read_flight_poses
 from kgcp.io.tables import write_table
 from kgcp.settings import DetectSettings
-from kgcp.target.common import common_uncertainty
-from kgcp.target.layout import Target
-from kgcp.target.measure import measure_frame
-from kgcp.target.observation import Miss, Outcome
+from kgcp.target.expected import Expectation
+from kgcp.target.observation import Miss, Observation, is_unreadable
 from kgcp.target.prior import NormalPrior, normal_priors
-from kgcp.workers import ordered_map
-
-_FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
-
-
-@dataclass(frozen=True, slots=True)
-class FrameTask:
-    """What a worker needs to know to examine any frame of a flight."""
-
-    frames_folder: Path
-    camera: Camera
-    calibration_covariance: CalibrationCovariance | None
-    targets: tuple[Target, ...]
-    settings: DetectSettings
-
-
-@dataclass(frozen=True, slots=True)
-class FrameNote:
-    """What a worker needs to know about one frame.
-
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    time_s : float or None
-        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: EXIF decides.
-    prior : NormalPrior or None
-        Of the normal of the plate on the vehicle; None: nothing is known of it.
-    """
-
-    frame: str
-    time_s: float | None
-    prior: NormalPrior | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +54,10 @@ class SurveySummary:
     frames_without_attitude : int
         Frames whose camera attitude is not known, so that a level plate tells nothing about them;
         0 where the plate is not said to be level.
+    guided : int
+        Rows measured by a second look only.
+    guide_problem : str or None
+        Why reference poses and trajectory could not say where to look again, if they could not.
     """
 
     frames: int
@@ -94,6 +67,8 @@ class SurveySummary:
     times_without_frame: int
     exif_times_in_whole_seconds: int
     frames_without_attitude: int
+    guided: int
+    guide_problem: str | None
 
 
 def detect_flight(
@@ -103,8 +78,11 @@ def detect_flight(
     *,
     jobs: int,
     on_frame: Callable[[FrameResult], None],
+    debug: Debug | None = None,
 ) -> SurveySummary:
     """Examine every frame of a flight and write `detections.parquet`.
+
+    Frames without a target are looked at again where the others say that it must be.
 
     Parameters
     ----------
@@ -115,7 +93,9 @@ def detect_flight(
     jobs : int
         Worker processes; 1 works in this one. The table does not depend on it.
     on_frame : callable
-        Called with each frame's result, in the frames' order.
+        Called with each frame's result, in the frames' order, then with those of second looks.
+    debug : Debug, optional
+        Pictures to draw.
 
     Raises
     ------
@@ -139,11 +119,21 @@ def detect_flight(
         flight.calibration_covariance,
         flight.targets,
         settings,
+        debug,
     )
     results = []
     for result in examine_frames(task, notes, jobs=jobs):
         on_frame(result)
         results.append(result)
+    guide_problem = None
+    if settings.is_guided:
+        expected, guide_problem = expectations(flight, results)
+        looks = _second_looks(flight, notes, results, expected)
+        rows = {result.frame: row for row, result in enumerate(results)}
+        for result in examine_again(task, looks, jobs=jobs):
+            on_frame(result)
+            results[rows[result.frame]] = result
+        results = list(map(with_expectations, results, expected))
     write_table(
         out / "detections.parquet",
         DETECTION_COLUMNS,
@@ -152,7 +142,7 @@ def detect_flight(
     )
     is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
     without_attitude = sum(note.prior is None for note in notes) if is_level else 0
-    return _summarise(results, times, without_attitude)
+    return _summarise(results, times, without_attitude, guide_problem)
 
 
 def _take_notes(
@@ -177,76 +167,19 @@ def _take_notes(
     ]
 
 
-def examine_frames(
-    task: FrameTask, notes: Sequence[FrameNote], *, jobs: int
-) -> Iterator[FrameResult]:
-    """Yield the result of every frame, in the order given, from a pool of `jobs` processes."""
-    return ordered_map(
-        _examine_in_worker,
-        notes,
-        jobs=jobs,
-        start=_start_worker,
-        start_arguments=(task,),
-        items_per_task=_FRAMES_PER_TASK,
-    )
-
-
-def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
-    """Read and measure one frame; whatever a frame can do wrong becomes its result."""
-    path = task.frames_folder / note.frame
-    exif = read_exif(path)
-    outcomes: tuple[Outcome, ...]
-    try:
-        grey = read_grey(path, task.camera)
-        measured = measure_frame(grey, task.camera, task.targets, task.settings, note.prior)
-        outcomes = tuple(_with_common_uncertainty(task, outcome) for outcome in measured)
-    except Rejection as rejection:
-        outcomes = tuple(
-            Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
-        )
-    time_s = exif.time_s if note.time_s is None else note.time_s
-    reference = task.camera.time_reference
-    if time_s is not None and reference is not TimeReference.MIDDLE:
-        is_readable = not any(_is_unreadable(outcome) for outcome in outcomes)
-        time_s = _mid_exposure_s(time_s, exif, reference, path) if is_readable else None
-    return FrameResult(note.frame, time_s, exif, outcomes)
-
-
-def _is_unreadable(outcome: Outcome) -> bool:
-    return isinstance(outcome, Miss) and outcome.reason.status is Status.UNREADABLE
-
-
-def _mid_exposure_s(time_s: float, exif: Exif, reference: TimeReference, path: Path) -> float:
-    if exif.exposure_time_s is None:
-        raise KgcpError(
-            f"{path}: has no exposure time in EXIF, which [camera] time_reference ="
-            f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
-            " of mid-exposure and delete time_reference"
-        )
-    return time_s + reference.to_middle_s(exif.exposure_time_s)
-
-
-def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
-    if isinstance(outcome, Miss):
-        return outcome
-    ring = next(target.ring for target in task.targets if target.name == outcome.target)
-    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
-    return replace(outcome, common=common)
-
-
-_worker_task: FrameTask | None = None  # set once per process: sent with every frame it would cost
-
-
-def _start_worker(task: FrameTask) -> None:
-    global _worker_task  # noqa: PLW0603 - the only state a pool's initializer can leave behind
-    _worker_task = task
-    cv2.setNumThreads(0)  # the processes are the parallelism
-
-
-def _examine_in_worker(note: FrameNote) -> FrameResult:
-    if _worker_task is None:
-        raise RuntimeError("worker used before it was started")
-    return examine_frame(_worker_task, note)
+def _second_looks(
+    flight: Flight,
+    notes: Sequence[FrameNote],
+    results: Sequence[FrameResult],
+    expected: Sequence[Mapping[str, Expectation]],
+) -> list[SecondLook]:
+    """Return the readable frames in which a missing target must be visible."""
+    looks = []
+    for note, result, here in zip(notes, results, expected, strict=True):
+        visible = {name: one for name, one in here.items() if one.is_visible(flight.camera)}
+        if visible and not any(map(is_unreadable, result.outcomes)):
+            looks.append(SecondLook(note, result, visible))
+    return looks
 
 
 def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
@@ -259,7 +192,10 @@ def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
 
 
 def _summarise(
-    results: Sequence[FrameResult], times: Mapping[str, float], frames_without_attitude: int
+    results: Sequence[FrameResult],
+    times: Mapping[str, float],
+    frames_without_attitude: int,
+    guide_problem: str | None,
 ) -> SurveySummary:
     outcomes = [outcome for result in results for outcome in result.outcomes]
     reasons = Counter(outcome.reason for outcome in outcomes if isinstance(outcome, Miss))
@@ -275,6 +211,8 @@ def _summarise(
         times_without_frame=len(times.keys() - {result.frame for result in results}),
         exif_times_in_whole_seconds=_whole_seconds(results, times),
         frames_without_attitude=frames_without_attitude,
+        guided=sum(isinstance(one, Observation) and one.is_guided for one in outcomes),
+        guide_problem=guide_problem,
     )
 
 

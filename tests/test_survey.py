@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from kgcp.errors import KgcpError
+from kgcp.examine import Debug
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.columns import DETECTION_COLUMNS
 from kgcp.io.flight import read_flight
@@ -58,6 +59,22 @@ def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 1) -> S
         )
     finally:
         (folder / "flight.toml").write_text(original, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """So far that the search passes over some of the rings; trajectory and reference are there."""
+    settings = replace(
+        preset("far"),
+        camera=replace(preset("far").camera, width=800, height=600, cx=404.2, cy=297.1),
+        frames=12,
+        distance_m=(100.0, 215.0),
+        absent_share=0.17,
+        decoy_share=0.0,
+    )
+    folder = tmp_path_factory.mktemp("tiny") / "flight"
+    write_simulated_flight(plan_flight(settings, 3), folder, jobs=1, on_frame=lambda: None)
+    return folder
 
 
 def measured(out: Path) -> pd.DataFrame:
@@ -109,6 +126,58 @@ def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_
         detect(flight, tmp_path / str(jobs), *edits, jobs=jobs)
         tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
     assert tables[0] == tables[1]
+
+
+def test_a_second_look_finds_what_the_reference_promises(tiny: Path, tmp_path: Path) -> None:
+    flight = read_flight(tiny)
+    summaries = {
+        (is_guided, jobs): detect_flight(
+            flight,
+            DetectSettings(is_guided=is_guided),
+            tmp_path / f"{is_guided}{jobs}",
+            jobs=jobs,
+            on_frame=lambda _: None,
+        )
+        for is_guided, jobs in ((False, 1), (True, 1), (True, 2))
+    }
+    first, second = (measured(tmp_path / name) for name in ("False1", "True1"))
+    assert not first["guided"].any()
+    assert summaries[True, 1].guided == second["guided"].sum() == len(second) - len(first) >= 2
+    truth = pd.read_csv(tiny / "truth.csv", index_col="frame")
+    assert set(second.index) == set(truth.index[truth["present"] == 1])
+    off_px = second[["x_px", "y_px"]].to_numpy() - truth.loc[second.index, ["x", "y"]].to_numpy()
+    assert np.abs(off_px).max() < 0.2
+    tables = [(tmp_path / name / "detections.parquet").read_bytes() for name in ("True1", "True2")]
+    assert tables[0] == tables[1]
+    rows = read_table(tmp_path / "True1" / "detections.parquet", DETECTION_COLUMNS)
+    details = rows.loc[rows["status"] != "measured", "detail"]
+    assert details.str.contains("expected by the reference at").all()
+
+
+def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path: Path) -> None:
+    late = ("[vehicle]\n", "[vehicle]\ntime_offset_s = 5000.0\n")
+    summary = detect(tiny, tmp_path / "out", late)
+    assert summary.guided == 0
+    assert summary.guide_problem is not None
+    assert "none of the" in summary.guide_problem
+    missing = ('poses = "reference.csv"', 'poses = "later.csv"')
+    assert detect(tiny, tmp_path / "out", missing).guide_problem is None
+
+
+def test_pictures_are_drawn_of_the_frames_asked_for(tiny: Path, tmp_path: Path) -> None:
+    debug = Debug(tmp_path / "debug", "frame_00[01]*")
+    detect_flight(
+        *(read_flight(tiny), DetectSettings(), tmp_path / "out"),
+        jobs=2,
+        on_frame=lambda _: None,
+        debug=debug,
+    )
+    pictures = sorted(path.name for path in debug.folder.iterdir())
+    first = [f"frame_{index:04d}.png.jpg" for index in range(12)]
+    assert [name for name in pictures if "guided" not in name] == first
+    looked_again = [name for name in pictures if name.endswith(".guided.jpg")]
+    assert looked_again
+    assert len(looked_again) + len(first) == len(pictures)
 
 
 def test_without_reference_poses_the_camera_is_plumb_or_unknown(

@@ -11,7 +11,7 @@ from PIL.ExifTags import IFD, Base
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.settings import DetectSettings
-from kgcp.survey import FrameNote, FrameTask, examine_frame
+from kgcp.examine import FrameNote, FrameTask, examine_frame
 from kgcp.target.layout import Ring, Target
 
 _CAMERA = Camera(96, 64, 120.0, 120.0, 47.5, 31.5)

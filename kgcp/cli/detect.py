@@ -38,14 +38,42 @@ _DEFAULTS = DetectSettings()
     type=float,
     default=_DEFAULTS.min_radius_px,
     show_default=True,
-    help="Smallest radius of a circle to look at [px].",
+    help="Smallest radius of a ring to look for [px]; a larger one saves time.",
 )
 @click.option(
     "--min-score",
     type=float,
     default=_DEFAULTS.min_score,
     show_default=True,
-    help="Threshold on the normalised cross-correlation of the code.",
+    help="Threshold on the normalised cross-correlation of the ring and its dots.",
+)
+@click.option(
+    "--false-alarm",
+    type=float,
+    metavar="P",
+    default=_DEFAULTS.false_alarm,
+    show_default=True,
+    help="Chance per frame, at most, that random light on a ring is taken for the code.",
+)
+@click.option(
+    "--guided/--no-guided",
+    "is_guided",
+    default=_DEFAULTS.is_guided,
+    show_default=True,
+    help="Look again, closer, where other frames or reference poses say that a target must be.",
+)
+@click.option(
+    "--debug",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Write a picture per frame to DIR: what was considered, and why it was dropped.",
+)
+@click.option(
+    "--debug-frames",
+    metavar="PATTERN",
+    default="*",
+    show_default=True,
+    help="Draw these frames only, for example 'east/*_01?.jpg'.",
 )
 @json_option
 def command(
@@ -55,7 +83,11 @@ def command(
     method: str,
     min_radius: float,
     min_score: float,
+    false_alarm: float,
+    debug: Path | None,
+    debug_frames: str,
     *,
+    is_guided: bool,
     as_json: bool,
 ) -> None:
     """Find and measure the target in every frame of FLIGHT.
@@ -73,6 +105,7 @@ def command(
 
     from tqdm import tqdm
 
+    from kgcp.examine import Debug
     from kgcp.io.detections import FrameResult
     from kgcp.io.flight import read_flight
     from kgcp.io.frames import list_frames
@@ -80,21 +113,32 @@ def command(
     from kgcp.target.observation import Observation
     from kgcp.workers import usable_cores
 
-    settings = DetectSettings(method=Method(method), min_radius_px=min_radius, min_score=min_score)
+    settings = DetectSettings(
+        method=Method(method),
+        min_radius_px=min_radius,
+        min_score=min_score,
+        false_alarm=false_alarm,
+        is_guided=is_guided,
+    )
     the_flight = read_flight(flight)
     folder = out or the_flight.folder / "kgcp"
-    found = 0
+    found: set[str] = set()
     start = time.perf_counter()
     with tqdm(total=len(list_frames(the_flight.frames_folder)), unit="frame") as bar:
 
         def advance(result: FrameResult) -> None:
-            nonlocal found
-            found += any(isinstance(outcome, Observation) for outcome in result.outcomes)
-            bar.set_postfix(found=found, refresh=False)
+            if any(isinstance(outcome, Observation) for outcome in result.outcomes):
+                found.add(result.frame)
+            if bar.n == bar.total:  # a second look
+                bar.total += 1
+            bar.set_postfix(found=len(found), refresh=False)
             bar.update()
 
         summary = detect_flight(
-            the_flight, settings, folder, jobs=jobs or usable_cores(), on_frame=advance
+            *(the_flight, settings, folder),
+            jobs=jobs or usable_cores(),
+            on_frame=advance,
+            debug=None if debug is None else Debug(debug, debug_frames),
         )
     _report(summary, folder / "detections.parquet", time.perf_counter() - start, as_json=as_json)
 
@@ -115,6 +159,10 @@ def _report(summary: SurveySummary, table: Path, seconds: float, *, as_json: boo
     )
     for reason, count in summary.reasons.items():
         click.echo(f"  {count:6d} {reason}", err=True)
+    if summary.guided:
+        click.echo(f"{summary.guided} of them measured by a second look", err=True)
+    if summary.guide_problem is not None:
+        click.echo(f"no second look by the reference: {summary.guide_problem}", err=True)
     if summary.frames_without_time:
         click.echo(
             f"{summary.frames_without_time} frames have no time: name a times file in flight.toml"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.errors import Reason
+from kgcp.errors import Reason, Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
@@ -170,6 +170,11 @@ class Miss:
 
 
 Outcome = Observation | Miss
+
+
+def is_unreadable(outcome: Outcome) -> bool:
+    """Tell whether an outcome is that of a frame without an image."""
+    return isinstance(outcome, Miss) and outcome.reason.status is Status.UNREADABLE
 
 
 @dataclass(frozen=True, slots=True)
