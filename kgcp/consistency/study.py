@@ -93,7 +93,7 @@ def study_consistency(
     Returns
     -------
     Consistency or None
-        None with fewer than ten frames to compare.
+        None with fewer than ten frames to compare, or that fit any correction.
 
     Raises
     ------
@@ -106,6 +106,8 @@ def study_consistency(
     views = Views.of(poses, whereabouts.frame)
     system = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
     outlier = find_outliers(system.design, system.offset, system.fading + system.white)
+    if np.count_nonzero(~outlier) < MIN_POINTS:
+        return None
     found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), system, ~outlier)
     offset_s = whereabouts.carrier.settings.time_offset_s
     return Consistency(
@@ -123,13 +125,16 @@ def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estima
         (system.design, system.offset[:, :, None], system.common[:, :, None]), axis=2
     )[kept]
     trials = []
-    for correlation_s in _CORRELATIONS_S if system.fading.any() else (0.0,):
+    for correlation_s in _CORRELATIONS_S:
         whitened, log_det = whiten(
             time_s[kept], system.fading[kept], system.white[kept], correlation_s, columns
         )
         rows = whitened.reshape(-1, columns.shape[2])
         found = estimate(rows, has_deviations=system.has_deviations)
-        trials.append((found.chi2_after + log_det, correlation_s, found))
+        misfit = found.chi2_after
+        if not system.has_deviations:  # the likeliest scale is part of the likelihood
+            misfit = len(rows) * float(np.log(misfit))
+        trials.append((misfit + log_det, correlation_s, found))
     _, correlation_s, found = min(trials, key=lambda trial: trial[0])
     return found, correlation_s
 

@@ -18,6 +18,7 @@ from kgcp.target.sighting import Sighting
 from kgcp.views import Views
 
 _MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
+_UNSTATED_SD_M = 0.01  # of what has no deviations; the residuals set the scale then
 _STANDING_M_S = 0.2  # below, the track is where the vehicle points
 _NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
 
@@ -113,7 +114,7 @@ class System:
 
 def _fading_m2(place: Place) -> FloatArray:
     if place.cov_m2 is None or place.common_m is None:
-        return np.zeros((3, 3))
+        return _UNSTATED_SD_M**2 * np.eye(3)
     return place.cov_m2 - place.common_m @ place.common_m.T
 
 
@@ -127,8 +128,8 @@ def _white_m2(
     measured = [one.seen.pose_cov for one in meetings]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
-    if views.cov_m2 is not None:
-        total = total + views.cov_m2[rows]
+    unstated = _UNSTATED_SD_M**2 * np.eye(3)
+    total = total + (unstated if views.cov_m2 is None else views.cov_m2[rows])
     if poses.sd_angle_deg is not None:
         effect = _cross(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
         total = total + effect @ np.swapaxes(effect, 1, 2)

@@ -49,6 +49,7 @@ class Flight:
     boresight_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
     is_straight: bool = False
     wrong: tuple[int, ...] = ()
+    has_deviations: bool = True
     settings: VehicleSettings = _SETTINGS
 
     def vehicle(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,7 +98,11 @@ class Flight:
             for index, t in enumerate(time_s)
         ]
         poses = _reference(names, self.drone(time_s), spin @ _turns(self.boresight_rad), rng)
-        whereabouts = Whereabouts.of(_CRS, [_TARGET], self._trajectory(rng), self.settings)
+        trajectory = self._trajectory(rng)
+        if not self.has_deviations:
+            trajectory = replace(trajectory, sd_position_m=None)
+            poses = replace(poses, sd_position_m=None, sd_angle_deg=None)
+        whereabouts = Whereabouts.of(_CRS, [_TARGET], trajectory, self.settings)
         # the frames' clock is behind the trajectory's
         late = [
             replace(one, time_s=float(t) - self.time_offset_s)
@@ -284,6 +289,14 @@ def test_wrong_points_are_named_and_take_no_part() -> None:
 def test_the_trajectorys_correlation_time_is_found_to_within_its_neighbours() -> None:
     times = [Flight(seed=seed).study().correlation_s for seed in range(3)]
     assert set(times) <= {10.0, 30.0}  # 20 s, of 0, 1, 3, 10, 30, 100, 300
+
+
+def test_without_deviations_the_residuals_set_the_scale() -> None:
+    flight = Flight(has_deviations=False, time_offset_s=0.025)
+    truth = np.array([0.025, *[0.0] * 7])
+    tables = np.array([_corrections(replace(flight, seed=k).study()) for k in range(6)])
+    standardised = (tables[:, :, 0] - truth) / tables[:, :, 1]
+    assert 0.7 < math.sqrt(np.mean(standardised**2)) < 2.5  # rough, as the documentation says
 
 
 def test_a_few_frames_are_not_enough() -> None:
