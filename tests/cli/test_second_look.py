@@ -1,0 +1,113 @@
+"""`kgcp detect` on a smooth passage with one frame in haze: the neighbours tell where to look."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.synthetic.flight import TARGET_PLATE
+from kgcp.synthetic.imaging import Optics, Sensor
+from kgcp.synthetic.plate import image_plate
+
+CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
+HAZY, FRAMES = 4, 9
+FLIGHT = """\
+[camera]
+width = 480
+height = 360
+fx = 900.0
+fy = 904.0
+cx = 236.3
+cy = 184.2
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+def pose_of(number: int) -> Pose:
+    """Some 20 px and 0.3 m farther with every frame, with a slight bend."""
+    x, y = -2.6 + 0.6 * number, -1.0 + 0.2 * number + 0.01 * number**2
+    return Pose(np.eye(3), np.array([x, y, 27.0 + 0.3 * number]))
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("haze")
+    (folder / "frames").mkdir()
+    (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
+    rng = np.random.default_rng(9)
+    lines = ["frame,time"]
+    for number in range(FRAMES):
+        irradiance = np.full((CAMERA.height, CAMERA.width), 0.3)
+        image_plate(CAMERA, TARGET_PLATE, pose_of(number), Optics(0.7)).paste(irradiance)
+        grey = Sensor().expose(irradiance, 0.9, rng)
+        if number == HAZY:
+            grey = np.rint(120.0 + 0.05 * (grey.astype(np.float64) - 120.0)).astype(np.uint8)
+        assert cv2.imwrite(str(folder / "frames" / f"f_{number}.png"), grey)
+        lines.append(f"f_{number}.png,2026-06-16T08:15:{number:02d}Z")
+    (folder / "frames.csv").write_text("\n".join(lines), encoding="utf-8")
+    return folder
+
+
+def detect(flight: Path, out: Path, *options: str) -> Result:
+    arguments = ["detect", str(flight), "--out", str(out), "--jobs", "1", "--json", *options]
+    return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+
+def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> None:
+    result = detect(
+        flight, tmp_path, "--debug", str(tmp_path / "debug"), "--debug-frames", f"f_{HAZY}*"
+    )
+    assert json.loads(result.stdout)["guided"] == 1
+    assert "1 of them measured by a second look" in result.stderr
+    rows = pd.read_parquet(tmp_path / "detections.parquet").set_index("frame")
+    assert rows["status"].eq("measured").all()
+    assert rows.index[rows["guided"]].to_list() == [f"f_{HAZY}.png"]
+    truth = pose_of(HAZY)
+    seen = rows.loc[f"f_{HAZY}.png"]
+    assert np.hypot(*(seen[["x_px", "y_px"]] - CAMERA.project(truth.translation_m))) < 0.1
+    assert seen["distance_m"] == pytest.approx(truth.distance_m, rel=5e-3)
+    pictures = sorted(path.name for path in (tmp_path / "debug").iterdir())
+    assert pictures == [f"f_{HAZY}.png.guided.jpg", f"f_{HAZY}.png.jpg"]
+
+
+def test_without_the_second_look_it_is_missed_and_explained(flight: Path, tmp_path: Path) -> None:
+    result = detect(flight, tmp_path, "--no-guided")
+    assert json.loads(result.stdout)["guided"] == 0
+    rows = pd.read_parquet(tmp_path / "detections.parquet").set_index("frame")
+    assert rows.index[rows["status"] != "measured"].to_list() == [f"f_{HAZY}.png"]
+    assert rows.loc[f"f_{HAZY}.png", "reason"] == "no_candidate"
+    assert not rows["guided"].any()
+
+
+def test_a_chance_that_nothing_meets_leaves_nothing(flight: Path, tmp_path: Path) -> None:
+    detect(flight, tmp_path, "--false-alarm", "1e-60")
+    rows = pd.read_parquet(tmp_path / "detections.parquet")
+    assert (rows["status"] != "measured").all()
+    assert rows["detail"].str.contains("comes about by chance").sum() == FRAMES - 1
+
+
+def test_an_impossible_chance_is_refused_in_one_line(flight: Path, tmp_path: Path) -> None:
+    result = detect(flight, tmp_path, "--false-alarm", "0")
+    assert result.exit_code == 1
+    assert "false_alarm: 0 is out of range; give a value above 0 and at most 1" in result.stderr
+
+
+def test_the_smallest_radius_reaches_the_search(flight: Path, tmp_path: Path) -> None:
+    detect(flight, tmp_path, "--min-radius", "40", "--no-guided")
+    rows = pd.read_parquet(tmp_path / "detections.parquet")
+    assert (rows["status"] != "measured").all()
