@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from pathlib import Path
@@ -157,6 +158,11 @@ def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
     assert f"{_FRAMES} KGCPs, 0 sightings left out" in result.stderr
     table = read_table(folder / "kgcp" / "kgcps.parquet", KGCP_COLUMNS)
     assert list(table.loc[table["flag"] != "", "frame"]) == ["f_20.jpg"]
+    with (folder / "kgcp" / "kgcps.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["frame"] for row in rows if row["flag"]] == ["f_20.jpg"]
+    assert {row["role"] for row in rows} == {"control"}
+    assert {float(row["sd_common_x"]) for row in rows} == {0.0}  # neither arm nor clock has any
 
 
 def test_gates_spacing_and_check_points(folder: Path) -> None:

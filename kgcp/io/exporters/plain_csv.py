@@ -15,7 +15,9 @@ from kgcp.io.times import format_time
 COLUMNS = (
     *("id", "frame", "target", "time", "x", "y", "z", "sd_x", "sd_y", "sd_z"),
     *("cov_xy", "cov_xz", "cov_yz", "x_px", "y_px", "sd_x_px", "sd_y_px", "cov_xy_px2"),
-    *("distance_m", "sd_distance_m", "sd_common_distance_m", "crs"),
+    *("distance_m", "sd_distance_m", "sd_common_distance_m"),
+    *("sd_common_x", "sd_common_y", "sd_common_z"),
+    *("cov_common_xy", "cov_common_xz", "cov_common_yz", "role", "flag", "crs"),
 )
 """x is easting or longitude, y northing or latitude, z height, in `crs`; deviations in metres and
 covariances in m² along these axes; (0, 0) px is the centre of the top-left pixel."""
@@ -38,6 +40,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
                 f"{point.distance_m:.5f}",
                 _text(point.sd_distance_m),
                 _text(point.sd_common_distance_m),
+                *_covariance(point.cov_common_m2, 3),
+                "check" if point.is_checkpoint else "control",
+                "" if point.flag is None else point.flag.value,
                 points.crs,
             )
         )
