@@ -185,10 +185,9 @@ def _merged(
         first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
     instead: dict[str, Outcome] = {}
     for target in missed:
-        own = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
-        miss = miss_of(grey, target, own, task.settings)
-        is_better = miss.score is not None and miss.score >= (first[target.name].score or 0.0)
-        instead[target.name] = miss if is_better else first[target.name]
+        there = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
+        known = miss_of(grey, target, there, task.settings) if there else first[target.name]
+        instead[target.name] = known
     for name in first.keys() & found.keys():
         instead[name] = _with_common_uncertainty(task, found[name])
     return tuple(
