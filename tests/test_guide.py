@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.guide import Track, expect, expect_between, expect_by_reference
 
 FRAMES = 200
@@ -20,9 +20,9 @@ def wander(rng: np.random.Generator, time_s: FloatArray, acceleration: float) ->
     return np.column_stack([np.interp(time_s, fine, column) for column in place.T])
 
 
-def without(state: FloatArray, missing: FloatArray) -> FloatArray:
+def without(state: FloatArray, missing: IndexArray) -> FloatArray:
     kept = state.copy()
-    kept[missing.astype(int)] = np.nan
+    kept[missing] = np.nan
     return kept
 
 

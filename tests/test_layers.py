@@ -16,6 +16,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "kgcp"
 LAYERS = (
     ("errors",),
     ("settings",),
+    ("compiled",),
     ("geometry",),
     ("target",),
     ("mapframe",),
@@ -36,6 +37,7 @@ LEVEL = {member: level for level, members in enumerate(LAYERS) for member in mem
 LIBRARIES = {
     "errors": set(),
     "settings": set(),
+    "compiled": {"numba"},
     "workers": set(),
     "geometry": {"numpy", "scipy"},
     "target": {"numpy", "scipy", "cv2"},

@@ -9,9 +9,9 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from kgcp.errors import KgcpError
+from kgcp.examine import FrameNote, FrameTask, examine_frame
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.settings import DetectSettings
-from kgcp.examine import FrameNote, FrameTask, examine_frame
 from kgcp.target.layout import Ring, Target
 
 _CAMERA = Camera(96, 64, 120.0, 120.0, 47.5, 31.5)

@@ -17,7 +17,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.settings import require_range
 
 _MAX_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-13
+_NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
 
 
 class Response(StrEnum):
@@ -132,7 +132,7 @@ class Camera:
                 normalised = normalised - step
                 if not np.any(np.abs(step) > _NEWTON_TOLERANCE):
                     break
-            lost = ~np.all(np.abs(step) < 1e-9, axis=-1)
+            lost = ~np.all(np.abs(step) <= _NEWTON_TOLERANCE, axis=-1)
         normalised[lost] = np.nan
         return normalised
 

@@ -65,13 +65,13 @@ class Pose:
 
         The least turn that does it: about the axis square to both, by twice their angle.
         """
-        ray = self.translation_m / self.distance_m
-        axis = np.cross(self.normal, ray)
-        sine, cosine = float(np.linalg.norm(axis)), float(self.normal @ ray)
-        if sine < _SQUARE_VIEW:
+        (a, b, c), (x, y, z) = self.normal.tolist(), self.translation_m.tolist()
+        axis = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+        sine, cosine = math.hypot(*axis), a * x + b * y + c * z
+        if sine < _SQUARE_VIEW * self.distance_m:
             return self
-        turn = Rotation.from_rotvec(axis / sine * 2.0 * math.atan2(sine, cosine))
-        return Pose(turn.as_matrix() @ self.rotation, self.translation_m)
+        turn = rotation_about(axis / sine * 2.0 * math.atan2(sine, cosine))
+        return Pose(turn @ self.rotation, self.translation_m)
 
     @property
     def roll_deg(self) -> float:
@@ -95,13 +95,20 @@ def rotation_about(vector: FloatArray) -> FloatArray:
 
     Adjustments take so many small turns that the overhead of a general library shows.
     """
-    angle = math.sqrt(float(vector @ vector))
-    x, y, z = vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    x, y, z = vector.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
     first = math.sin(angle) / angle if angle > 1e-8 else 1.0
-    second = (1.0 - math.cos(angle)) / angle**2 if angle > 1e-4 else 0.5
-    matrix: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return matrix
+    second = (1.0 - math.cos(angle)) / square if angle > 1e-4 else 0.5
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    x, y, z, xx, yy, zz = first * x, first * y, first * z, x * x, y * y, z * z
+    return np.array(
+        [
+            [1.0 - second * (yy + zz), xy - z, xz + y],
+            [xy + z, 1.0 - second * (xx + zz), yz - x],
+            [xz - y, yz + x, 1.0 - second * (xx + yy)],
+        ]
+    )
 
 
 def image_heading_deg(camera: Camera, pose: Pose) -> float:

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
 FRAME_ORDER = 15  # undistortion is smooth: 1e-10 px over a whole frame of usual lenses
-WINDOW_ORDER = 9  # the same over a window of some hundred pixels
+WINDOW_ORDER = 7  # the same over a window of some hundred pixels
 
 
 @cache
@@ -55,9 +55,7 @@ def normalised_grid(
     return rows @ normalised[..., 0] @ columns.T, rows @ normalised[..., 1] @ columns.T
 
 
-def normalised_window(
-    camera: Camera, x_px: FloatArray, y_px: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def rays_of_window(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """Undistort a small grid, with derivatives.
 
     Parameters
@@ -67,18 +65,17 @@ def normalised_window(
 
     Returns
     -------
-    normalised : (2, n · m) array
-        Normalised coordinates, row by row.
-    normalised_from_px : (2, 2, n · m) array
-        Their derivative with respect to the raw pixel coordinates.
+    (6, n · m) array
+        Normalised coordinates x, y, row by row, and their derivatives xx, xy, yx, yy with respect
+        to the raw pixel coordinates.
     """
     x_nodes, columns = _interpolator(x_px, WINDOW_ORDER)
     y_nodes, rows = _interpolator(y_px, WINDOW_ORDER)
     at_nodes = camera.undistort(np.stack(np.meshgrid(x_nodes, y_nodes), axis=-1))
     inverse = _inverse_2x2(camera.distort_jacobian(at_nodes))
     fields = np.concatenate((at_nodes, inverse.reshape(*at_nodes.shape[:2], 4)), axis=-1)
-    flat = (rows @ np.moveaxis(fields, -1, 0) @ columns.T).reshape(6, -1)
-    return flat[:2], flat[2:].reshape(2, 2, -1)
+    flat: FloatArray = (rows @ np.moveaxis(fields, -1, 0) @ columns.T).reshape(6, -1)
+    return flat
 
 
 def _inverse_2x2(matrix: FloatArray) -> FloatArray:

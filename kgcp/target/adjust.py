@@ -13,13 +13,13 @@ from kgcp.target.coverage import white_level, white_share
 from kgcp.target.light import PARAM_COUNT, Light, Parameters, light_of_levels
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
 from kgcp.target.pairs import Blur
-from kgcp.target.plate import PlateView, view_plate
 from kgcp.target.sample import Imaging, Sample, choose_sample
 
 _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
-_SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.2, 0.4
+_SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.15, 0.4
+_NOISE_ROUNDS = 3
 _LARGE_GAIN = 4.0
 _NEGLIGIBLE = 1e-6
 _DAMPING = 1e-3
@@ -32,14 +32,15 @@ class Prediction:
 
     Attributes
     ----------
-    view : PlateView
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
     share : (n,) array
         White share.
     levels : (n,) array
         Grey values before clipping.
     """
 
-    view: PlateView
+    points_m: FloatArray
     share: FloatArray
     levels: FloatArray
 
@@ -81,8 +82,6 @@ class Fit:
     misfit : Misfit
         Without the priors.
     unknowns : Unknowns
-    normal : (p, p) array
-        Normal matrix, priors included.
     """
 
     sample: Sample
@@ -92,7 +91,12 @@ class Fit:
     sd: FloatArray
     misfit: Misfit
     unknowns: Unknowns
-    normal: FloatArray
+
+    @property
+    def normal(self) -> FloatArray:
+        """Normal matrix (p, p), priors included."""
+        scaled = self.jacobian[self.unknowns.free] / self.sd
+        return _normal_matrix(scaled, self.misfit, self.unknowns)
 
     @property
     def total(self) -> float:
@@ -102,17 +106,16 @@ class Fit:
 
 def predict(sample: Sample, parameters: Parameters) -> Prediction:
     """Model the grey values of a sample."""
-    view = view_plate(parameters.pose, sample.normalised, sample.normalised_from_px)
-    share = white_level(view, parameters.blur, sample.pairs)
-    return Prediction(view, share, sample.imager.levels(share, parameters.light))
+    share = white_level(parameters.pose, sample.rays, parameters.blur, sample.pairs)
+    levels = sample.imager.levels(share.value, parameters.light)
+    return Prediction(share.points_m, share.value, levels)
 
 
 def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
     """Model the grey values of a sample, and return their Jacobian (19, n) with them."""
-    view = view_plate(parameters.pose, sample.normalised, sample.normalised_from_px)
-    share = white_share(view, parameters.blur, sample.pairs)
+    share = white_share(parameters.pose, sample.rays, parameters.blur, sample.pairs)
     levels, jacobian = sample.imager.linearised(share, parameters.light)
-    return Prediction(view, share.value, levels), jacobian
+    return Prediction(share.points_m, share.value, levels), jacobian
 
 
 def first_levels(sample: Sample, pose: Pose, blur: Blur) -> Light:
@@ -123,28 +126,25 @@ def first_levels(sample: Sample, pose: Pose, blur: Blur) -> Light:
     Rejection
         `NO_CONTRAST` if ink is not darker than the plate.
     """
-    view = view_plate(pose, sample.normalised, sample.normalised_from_px)
-    share = white_level(view, blur, sample.pairs)
-    levels = sample.levels
-    black = float(np.median(levels[share <= max(0.1, np.quantile(share, 0.1))]))
-    white = float(np.median(levels[share >= min(0.9, np.quantile(share, 0.9))]))
+    share = white_level(pose, sample.rays, blur, sample.pairs).value
+    tenth = len(share) // 10
+    darkest, brightest = np.partition(share, (tenth, -1 - tenth))[[tenth, -1 - tenth]]
+    black = float(np.median(sample.levels[share <= max(0.1, darkest)]))
+    white = float(np.median(sample.levels[share >= min(0.9, brightest)]))
     if white - black < 4.0 * sample.imaging.window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
     return light_of_levels(black, white, sample.imaging.response)
 
 
-def adjust(
-    imaging: Imaging, start: Parameters, unknowns: Unknowns, sample: Sample | None = None
-) -> Fit:
+def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:
+    """Come near the minimum from a rough start, on pixels chosen for that start."""
+    return _fit_with_noise(sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN)
+
+
+def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | None = None) -> Fit:
     """Estimate the unknowns, in rounds: pixels, noise and outliers are settled anew in each.
 
-    Parameters
-    ----------
-    imaging : Imaging
-    start : Parameters
-    unknowns : Unknowns
-    sample : Sample, optional
-        The pixels of the first round.
+    With at most so many pixels, where `most` is given.
 
     Raises
     ------
@@ -152,41 +152,40 @@ def adjust(
         As `choose_sample`; `POOR_FIT` if the steps diverge.
     """
     parameters = start
-    for number in range(_MAX_ROUNDS):
-        if sample is None:
-            sample = choose_sample(imaging, parameters.pose, parameters.blur, parameters.light)
-        linear = linearise(sample, parameters)
-        sd = noise_of(sample, linear[0]).sd
-        is_first = number == 0
-        fit = minimise(
-            sample,
-            parameters,
-            sd,
-            unknowns,
-            steps=_EARLY_STEPS if is_first else _STEPS,
-            enough=_EARLY_GAIN if is_first else _LAST_GAIN,
-            linear=linear,
-        )
-        if not is_first and _is_settled(parameters, fit):
+    for _ in range(_MAX_ROUNDS):
+        pose, blur, light = parameters.pose, parameters.blur, parameters.light
+        sample = choose_sample(imaging, pose, blur, light, most)
+        fit = _fit_with_noise(sample, parameters, unknowns, steps=_STEPS, enough=_LAST_GAIN)
+        if _is_settled(parameters, fit):
             break
-        parameters, sample = fit.parameters, None
+        parameters = fit.parameters
+    return fit
+
+
+def _fit_with_noise(
+    sample: Sample, parameters: Parameters, unknowns: Unknowns, *, steps: int, enough: float
+) -> Fit:
+    """Minimise until the noise that the residuals show is the one that they were weighed by."""
+    linear = linearise(sample, parameters)
+    sd = noise_of(sample, linear[0]).sd
+    for _ in range(_NOISE_ROUNDS):
+        fit = minimise(sample, parameters, sd, unknowns, steps=steps, enough=enough, linear=linear)
+        parameters, linear = fit.parameters, (fit.prediction, fit.jacobian)
+        before, sd = sd, noise_of(sample, fit.prediction).sd
+        if abs(float(sd.sum() / before.sum()) - 1.0) < _SETTLED_NOISE:
+            break
     return fit
 
 
 def _is_settled(before: Parameters, fit: Fit) -> bool:
-    """Tell whether the pixels and the noise of a round are right for what it found."""
+    """Tell whether the pixels of a round are right for what it found."""
     imaging, after = fit.sample.imaging, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
-    noise = float(np.median(noise_of(fit.sample, fit.prediction).sd / fit.sd))
     shift_m = after.pose.translation_m - before.pose.translation_m
     distance_m = after.pose.distance_m
     across_px = float(np.linalg.norm(shift_m[:2])) / distance_m * imaging.focal_px
     growth_px = abs(float(shift_m[2])) / distance_m * imaging.outer_radius_px
-    return (
-        abs(blur - 1.0) < _SETTLED_BLUR
-        and abs(noise - 1.0) < _SETTLED_NOISE
-        and max(across_px, growth_px) < _SETTLED_PX
-    )
+    return abs(blur - 1.0) < _SETTLED_BLUR and max(across_px, growth_px) < _SETTLED_PX
 
 
 def noise_of(sample: Sample, prediction: Prediction) -> Noise:
@@ -217,13 +216,15 @@ def minimise(
     """
     damping = _DAMPING
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
+    scaled = jacobian[unknowns.free] / sd
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
     for number in range(steps):
-        normal, gradient = _normal_equations(jacobian, parameters, sd, current, unknowns)
+        normal = _normal_matrix(scaled, current, unknowns)
+        gradient = _gradient(scaled, parameters, current, unknowns)
         while True:
             step = np.zeros(PARAM_COUNT)
-            damped = _solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            damped = _solve(_damped(normal, damping), gradient)
             step[unknowns.free] = damped
             candidate = parameters.moved(step)
             is_large = 0.5 * float(gradient @ damped) > _LARGE_GAIN
@@ -239,26 +240,34 @@ def minimise(
         if trial_total > total + _NEGLIGIBLE:
             break
         gain, total = total - trial_total, trial_total
-        parameters, prediction, jacobian, current = candidate, attempt, attempt_jacobian, trial
+        if attempt_jacobian is not jacobian:
+            jacobian, scaled = attempt_jacobian, attempt_jacobian[unknowns.free] / sd
+        parameters, prediction, current = candidate, attempt, trial
         damping = max(0.1 * damping, 1e-9)
         if gain < enough:
             break
-    normal, _ = _normal_equations(jacobian, parameters, sd, current, unknowns)
-    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns, normal)
+    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)
 
 
-def _normal_equations(
-    jacobian: FloatArray,
-    parameters: Parameters,
-    sd: FloatArray,
-    current: Misfit,
-    unknowns: Unknowns,
-) -> tuple[FloatArray, FloatArray]:
-    scaled = jacobian[unknowns.free] / sd
-    pull = unknowns.precision * (unknowns.mean - parameters.nuisance_vector)
+def _normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
+    """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
     normal = (scaled * current.weight) @ scaled.T
-    normal += np.diag(unknowns.precision[unknowns.free])
-    return normal, scaled @ current.score + pull[unknowns.free]
+    normal.flat[:: len(normal) + 1] += unknowns.precision[unknowns.free]
+    return normal
+
+
+def _gradient(
+    scaled: FloatArray, parameters: Parameters, current: Misfit, unknowns: Unknowns
+) -> FloatArray:
+    pull = unknowns.precision * (unknowns.mean - parameters.nuisance_vector)
+    return scaled @ current.score + pull[unknowns.free]
+
+
+def _damped(normal: FloatArray, damping: float) -> FloatArray:
+    """Return a normal matrix with a share of its diagonal added."""
+    damped = normal.copy()
+    damped.flat[:: len(normal) + 1] *= 1.0 + damping
+    return damped
 
 
 def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:

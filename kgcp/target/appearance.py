@@ -10,19 +10,18 @@ from kgcp.target.adjust import Fit
 from kgcp.target.layout import Target
 from kgcp.target.light import encoded, plateau_levels, tone_curve
 from kgcp.target.observation import Appearance
-from kgcp.target.window import semi_major_axis_px
+from kgcp.target.window import contour_px, semi_major_axis_px
 
 
 def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
     """Return levels, clipping, blur and edge displacement of a fitted target."""
     imaging = fit.sample.imaging
     black, white = plateau_levels(fit.parameters.light, imaging.response)
-    inside = np.hypot(*fit.prediction.view.points_m) < imaging.outer_radius_m
+    inside = np.hypot(*fit.prediction.points_m) < imaging.outer_radius_m
     clipped = fit.sample.censoring.at_high | fit.sample.censoring.at_low
+    contour = contour_px(camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m)
     return Appearance(
-        radius_px=semi_major_axis_px(
-            camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m
-        ),
+        radius_px=semi_major_axis_px(contour),
         black=float(np.clip(black, 0.0, 1.0)),
         white=float(np.clip(white, 0.0, 1.0)),
         saturated=float(np.mean(clipped[inside])),

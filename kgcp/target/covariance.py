@@ -9,12 +9,14 @@ scatter of these sums gives the covariance of the gradient: a cluster-robust ("s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
@@ -115,25 +117,37 @@ def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> FloatArray:
 def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
     """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
     imaging = fit.sample.imaging
+    circles, points = imaging.circles, fit.prediction.points_m
     px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
-    points = fit.prediction.view.points_m
-    nearest = np.full(points.shape[1], np.inf)
-    circle = np.zeros(points.shape[1], dtype=np.intp)
-    arc = circle.copy()
-    first = 0
-    for index, (centre, radius) in enumerate(
-        zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True)
-    ):
-        x, y = points - centre[:, None]
-        off_edge = np.abs(np.sqrt(x * x + y * y) - radius)
-        count = max(1, round(2.0 * np.pi * radius * px_per_m / _ARC_PX))
-        closer = np.flatnonzero(off_edge < nearest)
-        turn = (np.arctan2(y[closer], x[closer]) / (2.0 * np.pi)) % 1.0
-        arc[closer] = first + np.minimum((turn * count).astype(np.intp), count - 1)
-        circle[closer] = index
-        nearest[closer] = off_edge[closer]
-        first += count
+    counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
+    firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    circle, arc = (np.zeros(points.shape[1], dtype=np.intp) for _ in range(2))
+    _number_arcs(points, circles.centres_m, circles.radii_m, firsts, counts, circle, arc)
     return circle, arc
+
+
+@compiled
+def _number_arcs(
+    points_m: FloatArray,
+    centres_m: FloatArray,
+    radii_m: FloatArray,
+    firsts: FloatArray,
+    counts: FloatArray,
+    circle: IndexArray,
+    arc: IndexArray,
+) -> None:
+    for i in range(points_m.shape[1]):
+        nearest = np.inf
+        for c in range(len(radii_m)):
+            x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+            off_edge = abs(math.sqrt(x * x + y * y) - radii_m[c])
+            if off_edge < nearest:
+                nearest, circle[i] = off_edge, c
+        c = circle[i]
+        x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+        turn = math.atan2(y, x) / (2.0 * math.pi)
+        turn -= math.floor(turn)
+        arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:

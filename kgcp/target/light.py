@@ -8,17 +8,18 @@ Together they are what displaces apparent edges: δ is a consequence here, not a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import dataclass
 from enum import IntEnum
 
-import cv2
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import WhiteShare
 from kgcp.target.pairs import Blur
+from kgcp.target.sharpening import Mask
 
 
 class Param(IntEnum):
@@ -40,10 +41,13 @@ class Param(IntEnum):
 
 
 PARAM_COUNT = 19
+_NO_POSE = (0.0,) * 6
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 # The gradient of the light is left out: over a whole ring, it is flat over the mask.
-_FILTERED = [*range(11), Param.BLACK, Param.WHITE, *range(Param.TONE_1, Param.SHARPENING)]
+_FILTERED = [*range(9), Param.BLACK, Param.WHITE]
+_STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
+_TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +75,12 @@ class Light:
     tone_3: float = 0.0
     sharpening: float = 0.0
 
+    @property
+    def values(self) -> tuple[float, ...]:
+        """All eight, in the order of `Param`."""
+        levels = (self.black, self.white, self.slope_x, self.slope_y)
+        return (*levels, self.tone_1, self.tone_2, self.tone_3, self.sharpening)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
@@ -82,92 +92,55 @@ class Parameters:
 
     def moved(self, step: FloatArray) -> Parameters:
         """Return the parameters after a step (19,) in the order of `Param`."""
-        old = self.blur
-        mean = max(0.5 * (old.xx + old.yy) + float(step[Param.BLUR_MEAN]), _MIN_VARIANCE_PX2)
-        difference = 0.5 * (old.xx - old.yy) + float(step[Param.BLUR_DIFFERENCE])
-        xy = old.xy + float(step[Param.BLUR_XY])
-        excess = float(np.hypot(difference, xy)) / (_MAX_ANISOTROPY * mean)
+        values = (self.nuisance_vector + step).tolist()
+        mean = max(values[Param.BLUR_MEAN], _MIN_VARIANCE_PX2)
+        difference, xy = values[Param.BLUR_DIFFERENCE], values[Param.BLUR_XY]
+        excess = math.hypot(difference, xy) / (_MAX_ANISOTROPY * mean)
         if excess > 1.0:  # the covariance must stay positive definite
             difference, xy = difference / excess, xy / excess
-        blur = Blur(
-            mean + difference,
-            mean - difference,
-            xy,
-            old.streak_x + float(step[Param.STREAK_X]),
-            old.streak_y + float(step[Param.STREAK_Y]),
-        )
-        names = [field.name for field in fields(Light)]
-        values = {
-            name: getattr(self.light, name) + float(step[Param.BLACK + i])
-            for i, name in enumerate(names)
-        }
-        return Parameters(self.pose.moved(step[:6]), blur, replace(self.light, **values))
+        streak = values[Param.STREAK_X : Param.STREAK_Y + 1]
+        blur = Blur(mean + difference, mean - difference, xy, *streak)
+        return Parameters(self.pose.moved(step[:6]), blur, Light(*values[Param.BLACK :]))
 
     @property
     def nuisance_vector(self) -> FloatArray:
         """All parameters (19,) in the order of `Param`, with zeros for the pose."""
         blur, light = self.blur, self.light
-        values = [getattr(light, field.name) for field in fields(Light)]
-        return np.array(
-            [
-                *[0.0] * 6,
-                *(0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy), blur.xy),
-                *(blur.streak_x, blur.streak_y),
-                *values,
-            ]
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Grid:
-    """Where the modelled pixels lie in their window.
-
-    Attributes
-    ----------
-    width, height : int
-        Of the window [px].
-    index : (n,) array
-        Of the modelled pixels in the flattened window.
-    offsets : (2, n) array
-        From the target's centre, in ring radii.
-    plateau : (height × width,) array, or (0,)
-        White share of all pixels as if there were no blur; the modelled ones' is replaced. Empty
-        where the camera does not sharpen.
-    """
-
-    width: int
-    height: int
-    index: IndexArray
-    offsets: FloatArray
-    plateau: FloatArray
+        mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
+        values = (mean, difference, blur.xy, blur.streak_x, blur.streak_y, *light.values)
+        return np.array((*_NO_POSE, *values))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imager:
-    """From white share to grey value, for the pixels of one sample.
+    """From white share to grey value, for the n pixels of one sample.
 
     Attributes
     ----------
-    grid : Grid
+    offsets : (2, n) array
+        From the target's centre, in ring radii.
     response : Response
         `linear` and `srgb` are applied as known; `unknown` uses the tone parameters.
-    sharpening_px : float
-        σ of the unsharp mask [px]; 0: the camera does not sharpen.
+    mask : Mask or None
+        Of the camera's sharpening; None: it does not sharpen.
+    plateau : (q,) array
+        White share of the mask's other pixels as if there were no blur; empty without a mask.
     """
 
-    grid: Grid
+    offsets: FloatArray
     response: Response
-    sharpening_px: float
+    mask: Mask | None
+    plateau: FloatArray
 
     def levels(self, share: FloatArray, light: Light) -> FloatArray:
         """Return the modelled grey values (n,) before clipping."""
         core = light.black + (light.white - light.black) * tone_curve(share, light)
         value = encoded(core * self._lit(light), self.response)
-        if self.sharpening_px == 0.0:
+        if self.mask is None:
             return value
-        layers = self._plateaus(light)[:, None]
-        layers[self.grid.index, 0] = value
-        return value + light.sharpening * self._detail(layers)[:, 0]
+        core = self._plateau_core(light)
+        layers = np.concatenate((value, encoded(core, self.response)))[:, None]
+        return value + light.sharpening * self.mask.detail(layers)[:, 0]
 
     def linearised(self, share: WhiteShare, light: Light) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) and their Jacobian (19, n)."""
@@ -186,53 +159,46 @@ class Imager:
         np.multiply(share.jacobian, gain * contrast * slope, out=jacobian[:11])
         jacobian[Param.BLACK] = gain * (1.0 - tone)
         jacobian[Param.WHITE] = gain * tone
-        np.multiply(self.grid.offsets, core, out=jacobian[Param.SLOPE_X : Param.SLOPE_Y + 1])
-        jacobian[Param.TONE_1] = gain * contrast * arch
-        jacobian[Param.TONE_2] = jacobian[Param.TONE_1] * (2.0 * t - 1.0)
-        jacobian[Param.TONE_3] = jacobian[Param.TONE_2] * (2.0 * t - 1.0)
-        jacobian[Param.SHARPENING] = 0.0
-        return (
-            (value, jacobian)
-            if self.sharpening_px == 0.0
-            else self._sharpened(value, jacobian, light)
-        )
+        np.multiply(self.offsets, core, out=jacobian[Param.SLOPE_X : Param.SLOPE_Y + 1])
+        jacobian[Param.TONE_1 :] = 0.0
+        if self.response is Response.UNKNOWN:
+            jacobian[Param.TONE_1] = gain * contrast * arch
+            jacobian[Param.TONE_2] = jacobian[Param.TONE_1] * (2.0 * t - 1.0)
+            jacobian[Param.TONE_3] = jacobian[Param.TONE_2] * (2.0 * t - 1.0)
+        if self.mask is None:
+            return value, jacobian
+        detail = self._detail(self.mask, value, jacobian, light)
+        jacobian[Param.SHARPENING] = detail
+        return value + light.sharpening * detail, jacobian
 
     def _lit(self, light: Light) -> FloatArray:
-        lit: FloatArray = 1.0 + light.slope_x * self.grid.offsets[0]
-        lit += light.slope_y * self.grid.offsets[1]
+        lit: FloatArray = 1.0 + light.slope_x * self.offsets[0]
+        lit += light.slope_y * self.offsets[1]
         return lit
 
-    def _plateaus(self, light: Light) -> FloatArray:
-        """Return the window without blur; the light's gradient hardly changes over the mask."""
-        plateau = self.grid.plateau
-        return encoded(light.black + (light.white - light.black) * plateau, self.response)
+    def _plateau_core(self, light: Light) -> FloatArray:
+        """Return the light without blur; its gradient hardly changes over the mask."""
+        return light.black + (light.white - light.black) * self.plateau
 
-    def _sharpened(
-        self, value: FloatArray, jacobian: FloatArray, light: Light
-    ) -> tuple[FloatArray, FloatArray]:
-        grid = self.grid
-        layers = np.zeros((len(grid.plateau), 1 + len(_FILTERED)))
-        layers[:, 0] = self._plateaus(light)
-        gain = np.ones_like(grid.plateau)
-        if self.response is Response.SRGB:
-            gain = _srgb_slope(light.black + (light.white - light.black) * grid.plateau)
-        layers[:, 1 + _FILTERED.index(Param.BLACK)] = gain * (1.0 - grid.plateau)
-        layers[:, 1 + _FILTERED.index(Param.WHITE)] = gain * grid.plateau
-        layers[grid.index, 0] = value
-        layers[grid.index, 1:] = jacobian[_FILTERED].T
-        detail = self._detail(layers)
-        jacobian[_FILTERED] += light.sharpening * detail[:, 1:].T
-        jacobian[Param.SHARPENING] = detail[:, 0]
-        return value + light.sharpening * detail[:, 0], jacobian
-
-    def _detail(self, layers: FloatArray) -> FloatArray:
-        """Return what an unsharp mask adds at the modelled pixels, for layers of the window."""
-        grid, sigma = self.grid, self.sharpening_px
-        kernel = cv2.getGaussianKernel(2 * int(np.ceil(3.0 * sigma)) + 1, sigma)
-        stack = layers.reshape(grid.height, grid.width, -1)
-        smooth = cv2.sepFilter2D(stack, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
-        detail: FloatArray = layers[grid.index] - smooth.reshape(layers.shape)[grid.index]
-        return detail
+    def _detail(
+        self, mask: Mask, value: FloatArray, jacobian: FloatArray, light: Light
+    ) -> FloatArray:
+        """Sharpen the rows of a Jacobian, and return what the mask adds to the grey values."""
+        rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
+        if jacobian[_STREAK_ROWS].any():
+            rows += _STREAK_ROWS
+        core = self._plateau_core(light)
+        gain = _srgb_slope(core) if self.response is Response.SRGB else 1.0
+        bright = gain * self.plateau
+        count = len(value)
+        layers = np.zeros((count + len(core), 1 + len(rows)))
+        layers[:count, 0], layers[count:, 0] = value, encoded(core, self.response)
+        layers[:count, 1:] = jacobian[rows].T
+        layers[count:, 1 + rows.index(Param.BLACK)] = gain - bright
+        layers[count:, 1 + rows.index(Param.WHITE)] = bright
+        detail = mask.detail(layers)
+        jacobian[rows] += light.sharpening * detail[:, 1:].T
+        return detail[:, 0]
 
 
 def tone_curve(share: FloatArray, light: Light) -> FloatArray:

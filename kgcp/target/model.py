@@ -15,7 +15,7 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit, Unknowns, adjust, first_levels, minimise
+from kgcp.target.adjust import Fit, Unknowns, adjust, approach, first_levels, minimise
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
 from kgcp.target.layout import Target
@@ -123,8 +123,9 @@ def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Ima
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
+        contour = contour_px(camera, pose, radius_m)
         try:
-            window = cut_window(grey, camera, pose, radius_m, _MARGIN_PX)
+            window = cut_window(grey, camera, contour, _MARGIN_PX)
         except Rejection as rejection:
             cut = rejection
             continue
@@ -133,7 +134,7 @@ def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Ima
             circles=circles_of(target.rings),
             measured_count=_measured_count(camera, target, pose),
             outer_radius_m=radius_m,
-            outer_radius_px=semi_major_axis_px(camera, pose, radius_m),
+            outer_radius_px=semi_major_axis_px(contour),
             centre_px=camera.project(pose.translation_m[None])[0],
             focal_px=camera.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
@@ -155,21 +156,34 @@ def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
 
 
 def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
-    """Adjust from a start pose, then from its mirror image about the viewing ray."""
-    sample = choose_sample(imaging, pose, _START_BLUR, None)
+    """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
+    sample = choose_sample(imaging, pose, _START_BLUR, None, imaging.few_pixels)
     light = first_levels(sample, pose, _START_BLUR)
     unknowns = _unknowns(imaging.response, has_streak=False)
-    best = adjust(imaging, Parameters(pose, _START_BLUR, light), unknowns, sample)
-    streak = _streak_of(best.parameters.blur)
-    if streak is not None:
-        unknowns = _unknowns(imaging.response, has_streak=True)
-        start = Parameters(best.parameters.pose, streak, best.parameters.light)
-        best = adjust(imaging, start, unknowns)
+    rough = approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
+    other = _mirrored_fit(rough)
+    near = other.parameters if other.total < rough.total else rough.parameters
+    best = _adjust_with_streak(imaging, near)
     other = _mirrored_fit(best)
     if other.total < best.total:
-        best = adjust(imaging, other.parameters, unknowns)
+        best = adjust(imaging, other.parameters, best.unknowns)
         other = _mirrored_fit(best)
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
+
+
+def _adjust_with_streak(imaging: Imaging, start: Parameters) -> Fit:
+    """Adjust with a Gaussian blur, or with a streak as soon as that is elongated enough."""
+    streak = _streak_of(start.blur)
+    if streak is None:
+        best = adjust(imaging, start, _unknowns(imaging.response, has_streak=False))
+        streak, start = _streak_of(best.parameters.blur), best.parameters
+        if streak is None:
+            return best
+    unknowns = _unknowns(imaging.response, has_streak=True)
+    near = adjust(
+        imaging, Parameters(start.pose, streak, start.light), unknowns, imaging.few_pixels
+    )
+    return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
 def _choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
@@ -200,13 +214,20 @@ def _advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior |
 def _mirrored_fit(fit: Fit) -> Fit:
     parameters = fit.parameters
     mirrored = Parameters(parameters.pose.mirrored(), parameters.blur, parameters.light)
+    linear = None
     for steps in _MIRRORED_STEPS:
         other = minimise(
-            fit.sample, mirrored, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
+            fit.sample,
+            mirrored,
+            fit.sd,
+            fit.unknowns,
+            steps=steps,
+            enough=_MIRRORED_GAIN,
+            linear=linear,
         )
         if other.total - fit.total > _HOPELESS:
             break
-        mirrored = other.parameters
+        mirrored, linear = other.parameters, (other.prediction, other.jacobian)
     return other
 
 

@@ -8,15 +8,19 @@ a finger of shadow, a hidden part) are weighted down as by a heavy-tailed distri
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import log_ndtr
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 
 _OUTLIER_SIGMAS = 3.5
+_FARTHEST_CLIPPED = (
+    3.23249  # sigmas short of the limit: there the pull is as strong as an outlier's
+)
 _MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
 _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
@@ -105,15 +109,16 @@ def estimate_noise(
         One grey value's step.
     """
     floor = (_MIN_NOISE_COUNTS * count) ** 2
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
     dark = _trimmed_variance(residuals[usable & (share < 0.15)])
     bright = _trimmed_variance(residuals[usable & (share > 0.85)])
     if dark is None or bright is None:
         dark = bright = dark or bright or _trimmed_variance(residuals[usable]) or floor
-    plateau = np.maximum(dark + (bright - dark) * np.clip(share, 0.0, 1.0), floor)
+    plateau = np.maximum(dark + (bright - dark) * share, floor)
     edge = usable & (share > 0.2) & (share < 0.8)
     standardised = _trimmed_variance(residuals[edge] / np.sqrt(plateau[edge]))
     excess = max(0.0, standardised - 1.0) if standardised is not None else 0.0
-    variance = plateau * (1.0 + excess * np.clip(4.0 * share * (1.0 - share), 0.0, 1.0))
+    variance = plateau * (1.0 + excess * 4.0 * share * (1.0 - share))
     return Noise(np.sqrt(variance), np.sqrt(plateau))
 
 
@@ -121,8 +126,9 @@ def _trimmed_variance(values: FloatArray) -> float | None:
     """Return the variance of the central part, scaled to the whole; None if there are too few."""
     if len(values) < _MIN_SAMPLES:
         return None
-    squares = np.sort(values * values)[: max(1, int(_TRIM * len(values)))]
-    return float(squares.mean()) / _TRIMMED_VARIANCE
+    count = max(1, int(_TRIM * len(values)))
+    squares = np.partition(values * values, count - 1)[:count]
+    return float(squares.sum()) / (count * _TRIMMED_VARIANCE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,25 +151,50 @@ class Misfit:
 
 
 def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Censoring) -> Misfit:
-    """Compare observed and modelled levels (n,) under noise of standard deviation `sd` (n,)."""
-    z = (levels - model) / sd
-    square = z * z
-    outlying = square > _OUTLIER_SIGMAS**2
-    down = np.where(outlying, _OUTLIER_SIGMAS**2 / np.maximum(square, 1e-12), 1.0)
-    # beyond the limit the density falls like a power of z: the loss grows as its logarithm
-    loss = np.where(outlying, 0.5 * _OUTLIER_SIGMAS**2 * (1.0 - np.log(down)), 0.5 * square)
-    score, weight = z * down, down
-    for clipped, limit, sign in (
-        (censoring.at_high, censoring.high, 1.0),
-        (censoring.at_low, censoring.low, -1.0),
-    ):
-        if not clipped.any():
+    """Compare observed and modelled levels (n,) under noise of standard deviation `sd` (n,).
+
+    Far from the model the density of a seen pixel falls like a power of the distance, so that its
+    loss grows as the logarithm; that of a clipped pixel falls exponentially, its loss grows
+    linearly.
+    """
+    score, weight = np.empty_like(levels), np.empty_like(levels)
+    clips = (censoring.at_low, censoring.at_high)
+    total = _misfit(levels, model, sd, *clips, censoring.low, censoring.high, score, weight)
+    return Misfit(total, score, weight)
+
+
+@compiled
+def _misfit(
+    levels: FloatArray,
+    model: FloatArray,
+    sd: FloatArray,
+    at_low: BoolArray,
+    at_high: BoolArray,
+    low: float,
+    high: float,
+    score: FloatArray,
+    weight: FloatArray,
+) -> float:
+    total = 0.0
+    for i in range(len(levels)):
+        if at_low[i] or at_high[i]:
+            sign, limit = (-1.0, low) if at_low[i] else (1.0, high)
+            missing = sign * (limit - model[i]) / sd[i]
+            near = min(missing, _FARTHEST_CLIPPED)
+            tail = 0.5 * math.erfc(near * math.sqrt(0.5))
+            hazard = math.exp(-0.5 * near * near) / (math.sqrt(2.0 * math.pi) * tail)
+            total += hazard * (missing - near) - math.log(tail)
+            score[i] = sign * hazard
+            curvature = hazard * (hazard - near) if missing == near else hazard / missing
+            weight[i] = max(curvature, 1e-9)
             continue
-        missing = sign * (limit - model[clipped]) / sd[clipped]
-        log_tail = log_ndtr(-missing)
-        hazard = np.exp(-0.5 * missing * missing - 0.5 * np.log(2.0 * np.pi) - log_tail)
-        far = np.minimum(1.0, _OUTLIER_SIGMAS / np.maximum(hazard, 1e-12))
-        loss[clipped] = -log_tail * far
-        score[clipped] = sign * hazard * far
-        weight[clipped] = np.maximum(hazard * (hazard - missing), 1e-9) * far
-    return Misfit(float(loss.sum()), score, weight)
+        z = (levels[i] - model[i]) / sd[i]
+        square = z * z / (_OUTLIER_SIGMAS * _OUTLIER_SIGMAS)
+        if square <= 1.0:
+            total += 0.5 * z * z
+            weight[i] = 1.0
+        else:
+            total += 0.5 * _OUTLIER_SIGMAS * _OUTLIER_SIGMAS * (1.0 + math.log(square))
+            weight[i] = 1.0 / square
+        score[i] = z * weight[i]
+    return total

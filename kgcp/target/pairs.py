@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.target.plate import Circles, PlateView, largest_metres_per_px
-from kgcp.target.profile import Quadrature, quadrature_for
+from kgcp.target.plate import Circles
+from kgcp.target.quadrature import quadrature_for
 
-REACH_SIGMAS = 4.2  # beyond, a blurred edge is flat to 1e-5 of the contrast
-_SLACK_PX = 0.7  # what a circle may move before the pairs are made anew
+REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
+_SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +40,11 @@ class Blur:
         return bool(self.streak_x or self.streak_y)
 
     @property
+    def vector(self) -> FloatArray:
+        """All five, in the order of the attributes."""
+        return np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
+
+    @property
     def total_covariance(self) -> tuple[float, float, float]:
         """Covariance of Gaussian and streak together: xx, yy, xy [px²]."""
         return (
@@ -53,6 +60,14 @@ class Blur:
         return float(np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)))
 
     @property
+    def smallest_sd_px(self) -> float:
+        """Standard deviation that spaces chords: across a streak, or else the largest [px]."""
+        if not self.has_streak:
+            return self.largest_sd_px
+        half_range = math.hypot(0.5 * (self.xx - self.yy), self.xy)
+        return math.sqrt(0.5 * (self.xx + self.yy) - half_range)
+
+    @property
     def mean_sd_px(self) -> float:
         """Standard deviation averaged over directions [px]."""
         xx, yy, _ = self.total_covariance
@@ -61,112 +76,67 @@ class Blur:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePairs:
-    """Which pixels feel the edge of which circle: m pairs, sorted by rule of integration.
+    """Which of n pixels feel the edge of which of c circles.
 
     Attributes
     ----------
-    small_groups : tuple of (Quadrature, slice)
-        The pairs of each rule, of circles that are small against the blur.
-    small, large : slice
-        All these, and the pairs of large circles behind them.
-    pixel : (m,) array of int
-    centre_m : (2, m) array
-    radius_m, sign : (m,) array
-        Of the pair's circle.
+    circles : (c, 5) array
+        Centre x, y, radius [m], sign and rule of integration.
+    starts : (n + 1,) array of int, members : (m,) array of int
+        The circles that pixel i feels are members[starts[i]:starts[i + 1]].
     background : (n,) array
         White share of every pixel from the circles whose edge it does not feel.
     """
 
-    small_groups: tuple[tuple[Quadrature, slice], ...]
-    small: slice
-    large: slice
-    pixel: IndexArray
-    centre_m: FloatArray
-    radius_m: FloatArray
-    sign: FloatArray
+    circles: FloatArray
+    starts: IndexArray
+    members: IndexArray
     background: FloatArray
 
 
-def pair_edges(view: PlateView, circles: Circles, blur: Blur) -> EdgePairs:
-    """Find the pairs of pixels and circles whose edges are within reach of the blur."""
-    metres_per_px = largest_metres_per_px(view)
-    sd_m = blur.largest_sd_px * metres_per_px
-    reach_m = REACH_SIGMAS * sd_m + _SLACK_PX * metres_per_px
-    order = np.argsort(circles.radii_m)
-    rules = [quadrature_for(float(circles.radii_m[index] / sd_m)) for index in order]
-    background = np.ones(view.points_m.shape[1])
-    pixels = []
-    for index in order:
-        x, y = view.points_m - circles.centres_m[:, index, None]
-        inward = circles.radii_m[index] - np.sqrt(x * x + y * y)
-        background[inward > reach_m] += circles.signs[index]
-        pixels.append(np.flatnonzero(np.abs(inward) <= reach_m))
-    counts = [len(found) for found in pixels]
-    circle = np.repeat(order, counts)
-    ends = [0, *np.cumsum(counts).tolist()]
-    groups = []
-    for rule in sorted(set(rules) - {Quadrature.EDGE}):
-        members = [i for i, other in enumerate(rules) if other is rule]
-        groups.append((rule, slice(ends[members[0]], ends[members[-1] + 1])))
-    small = slice(0, groups[-1][1].stop if groups else 0)
-    return EdgePairs(
-        small_groups=tuple(groups),
-        small=small,
-        large=slice(small.stop, ends[-1]),
-        pixel=np.concatenate(pixels),
-        centre_m=circles.centres_m[:, circle],
-        radius_m=circles.radii_m[circle],
-        sign=circles.signs[circle],
-        background=background,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Meeting:
-    """How m pixels stand to the circles whose edges they feel.
-
-    Attributes
-    ----------
-    rho, x, y : (m,) array
-        Distance from the circle's centre [m] and unit direction.
-    radial, tangential, mixed : (m,) array
-        The blur's covariance in these directions [m²].
-    """
-
-    rho: FloatArray
-    x: FloatArray
-    y: FloatArray
-    radial: FloatArray
-    tangential: FloatArray
-    mixed: FloatArray
-
-
-def meet(points_m: FloatArray, spread: FloatArray, pairs: EdgePairs, which: slice) -> Meeting:
-    """Return how some of the pairs stand to each other.
+def pair_edges(
+    points_m: FloatArray, metres_per_px: float, circles: Circles, blur: Blur
+) -> EdgePairs:
+    """Find the pairs of pixels and circles whose edges are within reach of the blur.
 
     Parameters
     ----------
     points_m : (2, n) array
-        The pixels on the plate.
-    spread : (3, n) array
-        The blur's covariance there, xx, xy, yy [m²].
-    pairs : EdgePairs
-    which : slice
-        Of the pairs.
+        Where the pixels' rays meet the plate.
+    metres_per_px : float
+        Largest length on the plate that a pixel spans.
+    circles : Circles
+    blur : Blur
     """
-    pixel = pairs.pixel[which]
-    x = points_m[0].take(pixel) - pairs.centre_m[0, which]
-    y = points_m[1].take(pixel) - pairs.centre_m[1, which]
-    rho = np.sqrt(x * x + y * y) + 1e-12
-    x /= rho
-    y /= rho
-    xx, xy, yy = (row.take(pixel) for row in spread)
-    radial = (xx * x + 2.0 * xy * y) * x + yy * y * y
-    return Meeting(
-        rho=rho,
-        x=x,
-        y=y,
-        radial=radial,
-        tangential=xx + yy - radial,
-        mixed=(yy - xx) * x * y + xy * (x * x - y * y),
-    )
+    sd_m = blur.largest_sd_px * metres_per_px
+    reach_m = REACH_SIGMAS * sd_m + _SLACK_PX * metres_per_px
+    sharpest_m = blur.smallest_sd_px * metres_per_px
+    rules = [quadrature_for(radius / sd_m, radius / sharpest_m) for radius in circles.radii_m]
+    table = np.column_stack((circles.centres_m.T, circles.radii_m, circles.signs, rules))
+    count = points_m.shape[1]
+    starts, background = np.zeros(count + 1, dtype=np.intp), np.ones(count)
+    members = np.empty(count * len(table), dtype=np.intp)
+    _pair(points_m, table, reach_m, starts, members, background)
+    return EdgePairs(table, starts, members[: starts[-1]], background)
+
+
+@compiled
+def _pair(
+    points_m: FloatArray,
+    circles: FloatArray,
+    reach_m: float,
+    starts: IndexArray,
+    members: IndexArray,
+    background: FloatArray,
+) -> None:
+    found = 0
+    for i in range(points_m.shape[1]):
+        for c in range(circles.shape[0]):
+            dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
+            inward = circles[c, 2] - math.sqrt(dx * dx + dy * dy)
+            if inward > reach_m:
+                background[i] += circles[c, 3]
+            elif inward >= -reach_m:
+                members[found] = c
+                found += 1
+        starts[i + 1] = found

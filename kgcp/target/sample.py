@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import cv2
 import numpy as np
 
+from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
-from kgcp.target.light import PARAM_COUNT, Grid, Imager, Light, plateau_levels
+from kgcp.target.light import PARAM_COUNT, Imager, Light, plateau_levels
 from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
-from kgcp.target.plate import Circles, PlateView, largest_metres_per_px, view_plate
+from kgcp.target.plate import Circles, largest_metres_per_px, plate_points
+from kgcp.target.sharpening import unsharp_mask
 from kgcp.target.window import Window
 
 _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
@@ -24,7 +28,10 @@ _CLEAR_SIGMAS = 2.6  # from the outer circle on, where the plate shows its own l
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
 _NEAR_SIGMAS, _NEAR_PX = 2.0, 0.3  # half width of the band around an edge that is used
+_SCALE_PIXELS = 100  # enough to see how the plate's scale varies
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
+_FEW_PIXELS = 600  # enough to come near the minimum, at a fraction of the time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,22 +69,45 @@ class Imaging:
     response: Response
     sharpening_px: float
 
+    @property
+    def few_pixels(self) -> int | None:
+        """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
+        return None if self.sharpening_px else _FEW_PIXELS
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """The pixels that take part, chosen for an approximate pose and blur."""
+    """The pixels that take part, chosen for an approximate pose and blur.
+
+    Attributes
+    ----------
+    imaging : Imaging
+    index : (n,) array of int
+        The pixels, in the flattened window.
+    is_thinned : bool
+        There would be more.
+    levels : (n,) array
+    rays : (6, n) array
+        As in `Window`.
+    imager : Imager
+    censoring : Censoring
+    pairs : EdgePairs
+    """
 
     imaging: Imaging
+    index: IndexArray
+    is_thinned: bool
     levels: FloatArray
-    normalised: FloatArray
-    normalised_from_px: FloatArray
+    rays: FloatArray
     imager: Imager
     censoring: Censoring
     pairs: EdgePairs
 
 
-def choose_sample(imaging: Imaging, pose: Pose, blur: Blur, light: Light | None) -> Sample:
-    """Choose the pixels near edges, and a share of the plateaus.
+def choose_sample(
+    imaging: Imaging, pose: Pose, blur: Blur, light: Light | None, most: int | None = None
+) -> Sample:
+    """Choose the pixels near edges, and a share of the plateaus; `most` of them, where given.
 
     Beyond the outer circle only pixels that the surroundings of the plate do not reach by blur are
     used: what is foreign is seen from the levels, once they are known (`light`).
@@ -91,67 +121,148 @@ def choose_sample(imaging: Imaging, pose: Pose, blur: Blur, light: Light | None)
         `EDGES_LOST` if too little of the target is within the frame.
     """
     window = imaging.window
-    view = view_plate(pose, window.normalised, window.normalised_from_px)
-    x, y = view.points_m / imaging.outer_radius_m
-    border_px = _BORDER_SIGMAS * blur.largest_sd_px + _BORDER_PX
-    limit = 1.0 + min(_BORDER_RADII, border_px / imaging.outer_radius_px)
-    within = x * x + y * y < limit * limit
+    some = slice(None, None, max(1, window.rays.shape[1] // _SCALE_PIXELS))
+    scale = largest_metres_per_px(pose, window.rays[:, some])
+    points = plate_points(pose, window.rays)
+    zone = _zones(imaging, points, blur, scale)
     if light is not None:
-        within &= ~_reached_by_surroundings(imaging, np.hypot(x, y) - 1.0, blur, light)
-    near, in_tail = _edge_zones(view, imaging, blur)
-    flat = np.flatnonzero(within & ~near & ~in_tail)
-    chosen = within & near
-    chosen[flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]] = True
-    index = np.flatnonzero(chosen)
+        zone[_reached_by_surroundings(imaging, points, blur, light)] = _Zone.UNUSED
+    near, flat = np.flatnonzero(zone == _Zone.NEAR), np.flatnonzero(zone == _Zone.FLAT)
+    index = np.concatenate((near, flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]))
+    index.sort()
+    is_thinned = most is not None and len(index) > most
+    if most is not None and is_thinned:
+        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
     if len(index) < 4 * PARAM_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
-    normalised = np.ascontiguousarray(window.normalised[:, index])
-    normalised_from_px = np.ascontiguousarray(window.normalised_from_px[:, :, index])
-    clip = imaging.censoring
+    rays, clip = window.rays[:, index], imaging.censoring
     return Sample(
         imaging=imaging,
+        index=index,
+        is_thinned=is_thinned,
         levels=window.levels[index],
-        normalised=normalised,
-        normalised_from_px=normalised_from_px,
-        imager=Imager(
-            Grid(
-                window.width,
-                window.height,
-                index,
-                (window.pixels(index) - imaging.centre_px).T / imaging.outer_radius_px,
-                _unblurred(view, imaging.circles) if imaging.sharpening_px > 0.0 else np.zeros(0),
-            ),
-            imaging.response,
-            imaging.sharpening_px,
-        ),
+        rays=rays,
+        imager=_imager(imaging, points, index),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
-        pairs=_pairs(view_plate(pose, normalised, normalised_from_px), imaging, blur),
+        pairs=_pairs(imaging, pose, blur, rays, points[:, index], scale),
     )
 
 
-def _pairs(view: PlateView, imaging: Imaging, blur: Blur) -> EdgePairs:
+class _Zone(IntEnum):
+    """What a pixel of the window is good for."""
+
+    UNUSED = 0
+    NEAR = 1  # it knows where an edge is
+    FLAT = 2  # it knows the level of ink or plate
+
+
+def _zones(imaging: Imaging, points_m: FloatArray, blur: Blur, metres_per_px: float) -> IndexArray:
+    """Return the zone (n,) of every pixel. Within circles that are not measured none is used."""
+    near_m = (_NEAR_SIGMAS * blur.largest_sd_px + _NEAR_PX) * metres_per_px
+    tail_m = REACH_SIGMAS * blur.largest_sd_px * metres_per_px
+    border_px = _BORDER_SIGMAS * blur.largest_sd_px + _BORDER_PX
+    limit = 1.0 + min(_BORDER_RADII, border_px / imaging.outer_radius_px)
+    circles, count = imaging.circles, imaging.measured_count
+    zone = np.zeros(points_m.shape[1], dtype=np.intp)
+    _fill_zones(
+        points_m,
+        circles.centres_m[:, :count],
+        circles.radii_m[:count],
+        near_m,
+        tail_m,
+        tail_m + circles.radii_m[count:].max(initial=-tail_m),
+        limit * imaging.outer_radius_m,
+        zone,
+    )
+    return zone
+
+
+@compiled
+def _fill_zones(
+    points_m: FloatArray,
+    centres_m: FloatArray,
+    radii_m: FloatArray,
+    near_m: float,
+    tail_m: float,
+    unmeasured_m: float,
+    limit_m: float,
+    zone: IndexArray,
+) -> None:
+    for i in range(points_m.shape[1]):
+        x, y = points_m[0, i], points_m[1, i]
+        square = x * x + y * y
+        if square >= limit_m * limit_m:
+            continue
+        zone[i] = 2 if square >= unmeasured_m * unmeasured_m else 0
+        for c in range(len(radii_m)):
+            dx, dy = x - centres_m[0, c], y - centres_m[1, c]
+            off_edge = abs(math.sqrt(dx * dx + dy * dy) - radii_m[c])
+            if off_edge < near_m:
+                zone[i] = 1
+                break
+            if off_edge < tail_m:
+                zone[i] = 0
+
+
+def _imager(imaging: Imaging, points_m: FloatArray, index: IndexArray) -> Imager:
+    window = imaging.window
+    offsets = (window.pixels(index) - imaging.centre_px).T / imaging.outer_radius_px
+    if imaging.sharpening_px == 0.0:
+        return Imager(offsets, imaging.response, None, np.zeros(0))
+    mask = unsharp_mask(window.width, window.height, index, imaging.sharpening_px)
+    circles, plateau = imaging.circles, np.ones(len(mask.others))
+    others_m = points_m[:, mask.others]
+    _fill_plateau(others_m, circles.centres_m, circles.radii_m, circles.signs, plateau)
+    return Imager(offsets, imaging.response, mask, plateau)
+
+
+@compiled
+def _fill_plateau(
+    points_m: FloatArray,
+    centres_m: FloatArray,
+    radii_m: FloatArray,
+    signs: FloatArray,
+    plateau: FloatArray,
+) -> None:
+    """Add every circle to the white share without blur."""
+    for i in range(points_m.shape[1]):
+        for c in range(len(radii_m)):
+            dx, dy = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+            if dx * dx + dy * dy < radii_m[c] * radii_m[c]:
+                plateau[i] += signs[c]
+
+
+def _pairs(
+    imaging: Imaging,
+    pose: Pose,
+    blur: Blur,
+    rays: FloatArray,
+    points_m: FloatArray,
+    metres_per_px: float,
+) -> EdgePairs:
     """Pair the pixels with the measured circles; the others are as they are for this pose."""
     measured = imaging.circles.part(slice(0, imaging.measured_count))
     others = imaging.circles.part(slice(imaging.measured_count, None))
-    pairs = pair_edges(view, measured, blur)
-    reach_m = REACH_SIGMAS * blur.largest_sd_px * largest_metres_per_px(view)
-    x, y = view.points_m
-    if (x * x + y * y).min() > (others.radii_m.max(initial=-reach_m) + reach_m) ** 2:
-        return pairs  # all replicas lie inside
-    added = white_level(view, blur, pair_edges(view, others, blur)) - 1.0
+    pairs = pair_edges(points_m, metres_per_px, measured, blur)
+    if not len(others.radii_m):
+        return pairs
+    replicas = pair_edges(points_m, metres_per_px, others, blur)
+    if not len(replicas.members) and np.all(replicas.background == 1.0):
+        return pairs
+    added = white_level(pose, rays, blur, replicas).value - 1.0
     return replace(pairs, background=pairs.background + added)
 
 
 def _reached_by_surroundings(
-    imaging: Imaging, beyond: FloatArray, blur: Blur, light: Light
+    imaging: Imaging, points_m: FloatArray, blur: Blur, light: Light
 ) -> BoolArray:
     """Tell which pixels of the window blur may mix with something that is not plate.
 
     Parameters
     ----------
     imaging : Imaging
-    beyond : (n,) array
-        Distance beyond the outer circle, in ring radii.
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
     blur : Blur
     light : Light
     """
@@ -159,6 +270,7 @@ def _reached_by_surroundings(
     size = (window.height, window.width)
     black, white = plateau_levels(light, imaging.response)
     contrast, white = white - black, min(white, 1.0)
+    beyond = np.hypot(*points_m) / imaging.outer_radius_m - 1.0
     seen = cv2.medianBlur(window.levels.reshape(size).astype(np.float32), 3).ravel()
     outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
     foreign = outside & (np.abs(seen - white) > _FOREIGN_CONTRAST * contrast)
@@ -170,32 +282,4 @@ def _reached_by_surroundings(
     distance2 = (yy * columns**2 - 2.0 * xy * columns * rows + xx * rows**2) / determinant
     kernel = (distance2 <= _FOREIGN_SIGMAS**2).astype(np.uint8)
     reached = cv2.dilate(foreign.reshape(size).astype(np.uint8), kernel)
-    return np.asarray(reached.ravel() > 0) & (beyond > -2.0 * reach / imaging.outer_radius_px)
-
-
-def _edge_zones(view: PlateView, imaging: Imaging, blur: Blur) -> tuple[BoolArray, BoolArray]:
-    """Tell which pixels are near a measured edge, and which in the tails of any."""
-    metres_per_px = largest_metres_per_px(view)
-    near_m = (_NEAR_SIGMAS * blur.largest_sd_px + _NEAR_PX) * metres_per_px
-    tail_m = REACH_SIGMAS * blur.largest_sd_px * metres_per_px
-    near = np.zeros(view.points_m.shape[1], dtype=bool)
-    in_tail = near.copy()
-    circles = imaging.circles
-    for index, radius in enumerate(circles.radii_m):
-        x, y = view.points_m - circles.centres_m[:, index, None]
-        off_edge = np.abs(np.sqrt(x * x + y * y) - radius)
-        if index < imaging.measured_count:
-            near |= off_edge < near_m
-        in_tail |= off_edge < tail_m
-    return near, in_tail
-
-
-def _unblurred(view: PlateView, circles: Circles) -> FloatArray:
-    """Return the white share of all pixels of a window without blur."""
-    share = np.ones(view.points_m.shape[1])
-    for centre, radius, sign in zip(
-        circles.centres_m.T, circles.radii_m, circles.signs, strict=True
-    ):
-        x, y = view.points_m - centre[:, None]
-        share += sign * (x * x + y * y < radius * radius)
-    return share
+    return np.asarray((reached.ravel() > 0) & (beyond > -2.0 * reach / imaging.outer_radius_px))

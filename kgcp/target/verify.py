@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.adjust import Fit
@@ -94,18 +95,36 @@ def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
     black, white = plateau_levels(fit.parameters.light, sample.imaging.response)
     lack = sample.levels - np.minimum(fit.prediction.levels, clip)
     lack = lack / max(min(white, clip) - black, sample.imaging.window.levels_per_count)
+    code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m
+    counts, sums = np.zeros(_POSITIONS), np.zeros(_POSITIONS)
     angles = np.arange(_POSITIONS) * (2.0 * np.pi / _POSITIONS)
-    centres = 0.5 * ring.code_diameter_m * np.stack((np.cos(angles), np.sin(angles)))
-    points = fit.prediction.view.points_m
-    near = np.abs(np.hypot(*points) - 0.5 * ring.code_diameter_m) < 0.5 * ring.dot_diameter_m
-    x, y = points[:, near, None] - centres[:, None, :]
-    within = x * x + y * y < (0.5 * ring.dot_diameter_m) ** 2
-    counts = within.sum(axis=0)
-    sums = lack[near] @ within
+    centres_m = code_m * np.stack((np.cos(angles), np.sin(angles)))
+    _gather_around(fit.prediction.points_m, lack, centres_m, dot_m, counts, sums)
     px_per_m = sample.imaging.outer_radius_px / sample.imaging.outer_radius_m
-    ratio = 0.5 * ring.dot_diameter_m * px_per_m / fit.parameters.blur.mean_sd_px
+    ratio = dot_m * px_per_m / fit.parameters.blur.mean_sd_px
     visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
     mean = np.full(_POSITIONS, np.nan)
     enough = counts >= _MIN_PIXELS
     mean[enough] = sums[enough] / counts[enough] / visible
     return mean
+
+
+@compiled
+def _gather_around(
+    points_m: FloatArray,
+    lack: FloatArray,
+    centres_m: FloatArray,
+    dot_m: float,
+    counts: FloatArray,
+    sums: FloatArray,
+) -> None:
+    """Count the pixels within discs, and add up what they lack."""
+    code_m = math.sqrt(centres_m[0, 0] ** 2 + centres_m[1, 0] ** 2)
+    for i in range(points_m.shape[1]):
+        if abs(math.sqrt(points_m[0, i] ** 2 + points_m[1, i] ** 2) - code_m) > dot_m:
+            continue
+        for k in range(len(counts)):
+            dx, dy = points_m[0, i] - centres_m[0, k], points_m[1, i] - centres_m[1, k]
+            if dx * dx + dy * dy < dot_m * dot_m:
+                counts[k] += 1.0
+                sums[k] += lack[i]

@@ -10,9 +10,10 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.geometry.raster import normalised_window
+from kgcp.geometry.raster import rays_of_window
 
-_CONTOUR_POINTS = 72
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+_UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,10 +28,9 @@ class Window:
         Grey values, 0…1 of the data type's range.
     levels_per_count : float
         One grey value's step.
-    normalised : (2, n) array
-        Normalised image coordinates of the pixel centres, free of distortion.
-    normalised_from_px : (2, 2, n) array
-        Derivative of `normalised` with respect to the raw pixel coordinates.
+    rays : (6, n) array
+        Normalised image coordinates x, y of the pixel centres, free of distortion, and their
+        derivatives xx, xy, yx, yy with respect to the raw pixel coordinates.
     """
 
     x0: int
@@ -39,8 +39,7 @@ class Window:
     height: int
     levels: FloatArray
     levels_per_count: float
-    normalised: FloatArray
-    normalised_from_px: FloatArray
+    rays: FloatArray
 
     def pixels(self, chosen: IndexArray) -> FloatArray:
         """Return raw pixel coordinates (m, 2) of the chosen pixels."""
@@ -52,28 +51,23 @@ class Window:
 
 def contour_px(camera: Camera, pose: Pose, radius_m: float) -> FloatArray:
     """Return points (72, 2) of the image of a circle about the target's centre [px]."""
-    angle = np.linspace(0.0, 2.0 * np.pi, _CONTOUR_POINTS, endpoint=False)
-    circle = radius_m * np.column_stack((np.cos(angle), np.sin(angle)))
-    return camera.project(pose.transform(circle))
+    return camera.project(pose.transform(radius_m * _UNIT_CIRCLE))
 
 
-def semi_major_axis_px(camera: Camera, pose: Pose, radius_m: float) -> float:
-    """Return the semi-major axis of the image of a circle about the target's centre [px]."""
-    contour = contour_px(camera, pose, radius_m)
-    return float(0.5 * np.linalg.norm(contour[:36] - contour[36:], axis=1).max())
+def semi_major_axis_px(contour: FloatArray) -> float:
+    """Return the semi-major axis of a circle's image of which `contour_px` gave the points [px]."""
+    half = len(contour) // 2
+    return float(0.5 * np.hypot(*(contour[:half] - contour[half:]).T).max())
 
 
-def cut_window(
-    grey: GreyArray, camera: Camera, pose: Pose, radius_m: float, margin_px: float
-) -> Window:
-    """Cut out the image of a circle with a margin around it.
+def cut_window(grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: float) -> Window:
+    """Cut out the image of a circle, by `contour_px`, with a margin around it.
 
     Raises
     ------
     Rejection
         `CUT` if less than a quarter of the circle's box is within the frame.
     """
-    contour = contour_px(camera, pose, radius_m)
     low, high = contour.min(axis=0) - margin_px, contour.max(axis=0) + margin_px
     height, width = grey.shape
     x0, y0 = (max(0, int(np.floor(value))) for value in low)
@@ -84,7 +78,7 @@ def cut_window(
     if (x1 - x0) <= 0 or (y1 - y0) <= 0 or (x1 - x0) * (y1 - y0) < 0.25 * np.prod(high - low):
         raise Rejection(Reason.CUT, f"box {low.round()} … {high.round()} px")
     scale = float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
-    normalised, normalised_from_px = normalised_window(
+    rays = rays_of_window(
         camera, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)
     )
     return Window(
@@ -94,6 +88,5 @@ def cut_window(
         height=y1 - y0,
         levels=grey[y0:y1, x0:x1].ravel().astype(np.float64) / scale,
         levels_per_count=1.0 / scale,
-        normalised=normalised,
-        normalised_from_px=normalised_from_px,
+        rays=rays,
     )

@@ -7,7 +7,7 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.raster import normalised_grid, normalised_window
+from kgcp.geometry.raster import normalised_grid, rays_of_window
 
 CAMERA = Camera(
     *(1600, 1100, 2306.0, 2302.0, 792.6, 543.9, -0.11, 0.07, 8e-4, -6e-4, -0.01, 0.02, 0.01, 0.0)
@@ -27,7 +27,8 @@ def pixels_of(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     ],
 )
 def test_a_window_is_undistorted_like_its_pixels(x_px: FloatArray, y_px: FloatArray) -> None:
-    normalised, from_px = normalised_window(CAMERA, x_px, y_px)
+    rays = rays_of_window(CAMERA, x_px, y_px)
+    normalised, from_px = rays[:2], rays[2:].reshape(2, 2, -1)
     pixels = pixels_of(x_px, y_px)
     exact = CAMERA.undistort(pixels)
     np.testing.assert_allclose(normalised.T * CAMERA.fx, exact * CAMERA.fx, rtol=0.0, atol=1e-9)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.io.debug_pictures import write_debug_picture
 from kgcp.target.expected import Expectation
@@ -64,7 +65,7 @@ def test_what_was_expected_is_drawn_and_the_first_picture_stays(tmp_path: Path) 
 def test_frames_of_any_size_and_depth_can_be_drawn(
     tmp_path: Path, shape: tuple[int, int], dtype: type
 ) -> None:
-    grey = np.zeros(shape, dtype=dtype)
+    grey: GreyArray = np.zeros(shape, dtype=dtype)
     write_debug_picture(tmp_path, "a.png", grey, Examination((MISS,), CANDIDATES * 20))
     assert picture(tmp_path / "a.png.jpg").shape[1] == 1600
 

@@ -20,7 +20,7 @@ from kgcp.target.noise import find_censoring
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.plate import circles_of
 from kgcp.target.sample import Imaging
-from kgcp.target.window import cut_window, semi_major_axis_px
+from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 SUBPIXELS = 4
 DrawFrame = Callable[..., GreyArray]
@@ -124,14 +124,14 @@ def imaging_of() -> Callable[..., Imaging]:
 
     def collect(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
         radius_m = 0.5 * target.ring.outer_diameter_m
-        window = cut_window(grey, camera, pose, radius_m, 12.0)
+        window = cut_window(grey, camera, contour_px(camera, pose, radius_m), 12.0)
         circles = circles_of(target.rings)
         return Imaging(
             window=window,
             circles=circles,
             measured_count=len(circles.radii_m),
             outer_radius_m=radius_m,
-            outer_radius_px=semi_major_axis_px(camera, pose, radius_m),
+            outer_radius_px=semi_major_axis_px(contour_px(camera, pose, radius_m)),
             centre_px=camera.project(pose.translation_m),
             focal_px=camera.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
@@ -178,7 +178,7 @@ def start_near() -> Callable[..., Observation]:
         return Observation(
             *("A", "A", 0, 0.97, near, camera.project(translation_m)),
             image_heading_deg(camera, near),
-            Appearance(semi_major_axis_px(camera, near, 0.45), 0.1, 0.8, 0.0, 0.0),
+            Appearance(semi_major_axis_px(contour_px(camera, near, 0.45)), 0.1, 0.8, 0.0, 0.0),
             *(None, None),
         )
 

@@ -86,7 +86,7 @@ def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: Fit) -> None:
 
 def test_residuals_that_run_along_the_edges_make_it_worse(fit: Fit) -> None:
     """The same residuals, constant over each of some stripes: fewer independent ones."""
-    x = fit.prediction.view.points_m[0] * fit.sample.imaging.outer_radius_px / 0.45
+    x = fit.prediction.points_m[0] * fit.sample.imaging.outer_radius_px / 0.45
     stripe = (x // 5.0).astype(int) - int(x.min() // 5.0)
     sign = np.random.default_rng(1).choice((-1.0, 1.0), stripe.max() + 1)[stripe]
     score = sign * np.abs(fit.misfit.score)

@@ -12,8 +12,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.layout import Ring
-from kgcp.target.pairs import Blur, pair_edges
-from kgcp.target.plate import Circles, circles_of, view_plate
+from kgcp.target.pairs import Blur, EdgePairs, pair_edges
+from kgcp.target.plate import Circles, circles_of, largest_metres_per_px, plate_points
 
 CAMERA = Camera(1100, 800, 2300.0, 2310.0, 560.3, 391.8, k1=-0.06, k2=0.05, p1=-4e-4, p2=6e-4)
 RING = Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0))
@@ -34,11 +34,16 @@ def pixels_around(centre: FloatArray, half: int) -> FloatArray:
     return np.column_stack((x.ravel(), y.ravel()))
 
 
-def rays_of(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normalised coordinates (2, n) and their derivative (2, 2, n)."""
+def rays_of(pixels: FloatArray) -> FloatArray:
+    """Normalised coordinates and their derivatives, (6, n)."""
     normalised = CAMERA.undistort(pixels)
     inverse = np.asarray(np.linalg.inv(CAMERA.distort_jacobian(normalised)), dtype=np.float64)
-    return normalised.T.copy(), inverse.transpose(1, 2, 0).copy()
+    return np.vstack((normalised.T, inverse.reshape(-1, 4).T))
+
+
+def pairs_of(pose: Pose, rays: FloatArray, blur: Blur) -> EdgePairs:
+    scale = largest_metres_per_px(pose, rays)
+    return pair_edges(plate_points(pose, rays), scale, CIRCLES, blur)
 
 
 CIRCLES = circles_of(RINGS)
@@ -59,17 +64,17 @@ def moved(step: FloatArray) -> tuple[Pose, Blur]:
 
 @pytest.mark.parametrize("index", range(11))
 def test_jacobian_is_that_of_the_value(index: int) -> None:
-    view = view_plate(POSE, *RAYS)
     blur = moved(np.zeros(11))[1]
-    pairs = pair_edges(view, CIRCLES, blur)
-    share = white_share(view, blur, pairs)
-    assert np.allclose(white_level(view, blur, pairs), share.value, atol=1e-12)
+    pairs = pairs_of(POSE, RAYS, blur)
+    share = white_share(POSE, RAYS, blur, pairs)
+    assert np.allclose(white_level(POSE, RAYS, blur, pairs).value, share.value, atol=1e-12)
+    assert np.allclose(share.points_m, plate_points(POSE, RAYS), rtol=0.0, atol=1e-12)
     step = np.zeros(11)
     step[index] = 1e-5
     levels = []
     for sign in (1.0, -1.0):
         pose, other = moved(sign * step)
-        levels.append(white_level(view_plate(pose, *RAYS), other, pairs))
+        levels.append(white_level(pose, RAYS, other, pairs).value)
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order
     tolerance = 0.06 if index in {3, 4, 5} else 0.01 if index > 8 else 1e-3
@@ -95,15 +100,14 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     fine = 16
     offsets = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
     x, y = np.meshgrid(centre[0] + offsets, centre[1] + offsets)
-    view = view_plate(pose, *rays_of(np.column_stack((x.ravel(), y.ravel()))))
-    exact = exact_plate(view.points_m, CIRCLES).reshape(x.shape)
+    fine_rays = rays_of(np.column_stack((x.ravel(), y.ravel())))
+    exact = exact_plate(plate_points(pose, fine_rays), CIRCLES).reshape(x.shape)
     blurred = gaussian_filter(exact, 0.75 * fine, truncate=6.0)
     size = 2 * half + 1
     expected = blurred.reshape(size, fine, size, fine).mean(axis=(1, 3)).ravel()
     blur = Blur(0.75**2 + 1.0 / 12.0, 0.75**2 + 1.0 / 12.0, 0.0)
-    view = view_plate(pose, *rays_of(pixels))
-    level = white_level(view, blur, pair_edges(view, CIRCLES, blur))
-    inner = np.hypot(*view.points_m) < 0.6
-    difference = (level - expected)[inner]
+    rays = rays_of(pixels)
+    seen = white_level(pose, rays, blur, pairs_of(pose, rays, blur))
+    difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4

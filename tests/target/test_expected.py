@@ -37,7 +37,7 @@ def look(
 
 @pytest.mark.parametrize(
     ("radius_px", "light"),
-    [(5.5, {"ground": 0.75}), (14.0, {"black": 0.28, "white": 0.31, "noise": 0.002})],
+    [(5.0, {"ground": 0.75}), (14.0, {"black": 0.28, "white": 0.31, "noise": 0.002})],
     ids=["tiny", "faint"],
 )
 def test_what_was_missed_is_found_where_it_must_be(

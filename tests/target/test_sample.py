@@ -17,7 +17,7 @@ from kgcp.synthetic.shapes import ConvexPolygon, regular_polygon
 from kgcp.target.layout import Target
 from kgcp.target.light import Light
 from kgcp.target.pairs import Blur
-from kgcp.target.plate import view_plate
+from kgcp.target.plate import plate_points
 from kgcp.target.sample import Imaging, Sample, choose_sample
 
 PlacePlate = Callable[..., Pose]
@@ -41,14 +41,14 @@ def photograph(
 
 def opacity_of(sample: Sample, image: PlateImage) -> FloatArray:
     window = sample.imaging.window
-    x, y = window.pixels(sample.imager.grid.index).astype(int).T
+    x, y = window.pixels(sample.index).astype(int).T
     return np.asarray(image.opacity[y - image.window.row, x - image.window.column])
 
 
 def beyond_px(sample: Sample, pose: Pose) -> FloatArray:
     """How far the pixels are beyond the outer circle."""
     imaging = sample.imaging
-    points = view_plate(pose, sample.normalised, sample.normalised_from_px).points_m
+    points = plate_points(pose, sample.rays)
     beyond = np.hypot(*points) / imaging.outer_radius_m - 1.0
     return np.asarray(beyond * imaging.outer_radius_px)
 
@@ -88,7 +88,7 @@ def test_surroundings_as_bright_as_the_plate_are_no_loss(
     grey, _ = photograph(camera, target, pose, NARROW, WHITE)
     imaging = imaging_of(grey, camera, target, pose)
     found, everything = (choose_sample(imaging, pose, BLUR, light) for light in (LIGHT, None))
-    np.testing.assert_array_equal(found.imager.grid.index, everything.imager.grid.index)
+    np.testing.assert_array_equal(found.index, everything.index)
 
 
 def test_all_that_says_where_edges_are_is_used(
@@ -100,15 +100,15 @@ def test_all_that_says_where_edges_are_is_used(
     imaging = imaging_of(grey, camera, target, pose)
     sample = choose_sample(imaging, pose, BLUR, LIGHT)
     window = imaging.window
-    everywhere = view_plate(pose, window.normalised, window.normalised_from_px).points_m
+    everywhere = plate_points(pose, window.rays)
     near = np.zeros(everywhere.shape[1], bool)
     px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
     for centre, radius in zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True):
         off_edge = np.hypot(*(everywhere - centre[:, None])) - radius
         near |= np.abs(off_edge) * px_per_m < 1.5 * BLUR.largest_sd_px
-    assert set(np.flatnonzero(near)) <= set(sample.imager.grid.index)
+    assert set(np.flatnonzero(near)) <= set(sample.index)
     assert 1.5 < beyond_px(sample, pose).max() < 4.0
-    np.testing.assert_array_equal(sample.levels, window.levels[sample.imager.grid.index])
+    np.testing.assert_array_equal(sample.levels, window.levels[sample.index])
 
 
 def test_a_target_outside_its_window_has_lost_its_edges(

@@ -11,7 +11,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
+from kgcp.target.window import Window, contour_px, cut_window, semi_major_axis_px
 
 PlacePlate = Callable[..., Pose]
 RADIUS_M, MARGIN_PX = 0.45, 5.0
@@ -21,10 +21,14 @@ def numbered_frame(camera: Camera) -> GreyArray:
     return np.arange(camera.width * camera.height, dtype=np.uint32).reshape(camera.height, -1)
 
 
+def cut_plate(frame: GreyArray, camera: Camera, pose: Pose) -> Window:
+    return cut_window(frame, camera, contour_px(camera, pose, RADIUS_M), MARGIN_PX)
+
+
 def test_a_window_holds_the_circle_and_its_margin(camera: Camera, place_plate: PlacePlate) -> None:
     pose = place_plate((151.3, 222.8), 31.0, tilt_deg=25.0, way_deg=70.0)
     frame = numbered_frame(camera)
-    window = cut_window(frame, camera, pose, RADIUS_M, MARGIN_PX)
+    window = cut_plate(frame, camera, pose)
     contour = contour_px(camera, pose, RADIUS_M)
     first = np.array([window.x0, window.y0])
     last = first + np.array([window.width - 1, window.height - 1])
@@ -38,11 +42,11 @@ def test_a_window_holds_the_circle_and_its_margin(camera: Camera, place_plate: P
 
 def test_pixels_and_rays_belong_together(camera: Camera, place_plate: PlacePlate) -> None:
     pose = place_plate((401.0, 72.0), 20.0)
-    window = cut_window(numbered_frame(camera), camera, pose, RADIUS_M, MARGIN_PX)
+    window = cut_plate(numbered_frame(camera), camera, pose)
     chosen = np.array([0, 1, window.width, 7 * window.width + 3])
     pixels = window.pixels(chosen)
     np.testing.assert_array_equal(pixels[3], [window.x0 + 3, window.y0 + 7])
-    np.testing.assert_allclose(camera.distort(window.normalised[:, chosen].T), pixels, atol=1e-8)
+    np.testing.assert_allclose(camera.distort(window.rays[:2, chosen].T), pixels, atol=1e-8)
 
 
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
@@ -51,7 +55,7 @@ def test_levels_are_shares_of_the_range(
 ) -> None:
     frame: GreyArray = np.full((camera.height, camera.width), full, dtype)
     frame[::2] = 1
-    window = cut_window(frame, camera, place_plate((240.0, 180.0), 20.0), RADIUS_M, MARGIN_PX)
+    window = cut_plate(frame, camera, place_plate((240.0, 180.0), 20.0))
     assert set(window.levels) == {1.0 / full, 1.0}
     assert window.levels_per_count == 1.0 / full
 
@@ -60,9 +64,7 @@ def test_levels_are_shares_of_the_range(
 def test_the_frame_s_border_cuts(
     camera: Camera, place_plate: PlacePlate, centre_px: tuple[float, float]
 ) -> None:
-    window = cut_window(
-        numbered_frame(camera), camera, place_plate(centre_px, 30.0), RADIUS_M, MARGIN_PX
-    )
+    window = cut_plate(numbered_frame(camera), camera, place_plate(centre_px, 30.0))
     assert window.x0 >= 0
     assert window.y0 >= 0
     assert window.x0 + window.width <= camera.width
@@ -78,13 +80,13 @@ def test_too_little_within_the_frame_is_a_rejection(
     camera: Camera, place_plate: PlacePlate, centre_px: tuple[float, float]
 ) -> None:
     with pytest.raises(Rejection) as caught:
-        cut_window(
-            numbered_frame(camera), camera, place_plate(centre_px, 30.0), RADIUS_M, MARGIN_PX
-        )
+        cut_plate(numbered_frame(camera), camera, place_plate(centre_px, 30.0))
     assert caught.value.reason is Reason.CUT
 
 
 def test_the_semi_major_axis_is_that_of_the_image(camera: Camera, place_plate: PlacePlate) -> None:
     for tilt_deg in (0.0, 50.0):
         pose = place_plate((236.3, 184.2), 30.0, tilt_deg=tilt_deg, way_deg=200.0)
-        assert semi_major_axis_px(camera, pose, RADIUS_M) == pytest.approx(30.0, rel=0.01)
+        assert semi_major_axis_px(contour_px(camera, pose, RADIUS_M)) == pytest.approx(
+            30.0, rel=0.01
+        )

@@ -1,0 +1,20 @@
+"""Loops over pixels, compiled to machine code when they are first used.
+
+The compiled code is kept beside the source, or in the user's cache folder where that cannot be
+written, and found again by later runs. It is found by the source file of the function alone: so
+compiled functions call only compiled functions of their own file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
+    return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
