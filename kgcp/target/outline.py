@@ -1,30 +1,67 @@
-"""From places that may be a ring's to the ellipses of outer edges, many at once."""
+"""From places that may be a ring's to the ellipses of outer edges, all at once."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.errors import Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
-from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
+from kgcp.geometry.conic import Ellipse
 from kgcp.target.seeds import Level, Seeds
 
 _ANGLES = 40
 _ANGLES_RAD = 2.0 * np.pi / _ANGLES * np.arange(_ANGLES)
+_DIRECTIONS = np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=-1)
 _RADII = np.arange(0.5, 1.71, 0.04)  # of the seed's radius
 _STEP = 2  # samples either side that a slope is taken over
+_MIDDLES = _RADII[_STEP:-_STEP]
 _FINEST_RADIUS_PX = 12.0
 # ρ(θ) of an ellipse that is not far from a circle, nor its centre from the seed's.
 _HARMONICS = np.stack(
     [np.ones(_ANGLES), *(f(k * _ANGLES_RAD) for k in (1, 2) for f in (np.cos, np.sin))], axis=1
 )
 _PRODUCTS = np.einsum("ai,aj->aij", _HARMONICS, _HARMONICS).reshape(_ANGLES, -1)
-_WIDTHS = (0.25, 0.12, 0.07, 0.05, 0.05)  # of the weighting of residuals, of the seed's radius
+_WIDTHS = (0.25, 0.12, 0.07, 0.05)  # of the weighting of residuals, of the seed's radius
+_REACH = 0.17  # of an edge from a curve, of the seed's radius
 _INLIER = 0.07
-_MIN_INLIERS = 0.55
+_MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.4
 _MAX_AXIS_RATIO = 2.0
+_NO_SLOPE = -1000
+_RIDGE = 1e-9  # keeps the points of too few edges from a singular fit; they are refused anyway
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outlines:
+    """Ellipses (n,) and how clear they are: centres, semi-axes [px], directions [rad]."""
+
+    centres_px: FloatArray
+    axes_px: FloatArray
+    angles_rad: FloatArray
+    clearness: FloatArray
+
+    @property
+    def radii_px(self) -> FloatArray:
+        """Radii of circles of the same areas."""
+        return np.asarray(np.sqrt(self.axes_px.prod(axis=1)))
+
+    def chosen(self, which: IndexArray) -> _Outlines:
+        """Return some of them."""
+        return _Outlines(
+            self.centres_px[which],
+            self.axes_px[which],
+            self.angles_rad[which],
+            self.clearness[which],
+        )
+
+    def ellipses(self) -> tuple[Ellipse, ...]:
+        """Return them one by one."""
+        rows = np.column_stack((self.centres_px, self.axes_px, self.angles_rad)).tolist()
+        return tuple(Ellipse(*row) for row in rows)
 
 
 def find_outlines(pyramid: tuple[Level, ...], seeds: Seeds) -> tuple[Ellipse, ...]:
@@ -32,102 +69,62 @@ def find_outlines(pyramid: tuple[Level, ...], seeds: Seeds) -> tuple[Ellipse, ..
 
     Twice: the centre of a large ring is known to some pixels at first.
     """
-    return _distinct(_follow(pyramid, _reseeded(_follow(pyramid, seeds))))
+    for _ in range(2):
+        if not len(seeds):
+            return ()
+        outlines = _distinct(_follow(pyramid, seeds))
+        seeds = Seeds(outlines.centres_px, outlines.radii_px, np.ones(len(outlines.clearness)))
+    return outlines.ellipses()
 
 
-def _follow(pyramid: tuple[Level, ...], seeds: Seeds) -> list[tuple[float, Ellipse]]:
-    """Return an ellipse for every seed that has an outline, and how clear it is; best first."""
-    found: list[tuple[float, Ellipse]] = []
-    level_of = _finest_levels(pyramid, seeds.radii_px)
-    for index, level in enumerate(pyramid):
-        members = seeds.chosen(np.flatnonzero(level_of == index))
-        if len(members):
-            found += _outlines_in_level(level, members)
-    return sorted(found, key=lambda item: -item[0])
-
-
-def _reseeded(found: list[tuple[float, Ellipse]]) -> Seeds:
-    outlines = _distinct(found)
-    return Seeds(
-        np.array([outline.centre for outline in outlines]).reshape(-1, 2),
-        np.array([outline.mean_radius for outline in outlines]),
-        np.ones(len(outlines)),
-    )
-
-
-def _distinct(found: list[tuple[float, Ellipse]]) -> tuple[Ellipse, ...]:
-    """Drop ellipses that agree with an earlier one."""
-    ellipses = [ellipse for _, ellipse in found]
-    table = np.array([(e.x, e.y, e.mean_radius) for e in ellipses]).reshape(-1, 3)
-    free = np.ones(len(table), dtype=bool)
+def _distinct(outlines: _Outlines) -> _Outlines:
+    """Drop ellipses that agree with a clearer one; the clearest comes first."""
+    order = np.argsort(-outlines.clearness, kind="stable")
+    x, y = outlines.centres_px[order].T
+    size = np.log(outlines.radii_px[order])
+    free = np.ones(len(order), dtype=bool)
     kept = []
-    for i, (x, y, radius) in enumerate(table):
-        if not free[i]:
-            continue
-        kept.append(ellipses[i])
-        apart = np.hypot(table[:, 0] - x, table[:, 1] - y)
-        free &= (apart > 0.25 * radius) | (np.abs(np.log(table[:, 2] / radius)) > 0.15)
-    return tuple(kept)
+    for i in range(len(order)):
+        if free[i]:
+            kept.append(order[i])
+            apart = np.hypot(x - x[i], y - y[i])
+            free &= (apart > 0.25 * np.exp(size[i])) | (np.abs(size - size[i]) > 0.15)
+    return outlines.chosen(np.array(kept, dtype=np.intp))
 
 
-def _finest_levels(pyramid: tuple[Level, ...], radii_px: FloatArray) -> IndexArray:
-    wanted = np.floor(np.log2(np.maximum(radii_px / _FINEST_RADIUS_PX, 1.0))).astype(np.intp)
-    return np.minimum(wanted, len(pyramid) - 1)
-
-
-def _outlines_in_level(level: Level, seeds: Seeds) -> list[tuple[float, Ellipse]]:
-    centres = level.from_frame(seeds.centres_px)
-    radii = seeds.radii_px / level.factor
-    slopes = _radial_slopes(level.image, centres, radii)
-    edge, strength = _first_guess(slopes)
+def _follow(pyramid: tuple[Level, ...], seeds: Seeds) -> _Outlines:
+    """Return an ellipse for every seed that has an outline."""
+    slopes = _radial_slopes(pyramid, seeds)
+    best = slopes.argmax(axis=2)
+    edge, strength = _MIDDLES[best], np.maximum(_taken(slopes, best), 0)
     curve = _fit_curves(edge, strength)
-    fair = (np.abs(edge - curve @ _HARMONICS.T) < 2.0 * _INLIER).mean(axis=1) > _MIN_INLIERS - 0.15
-    slopes, curve, centres, radii = slopes[fair], curve[fair], centres[fair], radii[fair]
-    seeds = seeds.chosen(np.flatnonzero(fair))
-    edge, strength, near = _near_curve(slopes, curve)
-    curve = _fit_curves(edge, np.where(near, strength, 0.0), _WIDTHS[2:])
-    residual = np.abs(edge - curve @ _HARMONICS.T)
-    inlying = near & (residual < _INLIER) & (strength > 0.0)
+    inlying = np.abs(edge - curve @ _HARMONICS.T) < 2.0 * _INLIER
+    fair = np.flatnonzero(inlying.mean(axis=1) > _MIN_INLIERS_AT_FIRST)
+    seeds, curve = seeds.chosen(fair), curve[fair]
+    edge, strength = _near_curves(slopes[fair], curve)
+    curve = _fit_curves(edge, strength, _WIDTHS[2:])
+    inlying = (np.abs(edge - curve @ _HARMONICS.T) < _INLIER) & (strength > 0)
     share = inlying.mean(axis=1)
-    result = []
-    for i in np.flatnonzero(share >= _MIN_INLIERS):
-        rho = edge[i, inlying[i]] * radii[i]
-        angle = _ANGLES_RAD[inlying[i]]
-        points = centres[i] + rho[:, None] * np.column_stack((np.cos(angle), np.sin(angle)))
-        ellipse = _ellipse_through(points, level)
-        if ellipse is not None:
-            result.append((float(share[i] * seeds.contrasts[i]), ellipse))
-    return result
-
-
-def _ellipse_through(points: FloatArray, level: Level) -> Ellipse | None:
-    try:
-        found = ellipse_from_conic(fit_ellipse(points))
-    except Rejection:
-        return None
-    if found.a > _MAX_AXIS_RATIO * found.b:
-        return None
-    k = float(level.factor)
-    return Ellipse(
-        k * (found.x + 0.5) - 0.5,
-        k * (found.y + 0.5) - 0.5,
-        k * found.a,
-        k * found.b,
-        found.angle_rad,
+    good = np.flatnonzero(share >= _MIN_INLIERS)
+    return _fit_ellipses(
+        edge[good], inlying[good], seeds.chosen(good), share[good] * seeds.contrasts[good]
     )
 
 
-def _radial_slopes(image: GreyArray, centres: FloatArray, radii: FloatArray) -> FloatArray:
-    """Return slopes (n, angles, radii) outwards of the grey values around n centres."""
-    directions = np.stack((np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)), axis=-1).astype(np.float32)
-    rays = directions[:, None] * _RADII.astype(np.float32)[None, :, None]
-    points = (
-        centres[:, None, None].astype(np.float32)
-        + radii[:, None, None, None].astype(np.float32) * rays
-    )
-    points = points.reshape(len(radii), -1, 2)
-    values = _remap(image, points).reshape(len(radii), _ANGLES, len(_RADII))
-    return np.asarray(values[..., 2 * _STEP :].astype(np.float64) - values[..., : -2 * _STEP])
+def _radial_slopes(pyramid: tuple[Level, ...], seeds: Seeds) -> npt.NDArray[np.int16]:
+    """Return slopes (n, angles, radii) outwards of the grey values around the seeds."""
+    values = np.empty((len(seeds), _ANGLES, len(_RADII)), dtype=np.uint8)
+    wanted = np.floor(np.log2(np.maximum(seeds.radii_px / _FINEST_RADIUS_PX, 1.0))).astype(np.intp)
+    wanted = np.minimum(wanted, len(pyramid) - 1)
+    rays = (_DIRECTIONS[:, None] * _RADII[:, None]).astype(np.float32).reshape(-1, 2)
+    for index in np.unique(wanted):
+        level, members = pyramid[index], np.flatnonzero(wanted == index)
+        centres = level.from_frame(seeds.centres_px[members]).astype(np.float32)
+        radii = (seeds.radii_px[members] / level.factor).astype(np.float32)
+        points = centres[:, None] + radii[:, None, None] * rays
+        values[members] = _remap(level.image, points).reshape(-1, _ANGLES, len(_RADII))
+    outer, inner = values[..., 2 * _STEP :], values[..., : -2 * _STEP]
+    return np.subtract(outer, inner, dtype=np.int16)
 
 
 def _remap(image: GreyArray, points: npt.NDArray[np.float32]) -> GreyArray:
@@ -141,18 +138,12 @@ def _remap(image: GreyArray, points: npt.NDArray[np.float32]) -> GreyArray:
     return np.concatenate(parts)
 
 
-_MIDDLES = _RADII[_STEP:-_STEP]
-
-
-def _first_guess(slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    best = slopes.argmax(axis=2)
-    return _MIDDLES[best], np.maximum(
-        np.take_along_axis(slopes, best[..., None], axis=2)[..., 0], 0.0
-    )
+def _taken(values: npt.NDArray[np.int16], index: IndexArray) -> npt.NDArray[np.int16]:
+    return np.take_along_axis(values, index[..., None], axis=2)[..., 0]
 
 
 def _fit_curves(
-    edge: FloatArray, strength: FloatArray, widths: tuple[float, ...] = _WIDTHS
+    edge: FloatArray, strength: npt.NDArray[np.int16], widths: tuple[float, ...] = _WIDTHS
 ) -> FloatArray:
     """Fit the harmonics (n, 5) to edges (n, angles), robustly."""
     typical = np.median(strength, axis=1, keepdims=True) + 1e-6
@@ -168,20 +159,62 @@ def _fit_curves(
     return curve
 
 
-def _near_curve(
-    slopes: FloatArray, curve: FloatArray
-) -> tuple[FloatArray, FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
-    """Return the steepest edge within reach of each curve."""
+def _near_curves(
+    slopes: npt.NDArray[np.int16], curve: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.int16]]:
+    """Return the steepest edges (n, angles) within reach of the curves, and their slopes."""
     rho = curve @ _HARMONICS.T
-    within = np.abs(_MIDDLES - rho[..., None]) < 0.17
-    masked = np.where(within, slopes, -1e3)
-    best = masked.argmax(axis=2)
-    strength = np.take_along_axis(masked, best[..., None], axis=2)[..., 0]
+    within = np.abs(_MIDDLES - rho[..., None]) < _REACH
+    best = np.where(within, slopes, _NO_SLOPE).argmax(axis=2)
+    strength = np.where(within.any(axis=2), np.maximum(_taken(slopes, best), 0), 0)
     inner = np.clip(best, 1, len(_MIDDLES) - 2)
-    left, top, right = (
-        np.take_along_axis(slopes, (inner + d)[..., None], axis=2)[..., 0] for d in (-1, 0, 1)
-    )
+    left, top, right = (_taken(slopes, inner + d).astype(np.float64) for d in (-1, 0, 1))
     bend = np.minimum(left - 2.0 * top + right, -1e-3)
     shift = np.clip(0.5 * (left - right) / bend, -0.5, 0.5)
-    step = _RADII[1] - _RADII[0]
-    return _MIDDLES[inner] + shift * step, np.maximum(strength, 0.0), strength > 0.0
+    return _MIDDLES[inner] + shift * (_RADII[1] - _RADII[0]), strength
+
+
+def _fit_ellipses(
+    edge: FloatArray, inlying: BoolArray, seeds: Seeds, clearness: FloatArray
+) -> _Outlines:
+    """Fit an ellipse to each seed's edges, `kgcp.geometry.conic.fit_ellipse` for many at once.
+
+    The unit is the seed's radius, the origin its centre. What is no ellipse is dropped.
+    """
+    x, y = np.moveaxis(edge[..., None] * _DIRECTIONS, 2, 0)
+    quadratic = np.stack((x * x, x * y, y * y), axis=1) * inlying[:, None]
+    linear = np.stack((x, y, np.ones_like(x)), axis=1) * inlying[:, None]
+    mixed = linear @ quadratic.swapaxes(1, 2)
+    reduce = -np.linalg.solve(linear @ linear.swapaxes(1, 2) + _RIDGE * np.eye(3), mixed)
+    scatter = quadratic @ quadratic.swapaxes(1, 2) + mixed.swapaxes(1, 2) @ reduce
+    constrained = np.stack((0.5 * scatter[:, 2], -scatter[:, 1], 0.5 * scatter[:, 0]), axis=1)
+    vectors = np.real(np.linalg.eig(constrained)[1])
+    discriminants = 4.0 * vectors[:, 0] * vectors[:, 2] - vectors[:, 1] ** 2
+    best = discriminants.argmax(axis=1)
+    form = np.take_along_axis(vectors, best[:, None, None], axis=2)
+    real = np.flatnonzero(discriminants.max(axis=1) > 0.0)
+    coefficients = np.concatenate((form, reduce @ form), axis=1)[real, :, 0]
+    centre, axes, angle, possible = _axes_of_conics(coefficients)
+    seeds = seeds.chosen(real)
+    return _Outlines(
+        seeds.centres_px + seeds.radii_px[:, None] * centre,
+        seeds.radii_px[:, None] * axes,
+        angle,
+        clearness[real],
+    ).chosen(np.flatnonzero(possible))
+
+
+def _axes_of_conics(
+    coefficients: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return centres, semi-axes, directions, and which can be, of x², xy, y², x, y and 1."""
+    a, b, c, d, e, f = (coefficients * np.sign(coefficients[:, :1] + coefficients[:, 2:3])).T
+    determinant = 4.0 * a * c - b * b
+    x, y = (b * e - 2.0 * c * d) / determinant, (b * d - 2.0 * a * e) / determinant
+    depth = -(f + 0.5 * (d * x + e * y))
+    middle, half = 0.5 * (a + c), 0.5 * np.hypot(a - c, b)
+    squares = np.maximum(depth, 0.0) / np.stack((middle - half, middle + half))
+    axes = np.sqrt(squares).T
+    angle = 0.5 * np.arctan2(-b, c - a)  # of the lesser curvature
+    possible = (axes[:, 1] > 0.0) & (axes[:, 0] <= _MAX_AXIS_RATIO * axes[:, 1])
+    return np.stack((x, y), axis=1), axes, angle, possible

@@ -156,15 +156,21 @@ def find_code(
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
 
 
-def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> list[Ellipse]:
-    """Return the outlines with a dark ring between bright disc and plate, brighter in places."""
+def _sample_around(grey: GreyArray, outlines: tuple[Ellipse, ...], radii: FloatArray) -> FloatArray:
+    """Sample the frame (outlines, radii, angles) on ellipses of so many times the outlines."""
     if not outlines:
-        return []
+        return np.empty((0, len(radii), ANGLES))
+    circles = np.stack([outline.points(ANGLES_RAD) - outline.centre for outline in outlines])
+    centres = np.stack([outline.centre for outline in outlines])
+    points = centres[:, None, None] + radii[:, None, None] * circles[:, None]
+    return sample_grey(grey, points.reshape(-1, ANGLES, 2)).reshape(points.shape[:3])
+
+
+def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> tuple[Ellipse, ...]:
+    """Return the outlines with a dark ring between bright disc and plate, brighter in places."""
     code = ring.code_diameter_m / ring.outer_diameter_m
-    radii = (_DISC_SHARE * ring.inner_ratio, code, _PLATE)
-    points = np.stack([[o.points(ANGLES_RAD, radius) for radius in radii] for o in outlines])
-    values = sample_grey(grey, points.reshape(-1, ANGLES, 2)).reshape(-1, len(radii), ANGLES)
-    values.sort(axis=2)
+    radii = np.array((_DISC_SHARE * ring.inner_ratio, code, _PLATE))
+    values = np.sort(_sample_around(grey, outlines, radii), axis=2)
     disc, code_circle, plate = values.transpose(1, 0, 2)
     black, white = code_circle[:, _rank(0.25)], plate[:, _rank(0.5)]
     contrast = np.minimum(disc[:, _rank(0.5)], white) - black
@@ -172,7 +178,7 @@ def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> list[
     good &= code_circle[:, _rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
     for circle, low, high in ((code_circle, 0.05, 0.35), (disc, 0.3, 0.7), (plate, 0.4, 0.8)):
         good &= circle[:, _rank(high)] - circle[:, _rank(low)] < _UNEVEN * contrast
-    return [outlines[i] for i in np.flatnonzero(good)]
+    return tuple(outlines[i] for i in np.flatnonzero(good))
 
 
 def _rank(share: float) -> int:
@@ -193,9 +199,7 @@ def verify(
 
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
     """Sample a frame around an outline, for `judge`: (radii, angles)."""
-    return sample_grey(
-        grey, np.stack([outline.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
-    )
+    return np.asarray(_sample_around(grey, (outline,), SAMPLED_RADII)[0])
 
 
 def judge(patch: FloatArray, ring: Ring) -> Verdict:

@@ -1,12 +1,14 @@
 """Where a ring may be: bright cores in dark rings in bright surrounds, at all sizes.
 
-A pyramid of halved images brings rings of every size to radii between 3 and 6 pixels. There the
-maxima of a difference of two box filters are places brighter than what is around them; few of them
-also have dark around them in most directions, and bright again beyond.
+A pyramid of reduced images brings rings of every size to a radius of about 3 pixels. There a
+difference of small box filters answers to a bright core in a dark ring on a bright plate, and a
+ring is what makes up much of the range of grey values around: on textured ground, other things do.
+The few places that remain are looked at in the next finer image, in more and more directions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,36 +16,19 @@ import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.target.peaks import PEAK_RADIUS_PX, find_peaks
+from kgcp.target.ring_samples import RingSamples
 
 _BRIGHTEST_QUANTILE = 0.999
-_SMALLEST_PX = 3.0  # radius of a ring that a level of the pyramid still shows
 _SMALLEST_LEVEL_PX = 6
-_MIN_CONTRAST = 5  # grey values
-_STRETCHES = (0.84, 1.0, 1.19)
-_RING, _SURROUND = 0.76, (1.15, 1.34)  # circles that are looked at, of the ring's radius
+_SMALLEST_RATIO = 0.93  # of rings looked for in a level, to that radius
+_FIRST_SMALL = 2  # level of the pyramid whose image is small
+_STRETCHES = (0.85, 1.1)
 _FEW, _MANY = 8, 16  # directions
 _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 7  # hidden quarters and dots leave less than half of the ring
-_MARGIN_PX = 10
-_FINE, _FINE_STRETCHES = 24, (0.9, 1.0, 1.1)
-_CORE = 0.33  # circle in the core, of the ring's radius
+_FINE_STRETCHES = (0.9, 1.0, 1.1)
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
-_LARGE_FACTOR = 8  # from this level on, where there are few seeds
-_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
-
-
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """Radius [px], and how far aside the ring is looked at in four directions [px]."""
-
-    radius: float
-    core_box: int
-    aside: tuple[tuple[int, int], ...]
-
-
-_SCALES = (
-    _Scale(3.6, 3, ((2, 2), (-2, 2), (-2, -2), (2, -2))),
-    _Scale(5.1, 5, ((4, 0), (0, 4), (-4, 0), (0, -4))),
-)
+_LARGE_PX = 22.0  # radius from which there are few seeds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +38,16 @@ class Level:
     Attributes
     ----------
     image : (height, width) array of uint8
-    factor : int
+    factor : float
         How many pixels of the frame a pixel of the level is wide.
     """
 
     image: GreyArray
-    factor: int
+    factor: float
+
+    def to_frame(self, pixels: FloatArray) -> FloatArray:
+        """Return coordinates in the frame of coordinates in the level [px]."""
+        return np.asarray(self.factor * (pixels + 0.5) - 0.5)
 
     def from_frame(self, pixels: FloatArray) -> FloatArray:
         """Return coordinates in the level of coordinates in the frame [px]."""
@@ -91,6 +80,10 @@ class Seeds:
         """Return some of the seeds."""
         return Seeds(self.centres_px[which], self.radii_px[which], self.contrasts[which])
 
+    def stretched(self, factor: FloatArray) -> Seeds:
+        """Return the seeds with other radii."""
+        return Seeds(self.centres_px, factor * self.radii_px, self.contrasts)
+
 
 def eight_bit(grey: GreyArray) -> GreyArray:
     """Return an 8-bit frame for the search.
@@ -119,11 +112,48 @@ def build_pyramid(grey: GreyArray) -> tuple[Level, ...]:
 def find_seeds(pyramid: tuple[Level, ...], min_radius_px: float) -> Seeds:
     """Look for rings in all levels that `min_radius_px` needs."""
     found = []
-    for finer, level in pairwise(pyramid):
-        if level.factor * 2.0 * _SMALLEST_PX > min_radius_px:
-            seeds = _joined([_seeds_of_level(level, scale) for scale in _SCALES])
-            found.append(_clear_rings(finer, seeds))
+    for image, levels in _sheets(pyramid, min_radius_px):
+        peaks = [_peaks(level) for level, _, _ in levels]
+        seeds = _joined(peaks)
+        circles = _circles_around(image, levels, peaks)
+        found.append(_clear_rings(*_ring_like(circles, seeds)))
     return _distinct(_joined(found))
+
+
+_Searched = tuple[Level, Level, int]  # level, a finer one, the finer one's first row in a sheet
+
+
+def _sheets(
+    pyramid: tuple[Level, ...], min_radius_px: float
+) -> Iterator[tuple[GreyArray, list[_Searched]]]:
+    """Yield images to look closer in, and the levels whose peaks are looked at there.
+
+    All small images are put on one sheet: each costs time, whatever its size.
+    """
+    width = pyramid[min(_FIRST_SMALL, len(pyramid) - 1)].image.shape[1]
+    sheet, levels, row = [], [], 0
+    for index, (finer, half) in enumerate(pairwise(pyramid)):
+        searched = [
+            level
+            for level in (half, _third(half))
+            if level.factor * PEAK_RADIUS_PX >= _SMALLEST_RATIO * min_radius_px
+        ]
+        if index < _FIRST_SMALL:
+            yield finer.image, [(level, finer, 0) for level in searched]
+            continue
+        levels += [(level, finer, row) for level in searched]
+        padding = (0, 0, 0, width - finer.image.shape[1])
+        sheet.append(cv2.copyMakeBorder(finer.image, *padding, cv2.BORDER_REPLICATE))
+        row += len(finer.image)
+    if levels:
+        yield np.concatenate(sheet), levels
+
+
+def _third(half: Level) -> Level:
+    """Return a level whose pixels are half as wide again."""
+    height, width = (size // 3 for size in half.image.shape)
+    image = half.image[: 3 * height, : 3 * width]
+    return Level(cv2.resize(image, (2 * width, 2 * height)), 1.5 * half.factor)
 
 
 def _joined(parts: list[Seeds]) -> Seeds:
@@ -151,146 +181,54 @@ def _distinct(seeds: Seeds) -> Seeds:
     return seeds.chosen(np.array(kept, dtype=np.intp))
 
 
-def _clear_rings(level: Level, seeds: Seeds) -> Seeds:
-    """Keep seeds whose ring, core and surround are each of one grey value, dots apart.
+def _peaks(level: Level) -> Seeds:
+    points, middles = find_peaks(level.image)
+    radii = np.full(len(points), PEAK_RADIUS_PX * level.factor)
+    return Seeds(level.to_frame(points), radii, middles)
+
+
+def _circles_around(image: GreyArray, levels: list[_Searched], peaks: list[Seeds]) -> RingSamples:
+    """Return the circles of the levels' peaks in a sheet."""
+    width = image.shape[1]
+    places, radii = [], []
+    for (_, finer, row), seeds in zip(levels, peaks, strict=True):
+        x, y = np.rint(finer.from_frame(seeds.centres_px)).astype(np.intp).T
+        places.append((y + row) * width + x)
+        radii.append(seeds.radii_px / finer.factor)
+    return RingSamples(image.ravel(), width, np.concatenate(places), np.concatenate(radii))
+
+
+def _ring_like(circles: RingSamples, seeds: Seeds) -> tuple[RingSamples, Seeds]:
+    """Keep those with dark and then bright in some of eight directions."""
+    best, stretch = np.zeros(len(seeds), dtype=np.intp), np.ones(len(seeds))
+    for trial in _STRETCHES:
+        count = circles.stretched(trial).ring_directions(seeds.contrasts, _FEW)
+        stretch[count > best] = trial
+        best = np.maximum(best, count)
+    good = np.flatnonzero(best >= _ENOUGH_OF_FEW)
+    return circles.stretched(stretch).chosen(good), seeds.stretched(stretch).chosen(good)
+
+
+def _clear_rings(circles: RingSamples, seeds: Seeds) -> Seeds:
+    """Keep those whose ring, core and surround are each of one grey value, dots apart.
 
     Parameters
     ----------
-    level : Level
-        A finer one than the seeds were found in.
+    circles : RingSamples
     seeds : Seeds
         With grey values midway between ring and core as `contrasts`; those kept have contrasts,
         less spreads.
     """
-    margin = 4 * _MARGIN_PX
-    padded = cv2.copyMakeBorder(level.image, *(margin,) * 4, cv2.BORDER_REPLICATE)
-    values, width = padded.ravel(), padded.shape[1]
-    place = np.rint(level.from_frame(seeds.centres_px)).astype(np.intp) + margin
-    places, radii = place[:, 1] * width + place[:, 0], seeds.radii_px / level.factor
-    clear = _CLEAR_LARGE if 2 * level.factor >= _LARGE_FACTOR else _CLEAR
-    best, stretch = np.zeros(len(seeds)), np.ones(len(seeds))
-    for trial in _FINE_STRETCHES:
-        circles = _Circles(values, width, places, trial * radii)
-        seen = np.flatnonzero(circles.ring_directions(seeds.contrasts) >= _ENOUGH_OF_MANY)
-        clearness = circles.chosen(seen).clearness(clear)
-        better = clearness > best[seen]
-        best[seen[better]] = clearness[better]
-        stretch[seen[better]] = trial
-    good = best > 0.0
-    return Seeds(seeds.centres_px[good], (seeds.radii_px * stretch)[good], best[good])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Circles:
-    """Places (n,) in a flattened image of some width, and radii (n,) of rings there [px]."""
-
-    values: GreyArray
-    width: int
-    places: IndexArray
-    radii: FloatArray
-
-    def chosen(self, which: IndexArray) -> _Circles:
-        return _Circles(self.values, self.width, self.places[which], self.radii[which])
-
-    def around(self, ratio: float, count: int) -> GreyArray:
-        """Return grey values (n, count) on circles of so many times the radii."""
-        angles = 2.0 * np.pi / count * (np.arange(count) + 0.5)
-        rays = ratio * self.radii[:, None]
-        x = np.rint(rays * np.cos(angles)).astype(np.intp)
-        y = np.rint(rays * np.sin(angles)).astype(np.intp)
-        return np.asarray(self.values[self.places[:, None] + y * self.width + x])
-
-    def surround(self, count: int) -> GreyArray:
-        """Return the brighter (n, count) of two circles outside."""
-        near, far = (self.around(ratio, count) for ratio in _SURROUND)
-        return np.maximum(near, far)
-
-    def ring_directions(self, middle: FloatArray) -> IndexArray:
-        """Count the directions in which a dark ring is followed by a brighter surround."""
-        dark = self.around(_RING, _MANY) < middle[:, None]
-        return np.asarray(np.sum(dark & (self.surround(_MANY) > middle[:, None]), axis=1))
-
-    def clearness(self, clear: float) -> FloatArray:
-        """Return contrasts (n,), less spreads; 0 where they are spread by more than `clear`."""
-        ring, core, plate = (
-            np.sort(part, axis=1).astype(np.int16)
-            for part in (
-                self.around(_RING, _FINE),
-                self.around(_CORE, _FINE),
-                self.surround(_FINE),
-            )
-        )
-        contrast = np.minimum(core[:, 11], plate[:, 14]) - ring[:, 4]
-        spread = ring[:, 8] - ring[:, 1]
-        limit = clear * contrast
-        good = (contrast >= _MIN_CONTRAST) & (spread <= limit)
-        good &= (core[:, 17] - core[:, 7] <= limit) & (plate[:, 19] - plate[:, 11] <= limit)
-        good &= np.abs(core[:, 11] - plate[:, 14]) <= _SAME_WHITE * contrast
-        return np.where(good, np.maximum(contrast - 0.5 * spread, 1.0), 0.0)
-
-
-def _seeds_of_level(level: Level, scale: _Scale) -> Seeds:
-    padded = cv2.copyMakeBorder(level.image, *(_MARGIN_PX,) * 4, cv2.BORDER_REPLICATE)
-    core = cv2.blur(padded, (scale.core_box, scale.core_box))
-    places, contrast = _peaks(core, cv2.blur(padded, (3, 3)), scale)
-    values, width = padded.ravel(), padded.shape[1]
-    centre = core.ravel()[places]
-    middle = centre - contrast // 2
-    directions, stretch = _best_radius(values, width, places, middle, scale.radius)
-    good = directions >= _ENOUGH_OF_FEW
-    rows, columns = np.divmod(places[good], width)
-    centres = np.column_stack((columns, rows)) - (_MARGIN_PX - 0.5)
-    return Seeds(
-        level.factor * centres - 0.5,
-        level.factor * scale.radius * stretch[good],
-        middle[good].astype(np.float64),
-    )
-
-
-def _best_radius(
-    values: GreyArray, width: int, places: IndexArray, middle: GreyArray, radius: float
-) -> tuple[GreyArray, FloatArray]:
-    """Return in how many directions a ring is seen, at best, and the radius it is best seen at."""
-    most = np.zeros(len(places), dtype=np.uint8)
-    best = np.ones(len(places))
-    for stretch in _STRETCHES:
-        count = _ring_directions(values, width, places, middle, stretch * radius)
-        best[count > most] = stretch
-        most = np.maximum(most, count)
-    return most, best
-
-
-def _peaks(core: GreyArray, smooth: GreyArray, scale: _Scale) -> tuple[IndexArray, GreyArray]:
-    """Return where a core is brightest against what is beside it in three of four directions."""
-    height, width = core.shape
-    m = _MARGIN_PX
-    a, b, c, d = (smooth[m + y : height - m + y, m + x : width - m + x] for x, y in scale.aside)
-    second = cv2.max(cv2.max(cv2.min(a, b), cv2.min(c, d)), cv2.min(cv2.max(a, b), cv2.max(c, d)))
-    contrast = cv2.subtract(core[m:-m, m:-m], second)
-    highest = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
-    peaks = cv2.compare(contrast, highest, cv2.CMP_GE)
-    found = np.flatnonzero(cv2.bitwise_and(peaks, contrast) >= _MIN_CONTRAST)
-    rows, columns = np.divmod(found, contrast.shape[1])
-    return (rows + m) * width + columns + m, contrast.ravel()[found]
-
-
-def _ring_directions(
-    values: GreyArray,
-    width: int,
-    places: IndexArray,
-    middle: GreyArray,
-    radius: float,
-) -> GreyArray:
-    """Count the directions in which a dark ring is followed by a brighter surround."""
-    found = np.zeros(len(places), dtype=np.uint8)
-    near, far = (_offsets(ratio * radius, width) for ratio in _SURROUND)
-    for ring, one, other in zip(_offsets(_RING * radius, width), near, far, strict=True):
-        dark = values[places + ring] < middle
-        found += dark & (np.maximum(values[places + one], values[places + other]) > middle)
-    return found
-
-
-def _offsets(radius: float, width: int) -> IndexArray:
-    angles = 2.0 * np.pi / _FEW * (np.arange(_FEW) + 0.5)
-    x, y = np.rint(radius * np.cos(angles)), np.rint(radius * np.sin(angles))
-    return np.asarray((y * width + x).astype(np.intp))
+    count = len(seeds)
+    trials = np.repeat(_FINE_STRETCHES, count)
+    every = np.tile(np.arange(count), len(_FINE_STRETCHES))
+    tried = circles.chosen(every).stretched(trials)
+    seen = np.flatnonzero(tried.ring_directions(seeds.contrasts[every], _MANY) >= _ENOUGH_OF_MANY)
+    limits = np.where(seeds.radii_px >= _LARGE_PX, _CLEAR_LARGE, _CLEAR)
+    clearness = np.zeros(len(every))
+    clearness[seen] = tried.chosen(seen).clearness(limits[every][seen])
+    by_trial = clearness.reshape(len(_FINE_STRETCHES), count)
+    best = by_trial.max(axis=0)
+    good = np.flatnonzero(best)
+    stretched = seeds.stretched(np.array(_FINE_STRETCHES)[by_trial.argmax(axis=0)])
+    return Seeds(stretched.centres_px[good], stretched.radii_px[good], best[good])

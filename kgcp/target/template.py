@@ -15,6 +15,13 @@ from kgcp.target.layout import Ring
 ANGLES = 120
 _FREQUENCIES = 24  # a dot is wider than a wave of the highest
 ANGLES_RAD: FloatArray = np.linspace(0.0, 2.0 * np.pi, ANGLES, endpoint=False)
+# From real and imaginary parts of the frequencies to samples: `irfft` of 24 of 61 frequencies.
+_PHASES = ANGLES_RAD[:, None] * np.arange(_FREQUENCIES)
+_WAVES: FloatArray = (
+    np.hstack((np.cos(_PHASES), -np.sin(_PHASES)))
+    * np.tile(np.where(np.arange(_FREQUENCIES) == 0, 1.0, 2.0), 2)
+    / ANGLES
+)
 _ROWS = 20
 _LOG_STEP = 0.06
 _OUTERMOST = 1.15  # of the outer radius: the plate's margin is hardly wider
@@ -107,15 +114,16 @@ def best_template(patch: FloatArray, templates: Templates) -> tuple[float, int, 
         Sampled at `SAMPLED_RADII`.
     """
     rows = templates.images.shape[1]
-    windows = np.lib.stride_tricks.sliding_window_view(patch, rows, axis=0)  # shift, angle, row
-    mean = np.einsum("sar,r->s", windows, templates.weights)
-    power = np.einsum("sar,r->s", windows**2, templates.weights)
+    sums = np.stack((patch.sum(axis=1), np.einsum("ra,ra->r", patch, patch)))
+    mean, power = np.lib.stride_tricks.sliding_window_view(sums, rows, axis=1) @ templates.weights
     sd = np.sqrt(np.maximum(power - mean**2, 1e-9))
     spectrum = np.fft.rfft(patch, axis=1)[:, :_FREQUENCIES].T
-    spectrum = np.lib.stride_tricks.sliding_window_view(spectrum, rows, axis=1).swapaxes(
-        1, 2
-    )  # frequency, row, shift
-    correlation = np.fft.irfft(templates.spectra @ spectrum, ANGLES, axis=0) / sd
+    shifted = np.lib.stride_tricks.sliding_window_view(spectrum, rows, axis=1).swapaxes(1, 2)
+    products = (templates.spectra @ shifted).reshape(_FREQUENCIES, -1)
+    correlation = (_WAVES @ np.concatenate((products.real, products.imag))).reshape(
+        ANGLES, len(templates.images), -1
+    )
+    correlation /= sd
     top = int(correlation.argmax())
     lag, template, shift = np.unravel_index(top, correlation.shape)
     return float(correlation.ravel()[top]), int(template), int(shift), int(lag)
