@@ -111,7 +111,7 @@ def build_pyramid(grey: GreyArray) -> tuple[Level, ...]:
 
 def find_seeds(pyramid: tuple[Level, ...], min_radius_px: float) -> Seeds:
     """Look for rings in all levels that `min_radius_px` needs."""
-    found = []
+    found = [Seeds(np.empty((0, 2)), np.empty(0), np.empty(0))]
     for image, levels in _sheets(pyramid, min_radius_px):
         peaks = [_peaks(level) for level, _, _ in levels]
         seeds = _joined(peaks)
@@ -139,7 +139,8 @@ def _sheets(
             if level.factor * PEAK_RADIUS_PX >= _SMALLEST_RATIO * min_radius_px
         ]
         if index < _FIRST_SMALL:
-            yield finer.image, [(level, finer, 0) for level in searched]
+            if searched:
+                yield finer.image, [(level, finer, 0) for level in searched]
             continue
         levels += [(level, finer, row) for level in searched]
         padding = (0, 0, 0, width - finer.image.shape[1])

@@ -35,6 +35,11 @@ inner_diameter_m = 0.45
 code_diameter_m = 0.642857143
 dot_diameter_m = 0.128571429
 code_deg = [0, 43, 78, 180]
+[[target]]
+name = "A-inner"
+replica_of = "A"
+scale = 0.2
+code_deg = [10, 80, 150, 250, 290]
 """
 
 
