@@ -8,7 +8,7 @@ from scipy.special import ndtri
 from kgcp.geometry.camera import Camera
 from kgcp.target.adjust import Fit
 from kgcp.target.layout import Target
-from kgcp.target.light import encoded, plateau_levels, tone_curve
+from kgcp.target.light import plateau_levels, share_at
 from kgcp.target.observation import Appearance
 from kgcp.target.window import contour_px, semi_major_axis_px
 
@@ -37,9 +37,6 @@ def _edge_shift_px(fit: Fit) -> float:
     clipped; the true one is where half the light comes from either side.
     """
     light, imaging = fit.parameters.light, fit.sample.imaging
-    share = np.linspace(0.0, 1.0, 401)
-    level = light.black + (light.white - light.black) * tone_curve(share, light)
-    grey = np.minimum(encoded(level, imaging.response), imaging.censoring.high)
-    middle = 0.5 * (grey[0] + grey[-1])
-    crossing = float(np.interp(middle, np.maximum.accumulate(grey), share))
+    black, white = plateau_levels(light, imaging.response)
+    crossing = share_at(0.5 * (black + min(white, imaging.censoring.high)), light, imaging.response)
     return float(-fit.parameters.blur.mean_sd_px * ndtri(np.clip(crossing, 1e-3, 1.0 - 1e-3)))

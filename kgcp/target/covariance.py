@@ -15,19 +15,21 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit, noise_of
-from kgcp.target.light import plateau_levels
+from kgcp.target.light import plateau_levels, share_at
 from kgcp.target.observation import Uncertainty
 
 _ARC_PX = 6.0
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
-_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it
+_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
+_EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,17 +73,28 @@ def _common_displacement_px(fit: Fit) -> float:
     """Return the standard deviation of the displacement that all of a circle's edge shares [px].
 
     From the residuals: what edges scatter beyond the noise of the plateaus (coarse sampling of a
-    print, compression, tails of what is not modelled) averages out along a circle only in part.
+    print, compression, tails of what is not modelled) averages out along a circle only in part. And
+    of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
     """
+    floor_px = math.hypot(_EDGE_FLOOR_PX, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction)
     share = fit.prediction.share
     edge = (share > 0.3) & (share < 0.7)
     if not edge.any():
-        return _EDGE_FLOOR_PX
+        return floor_px
     black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
     slope_per_px = (white - black) / (np.sqrt(2.0 * np.pi) * fit.parameters.blur.mean_sd_px)
     excess = np.sqrt(np.median(noise.sd[edge] ** 2 - noise.plateau_sd[edge] ** 2))
-    return max(_EDGE_FLOOR_PX, float(_COMMON_SHARE * excess / slope_per_px))
+    return max(floor_px, float(_COMMON_SHARE * excess / slope_per_px))
+
+
+def _clipped_reach_px(fit: Fit) -> float:
+    """Return how far the middle of a straight edge is within what is clipped [px]."""
+    light, imaging = fit.parameters.light, fit.sample.imaging
+    burnt = share_at(imaging.censoring.high, light, imaging.response)
+    sunk = share_at(imaging.censoring.low, light, imaging.response)
+    hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
+    return float(fit.parameters.blur.mean_sd_px * ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
 
 
 def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:

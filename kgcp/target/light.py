@@ -208,6 +208,14 @@ def tone_curve(share: FloatArray, light: Light) -> FloatArray:
     return tone
 
 
+def share_at(level: float, light: Light, response: Response) -> float:
+    """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
+    share = np.linspace(0.0, 1.0, 401)
+    core = light.black + (light.white - light.black) * tone_curve(share, light)
+    grey = np.maximum.accumulate(encoded(core, response))
+    return float(np.interp(level, grey, share))
+
+
 def _tone_slope(share: FloatArray, light: Light) -> FloatArray:
     arch, lean = share * (1.0 - share), 2.0 * share - 1.0
     slope: FloatArray = (

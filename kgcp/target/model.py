@@ -6,6 +6,7 @@ are adjusted; the one that fits better is reported, the other one kept with how 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 
@@ -26,12 +27,13 @@ from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
 from kgcp.target.prior import NormalPrior
 from kgcp.target.sample import Imaging, choose_sample
-from kgcp.target.verify import check_code, check_fit, check_precision
+from kgcp.target.verify import MAX_EDGE_NOISE, check_code, check_fit, check_precision, edge_noise
 from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
 _START_BLUR = Blur(0.5, 0.5, 0.0)
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
+_SPILT_PX = (0.7, 1.4)  # by which edges may be displaced
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
 _HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
@@ -157,10 +159,7 @@ def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
 
 def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
     """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
-    sample = choose_sample(imaging, pose, _START_BLUR, None, imaging.few_pixels)
-    light = first_levels(sample, pose, _START_BLUR)
-    unknowns = _unknowns(imaging.response, has_streak=False)
-    rough = approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
+    rough = _rough_fit(imaging, pose)
     other = _mirrored_fit(rough)
     near = other.parameters if other.total < rough.total else rough.parameters
     best = _adjust_with_streak(imaging, near)
@@ -169,6 +168,28 @@ def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
         best = adjust(imaging, other.parameters, best.unknowns)
         other = _mirrored_fit(best)
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
+
+
+def _rough_fit(imaging: Imaging, pose: Pose) -> Fit:
+    """Come near the minimum; from smaller distances if there is none near the start pose.
+
+    Where the plate is burnt white its light spills over the edges, and the start may be far off.
+    """
+    rough = _approach(imaging, pose)
+    for shift_px in _SPILT_PX:
+        if edge_noise(rough) <= MAX_EDGE_NOISE:
+            break
+        closer = imaging.outer_radius_px / (imaging.outer_radius_px + shift_px)
+        with contextlib.suppress(Rejection):
+            other = _approach(imaging, Pose(pose.rotation, closer * pose.translation_m))
+            rough = min(rough, other, key=edge_noise)
+    return rough
+
+
+def _approach(imaging: Imaging, pose: Pose) -> Fit:
+    sample = choose_sample(imaging, pose, _START_BLUR, None, imaging.few_pixels)
+    start = Parameters(pose, _START_BLUR, first_levels(sample, pose, _START_BLUR))
+    return approach(sample, start, _unknowns(imaging.response, has_streak=False))
 
 
 def _adjust_with_streak(imaging: Imaging, start: Parameters) -> Fit:

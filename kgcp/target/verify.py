@@ -15,12 +15,21 @@ from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3
-_MAX_EDGE_NOISE = 0.15
+MAX_EDGE_NOISE = 0.15
+"""Largest residuals near edges, of the contrast."""
 _MAX_RELATIVE_SD = 0.01
 _POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
 _DOT = 0.6  # of a dot's contrast: so much more or less light is a dot, or the lack of one
 _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
+
+
+def edge_noise(fit: Fit) -> float:
+    """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
+    share = fit.prediction.share
+    edge = (share > 0.2) & (share < 0.8)
+    black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
+    return float(np.median(fit.sd[edge])) / (white - black) if edge.any() and white > black else 2.0
 
 
 def check_fit(fit: Fit) -> None:
@@ -31,14 +40,11 @@ def check_fit(fit: Fit) -> None:
     Rejection
         `POOR_FIT`.
     """
-    share, light = fit.prediction.share, fit.parameters.light
     censoring = fit.sample.censoring
     seen = ~(censoring.at_high | censoring.at_low)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
-    edge = (share > 0.2) & (share < 0.8)
-    black, white = plateau_levels(light, fit.sample.imaging.response)
-    noise = float(np.median(fit.sd[edge])) / abs(white - black) if edge.any() else 1.0
-    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE or white <= black:
+    noise = edge_noise(fit)
+    if outlying > _MAX_OUTLIERS or noise > MAX_EDGE_NOISE:
         raise Rejection(
             Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
         )
