@@ -17,12 +17,13 @@ import click
 import pandas as pd
 
 from benchmarks.bands import BOUND_COLUMNS, join_truth, read_truth, summarise, table_lines
-from benchmarks.bound import Bound, frame_bound
+from benchmarks.bound import frame_bound
 from benchmarks.evaluate import detect
 from benchmarks.timing import time_measurement, timing_line
 from kgcp.io.flight import read_flight
 from kgcp.io.frames import list_frames
 from kgcp.io.simulated import write_simulated_flight
+from kgcp.planning.bound import Bound
 from kgcp.settings import DetectSettings, Method
 from kgcp.synthetic.flight import FlightPlan, FramePlan, frame_name, plan_flight
 from kgcp.synthetic.presets import SimulationSettings, preset

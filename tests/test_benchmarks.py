@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import accuracy, evaluate, reexpose
 from benchmarks.bands import join_truth, summarise, table_lines
-from benchmarks.bound import censored_information, frame_bound, pose_covariance
+from benchmarks.bound import frame_bound
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.planning.bound import censored_information, pose_covariance
 from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import TARGET_PLATE, FramePlan, plan_flight
 from kgcp.synthetic.imaging import Optics, Sensor

@@ -1,0 +1,1 @@
+"""What a flight will give before it is flown."""
