@@ -26,9 +26,7 @@ def detect(flight_folder: Path, settings: DetectSettings, jobs: int) -> pd.DataF
     """Run the detector over a flight, in a folder that is thrown away, and return its table."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        detect_flight(
-            read_flight(flight_folder), settings, out, jobs=jobs, on_frame=lambda _result: None
-        )
+        detect_flight(read_flight(flight_folder), settings, out, jobs=jobs)
         return read_detections(out / "detections.parquet")
 
 

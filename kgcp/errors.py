@@ -145,6 +145,16 @@ class Reason(StrEnum):
         Status.UNREADABLE,
         "the frame's size is not the camera's",
     )
+    WORKER_DIED = (
+        "worker_died",
+        Status.UNREADABLE,
+        "the process that examined the frame died, twice: out of memory, or a decoder's crash",
+    )
+    TIMED_OUT = (
+        "timed_out",
+        Status.UNREADABLE,
+        "the frame took longer than `--frame-timeout`, twice",
+    )
 
 
 class Rejection(Exception):  # noqa: N818 - not an error: the outcome of one frame

@@ -1,15 +1,15 @@
-"""One frame after the other, in a pool of processes: read, measure, look again."""
+"""One frame: read, measured, looked at again; and what it is when that ends its process."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import cv2
 
-from kgcp.errors import KgcpError, Rejection
+from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
@@ -25,9 +25,6 @@ from kgcp.target.measure import Examination, examine, miss_of
 from kgcp.target.observation import Considered, Miss, Observation, Outcome, is_unreadable
 from kgcp.target.prior import NormalPrior
 from kgcp.target.search import CODE_LIKE
-from kgcp.workers import ordered_map
-
-_FRAMES_PER_TASK = 4  # small enough to keep the progress bar moving and the workers evenly busy
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,36 +92,9 @@ class SecondLook:
     expected: Mapping[str, Expectation]
 
 
-def examine_frames(
-    task: FrameTask, notes: Sequence[FrameNote], *, jobs: int
-) -> Iterator[FrameResult]:
-    """Yield the result of every frame, in the order given, from a pool of `jobs` processes."""
-    return ordered_map(
-        _examine_in_worker,
-        notes,
-        jobs=jobs,
-        start=_start_worker,
-        start_arguments=(task,),
-        items_per_task=_FRAMES_PER_TASK,
-    )
-
-
-def examine_again(
-    task: FrameTask, looks: Sequence[SecondLook], *, jobs: int
-) -> Iterator[FrameResult]:
-    """Yield the result of every second look, in the order given, from a pool of processes."""
-    return ordered_map(
-        _look_in_worker,
-        looks,
-        jobs=jobs,
-        start=_start_worker,
-        start_arguments=(task,),
-        items_per_task=_FRAMES_PER_TASK,
-    )
-
-
 def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     """Read and measure one frame; whatever a frame can do wrong becomes its result."""
+    cv2.setNumThreads(0)  # the processes are the parallelism
     path = task.frames_folder / note.frame
     exif = read_exif(path)
     outcomes: tuple[Outcome, ...]
@@ -147,7 +117,15 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
 
 def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
-    grey = read_grey(task.frames_folder / look.note.frame, task.camera)
+    cv2.setNumThreads(0)
+    path = task.frames_folder / look.note.frame
+    try:
+        grey = read_grey(path, task.camera)
+    except Rejection as rejection:
+        raise KgcpError(
+            f"{path}: could be read, and cannot any more ({rejection.detail}); put it back, and the"
+            " same command goes on"
+        ) from rejection
     found = {
         outcome.target: outcome
         for outcome in look.first.outcomes
@@ -166,6 +144,24 @@ def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
                 found[target.name] = seen
     outcomes = _merged(task, look, grey, found, considered)
     _draw(task, look.note.frame, grey, Examination(outcomes, tuple(considered)), look.expected)
+    return replace(look.first, outcomes=outcomes)
+
+
+def lost_frame(task: FrameTask, note: FrameNote, reason: Reason) -> FrameResult:
+    """Return the result of a frame that cannot be examined without the end of the process."""
+    outcomes = tuple(Miss(target.name, reason) for target in task.targets)
+    is_known = task.camera.time_reference is TimeReference.MIDDLE
+    return FrameResult(note.frame, note.time_s if is_known else None, Exif(), outcomes)
+
+
+def kept_frame(look: SecondLook, reason: Reason) -> FrameResult:
+    """Return the result of the first look, where the second one ended its process."""
+    outcomes = tuple(
+        replace(one, detail="; ".join(filter(None, (one.detail, f"second look: {reason}"))))
+        if isinstance(one, Miss)
+        else one
+        for one in look.first.outcomes
+    )
     return replace(look.first, outcomes=outcomes)
 
 
@@ -222,24 +218,3 @@ def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
     ring = next(target.ring for target in task.targets if target.name == outcome.target)
     common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
     return replace(outcome, common=common)
-
-
-_worker_task: FrameTask | None = None  # set once per process: sent with every frame it would cost
-
-
-def _start_worker(task: FrameTask) -> None:
-    global _worker_task  # noqa: PLW0603 - the only state a pool's initializer can leave behind
-    _worker_task = task
-    cv2.setNumThreads(0)  # the processes are the parallelism
-
-
-def _examine_in_worker(note: FrameNote) -> FrameResult:
-    if _worker_task is None:
-        raise RuntimeError("worker used before it was started")
-    return examine_frame(_worker_task, note)
-
-
-def _look_in_worker(look: SecondLook) -> FrameResult:
-    if _worker_task is None:
-        raise RuntimeError("worker used before it was started")
-    return examine_frame_again(_worker_task, look)

@@ -20,55 +20,73 @@ from kgcp.target.layout import Target
 from kgcp.target.observation import Miss, Observation, is_unreadable
 
 
+class Sightings:
+    """What all frames must know of each other for a second look: few numbers of every frame.
+
+    Parameters
+    ----------
+    targets : sequence of Target
+    frames : sequence of str
+
+    Attributes
+    ----------
+    frames : sequence of str
+    time_s : (n,) array
+        Mid-exposures [s]; NaN: not known.
+    states : mapping of str to (n, 3) array
+        By the target's name, as in `Track`.
+    is_readable, is_found : (n,) arrays of bool
+        Whether there is an image, and whether any target was measured in it.
+    """
+
+    def __init__(self, targets: Sequence[Target], frames: Sequence[str]) -> None:
+        self.frames = frames
+        self.time_s = np.full(len(frames), math.nan)
+        self.states = {target.name: np.full((len(frames), 3), math.nan) for target in targets}
+        self.is_readable = np.zeros(len(frames), dtype=np.bool_)
+        self.is_found = np.zeros(len(frames), dtype=np.bool_)
+
+    def add(self, row: int, result: FrameResult) -> None:
+        """Take what is needed from the result of a frame."""
+        self.time_s[row] = math.nan if result.time_s is None else result.time_s
+        self.is_readable[row] = not any(map(is_unreadable, result.outcomes))
+        for outcome in result.outcomes:
+            if isinstance(outcome, Observation):
+                self.is_found[row] = True
+                if outcome.instance == 0:
+                    self.states[outcome.target][row] = state_of(outcome)
+
+
 def expectations(
-    flight: Flight, results: Sequence[FrameResult]
-) -> tuple[list[dict[str, Expectation]], str | None]:
+    flight: Flight, sightings: Sightings
+) -> tuple[dict[int, dict[str, Expectation]], str | None]:
     """Return, for each frame, where its missing targets must be, as far as that is sure.
 
     Returns
     -------
-    expected : list of dict
-        By the target's name, one per result.
+    expected : dict of dict
+        By the frame's row and the target's name; rows of which nothing is expected are left out.
     problem : str or None
         What is wrong with reference poses or trajectory. To detect needs neither: it is no error.
     """
-    expected: list[dict[str, Expectation]] = [{} for _ in results]
+    expected: dict[int, dict[str, Expectation]] = {}
     problem = None
     for target in flight.targets:
-        track = _track(target, results)
-        if not 0 < track.is_found.sum() < len(results):
+        track = Track(sightings.time_s, sightings.states[target.name])
+        if not 0 < track.is_found.sum() < len(sightings.frames):
             continue
         states = None
         try:
-            states = _reference_states(flight, target, results)
+            states = _reference_states(flight, target, sightings)
         except KgcpError as error:
             problem = str(error)
-        for here, one in zip(expected, expect(track, states), strict=True):
+        for row, one in enumerate(expect(track, states)):
             if one is not None and one.is_sure:
-                here[target.name] = one
+                expected.setdefault(row, {})[target.name] = one
     return expected, problem
 
 
-def _track(target: Target, results: Sequence[FrameResult]) -> Track:
-    """Collect where a target was found; unreadable frames count as any others without it."""
-    track = Track(
-        np.array([math.nan if one.time_s is None else one.time_s for one in results]),
-        np.full((len(results), 3), math.nan),
-    )
-    for row, result in enumerate(results):
-        for outcome in result.outcomes:
-            if (
-                isinstance(outcome, Observation)
-                and outcome.target == target.name
-                and outcome.instance == 0
-            ):
-                track.state[row] = state_of(outcome)
-    return track
-
-
-def _reference_states(
-    flight: Flight, target: Target, results: Sequence[FrameResult]
-) -> FloatArray | None:
+def _reference_states(flight: Flight, target: Target, sightings: Sightings) -> FloatArray | None:
     """Return where the reference puts a target; None where there is no reference (yet)."""
     files = [flight.reference_file]
     if target.position_m is None:
@@ -80,8 +98,8 @@ def _reference_states(
         None
         if poses is None
         else reference_states(
-            [one.frame for one in results],
-            [one.time_s for one in results],
+            sightings.frames,
+            [None if math.isnan(time_s) else float(time_s) for time_s in sightings.time_s],
             target,
             poses,
             read_whereabouts(flight),

@@ -58,8 +58,6 @@ def test_only_times_that_are_used_count(
         frame(tmp_path, name, subsec)
     if times:
         (tmp_path / "frames.csv").write_text(f"frame,time\n{times}")
-    summary = detect_flight(
-        read_flight(tmp_path), DetectSettings(), tmp_path / "out", jobs=1, on_frame=lambda _: None
-    )
+    summary = detect_flight(read_flight(tmp_path), DetectSettings(), tmp_path / "out", jobs=0)
     assert summary.exif_times_in_whole_seconds == count
     assert summary.frames_without_time == 0

@@ -20,10 +20,11 @@ from kgcp.io.flight import read_flight
 from kgcp.io.simulated import write_simulated_flight
 from kgcp.io.tables import read_table
 from kgcp.settings import DetectSettings
-from kgcp.survey import SurveySummary, detect_flight
+from kgcp.survey import detect_flight
 from kgcp.synthetic.flight import plan_flight
 from kgcp.synthetic.imaging import Sensor
 from kgcp.synthetic.presets import preset
+from kgcp.tally import SurveySummary
 
 LEVEL = ("sd_time_s = ", "level_sd_deg = 2.0\nsd_time_s = ")
 FRAMES = 6
@@ -46,7 +47,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 1) -> SurveySummary:
+def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> SurveySummary:
     original = (folder / "flight.toml").read_text(encoding="utf-8")
     text = original
     for old, new in edits:
@@ -54,9 +55,7 @@ def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 1) -> S
         text = text.replace(old, new)
     (folder / "flight.toml").write_text(text, encoding="utf-8")
     try:
-        return detect_flight(
-            read_flight(folder), DetectSettings(), out, jobs=jobs, on_frame=lambda _: None
-        )
+        return detect_flight(read_flight(folder), DetectSettings(), out, jobs=jobs)
     finally:
         (folder / "flight.toml").write_text(original, encoding="utf-8")
 
@@ -122,7 +121,7 @@ def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_
         ('[[target]]\nname = "A"', '[[target]]\nsd_outer_diameter_m = 3e-4\nname = "A"'),
     )
     tables = []
-    for jobs in (1, 2):
+    for jobs in (0, 2):
         detect(flight, tmp_path / str(jobs), *edits, jobs=jobs)
         tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
     assert tables[0] == tables[1]
@@ -136,20 +135,19 @@ def test_a_second_look_finds_what_the_reference_promises(tiny: Path, tmp_path: P
             DetectSettings(is_guided=is_guided),
             tmp_path / f"{is_guided}{jobs}",
             jobs=jobs,
-            on_frame=lambda _: None,
         )
-        for is_guided, jobs in ((False, 1), (True, 1), (True, 2))
+        for is_guided, jobs in ((False, 0), (True, 0), (True, 2))
     }
-    first, second = (measured(tmp_path / name) for name in ("False1", "True1"))
+    first, second = (measured(tmp_path / name) for name in ("False0", "True0"))
     assert not first["guided"].any()
-    assert summaries[True, 1].guided == second["guided"].sum() == len(second) - len(first) >= 2
+    assert summaries[True, 0].guided == second["guided"].sum() == len(second) - len(first) >= 2
     truth = pd.read_csv(tiny / "truth.csv", index_col="frame")
     assert set(second.index) == set(truth.index[truth["present"] == 1])
     off_px = second[["x_px", "y_px"]].to_numpy() - truth.loc[second.index, ["x", "y"]].to_numpy()
     assert np.abs(off_px).max() < 0.2
-    tables = [(tmp_path / name / "detections.parquet").read_bytes() for name in ("True1", "True2")]
+    tables = [(tmp_path / name / "detections.parquet").read_bytes() for name in ("True0", "True2")]
     assert tables[0] == tables[1]
-    rows = read_table(tmp_path / "True1" / "detections.parquet", DETECTION_COLUMNS)
+    rows = read_table(tmp_path / "True0" / "detections.parquet", DETECTION_COLUMNS)
     details = rows.loc[rows["status"] != "measured", "detail"]
     assert details.str.contains("expected by the reference at").all()
 
@@ -169,7 +167,6 @@ def test_pictures_are_drawn_of_the_frames_asked_for(tiny: Path, tmp_path: Path) 
     detect_flight(
         *(read_flight(tiny), DetectSettings(), tmp_path / "out"),
         jobs=2,
-        on_frame=lambda _: None,
         debug=debug,
     )
     pictures = sorted(path.name for path in debug.folder.iterdir())
@@ -219,11 +216,11 @@ def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: P
         encoding="utf-8",
     )
     tables = []
-    for jobs in (1, 2):
+    for jobs in (0, 2):
         summary = detect(folder, tmp_path / str(jobs), jobs=jobs)
         tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
     assert tables[0] == tables[1]
-    table = read_table(tmp_path / "1" / "detections.parquet", DETECTION_COLUMNS)
+    table = read_table(tmp_path / "0" / "detections.parquet", DETECTION_COLUMNS)
     names = ["east/frame_0002.png", "frame_0000.png", "frame_0001.png", "frame_0003.png"]
     assert table["frame"].to_list() == names
     assert table["status"].to_list() == ["measured", "measured", "unreadable", "measured"]
@@ -231,7 +228,7 @@ def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: P
     assert table["time"].notna().all(), "from EXIF where the times file has none"
     assert (summary.frames, summary.times_without_frame) == (4, 1)
     assert summary.reasons == {"decode_failed": 1}
-    metadata = pq.read_schema(tmp_path / "1" / "detections.parquet").metadata
+    metadata = pq.read_schema(tmp_path / "0" / "detections.parquet").metadata
     assert metadata[b"kgcp.flight_toml"] == (folder / "flight.toml").read_bytes()
     settings = json.loads(metadata[b"kgcp.settings"])
     assert settings == asdict(DetectSettings())

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import flight_argument, json_option, out_option
 from kgcp.settings import DetectSettings, Method
-
-if TYPE_CHECKING:
-    from kgcp.survey import SurveySummary
 
 _DEFAULTS = DetectSettings()
 
@@ -21,9 +19,10 @@ _DEFAULTS = DetectSettings()
 @out_option
 @click.option(
     "--jobs",
-    type=click.IntRange(1, 256),
+    type=click.IntRange(0, 256),
     default=None,
-    help="Worker processes.  [default: the usable cores]",
+    help="Worker processes; 0 works in this one, which a broken decoder may end."
+    "  [default: the usable cores]",
 )
 @click.option(
     "--method",
@@ -75,6 +74,27 @@ _DEFAULTS = DetectSettings()
     show_default=True,
     help="Draw these frames only, for example 'east/*_01?.jpg'.",
 )
+@click.option(
+    "--restart",
+    "is_restart",
+    is_flag=True,
+    help="Begin anew, whatever a run that was interrupted has left.",
+)
+@click.option(
+    "--frame-timeout",
+    type=click.FloatRange(1.0),
+    metavar="S",
+    default=300.0,
+    show_default=True,
+    help="Give a frame up that takes longer than this [s].",
+)
+@click.option("--profile", "is_profiled", is_flag=True, help="Print the time per stage.")
+@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
+@click.option(
+    "--log-json",
+    is_flag=True,
+    help="Print progress and summary to stderr as one JSON object per line.",
+)
 @json_option
 def command(
     flight: Path,
@@ -86,8 +106,13 @@ def command(
     false_alarm: float,
     debug: Path | None,
     debug_frames: str,
+    frame_timeout: float,
     *,
     is_guided: bool,
+    is_restart: bool,
+    is_profiled: bool,
+    is_quiet: bool,
+    log_json: bool,
     as_json: bool,
 ) -> None:
     """Find and measure the target in every frame of FLIGHT.
@@ -95,22 +120,17 @@ def command(
     Writes FLIGHT/kgcp/detections.parquet: one row per frame and target, with the projected
     centre, the distance and the orientation, or the reason why there is none.
 
+    A run that was interrupted goes on where it stopped when the same command is given again.
+
     Example: kgcp detect sample_flight --jobs 2
     """
-    import time
-
     from kgcp.workers import use_one_core_each
 
     use_one_core_each()  # before numpy is loaded
 
-    from tqdm import tqdm
-
     from kgcp.examine import Debug
-    from kgcp.io.detections import FrameResult
     from kgcp.io.flight import read_flight
-    from kgcp.io.frames import list_frames
     from kgcp.survey import detect_flight
-    from kgcp.target.observation import Observation
     from kgcp.workers import usable_cores
 
     settings = DetectSettings(
@@ -122,66 +142,17 @@ def command(
     )
     the_flight = read_flight(flight)
     folder = out or the_flight.folder / "kgcp"
-    found: set[str] = set()
     start = time.perf_counter()
-    with tqdm(total=len(list_frames(the_flight.frames_folder)), unit="frame") as bar:
-
-        def advance(result: FrameResult) -> None:
-            if any(isinstance(outcome, Observation) for outcome in result.outcomes):
-                found.add(result.frame)
-            if bar.n == bar.total:  # a second look
-                bar.total += 1
-            bar.set_postfix(found=len(found), refresh=False)
-            bar.update()
-
+    with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
         summary = detect_flight(
             *(the_flight, settings, folder),
-            jobs=jobs or usable_cores(),
-            on_frame=advance,
+            jobs=usable_cores() if jobs is None else jobs,
+            watcher=log,
             debug=None if debug is None else Debug(debug, debug_frames),
+            is_restart=is_restart,
+            frame_timeout_s=frame_timeout,
         )
-    _report(summary, folder / "detections.parquet", time.perf_counter() - start, as_json=as_json)
-
-
-def _report(summary: SurveySummary, table: Path, seconds: float, *, as_json: bool) -> None:
-    frames_per_s = summary.frames / seconds
-    if as_json:
-        import json
-        from dataclasses import asdict
-
-        numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
-        click.echo(json.dumps({**numbers, "table": str(table)}))
-    counts = ", ".join(
-        f"{count} {status.replace('_', ' ')}" for status, count in summary.status.items()
-    )
-    click.echo(
-        f"{summary.frames} frames in {seconds:.1f} s ({frames_per_s:.1f}/s): {counts}", err=True
-    )
-    for reason, count in summary.reasons.items():
-        click.echo(f"  {count:6d} {reason}", err=True)
-    if summary.guided:
-        click.echo(f"{summary.guided} of them measured by a second look", err=True)
-    if summary.guide_problem is not None:
-        click.echo(f"no second look by the reference: {summary.guide_problem}", err=True)
-    if summary.frames_without_time:
-        click.echo(
-            f"{summary.frames_without_time} frames have no time: name a times file in flight.toml"
-            " ([frames] times) to make KGCPs of them",
-            err=True,
-        )
-    if summary.exif_times_in_whole_seconds:
-        click.echo(
-            f"{summary.exif_times_in_whole_seconds} frames have times from EXIF in whole seconds"
-            " only, in which a vehicle goes metres: name a times file in flight.toml"
-            " ([frames] times) to make KGCPs of them",
-            err=True,
-        )
-    if summary.frames_without_attitude:
-        click.echo(
-            f"{summary.frames_without_attitude} frames have no camera attitude, so that a level"
-            " plate does not tell their two poses apart: give [camera] plumb_sd_deg",
-            err=True,
-        )
-    if summary.times_without_frame:
-        click.echo(f"{summary.times_without_frame} times belong to no frame", err=True)
-    click.echo(f"wrote {table}", err=True)
+    seconds = time.perf_counter() - start
+    report(summary, folder / "detections.parquet", seconds, log, as_json=as_json)
+    if is_profiled:
+        report_stages(summary)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.io.columns import DETECTION_COLUMNS, Column, ColumnType
+from kgcp.io.wholefile import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +29,7 @@ _ARROW_TYPES = {
     ColumnType.NUMBERS: pa.list_(pa.float64()),
 }
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_ROWS_PER_GROUP = 4096  # of the file's row groups: so many are in memory at once
 
 
 def time_cell(time_s: float | None) -> datetime | None:
@@ -47,7 +49,7 @@ def write_table(
     columns : sequence of Column
         The declared columns; a row that lacks one or has others is a programming error.
     rows : iterable of mapping
-        Column name to value; None is null.
+        Column name to value; None is null. Only a part of them is in memory at a time.
     metadata : mapping of str
         Goes into the Parquet schema's key-value metadata.
 
@@ -56,26 +58,30 @@ def write_table(
     KgcpError
         If the file cannot be written.
     """
-    names = [column.name for column in columns]
-    cells: dict[str, list[Any]] = {name: [] for name in names}
-    for row in rows:
-        if row.keys() != cells.keys():
-            raise ValueError(f"row and columns differ in {sorted(row.keys() ^ cells.keys())}")
-        for name in names:
-            cells[name].append(row[name])
     schema = pa.schema(
         [pa.field(column.name, _ARROW_TYPES[column.type]) for column in columns],
         metadata={f"kgcp.{key}": value for key, value in metadata.items()},
     )
-    temporary = path.with_name(f".{path.name}.part")
+    remaining = iter(rows)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.table(cells, schema=schema), temporary)
-        temporary.replace(path)
+        with whole_file(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+            writer.write_table(_table(schema, islice(remaining, _ROWS_PER_GROUP)))
+            for row in remaining:
+                group = chain((row,), islice(remaining, _ROWS_PER_GROUP - 1))
+                writer.write_table(_table(schema, group))
     except OSError as error:
-        with suppress(OSError):  # where the folder itself is no folder
-            temporary.unlink()
         raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+
+
+def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:
+    cells: dict[str, list[Any]] = {name: [] for name in schema.names}
+    for row in rows:
+        if row.keys() != cells.keys():
+            raise ValueError(f"row and columns differ in {sorted(row.keys() ^ cells.keys())}")
+        for name, column in cells.items():
+            column.append(row[name])
+    return pa.table(cells, schema=schema)
 
 
 def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:

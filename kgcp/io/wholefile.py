@@ -2,9 +2,38 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary name in the folder of `path`; rename it at the end.
+
+    What was written is on the disk before it has its name, so that not even a power failure leaves
+    half a file. If anything is raised, the temporary file goes.
+
+    Raises
+    ------
+    OSError
+        If the file does not exist at the end, or cannot be renamed.
+    """
+    temporary = path.with_name(f".{path.name}.part")
+    with suppress(FileNotFoundError):
+        temporary.unlink()  # of a run that was killed, or a link to another place
+    try:
+        yield temporary
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):  # it may not exist, or its folder be gone
+            temporary.unlink()
+        raise
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -15,10 +44,9 @@ def write_bytes(path: Path, content: bytes) -> None:
     KgcpError
         If it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(content)
-        temporary.replace(path)
+        with whole_file(path) as temporary:
+            temporary.write_bytes(content)
     except OSError as error:
         raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error

@@ -67,7 +67,7 @@ def test_bad_frames_are_rows_among_the_good_ones(flight: Path) -> None:
     (frames / "text.jpg").write_text("not an image\n")
     (frames / "zero.png").touch()
     assert cv2.imwrite(str(frames / "tiny.png"), np.zeros((1, 1), np.uint8))
-    result = run("detect", str(flight), "--jobs", "1", "--json")
+    result = run("detect", str(flight), "--jobs", "0", "--json")
     assert result.exit_code == 0
     summary = json.loads(result.stdout)
     assert summary["frames"] == 7

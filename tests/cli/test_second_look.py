@@ -69,7 +69,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def detect(flight: Path, out: Path, *options: str) -> Result:
-    arguments = ["detect", str(flight), "--out", str(out), "--jobs", "1", "--json", *options]
+    arguments = ["detect", str(flight), "--out", str(out), "--jobs", "0", "--json", *options]
     return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
 

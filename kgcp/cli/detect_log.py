@@ -1,0 +1,157 @@
+"""What `kgcp detect` says on stderr: while it works, when it is stopped, at its end."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+    from kgcp.tally import SurveySummary
+
+_EXIT_SIGNAL = 128  # plus the signal's number, as shells count
+_JSON_PROGRESS_S = 1.0  # between two lines of progress
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: it stops the work as Ctrl-C does."""
+
+
+class Log:
+    """Progress as a bar, or as lines of JSON, or not at all.
+
+    Parameters
+    ----------
+    bar : tqdm
+        Disabled where it is not wanted.
+    is_quiet, as_json : bool
+    """
+
+    def __init__(self, bar: tqdm[NoReturn], *, is_quiet: bool, as_json: bool) -> None:
+        self._bar = bar
+        self.is_quiet, self.is_json = is_quiet, as_json
+        self._due_s = 0.0
+        self.done = self.total = 0
+
+    def note(self, text: str) -> None:
+        """Print a line."""
+        if self.is_json:
+            self.event("note", text=text)
+        elif not self.is_quiet:
+            self._bar.clear()
+            click.echo(f"kgcp: {text}", err=True)
+
+    def progress(self, done: int, total: int, found: int) -> None:
+        """Move the bar."""
+        self.done, self.total = done, total
+        self._bar.total = total
+        self._bar.set_postfix(found=found, refresh=False)
+        self._bar.update(done - self._bar.n)
+        if self.is_json and (time.monotonic() >= self._due_s or done == total):
+            self._due_s = time.monotonic() + _JSON_PROGRESS_S
+            self.event("progress", done=done, total=total, found=found)
+
+    def stop(self) -> None:
+        """Tell how far the work went, and how to go on."""
+        self._bar.close()
+        if self.is_json:
+            self.event("stopped", done=self.done, total=self.total)
+        else:
+            text = f"stopped; {self.done} of {self.total} looks at frames are done and kept"
+            click.echo(f"kgcp: {text}: the same command goes on", err=True)
+
+    def event(self, event: str, **values: object) -> None:
+        """Print a line of JSON."""
+        click.echo(json.dumps({"event": event, **values}), err=True)
+
+
+@contextmanager
+def log_to_stderr(*, is_quiet: bool, as_json: bool) -> Iterator[Log]:
+    """Show progress until the block ends."""
+    from tqdm import tqdm
+
+    with tqdm(unit="look", disable=is_quiet or as_json) as bar:
+        yield Log(bar, is_quiet=is_quiet, as_json=as_json)
+
+
+@contextmanager
+def stopping(log: Log) -> Iterator[None]:
+    """End the program, with a line on how to go on, when SIGINT or SIGTERM stops the block."""
+    previous = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
+        log.stop()
+        click.get_current_context().exit(_EXIT_SIGNAL + number)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001 - as signal calls it
+    raise Terminated
+
+
+def report(summary: SurveySummary, table: Path, seconds: float, log: Log, *, as_json: bool) -> None:
+    """Print what became of the frames; with `as_json` also to stdout."""
+    frames_per_s = (summary.frames - summary.kept) / seconds
+    numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
+    if as_json:
+        click.echo(json.dumps({**numbers, "table": str(table)}))
+    if log.is_json:
+        log.event("summary", **numbers, table=str(table))
+    elif not log.is_quiet:
+        _report_in_words(summary, seconds, frames_per_s)
+        click.echo(f"wrote {table}", err=True)
+
+
+def report_stages(summary: SurveySummary) -> None:
+    """Print the time per stage."""
+    for stage, seconds in summary.stages_s.items():
+        click.echo(f"{seconds:10.2f} s  {stage}", err=True)
+
+
+def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float) -> None:
+    counts = ", ".join(
+        f"{count} {status.replace('_', ' ')}" for status, count in summary.status.items()
+    )
+    click.echo(
+        f"{summary.frames} frames in {seconds:.1f} s ({frames_per_s:.1f}/s): {counts}", err=True
+    )
+    for reason, count in summary.reasons.items():
+        click.echo(f"  {count:6d} {reason}", err=True)
+    if summary.guided:
+        click.echo(f"{summary.guided} of them measured by a second look", err=True)
+    if summary.guide_problem is not None:
+        click.echo(f"no second look by the reference: {summary.guide_problem}", err=True)
+    if summary.frames_without_time:
+        click.echo(
+            f"{summary.frames_without_time} frames have no time: name a times file in flight.toml"
+            " ([frames] times) to make KGCPs of them",
+            err=True,
+        )
+    if summary.exif_times_in_whole_seconds:
+        click.echo(
+            f"{summary.exif_times_in_whole_seconds} frames have times from EXIF in whole seconds"
+            " only, in which a vehicle goes metres: name a times file in flight.toml"
+            " ([frames] times) to make KGCPs of them",
+            err=True,
+        )
+    if summary.frames_without_attitude:
+        click.echo(
+            f"{summary.frames_without_attitude} frames have no camera attitude, so that a level"
+            " plate does not tell their two poses apart: give [camera] plumb_sd_deg",
+            err=True,
+        )
+    if summary.times_without_frame:
+        click.echo(f"{summary.times_without_frame} times belong to no frame", err=True)

@@ -1,0 +1,59 @@
+"""`run.json`: about a run rather than about the flight, and the one file that differs each time."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numba
+import numpy as np
+import PIL
+import pyarrow as pa
+import scipy
+
+from kgcp import __version__
+from kgcp.io.wholefile import write_bytes
+
+_KB_PER_MB = 1024.0
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of kgcp, of Python, and of the libraries that results depend on."""
+    libraries = {"numpy": np, "scipy": scipy, "opencv": cv2, "numba": numba, "pillow": PIL}
+    return {
+        "kgcp": __version__,
+        "python": platform.python_version(),
+        **{name: str(module.__version__) for name, module in libraries.items()},
+        "pyarrow": str(pa.__version__),
+    }
+
+
+def write_run_record(path: Path, record: Mapping[str, object]) -> None:
+    """Write a run's record, with versions, the machine and the peak of memory, as JSON.
+
+    Parameters
+    ----------
+    path : Path
+    record : mapping
+        What the run has to say: settings, counts, times.
+
+    Raises
+    ------
+    KgcpError
+        If it cannot be written.
+    """
+    peaks = {"parent": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
+    whole = {
+        **record,
+        "versions": versions(),
+        "host": {"cores": os.cpu_count(), "system": platform.platform()},
+        "peak_memory_mb": {
+            name: resource.getrusage(who).ru_maxrss / _KB_PER_MB for name, who in peaks.items()
+        },
+    }
+    write_bytes(path, f"{json.dumps(whole, indent=1)}\n".encode())
