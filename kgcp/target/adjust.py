@@ -10,16 +10,18 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
+from kgcp.target.imaging import Imaging
 from kgcp.target.light import PARAM_COUNT, Light, Parameters, light_of_levels
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
 from kgcp.target.pairs import Blur
-from kgcp.target.sample import Imaging, Sample, choose_sample
+from kgcp.target.sample import Sample, choose_sample
 
 _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
 _SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.15, 0.4
 _NOISE_ROUNDS = 3
+_SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_GAIN = 4.0
 _NEGLIGIBLE = 1e-6
 _DAMPING = 1e-3
@@ -154,7 +156,7 @@ def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | 
     parameters = start
     for _ in range(_MAX_ROUNDS):
         pose, blur, light = parameters.pose, parameters.blur, parameters.light
-        sample = choose_sample(imaging, pose, blur, light, most)
+        sample = choose_sample(imaging, pose, blur, light, most=most, slack_px=_SLACK_PX)
         fit = _fit_with_noise(sample, parameters, unknowns, steps=_STEPS, enough=_LAST_GAIN)
         if _is_settled(parameters, fit):
             break

@@ -19,6 +19,7 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.adjust import Fit, Unknowns, adjust, approach, first_levels, minimise
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
+from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import PARAM_COUNT, Param, Parameters
 from kgcp.target.noise import find_censoring
@@ -26,12 +27,12 @@ from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
 from kgcp.target.prior import NormalPrior
-from kgcp.target.sample import Imaging, choose_sample
+from kgcp.target.sample import choose_sample
 from kgcp.target.verify import MAX_EDGE_NOISE, check_code, check_fit, check_precision, edge_noise
 from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
-_START_BLUR = Blur(0.5, 0.5, 0.0)
+_START_BLUR, _START_SLACK_PX = Blur(0.5, 0.5, 0.0), 1.5
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 _SPILT_PX = (0.7, 1.4)  # by which edges may be displaced
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
@@ -187,9 +188,12 @@ def _rough_fit(imaging: Imaging, pose: Pose) -> Fit:
 
 
 def _approach(imaging: Imaging, pose: Pose) -> Fit:
-    sample = choose_sample(imaging, pose, _START_BLUR, None, imaging.few_pixels)
-    start = Parameters(pose, _START_BLUR, first_levels(sample, pose, _START_BLUR))
-    return approach(sample, start, _unknowns(imaging.response, has_streak=False))
+    few = imaging.few_pixels
+    sample = choose_sample(imaging, pose, _START_BLUR, None, most=few)
+    light = first_levels(sample, pose, _START_BLUR)
+    sample = choose_sample(imaging, pose, _START_BLUR, light, most=few, slack_px=_START_SLACK_PX)
+    unknowns = _unknowns(imaging.response, has_streak=False)
+    return approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
 
 
 def _adjust_with_streak(imaging: Imaging, start: Parameters) -> Fit:

@@ -6,73 +6,27 @@ import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
-import cv2
 import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
-from kgcp.target.light import PARAM_COUNT, Imager, Light, plateau_levels
-from kgcp.target.noise import BoolArray, Censoring
+from kgcp.target.foreign import SeenPlate, hidden_pixels, reached_by_surroundings
+from kgcp.target.imaging import Imaging
+from kgcp.target.light import PARAM_COUNT, Imager, Light
+from kgcp.target.noise import Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
-from kgcp.target.plate import Circles, largest_metres_per_px, plate_points
+from kgcp.target.plate import largest_metres_per_px, plate_points
 from kgcp.target.sharpening import unsharp_mask
-from kgcp.target.window import Window
 
 _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
 _BORDER_RADII = 0.2  # … and how far it is looked for at most
-_CLEAR_SIGMAS = 2.6  # from the outer circle on, where the plate shows its own level
-_FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
-_FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
 _NEAR_SIGMAS, _NEAR_PX = 2.0, 0.3  # half width of the band around an edge that is used
 _SCALE_PIXELS = 100  # enough to see how the plate's scale varies
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
-_FEW_PIXELS = 600  # enough to come near the minimum, at a fraction of the time
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Imaging:
-    """What is known of the imaging, and of the plate, before the adjustment.
-
-    Attributes
-    ----------
-    window : Window
-    circles : Circles
-        All circles of the plate.
-    measured_count : int
-        The first so many of them are measured; of the others only what they add there is modelled.
-    outer_radius_m, outer_radius_px : float
-        Of the ring that is measured.
-    centre_px : (2,) array
-        Approximate, raw image.
-    focal_px : float
-        Mean principal distance.
-    censoring : Censoring
-        Of the whole window.
-    response : Response
-    sharpening_px : float
-        σ of the unsharp mask to be modelled [px]; 0: none.
-    """
-
-    window: Window
-    circles: Circles
-    measured_count: int
-    outer_radius_m: float
-    outer_radius_px: float
-    centre_px: FloatArray
-    focal_px: float
-    censoring: Censoring
-    response: Response
-    sharpening_px: float
-
-    @property
-    def few_pixels(self) -> int | None:
-        """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
-        return None if self.sharpening_px else _FEW_PIXELS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,12 +59,19 @@ class Sample:
 
 
 def choose_sample(
-    imaging: Imaging, pose: Pose, blur: Blur, light: Light | None, most: int | None = None
+    imaging: Imaging,
+    pose: Pose,
+    blur: Blur,
+    light: Light | None,
+    *,
+    most: int | None = None,
+    slack_px: float = 0.0,
 ) -> Sample:
     """Choose the pixels near edges, and a share of the plateaus; `most` of them, where given.
 
-    Beyond the outer circle only pixels that the surroundings of the plate do not reach by blur are
-    used: what is foreign is seen from the levels, once they are known (`light`).
+    Pixels that blur may mix with what is foreign are not used: surroundings of the plate,
+    and what hides a part of the target. It is seen from the levels, once they are known (`light`),
+    by a pose that may be off by `slack_px`.
 
     Pixels in the far tails of an edge say little about it but cost as much as any other, and they
     feel first what the model does not know; they are left out.
@@ -126,7 +87,8 @@ def choose_sample(
     points = plate_points(pose, window.rays)
     zone = _zones(imaging, points, blur, scale)
     if light is not None:
-        zone[_reached_by_surroundings(imaging, points, blur, light)] = _Zone.UNUSED
+        seen = SeenPlate(imaging, points, scale, blur, light)
+        zone[reached_by_surroundings(seen) | hidden_pixels(seen, slack_px)] = _Zone.UNUSED
     near, flat = np.flatnonzero(zone == _Zone.NEAR), np.flatnonzero(zone == _Zone.FLAT)
     index = np.concatenate((near, flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]))
     index.sort()
@@ -251,35 +213,3 @@ def _pairs(
         return pairs
     added = white_level(pose, rays, blur, replicas).value - 1.0
     return replace(pairs, background=pairs.background + added)
-
-
-def _reached_by_surroundings(
-    imaging: Imaging, points_m: FloatArray, blur: Blur, light: Light
-) -> BoolArray:
-    """Tell which pixels of the window blur may mix with something that is not plate.
-
-    Parameters
-    ----------
-    imaging : Imaging
-    points_m : (2, n) array
-        Where the pixels' rays meet the plate.
-    blur : Blur
-    light : Light
-    """
-    window = imaging.window
-    size = (window.height, window.width)
-    black, white = plateau_levels(light, imaging.response)
-    contrast, white = white - black, min(white, 1.0)
-    beyond = np.hypot(*points_m) / imaging.outer_radius_m - 1.0
-    seen = cv2.medianBlur(window.levels.reshape(size).astype(np.float32), 3).ravel()
-    outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
-    foreign = outside & (np.abs(seen - white) > _FOREIGN_CONTRAST * contrast)
-    reach = _FOREIGN_SIGMAS * blur.largest_sd_px
-    half = int(np.ceil(reach))
-    columns, rows = np.meshgrid(*2 * [np.arange(-half, half + 1)])
-    xx, yy, xy = blur.total_covariance
-    determinant = xx * yy - xy * xy
-    distance2 = (yy * columns**2 - 2.0 * xy * columns * rows + xx * rows**2) / determinant
-    kernel = (distance2 <= _FOREIGN_SIGMAS**2).astype(np.uint8)
-    reached = cv2.dilate(foreign.reshape(size).astype(np.uint8), kernel)
-    return np.asarray((reached.ravel() > 0) & (beyond > -2.0 * reach / imaging.outer_radius_px))

@@ -15,11 +15,11 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.synthetic.flight import TARGET_PLATE
 from kgcp.synthetic.imaging import Optics, Sensor
 from kgcp.synthetic.plate import Plate, image_plate
+from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Ring, Target
 from kgcp.target.noise import find_censoring
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.plate import circles_of
-from kgcp.target.sample import Imaging
 from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 SUBPIXELS = 4

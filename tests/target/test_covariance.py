@@ -15,9 +15,9 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.adjust import Fit
 from kgcp.target.covariance import pose_covariance, propagate
+from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.model import fit_both_poses
-from kgcp.target.sample import Imaging
 
 PlacePlate = Callable[..., Pose]
 DRAWS = 4000

@@ -14,11 +14,12 @@ from kgcp.geometry.pose import Pose
 from kgcp.synthetic.imaging import Optics, Sensor
 from kgcp.synthetic.plate import Plate, PlateImage, image_plate
 from kgcp.synthetic.shapes import ConvexPolygon, regular_polygon
+from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import Light
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import plate_points
-from kgcp.target.sample import Imaging, Sample, choose_sample
+from kgcp.target.sample import Sample, choose_sample
 
 PlacePlate = Callable[..., Pose]
 ImagingOf = Callable[..., Imaging]

@@ -14,10 +14,10 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit
 from kgcp.target.covariance import propagate
+from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.model import fit_both_poses
 from kgcp.target.observation import Appearance, Observation
-from kgcp.target.sample import Imaging
 from kgcp.target.verify import check_code, check_fit, check_precision
 
 PlacePlate = Callable[..., Pose]

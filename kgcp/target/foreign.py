@@ -1,0 +1,158 @@
+"""What is not the target: surroundings of its plate, and what hides a part of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from kgcp.compiled import compiled
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.target.imaging import Imaging
+from kgcp.target.light import Light, plateau_levels
+from kgcp.target.noise import BoolArray
+from kgcp.target.pairs import Blur
+
+_CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
+_FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
+_FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
+_HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
+_NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
+_NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
+_HIDDEN_SIGMAS = 4.0  # from there through the next edge
+_MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
+_DOT_AREAS = 1.5  # larger than a dot, with what blur adds to it
+_SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPlate:
+    """A window under an approximate pose, blur and light.
+
+    Attributes
+    ----------
+    imaging : Imaging
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
+    metres_per_px : float
+        Largest length on the plate that a pixel spans.
+    blur : Blur
+    light : Light
+    """
+
+    imaging: Imaging
+    points_m: FloatArray
+    metres_per_px: float
+    blur: Blur
+    light: Light
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the window."""
+        return self.imaging.window.height, self.imaging.window.width
+
+    def smooth(self) -> FloatArray:
+        """Return the grey values (n,), median of three by three."""
+        levels = self.imaging.window.levels.reshape(self.shape).astype(np.float32)
+        return cv2.medianBlur(levels, 3).ravel()
+
+    def levels(self) -> tuple[float, float]:
+        """Return the grey values of ink and plate."""
+        return plateau_levels(self.light, self.imaging.response)
+
+    def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
+        """Return pixels (n,) with all that a kernel around them covers."""
+        reached = cv2.dilate(pixels.reshape(self.shape).astype(np.uint8), kernel)
+        return np.asarray(reached.ravel() > 0)
+
+
+def reached_by_surroundings(seen: SeenPlate) -> BoolArray:
+    """Tell which pixels (n,) of the window blur may mix with something that is not plate."""
+    imaging, blur = seen.imaging, seen.blur
+    black, white = seen.levels()
+    contrast, white = white - black, min(white, 1.0)
+    beyond = np.hypot(*seen.points_m) / imaging.outer_radius_m - 1.0
+    outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
+    foreign = outside & (np.abs(seen.smooth() - white) > _FOREIGN_CONTRAST * contrast)
+    reach = _FOREIGN_SIGMAS * blur.largest_sd_px
+    half = int(np.ceil(reach))
+    columns, rows = np.meshgrid(*2 * [np.arange(-half, half + 1)])
+    xx, yy, xy = blur.total_covariance
+    determinant = xx * yy - xy * xy
+    distance2 = (yy * columns**2 - 2.0 * xy * columns * rows + xx * rows**2) / determinant
+    kernel = (distance2 <= _FOREIGN_SIGMAS**2).astype(np.uint8)
+    reached = seen.dilated(foreign, kernel)
+    return np.asarray(reached & (beyond > -2.0 * reach / imaging.outer_radius_px))
+
+
+def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
+    """Tell which pixels (n,) of the window show something else than ink and plate.
+
+    By levels that are neither where it is flat, and by edges that are not there: grey values
+    just beside one that are like those beyond it. The pose may be off by `slack_px`.
+    """
+    imaging, sd_px = seen.imaging, seen.blur.largest_sd_px
+    count = seen.points_m.shape[1]
+    share, off_edge = np.ones(count), np.full(count, np.inf)
+    circles, per_px = imaging.circles, 1.0 / seen.metres_per_px
+    small_m = _SMALL_SIGMAS * sd_px * seen.metres_per_px
+    _fill_plateaus(
+        seen.points_m, circles.centres_m, circles.radii_m, circles.signs, small_m, share, off_edge
+    )
+    off_edge = off_edge * per_px - slack_px
+    beyond = (np.hypot(*seen.points_m) - imaging.outer_radius_m) * per_px - slack_px
+    black, white = seen.levels()
+    contrast = min(white, 1.0) - black
+    off_level = np.abs(seen.smooth() - (black + contrast * share))
+    tested = (off_edge > _CLEAR_SIGMAS * sd_px) & (beyond < 0.0)
+    other = tested & (off_level > _HIDDEN_CONTRAST * contrast)
+    near = (off_edge > _NO_EDGE_SIGMAS * sd_px) & (beyond < _NO_EDGE_OUTSIDE_SIGMAS * sd_px)
+    other |= near & (off_level > _NO_EDGE_CONTRAST * contrast)
+    other = _without_dots(seen, other)
+    found = int(np.count_nonzero(other))
+    if not found or found > _MAX_HIDDEN * np.count_nonzero(tested | near):
+        return np.zeros(count, dtype=bool)
+    half = math.ceil(_HIDDEN_SIGMAS * sd_px + slack_px)
+    size = (2 * half + 1, 2 * half + 1)
+    return seen.dilated(other, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size).astype(np.uint8))
+
+
+def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
+    """Leave out what may be a dot too many or too few: it lies in the ring, and is no larger.
+
+    That speaks of another code, and must not be overlooked.
+    """
+    radii_m = seen.imaging.circles.radii_m
+    _, labels = cv2.connectedComponents(other.reshape(seen.shape).astype(np.uint8))
+    rho_m = np.hypot(*seen.points_m)
+    beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
+    area_px = np.bincount(labels.ravel())
+    dot_px = math.pi * (radii_m[2] / seen.metres_per_px) ** 2
+    hides = (np.bincount(labels.ravel(), weights=beside) > 0) | (area_px > _DOT_AREAS * dot_px)
+    hides[0] = False
+    return np.asarray(hides[labels.ravel()])
+
+
+@compiled
+def _fill_plateaus(
+    points_m: FloatArray,
+    centres_m: FloatArray,
+    radii_m: FloatArray,
+    signs: FloatArray,
+    small_m: float,
+    share: FloatArray,
+    off_edge_m: FloatArray,
+) -> None:
+    """Fill in the white share without blur, and the distance to the nearest edge or small disc."""
+    for i in range(points_m.shape[1]):
+        for c in range(len(radii_m)):
+            dx, dy = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+            inward = radii_m[c] - math.sqrt(dx * dx + dy * dy)
+            if inward > 0.0:
+                share[i] += signs[c]
+            off = abs(inward)
+            if inward > 0.0 and radii_m[c] < small_m:
+                off = 0.0
+            off_edge_m[i] = min(off_edge_m[i], off)

@@ -1,0 +1,54 @@
+"""What is known of the imaging, and of the plate, before the adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Response
+from kgcp.target.noise import Censoring
+from kgcp.target.plate import Circles
+from kgcp.target.window import Window
+
+_FEW_PIXELS = 600  # enough to come near the minimum, at a fraction of the time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imaging:
+    """A window with a target in it, and what it is seen with.
+
+    Attributes
+    ----------
+    window : Window
+    circles : Circles
+        All circles of the plate.
+    measured_count : int
+        The first so many of them are measured; of the others only what they add there is modelled.
+    outer_radius_m, outer_radius_px : float
+        Of the ring that is measured.
+    centre_px : (2,) array
+        Approximate, raw image.
+    focal_px : float
+        Mean principal distance.
+    censoring : Censoring
+        Of the whole window.
+    response : Response
+    sharpening_px : float
+        σ of the unsharp mask to be modelled [px]; 0: none.
+    """
+
+    window: Window
+    circles: Circles
+    measured_count: int
+    outer_radius_m: float
+    outer_radius_px: float
+    centre_px: FloatArray
+    focal_px: float
+    censoring: Censoring
+    response: Response
+    sharpening_px: float
+
+    @property
+    def few_pixels(self) -> int | None:
+        """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
+        return None if self.sharpening_px else _FEW_PIXELS
