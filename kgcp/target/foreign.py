@@ -56,7 +56,7 @@ class SeenPlate:
     def smooth(self) -> FloatArray:
         """Return the grey values (n,), median of three by three."""
         levels = self.imaging.window.levels.reshape(self.shape).astype(np.float32)
-        return cv2.medianBlur(levels, 3).ravel()
+        return np.asarray(cv2.medianBlur(levels, 3).ravel(), dtype=np.float64)
 
     def levels(self) -> tuple[float, float]:
         """Return the grey values of ink and plate."""

@@ -205,9 +205,8 @@ def _adjust_with_streak(imaging: Imaging, start: Parameters) -> Fit:
         if streak is None:
             return best
     unknowns = _unknowns(imaging.response, has_streak=True)
-    near = adjust(
-        imaging, Parameters(start.pose, streak, start.light), unknowns, imaging.few_pixels
-    )
+    streaked = Parameters(start.pose, streak, start.light)
+    near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
     return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
 

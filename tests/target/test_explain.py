@@ -51,7 +51,7 @@ def test_a_ring_whose_dots_have_gone_is_too_blurred(
     bare: Target, camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
 ) -> None:
     pose = place_plate((240.0, 180.0), 14.0, turn_deg=30.0)
-    found = miss(draw_frame((bare, pose), blur_px=4.6), camera, bare)
+    found = miss(draw_frame((bare, pose), blur_px=4.2), camera, bare)
     assert found.reason is Reason.TOO_BLURRED
 
 
