@@ -148,12 +148,12 @@ class Reason(StrEnum):
     WORKER_DIED = (
         "worker_died",
         Status.UNREADABLE,
-        "the process that examined the frame died, twice: out of memory, or a decoder's crash",
+        "the process that examined the frame died, repeatedly: memory ran out, or a decoder crashed",
     )
     TIMED_OUT = (
         "timed_out",
         Status.UNREADABLE,
-        "the frame took longer than `--frame-timeout`, twice",
+        "the frame took longer than `--frame-timeout`, also alone",
     )
 
 

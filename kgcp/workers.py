@@ -29,6 +29,7 @@ Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _STARTS = 3  # of a process, before it counts as impossible
+_TRIES = 2  # of an item alone: the first death may have come before its turn
 
 
 def usable_cores() -> int:
@@ -152,7 +153,7 @@ def careful_map(
     """Yield every item with `function(item)`, as they come; few are in memory at a time.
 
     Where a process dies, what was under way is done again, one by one. An item whose process dies
-    then, too, is lost, and none but this one.
+    twice then is lost, and so is one that takes too long: these, and no other.
 
     Parameters
     ----------
@@ -219,16 +220,20 @@ def _one_by_one(
     pool = None
     try:
         for item in items:
-            pool = pool or _ready(start)
-            began_s = time.monotonic()
-            future = _submitted(pool, function, item)
-            if _is_broken(future):
+            for _ in range(_TRIES):
+                pool = pool or _ready(start)
+                began_s = time.monotonic()
+                future = _submitted(pool, function, item)
+                if not _is_broken(future):
+                    yield item, future.result()
+                    break
                 pool.shutdown(wait=True, cancel_futures=True)
                 pool = None
-                is_late = time.monotonic() - began_s >= limit_s
-                yield item, Loss.LATE if is_late else Loss.DIED
+                if time.monotonic() - began_s >= limit_s:
+                    yield item, Loss.LATE
+                    break
             else:
-                yield item, future.result()
+                yield item, Loss.DIED
     finally:
         if pool is not None:
             pool.shutdown(wait=True, cancel_futures=True)
