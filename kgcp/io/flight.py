@@ -96,13 +96,7 @@ def read_flight(folder: Path) -> Flight:
         is unknown, missing or of the wrong type, a value impossible, or the frames' folder, the
         times file or the calibration file does not exist.
     """
-    path = folder / "flight.toml"
-    text = _read_text(path)
-    try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
-    table = TomlTable(f"{path}:", values, FLIGHT_KEYS)
+    table, text = _read_toml(folder / "flight.toml")
     frames_folder, times_file, times_format = _read_frames(table, folder)
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
@@ -130,6 +124,42 @@ def read_flight(folder: Path) -> Flight:
         reference_notation=reference_notation,
         toml_text=text,
     )
+
+
+def read_printed_targets(folder: Path) -> tuple[Target, ...]:
+    """Read the targets alone: of a flight that has no frames yet, nor perhaps a camera.
+
+    Raises
+    ------
+    KgcpError
+        As `read_flight`, for what is wrong with the targets.
+    """
+    return read_targets(_read_toml(folder / "flight.toml")[0])
+
+
+def read_camera_and_targets(
+    folder: Path,
+) -> tuple[Camera, CalibrationCovariance | None, tuple[Target, ...]]:
+    """Read the camera, how well it is known, and the targets of a flight without frames yet.
+
+    Raises
+    ------
+    KgcpError
+        As `read_flight`, for what is wrong with them.
+    """
+    table, _ = _read_toml(folder / "flight.toml")
+    camera = table.table("camera", CAMERA_KEYS)
+    return read_camera(camera, folder), read_calibration_covariance(camera), read_targets(table)
+
+
+def _read_toml(path: Path) -> tuple[TomlTable, str]:
+    """Return the whole file as a table, and as text."""
+    text = _read_text(path)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
+    return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
 
 
 def _read_text(path: Path) -> str:

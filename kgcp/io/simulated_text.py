@@ -6,16 +6,15 @@ import json
 from collections.abc import Iterator
 
 from kgcp.geometry.camera import Camera
+from kgcp.io.target_text import target_lines
 from kgcp.settings import VehicleSettings
 from kgcp.synthetic.flight import CRS, TARGET_PLATE, FlightPlan
-from kgcp.target.layout import Ring
 
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 def flight_toml(plan: FlightPlan) -> str:
     """Return flight.toml by docs/conventions.md."""
-    target = TARGET_PLATE.target
     lines = [
         f"name = {json.dumps(plan.settings.name)}",
         f"crs = {json.dumps(CRS)}  # x, y: easting, northing [m]; z: ellipsoidal height [m]",
@@ -23,8 +22,7 @@ def flight_toml(plan: FlightPlan) -> str:
         'folder = "frames"',
         'times = "frames.csv"',
         *_camera_lines(plan.settings.camera),
-        *_ring_lines(target.ring),
-        *(line for ring in target.replicas for line in _replica_lines(ring, target.ring)),
+        *target_lines(TARGET_PLATE.target),
         *_vehicle_lines(plan.vehicle),
         "\n[reference]",
         'poses = "reference.csv"',
@@ -42,28 +40,6 @@ def _camera_lines(camera: Camera) -> Iterator[str]:
         if value := getattr(camera, key):
             yield f"{key} = {value!r}"
     yield f"response = {json.dumps(camera.response.value)}"
-
-
-def _ring_lines(ring: Ring) -> Iterator[str]:
-    yield "\n[[target]]"
-    yield f"name = {json.dumps(ring.name)}"
-    yield f"outer_diameter_m = {ring.outer_diameter_m!r}"
-    yield f"inner_diameter_m = {ring.inner_diameter_m!r}"
-    yield f"code_diameter_m = {ring.code_diameter_m!r}"
-    yield f"dot_diameter_m = {ring.dot_diameter_m!r}"
-    yield _code_line(ring)
-
-
-def _replica_lines(replica: Ring, ring: Ring) -> Iterator[str]:
-    yield "\n[[target]]"
-    yield f"name = {json.dumps(replica.name)}"
-    yield f"replica_of = {json.dumps(ring.name)}"
-    yield f"scale = {replica.outer_diameter_m / ring.outer_diameter_m:.12g}"
-    yield _code_line(replica)
-
-
-def _code_line(ring: Ring) -> str:
-    return f"code_deg = [{', '.join(f'{angle:g}' for angle in ring.code_deg)}]"
 
 
 def _vehicle_lines(vehicle: VehicleSettings) -> Iterator[str]:

@@ -1,0 +1,184 @@
+"""`kgcp target`: targets to be printed, of a flight or with new codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kgcp.cli.options import json_option
+
+# Named here, not imported, because the modules that know them take numpy; a test compares.
+FORMATS = ("pdf", "svg", "dxf", "png")
+PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
+
+
+@click.command()
+@click.argument("flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), required=False)
+@click.option("--target", "names", metavar="NAME", multiple=True, help="Only this one of FLIGHT.")
+@click.option(
+    "--new",
+    "new_count",
+    type=click.IntRange(1, 50),
+    help="Propose so many new targets with codes as far apart as possible.",
+)
+@click.option(
+    "--code",
+    "codes",
+    metavar="DEG,DEG,…",
+    multiple=True,
+    help="A new target with dots in these directions.",
+)
+@click.option(
+    "--diameter",
+    "diameter_m",
+    metavar="M",
+    type=click.FloatRange(0.0, 100.0, min_open=True),
+    help="Outer diameter of new targets [m].  [default: that of FLIGHT's first]",
+)
+@click.option(
+    "--dots",
+    type=click.IntRange(3, 6),
+    default=4,
+    show_default=True,
+    help="Dots of proposed codes.",
+)
+@click.option(
+    "--format",
+    "formats",
+    type=click.Choice(FORMATS),
+    multiple=True,
+    default=("pdf",),
+    show_default=True,
+    help="What to write; may be given several times.",
+)
+@click.option(
+    "--sheet",
+    "paper",
+    type=click.Choice(PAPERS),
+    default="fit",
+    show_default=True,
+    help="Paper; 'fit' is as large as the target needs.",
+)
+@click.option(
+    "--tiled", "is_tiled", is_flag=True, help="Use several sheets where one is too small."
+)
+@click.option(
+    "--plate",
+    "plate_m",
+    metavar="M",
+    type=click.FloatRange(0.0, 100.0, min_open=True),
+    help="Draw the outline of a square plate of this width [m].",
+)
+@click.option("--round", "is_round", is_flag=True, help="The plate is round.")
+@click.option(
+    "--holes",
+    "hole_mm",
+    metavar="MM",
+    type=click.FloatRange(0.0, 1000.0, min_open=True),
+    help="Mark four mounting holes of this diameter on the plate [mm].",
+)
+@click.option(
+    "--dpi",
+    type=click.IntRange(20, 2400),
+    default=300,
+    show_default=True,
+    help="Resolution of PNG.",
+)
+@click.option(
+    "--out",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Where to put the files.  [default: FLIGHT/kgcp/targets, or targets without FLIGHT]",
+)
+@json_option
+def command(
+    flight: Path | None,
+    names: tuple[str, ...],
+    *,
+    new_count: int | None,
+    codes: tuple[str, ...],
+    diameter_m: float | None,
+    dots: int,
+    formats: tuple[str, ...],
+    paper: str,
+    plate_m: float | None,
+    hole_mm: float | None,
+    dpi: int,
+    out: Path | None,
+    is_tiled: bool,
+    is_round: bool,
+    as_json: bool,
+) -> None:
+    r"""Draw targets at true scale, to be printed, cut or engraved.
+
+    Without --new and --code: those of FLIGHT's flight.toml. With them: new ones, whose codes
+    cannot be confused with each other nor with those of FLIGHT, if it is given. targets.toml has
+    the tables for flight.toml.
+
+    \b
+    Examples:
+      kgcp target sample_flight --format pdf --format dxf --plate 1.2 --holes 8
+      kgcp target --new 6 --diameter 0.15 --sheet A4
+    """
+    import warnings
+
+    from kgcp.errors import KgcpWarning, SettingError
+    from kgcp.io.flight import read_printed_targets
+    from kgcp.io.sheets.write import check_stems, write_sheets
+    from kgcp.io.target_text import write_target_tables
+    from kgcp.printing.artwork import Plate, draw_target
+    from kgcp.printing.codes import LEAST_DISTANCE, least_apart
+    from kgcp.printing.new import chosen_targets, new_targets
+    from kgcp.printing.sheets import Paper, lay_out
+
+    is_new = bool(new_count or codes)
+    if flight is None and not is_new:
+        flight = Path()
+    if (is_round or hole_mm is not None) and plate_m is None:
+        raise SettingError("plate", "is missing beside --round or --holes", "give its width")
+    known = () if flight is None else read_printed_targets(flight)
+    if is_new:
+        targets = new_targets(known, diameter_m, codes, new_count or 0, dots)
+    else:
+        targets = chosen_targets(known, names)
+    check_stems([target.name for target in targets])
+    plate = None if plate_m is None else Plate(1e3 * plate_m, is_round, hole_mm)
+    layouts = [
+        lay_out(draw_target(target, plate), target.name, Paper(paper), is_tiled=is_tiled)
+        for target in targets
+    ]
+    folder = out or (Path("targets") if flight is None else flight / "kgcp" / "targets")
+    files = [
+        path
+        for target, sheets in zip(targets, layouts, strict=True)
+        for path in write_sheets(sheets, target.name, folder, formats, dpi)
+    ]
+    files.append(write_target_tables(targets, folder))
+    apart = least_apart([target.ring for target in dict.fromkeys((*targets, *known))])
+    if apart < LEAST_DISTANCE:
+        warnings.warn(
+            f"turned or mirrored, codes are only {apart:.1f} dots apart: a dirty dot may give one"
+            " target the heading or the name of another; --new proposes better ones",
+            KgcpWarning,
+            stacklevel=2,
+        )
+    if as_json:
+        import json
+
+        summary = {
+            "targets": [
+                {"name": target.name, "code_deg": target.ring.code_deg, "sheets": len(sheets)}
+                for target, sheets in zip(targets, layouts, strict=True)
+            ],
+            "dots_apart": apart,
+            "files": [str(path) for path in files],
+        }
+        click.echo(json.dumps(summary))
+    for target, sheets in zip(targets, layouts, strict=True):
+        code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
+        click.echo(f"{target.name}: code [{code}], {len(sheets)} sheet(s)", err=True)
+    click.echo(f"codes at least {apart:.1f} dots apart, turned or mirrored", err=True)
+    for path in files:
+        click.echo(f"wrote {path}", err=True)

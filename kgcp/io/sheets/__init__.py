@@ -1,0 +1,1 @@
+"""Sheets of paper as files at true scale: PDF, SVG, DXF and PNG."""
