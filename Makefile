@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-accuracy bench-search sample-flight clean
+.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search torture sample-flight clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -45,6 +45,13 @@ PHOTOS := ../shared/real
 bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed, wrong (half an hour)
 	$(BIN)/python -m benchmarks.search $(BENCH)
 	$(BIN)/python -m benchmarks.false_alarms $(PHOTOS)
+
+bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (half an hour)
+	$(PIP) --editable '.[aat]'
+	$(BIN)/python -m benchmarks.aat_benefit --figure docs/aat_benefit.png $(BENCH)
+
+torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames (a quarter of an hour)
+	$(BIN)/python -m benchmarks.torture $(BENCH)
 
 sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
 	rm -rf sample_flight
