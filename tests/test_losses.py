@@ -56,8 +56,8 @@ def long_pool(jobs: int) -> Executor:
 def broken_pool(jobs: int) -> Executor:
     """A pool whose processes do not live to see their first item."""
     executor = LocalPool(jobs, LIMIT_S)
-    executor._initializer = os._exit  # type: ignore[attr-defined]
-    executor._initargs = (1,)  # type: ignore[attr-defined]
+    executor._initializer = os._exit
+    executor._initargs = (1,)
     return executor
 
 

@@ -27,8 +27,6 @@ from kgcp.target.observation import (
     Uncertainty,
 )
 
-MAKING = {"the settings": "a", "the camera": "b"}
-
 numbers = st.floats(width=64)
 maybe = st.none() | numbers
 
@@ -84,8 +82,9 @@ def result(frame: str) -> FrameResult:
     return FrameResult(frame, 0.1, Exif(), (Miss("A", Reason.CUT, "ü\n"),))
 
 
-def open_journal(folder: Path, *, is_new: bool = False, **making: str) -> Journal:
-    return Journal(folder / "journal", {**MAKING, **making}, is_new=is_new)
+def open_journal(folder: Path, *, is_new: bool = False, camera: str = "b") -> Journal:
+    making = {"the settings": "a", "the camera": camera}
+    return Journal(folder / "journal", making, is_new=is_new)
 
 
 @settings(max_examples=40, deadline=None)
@@ -130,11 +129,11 @@ def test_results_are_found_by_those_who_come_later(tmp_path: Path) -> None:
 def test_only_what_was_made_alike_is_kept(tmp_path: Path) -> None:
     with open_journal(tmp_path) as journal:
         journal.add("key", result("a"))
-    with open_journal(tmp_path, **{"the camera": "c"}) as journal:
+    with open_journal(tmp_path, camera="c") as journal:
         assert journal.changes == ("the camera",)
         assert "key" not in journal
         journal.add("key", result("b"))
-    with open_journal(tmp_path, **{"the camera": "c"}) as journal:
+    with open_journal(tmp_path, camera="c") as journal:
         assert journal.changes == ()
         assert journal.read("key").frame == "b"
     with open_journal(tmp_path, is_new=True) as journal:

@@ -1,0 +1,105 @@
+"""`kgcp detect` stopped by a signal, and what it says as it works."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+
+FRAMES = 40
+FLIGHT = """\
+[camera]
+width = 640
+height = 480
+fx = 800.0
+fy = 800.0
+cx = 320.0
+cy = 240.0
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames of rough ground: many, so that a run can be stopped in their midst."""
+    folder = tmp_path_factory.mktemp("stopping")
+    (folder / "frames").mkdir()
+    (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
+    rng = np.random.default_rng(3)
+    for number in range(FRAMES):
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)), (0, 0), 1.0 + number % 3)
+        assert cv2.imwrite(str(folder / "frames" / f"{number:02d}.jpg"), noise.astype(np.uint8))
+    return folder
+
+
+def run(flight: Path, out: Path, *options: str) -> Result:
+    arguments = ["detect", str(flight), "--out", str(out), "--jobs", "0", *options]
+    return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "jobs"), [(signal.SIGINT, 130, "2"), (signal.SIGTERM, 143, "0")]
+)
+def test_a_signal_stops_the_run_and_the_same_command_goes_on(
+    number: signal.Signals, code: int, jobs: str, flight: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "kgcp", "detect", str(flight), "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [*command, "--jobs", jobs, "--log-json"], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        lines = []
+        for line in process.stderr:
+            lines.append(line)
+            if json.loads(line).get("done", 0) >= 1:
+                break
+        process.send_signal(number)
+        lines += process.stderr
+        assert process.wait() == code
+    events = [json.loads(line) for line in lines]
+    assert {event["event"] for event in events[:-1]} == {"progress"}
+    assert (events[-1]["event"], events[-1]["total"]) == ("stopped", FRAMES)
+    done = events[-1]["done"]
+    assert 1 <= done < FRAMES
+    result = run(flight, tmp_path)
+    assert result.exit_code == 0
+    assert f"kgcp: going on with an interrupted run: {done} of {FRAMES} frames are" in result.stderr
+    assert f"{FRAMES} frames in" in result.stderr
+
+
+def test_what_is_said_can_be_chosen(flight: Path, tmp_path: Path) -> None:
+    quiet = run(flight, tmp_path / "a", "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    told = run(flight, tmp_path / "b", "--log-json", "--restart", "--json")
+    events = [json.loads(line) for line in told.stderr.splitlines()]
+    assert [event["event"] for event in events[-2:]] == ["progress", "summary"]
+    assert events[-1]["reasons"] == json.loads(told.stdout)["reasons"]
+    profiled = run(flight, tmp_path / "c", "--profile")
+    for stage in ("preparation", "first look", "table"):
+        assert f" s  {stage}\n" in profiled.stderr
+
+
+def test_the_run_is_recorded_beside_the_table(flight: Path, tmp_path: Path) -> None:
+    run(flight, tmp_path, "--min-radius", "8")
+    record = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    assert record["frames"] == sum(record["status"].values()) == FRAMES
+    assert record["settings"]["min_radius_px"] == 8.0
+    assert record["versions"].keys() >= {"kgcp", "python", "numpy", "opencv"}
+    assert record["host"]["cores"] >= 1
+    assert 50.0 < record["peak_memory_mb"]["parent"] < 5000.0
+    assert record["stages_s"]["first look"] > 0.0
