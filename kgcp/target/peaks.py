@@ -21,6 +21,8 @@ _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 1
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around
 
+_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 250, 1000  # of the pixels; in small images
+
 _Row = npt.NDArray[np.generic]
 
 
@@ -29,7 +31,7 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
 
     The score is core - disc + surround - disc, of the means of 3 x 3, 5 x 5 and, less at its
     corners, 7 x 7 pixels. It must be a maximum, of some grey values, and at least a fifth of the
-    range of grey values in 5 x 5 pixels.
+    range of grey values in 5 x 5 pixels. Of very many, those with the largest share are kept.
 
     Parameters
     ----------
@@ -46,14 +48,18 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
         image, _REACH, _REACH, _REACH, _REACH, borderType=cv2.BORDER_REPLICATE
     )
     most = ((image.shape[0] + 1) // 2) * ((image.shape[1] + 1) // 2)  # maxima have no neighbours
-    points, middles = np.empty((most, 2)), np.empty(most)
-    count = _scan(padded, points, middles)
-    return points[:count].copy(), middles[:count].copy()
+    points, middles, shares = np.empty((most, 2)), np.empty(most), np.empty(most)
+    count = _scan(padded, points, middles, shares)
+    kept = np.arange(count)
+    limit = max(int(_MAX_PEAK_SHARE * image.size), _MAX_PEAKS)
+    if count > limit:
+        kept = np.flatnonzero(shares[:count] >= np.partition(shares[:count], -limit)[-limit])
+    return points[kept], middles[kept]
 
 
 @compiled
-def _scan(padded: GreyArray, points: FloatArray, middles: FloatArray) -> int:
-    """Fill in where the peaks are, and the grey values between core and ring; return how many.
+def _scan(padded: GreyArray, points: FloatArray, middles: FloatArray, shares: FloatArray) -> int:
+    """Fill in where the peaks are, grey values between core and ring, shares; return how many.
 
     Row r of the image is number r + 4 of `padded`. Of what is kept of three rows, each at its
     number modulo 3, entry 0 is in column `reach` of `padded`.
@@ -96,6 +102,7 @@ def _scan(padded: GreyArray, points: FloatArray, middles: FloatArray) -> int:
                     points[count, 0] = x + _beside(level[x], level[x + 1], level[x + 2])
                     points[count, 1] = middle - _REACH + _beside(up, level[x + 1], down)
                     middles[count] = core[at, x + 3] / 18.0 + disc[at, x + 2] / 50.0
+                    shares[count] = answer[x] / max(float(extent[x + 2]), 1.0)
                     count += 1
     return count
 
