@@ -35,8 +35,10 @@ class Sightings:
         Mid-exposures [s]; NaN: not known.
     states : mapping of str to (n, 3) array
         By the target's name, as in `Track`.
-    is_readable, is_found : (n,) arrays of bool
-        Whether there is an image, and whether any target was measured in it.
+    is_readable : (n,) array of bool
+        Whether there is an image.
+    found : int
+        Frames in which any target was measured.
     """
 
     def __init__(self, targets: Sequence[Target], frames: Sequence[str]) -> None:
@@ -44,17 +46,19 @@ class Sightings:
         self.time_s = np.full(len(frames), math.nan)
         self.states = {target.name: np.full((len(frames), 3), math.nan) for target in targets}
         self.is_readable = np.zeros(len(frames), dtype=np.bool_)
-        self.is_found = np.zeros(len(frames), dtype=np.bool_)
+        self.found = 0
+        self._is_found = np.zeros(len(frames), dtype=np.bool_)
 
     def add(self, row: int, result: FrameResult) -> None:
         """Take what is needed from the result of a frame."""
         self.time_s[row] = math.nan if result.time_s is None else result.time_s
         self.is_readable[row] = not any(map(is_unreadable, result.outcomes))
-        for outcome in result.outcomes:
-            if isinstance(outcome, Observation):
-                self.is_found[row] = True
-                if outcome.instance == 0:
-                    self.states[outcome.target][row] = state_of(outcome)
+        seen = [one for one in result.outcomes if isinstance(one, Observation)]
+        self.found += bool(seen) - int(self._is_found[row])
+        self._is_found[row] = bool(seen)
+        for observation in seen:
+            if observation.instance == 0:
+                self.states[observation.target][row] = state_of(observation)
 
 
 def expectations(

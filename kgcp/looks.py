@@ -17,8 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-import numpy as np
-
 from kgcp.errors import KgcpError, Reason
 from kgcp.examine import (
     FrameNote,
@@ -182,7 +180,7 @@ class Looks:
 
     def _advance(self, looks: int) -> None:
         self._done += looks
-        self._watcher.progress(self._done, self._total, int(np.sum(self.sightings.is_found)))
+        self._watcher.progress(self._done, self._total, self.sightings.found)
 
     def _require_frame(self, result: FrameResult) -> None:
         """Stop where frames cannot be read because they are gone, with the disk they were on."""
