@@ -23,7 +23,7 @@ _NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side stil
 _NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
 _HIDDEN_SIGMAS = 4.0  # from there through the next edge
 _MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
-_DOT_AREAS = 1.5  # larger than a dot, with what blur adds to it
+_DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
 
 
@@ -125,12 +125,15 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
     That speaks of another code, and must not be overlooked.
     """
     radii_m = seen.imaging.circles.radii_m
-    _, labels = cv2.connectedComponents(other.reshape(seen.shape).astype(np.uint8))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(
+        other.reshape(seen.shape).astype(np.uint8)
+    )
     rho_m = np.hypot(*seen.points_m)
     beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
-    area_px = np.bincount(labels.ravel())
-    dot_px = math.pi * (radii_m[2] / seen.metres_per_px) ** 2
-    hides = (np.bincount(labels.ravel(), weights=beside) > 0) | (area_px > _DOT_AREAS * dot_px)
+    dot_px = 2.0 * radii_m[2] / seen.metres_per_px
+    hides = np.bincount(labels.ravel(), weights=beside) > 0
+    hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2
+    hides |= boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1) > _DOTS * dot_px + 1.0
     hides[0] = False
     return np.asarray(hides[labels.ravel()])
 

@@ -14,6 +14,8 @@ from kgcp.geometry.pose import Pose
 from kgcp.settings import DetectSettings
 from kgcp.target.code import CodeMatch, sample_grey
 from kgcp.target.layout import Ring
+from kgcp.target.noise import BoolArray
+from kgcp.target.occlusion import best_partial_template, visible_angles
 from kgcp.target.outline import find_outlines
 from kgcp.target.seeds import Seeds, build_pyramid, find_seeds
 from kgcp.target.template import (
@@ -21,7 +23,6 @@ from kgcp.target.template import (
     ANGLES_RAD,
     SAMPLED_RADII,
     SHIFTS,
-    Templates,
     best_template,
     templates_of,
 )
@@ -31,6 +32,7 @@ _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
 _UNEVEN = 0.5  # grey values of ink, disc and plate, of the contrast
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
+_CLEAR_SCORE = 0.9
 _DARKEST_BLACK = -0.15  # of the contrast; sharpening makes ink darker than it is
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 CODE_LIKE = 0.7
@@ -69,6 +71,11 @@ class Verdict:
     def limit(self) -> float:
         """What `misfit` may be: less where blur leaves little of the dots."""
         return min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * self.dot_contrast)
+
+    @property
+    def is_clear(self) -> bool:
+        """Tell whether the whole ring looks like the target's."""
+        return self.score >= _CLEAR_SCORE and self.misfit <= self.limit
 
     def check(self, min_score: float) -> None:
         """Raise `Rejection` unless this is the target's ring."""
@@ -203,15 +210,32 @@ def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
 
 
 def judge(patch: FloatArray, ring: Ring) -> Verdict:
-    """Compare a polar patch (radii, angles) of the frame with the ring's templates."""
+    """Compare a polar patch (radii, angles) of the frame with the ring's templates.
+
+    Where a part of the ring is hidden, the rest of it is compared.
+    """
+    match = best_template(patch, templates_of(ring))
+    verdict = _verdict(patch, ring, match, np.ones(ANGLES, dtype=bool))
+    visible = None
+    if not verdict.is_clear:
+        visible = visible_angles(patch[match[2] : len(patch) - 2 * SHIFTS + match[2]], ring)
+    if visible is None:
+        return verdict
+    partial = best_partial_template(patch, visible, ring)
+    return verdict if partial is None else _verdict(patch, ring, partial, visible)
+
+
+def _verdict(
+    patch: FloatArray, ring: Ring, match: tuple[float, int, int, int], visible: BoolArray
+) -> Verdict:
     templates = templates_of(ring)
-    score, index, shift, lag = best_template(patch, templates)
+    score, index, shift, lag = match
     image = np.roll(templates.images[index], lag, axis=1)
     seen = patch[shift : shift + len(image)]
-    black, contrast = _fit_levels(image, seen, templates)
+    black, contrast = _fit_levels(image, seen, templates.weights[:, None] * visible)
     band = _code_rows(ring)
     dots = _smoothed(image[band].mean(axis=0), ring)
-    rest = _smoothed((seen - black - contrast * image)[band].mean(axis=0), ring)
+    rest = _smoothed((seen - black - contrast * image)[band].mean(axis=0) * visible, ring)
     dot_contrast = float(np.ptp(dots))
     scale = max(abs(contrast) * dot_contrast, 1e-6)
     return Verdict(
@@ -224,8 +248,8 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
     )
 
 
-def _fit_levels(image: FloatArray, seen: FloatArray, templates: Templates) -> tuple[float, float]:
-    weights = templates.weights[:, None]
+def _fit_levels(image: FloatArray, seen: FloatArray, weights: FloatArray) -> tuple[float, float]:
+    weights = weights / weights.sum()
     image_mean, seen_mean = float(np.sum(image * weights)), float(np.sum(seen * weights))
     centred = image - image_mean
     contrast = float(np.sum(centred * seen * weights) / np.sum(centred**2 * weights))

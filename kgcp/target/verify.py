@@ -20,7 +20,8 @@ MAX_EDGE_NOISE = 0.15
 _MAX_RELATIVE_SD = 0.01
 _POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
-_DOT = 0.6  # of a dot's contrast: so much more or less light is a dot, or the lack of one
+_EXTRA, _LACK = 0.45, 0.6  # of a dot's contrast: another dot, or the lack of one
+_MOVED = 0.2  # of a dot's contrast: so much more light on one side of a dot and less on the other
 _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
 
 
@@ -80,16 +81,27 @@ def check_code(fit: Fit, ring: Ring) -> None:
     """
     excess = _light_around_code_circle(fit, ring)
     angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
-    off_dot_deg = np.abs((angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0)
-    at_dot = off_dot_deg.argmin(axis=0)
-    between = off_dot_deg.min(axis=1) > 2.0 * ring.dot_half_angle_deg
+    off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
+    at_dot = np.abs(off_dot_deg).argmin(axis=0)
+    between = np.abs(off_dot_deg).min(axis=1) > 2.0 * ring.dot_half_angle_deg
     with np.errstate(invalid="ignore"):  # NaN where the frame ends: says nothing
         extra = float(np.nanmax(np.append(excess[between], 0.0)))
-        missing = int(np.count_nonzero(excess[at_dot] < -_DOT))
-    if extra > _DOT or missing > len(ring.code_deg) // _DOTS_PER_MISSING:
-        raise Rejection(
-            Reason.OTHER_CODE, f"{missing} dots missing, {extra:.0%} of a dot's light elsewhere"
-        )
+        missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
+    moved = max(_displacement(excess, off_deg, ring) for off_deg in off_dot_deg.T)
+    if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
+        light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
+        raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
+
+
+def _displacement(excess: FloatArray, off_deg: FloatArray, ring: Ring) -> float:
+    """Return the light that is too much on one side of a dot and too little on the other."""
+    reach_deg = 2.0 * ring.dot_half_angle_deg
+    left = excess[(off_deg < 0.0) & (off_deg >= -reach_deg)]
+    right = excess[(off_deg > 0.0) & (off_deg <= reach_deg)]
+    sides = [np.nan_to_num(side) for side in (left, right)]
+    most = [float(side.max(initial=0.0)) for side in sides]
+    lack = [float(-side.min(initial=0.0)) for side in sides]
+    return max(min(most[0], lack[1]), min(most[1], lack[0]))
 
 
 def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
