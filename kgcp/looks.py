@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
@@ -31,6 +32,7 @@ from kgcp.expectations import Sightings
 from kgcp.io.detections import FrameResult
 from kgcp.io.journal import Journal
 from kgcp.io.journal_text import fingerprint
+from kgcp.profiling import profiled
 from kgcp.target.expected import Expectation
 from kgcp.target.observation import is_unreadable
 from kgcp.workers import Inline, LocalPool, Loss, careful_map
@@ -38,6 +40,7 @@ from kgcp.workers import Inline, LocalPool, Loss, careful_map
 _REASONS = {Loss.DIED: Reason.WORKER_DIED, Loss.LATE: Reason.TIMED_OUT}
 
 _Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 
 class Watcher(Protocol):
@@ -60,15 +63,32 @@ class Crew:
         Worker processes; 0 works in this one.
     limit_s : float
         Time for one look at one frame [s]; no limit in this process.
+    stages_s : Counter of float, or None
+        Takes the time of all workers by stage [s]; None: it is not measured.
     """
 
     jobs: int
     limit_s: float
+    stages_s: Counter[str] | None = None
 
     def map(
         self, function: Callable[[_Item], FrameResult], items: Iterable[_Item]
     ) -> Generator[tuple[_Item, FrameResult | Loss]]:
         """Yield items and results as they come."""
+        if self.stages_s is None:
+            yield from self._map(function, items)
+            return
+        with closing(self._map(partial(profiled, function), items)) as results:
+            for item, result in results:
+                if isinstance(result, Loss):
+                    yield item, result
+                else:
+                    self.stages_s.update(result.stages_s)
+                    yield item, result.result
+
+    def _map(
+        self, function: Callable[[_Item], _Result], items: Iterable[_Item]
+    ) -> Generator[tuple[_Item, _Result | Loss]]:
         return careful_map(function, items, start=self._start, jobs=self.jobs, limit_s=self.limit_s)
 
     def _start(self, jobs: int) -> Executor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -50,6 +51,7 @@ def detect_flight(
     debug: Debug | None = None,
     is_restart: bool = False,
     frame_timeout_s: float = FRAME_TIMEOUT_S,
+    is_profiled: bool = False,
 ) -> SurveySummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
@@ -73,6 +75,8 @@ def detect_flight(
         Whether to begin anew, whatever an interrupted run has left.
     frame_timeout_s : float
         Time for one look at one frame [s].
+    is_profiled : bool
+        Whether to measure what the workers spend their time on, at the price of some.
 
     Raises
     ------
@@ -99,7 +103,7 @@ def detect_flight(
         locked(out / ".detections.lock"),
         Journal(out / ".detections.journal", _making(task), is_new=is_restart) as journal,
     ):
-        crew = Crew(jobs, frame_timeout_s)
+        crew = Crew(jobs, frame_timeout_s, Counter() if is_profiled else None)
         looks = Looks(task, notes, journal, crew, watcher or Nobody())
         with stopwatch.stage("first look"):
             looks.look()
@@ -118,6 +122,8 @@ def detect_flight(
                 _provenance(flight, settings),
             )
         stopwatch.stages_s["journal, within these"] = journal.seconds
+        for stage, seconds in (crew.stages_s or Counter()).most_common():
+            stopwatch.stages_s[f"workers: {stage}"] = seconds
         is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
         summary = tally.summary(
             kept=looks.kept,

@@ -88,7 +88,9 @@ _DEFAULTS = DetectSettings()
     show_default=True,
     help="Give a frame up that takes longer than this [s].",
 )
-@click.option("--profile", "is_profiled", is_flag=True, help="Print the time per stage.")
+@click.option(
+    "--profile", "is_profiled", is_flag=True, help="Print the time per stage, which costs some."
+)
 @click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
 @click.option(
     "--log-json",
@@ -151,6 +153,7 @@ def command(
             debug=None if debug is None else Debug(debug, debug_frames),
             is_restart=is_restart,
             frame_timeout_s=frame_timeout,
+            is_profiled=is_profiled,
         )
     seconds = time.perf_counter() - start
     report(summary, folder / "detections.parquet", seconds, log, as_json=as_json)
