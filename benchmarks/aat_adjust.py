@@ -35,8 +35,8 @@ class Estimate:
     ----------
     checks_enu_m : (c, 3) array
         Places of the check points [m].
-    cov_m2 : (c, 3, 3) array
-        Their covariances.
+    cov_m2 : (3 c, 3 c) array
+        Their covariance.
     calibration, sd_calibration : (5,) array
         `FREE_PARAMETERS` and their deviations.
     """
@@ -259,14 +259,15 @@ def _solve(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Val
 
 
 def _estimate(graph: gtsam.NonlinearFactorGraph, found: gtsam.Values, checks: int) -> Estimate:
-    marginals = gtsam.Marginals(graph, found)
-    cov = marginals.marginalCovariance(C(0))
+    points = [L(index) for index in range(checks)]
+    # one elimination for all; point by point it takes longer than the adjustment
+    joint = gtsam.Marginals(graph, found).jointMarginalCovariance([C(0), *points])
     mean = np.zeros((len(_FREE_COLUMNS), 9))
     for row, columns in zip(mean, _FREE_COLUMNS, strict=True):
         row[list(columns)] = 1.0 / len(columns)
     return Estimate(
-        np.array([found.atPoint3(L(index)) for index in range(checks)]),
-        np.array([marginals.marginalCovariance(L(index)) for index in range(checks)]),
+        np.array([found.atPoint3(point) for point in points]),
+        joint.fullMatrix()[9:, 9:],  # the calibration's nine come first, as c before l
         calibration_vector(found.atCal3DS2(C(0))),
-        np.sqrt(np.diag(mean @ cov @ mean.T)),
+        np.sqrt(np.diag(mean @ joint.at(C(0), C(0)) @ mean.T)),
     )

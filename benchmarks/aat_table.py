@@ -18,6 +18,7 @@ _COLUMNS = (
     "RMS E / N / H [cm]",
     "predicted E / N / H [cm]",
     "scatter / predicted E / N / H",
+    "of all together",
     "f: RMS (predicted) [px]",
     "GNSS only's H RMS / this, median",
 )
@@ -31,7 +32,7 @@ class Trial:
     ----------
     error_m : (c, 3) array
         Of the check points, east, north, up [m].
-    cov_m2 : (c, 3, 3) array
+    cov_m2 : (3 c, 3 c) array
         As the adjustment predicts it.
     focal_error_px, sd_focal_px : float
     """
@@ -49,7 +50,13 @@ class Trial:
     @property
     def variance_m2(self) -> FloatArray:
         """Predicted variances (c, 3)."""
-        return np.diagonal(self.cov_m2, axis1=1, axis2=2)
+        return np.diagonal(self.cov_m2).reshape(-1, 3)
+
+    @property
+    def mahalanobis2(self) -> float:
+        """χ² of all errors by their joint covariance, over their number; ideally 1."""
+        error_m = self.error_m.ravel()
+        return float(error_m @ np.linalg.solve(self.cov_m2, error_m)) / len(error_m)
 
 
 Trials = Mapping[tuple[str, Way], Sequence[Trial]]  # by calibration and way; in the seeds' order
@@ -67,6 +74,8 @@ class Row:
         Root mean square of error over predicted deviation, ideally 1.
     sd_scatter : (3,) array
         How well so many blocks know it.
+    whole_scatter : float
+        The same of all errors of a block together, by their joint covariance.
     focal_rms_px, focal_predicted_px : float
     benefit : float
         Median over the blocks of GNSS only's height RMS over this one's.
@@ -76,6 +85,7 @@ class Row:
     predicted_m: FloatArray
     scatter: FloatArray
     sd_scatter: FloatArray
+    whole_scatter: float
     focal_rms_px: float
     focal_predicted_px: float
     benefit: float
@@ -96,6 +106,7 @@ def summarise(trials: Sequence[Trial], by_gnss: Sequence[Trial]) -> Row:
         predicted_m=np.sqrt(np.mean(variances, axis=(0, 1))),
         scatter=scatter,
         sd_scatter=squares.std(axis=0) / (2.0 * scatter * math.sqrt(len(trials))),
+        whole_scatter=math.sqrt(np.mean([trial.mahalanobis2 for trial in trials])),
         focal_rms_px=_rms([trial.focal_error_px for trial in trials]),
         focal_predicted_px=_rms([trial.sd_focal_px for trial in trials]),
         benefit=float(np.median(ratios)),
@@ -121,7 +132,8 @@ def table_lines(rows: Mapping[tuple[str, Way], Row]) -> Iterator[str]:
                 way.value,
                 _three(100.0 * row.rms_m, 1),
                 _three(100.0 * row.predicted_m, 1),
-                f"{_three(row.scatter, 2)} (H ± {row.sd_scatter[_UP]:.2f})",
+                f"{_three(row.scatter, 2)} (± {row.sd_scatter.max():.2f})",
+                f"{row.whole_scatter:.2f}",
                 f"{row.focal_rms_px:.2f} ({row.focal_predicted_px:.2f})",
                 f"{row.benefit:.1f}",
             )

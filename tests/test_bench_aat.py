@@ -150,7 +150,7 @@ def test_a_block_without_noise_returns_the_truth(block: Block, way: Way) -> None
 def test_more_control_predicts_better_heights(block: Block) -> None:
     exact, kgcps = without_noise(block)
     sds = [
-        np.sqrt(aat_adjust.adjust(exact, kgcps, way, None).cov_m2[:, 2, 2].mean())
+        np.sqrt(np.diagonal(aat_adjust.adjust(exact, kgcps, way, None).cov_m2)[2::3].mean())
         for way in (Way.GNSS, Way.KGCPS, Way.DISTANCES)
     ]
     assert sds[0] > 2.0 * sds[1] > 2.0 * sds[2]
@@ -216,14 +216,15 @@ def test_neighbours_share_their_errors_as_the_conventions_say() -> None:
 
 def test_true_predictions_are_called_true() -> None:
     rng = np.random.default_rng(6)
-    cov = np.tile(np.diag([1e-4, 4e-4, 9e-4]), (30, 1, 1))
-    sd = np.sqrt(np.diagonal(cov[0]))
+    sd = np.array([0.01, 0.02, 0.03])
+    cov = np.diag(np.tile(sd**2, 30))
     close = [Trial(sd * rng.standard_normal((30, 3)), cov, 0.5, 0.5) for _ in range(40)]
     far = [replace(trial, error_m=6.0 * trial.error_m) for trial in close]
     row = summarise(close, far)
     np.testing.assert_allclose(row.scatter, 1.0, atol=0.06)
     np.testing.assert_allclose(row.rms_m, sd, rtol=0.06)
     np.testing.assert_allclose(row.predicted_m, sd)
+    assert row.whole_scatter == pytest.approx(1.0, abs=0.04)
     assert row.benefit == pytest.approx(6.0)
     lines = list(table_lines({("free", Way.KGCPS): row}))
     assert len(lines) == 3
