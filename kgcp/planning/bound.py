@@ -23,7 +23,6 @@ from kgcp.synthetic.patch import Patch, Window, outline_box
 from kgcp.synthetic.plate import Plate
 from kgcp.synthetic.shapes import Disc
 
-_SUB_PIXELS_ACROSS = 600  # of a window; more changes the bound by less than a per mille
 _STEP_PX = 0.02  # of the central differences, as the largest movement of an edge
 _OPAQUE = 0.999  # share of the plate in a pixel from which the plate's outline does not matter
 _WHITE_LEVEL = 255.0
@@ -65,6 +64,8 @@ class Shot:
         Exposure relative to the one at which radiance 1 fills the well.
     has_unknown_streak : bool
         Whether a measurement has to find out how the image moved.
+    sub_pixels : int
+        Across the ring's window: 150 are good for 1 %, 600 for a per mille of the bound.
     """
 
     camera: Camera
@@ -74,6 +75,7 @@ class Shot:
     sensor: Sensor
     gain: float
     has_unknown_streak: bool
+    sub_pixels: int = 600
 
 
 def bound_of(shot: Shot) -> Bound:
@@ -84,8 +86,10 @@ def bound_of(shot: Shot) -> Bound:
     response is unknown.
     """
     view = _View(shot, _ring_window(shot))
-    weight = np.sqrt(_information(view))
-    nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view)])
+    white = view.white(shot.pose)
+    share = view.seen(white, shot.optics)
+    weight = np.sqrt(_information(view, share))
+    nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view, white, share)])
     pose = weight[:, None] * _pose_derivatives(view)
     return _in_words(shot.camera, shot.pose, pose_covariance(pose, nuisances))
 
@@ -115,18 +119,21 @@ class _View:
     shot: Shot
     window: Window
 
-    def share(self, pose: Pose, optics: Optics) -> FloatArray:
-        """Return the share of white (height, width) on a plate without end."""
+    def white(self, pose: Pose) -> FloatArray:
+        """Return the share of white in the sub-pixels, on a plate without end."""
         patch = Patch.of(self.shot.camera, pose, self.window, self._oversampling)
         white = np.ones_like(patch.x_m)
         for shape, radiance in replace(self.shot.plate, black=0.0, white=1.0).print_layers():
             patch.paint(white, shape, radiance)
+        return white
+
+    def seen(self, white: FloatArray, optics: Optics) -> FloatArray:
+        """Return the share of white (height, width) that reaches the pixels."""
         return optics.spread(white, self._oversampling)
 
-    def irradiance(self) -> FloatArray:
-        """Return the light (height, width) of a plate without end."""
+    def irradiance(self, share: FloatArray) -> FloatArray:
+        """Return the light of a share of white."""
         plate = self.shot.plate
-        share = self.share(self.shot.pose, self.shot.optics)
         return plate.black + (plate.white - plate.black) * share
 
     def opaque(self) -> npt.NDArray[np.bool_]:
@@ -145,7 +152,7 @@ class _View:
     @property
     def _oversampling(self) -> int:
         longest = max(self.window.width, self.window.height)
-        return int(np.clip(_SUB_PIXELS_ACROSS // longest, 2, 8))
+        return int(np.clip(self.shot.sub_pixels // longest, 2, 8))
 
 
 def _ring_window(shot: Shot) -> Window:
@@ -158,7 +165,7 @@ def _ring_window(shot: Shot) -> Window:
     return Window(int(column), int(row), int(width), int(height))
 
 
-def _information(view: _View) -> FloatArray:
+def _information(view: _View, share: FloatArray) -> FloatArray:
     """Return what each pixel (n,) tells about its irradiance: 1 / variance, for one that is seen.
 
     A pixel that may clip tells less, by the information of a censored normal variable; one that
@@ -166,7 +173,7 @@ def _information(view: _View) -> FloatArray:
     out, as JPEG is.
     """
     gain, sensor = view.shot.gain, view.shot.sensor
-    exposure = gain * view.irradiance().ravel()
+    exposure = gain * view.irradiance(share).ravel()
     slope = _WHITE_LEVEL * sensor.tone.slope(exposure)
     electrons = sensor.full_well_e * exposure + sensor.read_noise_e**2
     variance = electrons / sensor.full_well_e**2 + 1.0 / 12.0 / slope**2
@@ -207,17 +214,16 @@ def _pose_derivatives(view: _View) -> FloatArray:
     directions[:3, :3] = np.linalg.qr(np.column_stack((pose.translation_m, np.eye(3)[:, :2])))[0]
     columns = []
     for size, direction in zip(sizes, directions.T, strict=True):
-        after = view.share(pose.moved(size * direction), optics)
-        before = view.share(pose.moved(-size * direction), optics)
+        after = view.seen(view.white(pose.moved(size * direction)), optics)
+        before = view.seen(view.white(pose.moved(-size * direction)), optics)
         columns.append((plate.white - plate.black) * (after - before).ravel() / (2.0 * size))
     derivatives: FloatArray = np.column_stack(columns) @ directions.T
     return derivatives
 
 
-def _nuisances(view: _View) -> Iterator[FloatArray]:
+def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:
     """Yield the derivatives of the irradiance by everything unknown that is not the pose."""
     shot = view.shot
-    share = view.share(shot.pose, shot.optics)
     yield share
     yield 1.0 - share
     psf_px, (streak_x, streak_y) = shot.optics.psf_px, shot.optics.streak_px
@@ -227,9 +233,9 @@ def _nuisances(view: _View) -> Iterator[FloatArray]:
     for psf, x, y in changes:
         after = Optics(psf_px + psf, (streak_x + x, streak_y + y))
         before = Optics(psf_px - psf, (streak_x - x, streak_y - y))
-        yield view.share(shot.pose, after) - view.share(shot.pose, before)
+        yield view.seen(white, after) - view.seen(white, before)
     if shot.camera.response is Response.UNKNOWN:
-        slope = shot.sensor.tone.slope(shot.gain * view.irradiance())
+        slope = shot.sensor.tone.slope(shot.gain * view.irradiance(share))
         bend = share * (1.0 - share) / slope
         yield bend
         yield bend * (2.0 * share - 1.0)

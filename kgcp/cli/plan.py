@@ -1,0 +1,183 @@
+"""`kgcp plan`: what a camera and a target will give, before the flight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kgcp.cli.options import flight_argument
+
+if TYPE_CHECKING:
+    from kgcp.planning.outlook import Conditions, Outlook
+
+
+@click.command()
+@flight_argument
+@click.option("--target", "name", metavar="NAME", help="Which target.  [default: the first]")
+@click.option(
+    "--height",
+    "heights_m",
+    metavar="M",
+    type=float,
+    multiple=True,
+    help="Camera above target [m]; may be given several times.  [default: a table of usual ones]",
+)
+@click.option(
+    "--exposure",
+    "exposure_s",
+    metavar="S",
+    type=float,
+    default=0.001,
+    show_default=True,
+    help="Exposure time [s].",
+)
+@click.option(
+    "--blur",
+    "blur_px",
+    metavar="PX",
+    type=float,
+    default=1.0,
+    show_default=True,
+    help="Motion of the image during the exposure, at most [px].",
+)
+@click.option(
+    "--psf",
+    "psf_px",
+    metavar="PX",
+    type=float,
+    default=0.7,
+    show_default=True,
+    help="Blur of lens and sensor: σ of the point spread [px].",
+)
+@click.option(
+    "--accuracy",
+    "accuracy_percent",
+    metavar="PERCENT",
+    type=float,
+    default=0.05,
+    show_default=True,
+    help="Wanted standard deviation of one distance [% of it].",
+)
+@click.option(
+    "--plot",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Draw the table, as .png or .svg.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of the table.")
+def command(
+    flight: Path,
+    name: str | None,
+    heights_m: tuple[float, ...],
+    *,
+    exposure_s: float,
+    blur_px: float,
+    psf_px: float,
+    accuracy_percent: float,
+    plot: Path | None,
+    as_json: bool,
+) -> None:
+    r"""Say what the camera and the target of FLIGHT's flight.toml will give from some heights.
+
+    For each height: the ring's radius in the image, how likely it is found, standard deviations of
+    distance and centre in one frame, the largest speed for a given motion blur, and the smallest
+    target for a wanted accuracy. Neither frames nor trajectory need exist.
+
+    \b
+    Example:
+      kgcp plan sample_flight --height 20 --height 40 --exposure 0.0005 --plot plan.png
+    """
+    from kgcp.io.flight import read_camera_and_targets
+    from kgcp.planning.outlook import Conditions, look_ahead, usual_heights
+    from kgcp.printing.new import chosen_targets
+
+    conditions = Conditions(blur_px, exposure_s, psf_px, accuracy_percent)
+    camera, calibration, targets = read_camera_and_targets(flight)
+    target = chosen_targets(targets, (name,) if name else ())[0]
+    if plot is not None:
+        from kgcp.io.plan_files import check_figure_name
+
+        check_figure_name(plot)
+    heights = sorted(set(heights_m)) or usual_heights(camera, target)
+    outlooks = look_ahead(camera, calibration, target, heights, conditions)
+    if as_json:
+        _print_json(target.name, conditions, outlooks)
+    else:
+        for line in _table(target.name, conditions, outlooks):
+            click.echo(line)
+    if plot is not None:
+        from kgcp.io.plan_files import write_plan_figure
+
+        write_plan_figure(outlooks, f"Target {target.name}", plot)
+        click.echo(f"wrote {plot}", err=True)
+
+
+def _print_json(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> None:
+    import json
+    from dataclasses import asdict
+
+    rows = [asdict(outlook) for outlook in outlooks]
+    click.echo(json.dumps({"target": name, "conditions": asdict(conditions), "heights": rows}))
+
+
+_COLUMNS = (
+    ("height", "m"),
+    ("ring", ""),
+    ("R", "px"),
+    ("found", "%"),
+    ("σ distance", "mm"),
+    ("", "%"),
+    ("common", "mm"),
+    ("σ centre", "px"),
+    ("speed", "m/s"),
+    ("diameter", "m"),
+)
+
+
+def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
+    """Yield the table and what its columns mean."""
+    from kgcp.planning.outlook import SURE_PX, TILT_DEG
+
+    lines = [
+        [heading for heading, _ in _COLUMNS],
+        [unit for _, unit in _COLUMNS],
+        *(_cells(outlook) for outlook in outlooks),
+    ]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    yield f"Target {name}"
+    for cells in lines:
+        yield "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+    blur = f"{conditions.blur_px:g} px"
+    yield f"σ: of one frame, exposed well, in the middle of it, plate tilted by {TILT_DEG:g}°,"
+    yield f"  point spread {conditions.psf_px:g} px, motion blur {blur}; of the centre per axis."
+    yield "common: of calibration and print, in all frames alike."
+    yield f"speed: the largest that blurs by {blur} in {conditions.exposure_s:g} s, over ground."
+    yield (
+        f"diameter: the smallest for σ of {conditions.accuracy_percent:g} % of the distance,"
+        f" and a radius of {SURE_PX:g} px."
+    )
+
+
+def _cells(outlook: Outlook) -> list[str]:
+    def number(value: float | None, scale: float = 1.0) -> str:
+        return "–" if value is None else f"{scale * value:#.2g}".rstrip(".")
+
+    found, low, high = (
+        100.0 * share for share in (outlook.found, outlook.found_low, outlook.found_high)
+    )
+    sd_m, common_m = outlook.sd_distance_m, outlook.sd_common_distance_m
+    return [
+        f"{outlook.height_m:g}",
+        outlook.ring or "none whole",
+        f"{outlook.radius_px:.1f}",
+        f"{found:.0f} ({low:.0f}–{high:.0f})",
+        number(sd_m, 1e3),
+        number(sd_m, 100.0 / outlook.height_m),
+        number(common_m, 1e3),
+        number(outlook.sd_centre_px),
+        f"{outlook.largest_speed_mps:.1f}",
+        f"{outlook.smallest_diameter_m:.3f}",
+    ]
