@@ -167,7 +167,7 @@ class Journal:
                 for line in stream:
                     body = line[_CHECKSUM + 1 :]
                     if line[:_CHECKSUM] == f"{zlib.crc32(body):0{_CHECKSUM}x}".encode():
-                        key = body.partition(b" ")[0].decode()
+                        key = body.partition(b" ")[0].decode(errors="replace")
                         self._places[key] = number << _OFFSET_BITS | offset
                     offset += len(line)
 
@@ -185,6 +185,6 @@ def _read_header(folder: Path) -> Mapping[str, str] | None:
     """Return by what the results in a journal were made; None if there is none."""
     try:
         header = json.loads((folder / _HEADER).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError, RecursionError):
         return None
     return header if isinstance(header, dict) else None

@@ -55,7 +55,7 @@ def from_text(text: str | bytes) -> FrameResult:
     """
     try:
         result = json.loads(text, object_hook=_record)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"no record: {error}") from error
     if not isinstance(result, FrameResult):
         raise ValueError(f"a {type(result).__name__}, and not the result of a frame")

@@ -47,6 +47,7 @@ def write_run_record(path: Path, record: Mapping[str, object]) -> None:
     KgcpError
         If it cannot be written.
     """
+    # The kernel counts for a process also what its parent had when it was started.
     peaks = {"parent": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
     whole = {
         **record,

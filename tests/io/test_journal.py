@@ -27,6 +27,12 @@ from kgcp.target.observation import (
     Uncertainty,
 )
 
+NO_RESULTS = (
+    *("", "\0", "[]", "{}", "[" * 100_000),
+    *('{"record":"Path"}', '{"record":[]}', '{"record":"Exif","x":1}'),
+    *('{"record":"Miss","reason":"no such"}', '{"array":[[1],[1,2]]}'),
+)
+
 numbers = st.floats(width=64)
 maybe = st.none() | numbers
 
@@ -95,7 +101,7 @@ def test_a_result_comes_back_to_the_last_bit(one: FrameResult) -> None:
     assert bits(from_text(text)) == bits(one)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"record":"Path"}', '{"record":"Exif","x":1}'])
+@pytest.mark.parametrize("text", NO_RESULTS, ids=lambda text: text[:30])
 def test_what_is_no_result_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         from_text(text)
