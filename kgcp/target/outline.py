@@ -10,6 +10,7 @@ import numpy.typing as npt
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.target.distinct import distinct
+from kgcp.target.ellipses import fit_ellipses
 from kgcp.target.rays import RAYS, RAYS_RAD, follow
 from kgcp.target.seeds import Level, Seeds
 
@@ -17,7 +18,6 @@ _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 _FINEST_RADIUS_PX = 12.0
 _MAX_AXIS_RATIO = 2.0
 _NEAR, _ALIKE = 0.25, 0.15  # of one ring: distance of centres, of its radius; ratio of radii
-_RIDGE = 1e-9  # keeps the points of too few edges from a singular fit; they are refused anyway
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -90,46 +90,15 @@ def _follow(pyramid: tuple[Level, ...], seeds: Seeds) -> _Outlines:
 
 
 def _fit_ellipses(
-    edge: FloatArray, inlying: BoolArray, seeds: Seeds, clearness: FloatArray
+    edges: FloatArray, inlying: BoolArray, seeds: Seeds, clearness: FloatArray
 ) -> _Outlines:
-    """Fit an ellipse to each seed's edges, `kgcp.geometry.conic.fit_ellipse` for many at once.
+    """Fit an ellipse to each seed's edges; what is none is dropped.
 
-    The unit is the seed's radius, the origin its centre. What is no ellipse is dropped.
+    The unit of the edges is the seed's radius, the origin its centre.
     """
-    x, y = np.moveaxis(edge[..., None] * _DIRECTIONS, 2, 0)
-    quadratic = np.stack((x * x, x * y, y * y), axis=1) * inlying[:, None]
-    linear = np.stack((x, y, np.ones_like(x)), axis=1) * inlying[:, None]
-    mixed = linear @ quadratic.swapaxes(1, 2)
-    reduce = -np.linalg.solve(linear @ linear.swapaxes(1, 2) + _RIDGE * np.eye(3), mixed)
-    scatter = quadratic @ quadratic.swapaxes(1, 2) + mixed.swapaxes(1, 2) @ reduce
-    constrained = np.stack((0.5 * scatter[:, 2], -scatter[:, 1], 0.5 * scatter[:, 0]), axis=1)
-    vectors = np.real(np.linalg.eig(constrained)[1])
-    discriminants = 4.0 * vectors[:, 0] * vectors[:, 2] - vectors[:, 1] ** 2
-    best = discriminants.argmax(axis=1)
-    form = np.take_along_axis(vectors, best[:, None, None], axis=2)
-    real = np.flatnonzero(discriminants.max(axis=1) > 0.0)
-    coefficients = np.concatenate((form, reduce @ form), axis=1)[real, :, 0]
-    centre, axes, angle, possible = _axes_of_conics(coefficients)
-    seeds = seeds.chosen(real)
+    found, possible = np.empty((len(edges), 5)), np.empty(len(edges), dtype=np.bool_)
+    fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, found, possible)
+    scale = seeds.radii_px[:, None]
     return _Outlines(
-        seeds.centres_px + seeds.radii_px[:, None] * centre,
-        seeds.radii_px[:, None] * axes,
-        angle,
-        clearness[real],
+        seeds.centres_px + scale * found[:, :2], scale * found[:, 2:4], found[:, 4], clearness
     ).chosen(np.flatnonzero(possible))
-
-
-def _axes_of_conics(
-    coefficients: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return centres, semi-axes, directions, and which can be, of x², xy, y², x, y and 1."""
-    a, b, c, d, e, f = (coefficients * np.sign(coefficients[:, :1] + coefficients[:, 2:3])).T
-    determinant = 4.0 * a * c - b * b
-    x, y = (b * e - 2.0 * c * d) / determinant, (b * d - 2.0 * a * e) / determinant
-    depth = -(f + 0.5 * (d * x + e * y))
-    middle, half = 0.5 * (a + c), 0.5 * np.hypot(a - c, b)
-    squares = np.maximum(depth, 0.0) / np.stack((middle - half, middle + half))
-    axes = np.sqrt(squares).T
-    angle = 0.5 * np.arctan2(-b, c - a)  # of the lesser curvature
-    possible = (axes[:, 1] > 0.0) & (axes[:, 0] <= _MAX_AXIS_RATIO * axes[:, 1])
-    return np.stack((x, y), axis=1), axes, angle, possible
