@@ -18,6 +18,8 @@ COMMANDS = {
     "detect": "kgcp.cli.detect",
     "export-gcp": "kgcp.cli.export_gcp",
     "bias-report": "kgcp.cli.bias_report",
+    "plan": "kgcp.cli.plan",
+    "target": "kgcp.cli.target",
     "simulate": "kgcp.cli.simulate",
 }
 

@@ -52,7 +52,7 @@ _RADII_PX = (6.0, 9.0, 20.0, 45.0)  # where the bound is computed
 _Z95 = 1.959964
 _SPAN = 50.0
 _ROUND = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
-_WAYS_DEG = (35.0, 155.0, 275.0)  # of tilt and streak: small rings feel where their dots are
+_WAYS_DEG = (35.0, 125.0)  # of tilt and streak: small rings feel where their dots are
 _OFF_PX = 0.3  # the centre is not a pixel's
 _SUB_PIXELS = 150
 

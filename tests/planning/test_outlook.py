@@ -26,14 +26,15 @@ from kgcp.planning.outlook import (
 from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import TARGET_PLATE
 from kgcp.synthetic.imaging import Optics, Sensor
-from kgcp.synthetic.plate import image_plate
+from kgcp.synthetic.patch import Patch, Window
 from kgcp.target.layout import Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Observation
 
-CAMERA = Camera(160, 130, 1000.0, 1002.0, 81.3, 63.2, k1=-0.05, response=Response.LINEAR)
+CAMERA = Camera(130, 120, 1000.0, 1002.0, 66.3, 58.2, k1=-0.05, response=Response.LINEAR)
 TARGET = TARGET_PLATE.target
 CONDITIONS = Conditions(blur_px=0.8, exposure_s=0.002)
+_FINE = 3
 HEIGHTS_M = (20.0, 37.0)  # R of 22 and 12 px
 
 
@@ -51,9 +52,12 @@ def measured(height_m: float, rng: np.random.Generator) -> tuple[Observation, Po
     x, y = rng.uniform(-2.0, 2.0, 2) / CAMERA.fx
     pose = Pose(rotation.as_matrix(), height_m * np.array([x, y, 1.0]) / math.hypot(x, y, 1.0))
     streak = CONDITIONS.blur_px * math.cos(motion), CONDITIONS.blur_px * math.sin(motion)
-    light = np.full((CAMERA.height, CAMERA.width), 0.2)
-    image_plate(CAMERA, TARGET_PLATE, pose, Optics(CONDITIONS.psf_px, streak)).paste(light)
-    grey = Sensor().expose(light, GAIN, rng)
+    patch = Patch.of(CAMERA, pose, Window(0, 0, CAMERA.width, CAMERA.height), _FINE)
+    light = np.full_like(patch.x_m, TARGET_PLATE.white)
+    for shape, radiance in TARGET_PLATE.print_layers():
+        patch.paint(light, shape, radiance)
+    spread = Optics(CONDITIONS.psf_px, streak).spread(light, _FINE)
+    grey = Sensor().expose(spread, GAIN, rng)
     (outcome,) = measure_frame(grey, CAMERA, (TARGET,), DetectSettings())
     assert isinstance(outcome, Observation)
     return outcome, pose
@@ -131,7 +135,7 @@ def test_chances_are_those_of_the_benchmark() -> None:
 def test_usual_heights_are_round_and_of_use() -> None:
     heights = usual_heights(CAMERA, TARGET)
     assert heights == (2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0, 70.0)
-    assert 0.09 * 1001.0 / heights[0] <= LARGEST_SHARE * 130
+    assert 0.09 * 1001.0 / heights[0] <= LARGEST_SHARE * 120
     assert 0.45 * 1001.0 / heights[-1] >= 6.0
 
 

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+from click.testing import CliRunner, Result
+from PIL import Image
+
+from kgcp.cli import main
+
+FLIGHT = """
+[camera]
+width = 1200
+height = 900
+fx = 1902.0
+fy = 1902.0
+cx = 606.2
+cy = 446.1
+sd_fx = 1.0
+sd_fy = 1.0
+response = "linear"
+
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A folder without frames."""
+    (tmp_path / "flight.toml").write_text(FLIGHT, encoding="utf-8")
+    return tmp_path
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["plan", *map(str, arguments)])
+
+
+def test_the_table_has_a_line_per_height_and_its_conditions(flight: Path) -> None:
+    result = run(flight, "--height", "200", "--height", "40", "--exposure", "0.0005")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert lines[1].split()[:4] == ["height", "ring", "R", "found"]
+    near, far = lines[3].split(), lines[4].split()
+    assert near[:3] == ["40", "A", "21.4"]
+    # 1 px is 40 m / 1902 on the ground, in half a millisecond
+    assert near[-2:] == ["42.1", "0.379"]
+    assert far[:4] == ["200", "A", "4.3", "0"]
+    assert "–" in far
+    assert "1 px in 0.0005 s" in result.stdout
+    assert max(map(len, lines)) <= 100
+
+
+def test_json_has_the_same_numbers(flight: Path) -> None:
+    result = run(flight, "--json", "--accuracy", "0.01")
+    assert result.exit_code == 0, result.output
+    plan = json.loads(result.stdout)
+    assert plan["conditions"]["accuracy_percent"] == 0.01
+    heights = [row["height_m"] for row in plan["heights"]]
+    assert heights == sorted(heights)
+    assert heights[-1] == 100.0
+    sd_m = [row["sd_distance_m"] for row in plan["heights"]]
+    assert sd_m == sorted(sd_m)
+
+
+def test_the_figure_is_drawn(flight: Path) -> None:
+    path = flight / "plan.png"
+    result = run(flight, "--plot", path)
+    assert result.exit_code == 0, result.output
+    with Image.open(path) as picture:
+        assert picture.convert("L").getextrema() == (0, 255)
+        assert picture.width > 1000
+
+
+def test_the_same_plan_is_the_same_figure(flight: Path) -> None:
+    paths = [flight / "first.svg", flight / "second.svg"]
+    for path in paths:
+        assert run(flight, "--plot", path).exit_code == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    root = ET.fromstring(paths[0].read_text(encoding="utf-8"))  # noqa: S314 - our own file
+    assert len(list(root.iter("{http://www.w3.org/2000/svg}path"))) > 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--height", "-4"], "height: -4 m is out of range"),
+        (["--blur", "-1"], "blur: -1 px is out of range"),
+        (["--exposure", "0"], "exposure: 0 s is out of range"),
+        (["--accuracy", "nan"], "accuracy: nan % is out of range"),
+        (["--plot", "plan.pdf"], "plan.pdf is neither .png nor .svg"),
+        (["--target", "B"], "'B' is not in flight.toml; give one of A"),
+    ],
+)
+def test_impossible_inputs_are_one_line(flight: Path, arguments: list[str], words: str) -> None:
+    result = run(flight, *arguments)
+    assert result.exit_code == 1
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_flight_without_camera_is_told_so(flight: Path) -> None:
+    (flight / "flight.toml").write_text(FLIGHT.partition("[[")[2].join(["[[", ""]), "utf-8")
+    result = run(flight)
+    assert result.exit_code == 1
+    assert "camera: is missing" in result.stderr

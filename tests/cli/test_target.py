@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from kgcp.cli.target import FORMATS, PAPERS
+from kgcp.io.flight import read_printed_targets
+from kgcp.io.sheets import write
+from kgcp.printing.codes import LEAST_DISTANCE
+from kgcp.printing.sheets import Paper
+from kgcp.target.layout import Target
+
+TABLES = """
+[[target]]
+name = "A"
+outer_diameter_m = 0.15
+inner_diameter_m = 0.075
+code_diameter_m = 0.107
+dot_diameter_m = 0.0214
+code_deg = [0, 43, 78.25, 180]
+sd_outer_diameter_m = 0.0001
+position_m = [1.0, 2.0, 3.0]
+sd_position_m = [0.01, 0.01, 0.02]
+
+[[target]]
+name = "A-inner"
+replica_of = "A"
+scale = 0.2
+code_deg = [10, 80, 150, 250, 290]
+
+[[target]]
+name = "B b"
+outer_diameter_m = 0.15
+inner_diameter_m = 0.075
+code_diameter_m = 0.107
+dot_diameter_m = 0.0214
+code_deg = [0, 60, 150, 250]
+"""
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """A folder with nothing but targets: they are printed before there are frames."""
+    (tmp_path / "flight.toml").write_text(TABLES, encoding="utf-8")
+    return tmp_path
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["target", *map(str, arguments)])
+
+
+def read_back(folder: Path, path: Path) -> tuple[Target, ...]:
+    folder.mkdir()
+    (folder / "flight.toml").write_bytes(path.read_bytes())
+    return read_printed_targets(folder)
+
+
+def test_words_are_those_of_the_modules() -> None:
+    assert FORMATS == write.FORMATS
+    assert tuple(Paper) == PAPERS
+
+
+def test_targets_of_a_flight_are_written_with_their_tables(flight: Path) -> None:
+    result = run(flight, "--format", "svg", "--format", "dxf", "--json")
+    assert result.exit_code == 0, result.output
+    out = flight / "kgcp" / "targets"
+    names = ["target_A.svg", "target_A.dxf", "target_B_b.svg", "target_B_b.dxf", "targets.toml"]
+    assert sorted(path.name for path in out.iterdir()) == sorted(names)
+    summary = json.loads(result.stdout)
+    assert summary["files"] == [str(out / name) for name in names]
+    assert [target["name"] for target in summary["targets"]] == ["A", "B b"]
+    assert summary["dots_apart"] > LEAST_DISTANCE
+    assert read_back(flight / "again", out / "targets.toml") == read_printed_targets(flight)
+
+
+def test_one_target_in_tiles_on_a_plate(flight: Path, tmp_path: Path) -> None:
+    options = ("--sheet", "A4", "--tiled", "--plate", "0.4", "--round", "--holes", "6")
+    out = tmp_path / "out"
+    formats = ("--format", "png", "--format", "svg")
+    result = run(flight, "--target", "A", *options, *formats, "--dpi", "30", "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "A: code [0, 43, 78.25, 180], 6 sheet(s)" in result.stderr
+    assert len(list(out.glob("target_A_r?c?.png"))) == 6
+    assert len(list(out.glob("target_A_r?c?.svg"))) == 6
+
+
+def test_new_targets_differ_from_the_known_ones(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = (flight, "--new", "2", "--format", "svg", "--out", out)
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    new = read_back(tmp_path / "again", out / "targets.toml")
+    assert [target.name for target in new] == ["T1", "T2"]
+    assert new[0].ring.outer_diameter_m == 0.15
+    both = TABLES + (out / "targets.toml").read_text(encoding="utf-8")
+    assert len(tomllib.loads(both)["target"]) == 5
+    (flight / "flight.toml").write_text(both, encoding="utf-8")
+    assert len(read_printed_targets(flight)) == 4, "none of them could be confused"
+
+
+def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
+    text = TABLES.replace("[0, 60, 150, 250]", "[0, 90, 180, 270]")
+    (flight / "flight.toml").write_text(text, encoding="utf-8")
+    result = run(flight, "--format", "svg")
+    assert result.exit_code == 0
+    assert "kgcp: warning: turned or mirrored, codes are only 0.0 dots apart" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--new", "2"], "diameter: is missing"),
+        (["--code", "0,90,180,270", "--diameter", "0.2"], "away from itself, turned"),
+        (["--code", "a", "--diameter", "0.2"], "'a' is no list of angles"),
+        (["FLIGHT", "--code", "10,53,88.25,190"], "rotations of each other"),
+        (["FLIGHT", "--target", "C"], "'C' is not in flight.toml; give one of A, B b"),
+        (["FLIGHT", "--plate", "0.16"], "give at least 0.1875 m"),
+        (["FLIGHT", "--holes", "5"], "plate: is missing"),
+        (["FLIGHT", "--sheet", "A4", "--plate", "0.25"], "A4 is smaller; give --tiled"),
+        (["FLIGHT", "--tiled"], "'fit' is one sheet"),
+        (["FLIGHT", "--format", "png", "--dpi", "2400", "--plate", "0.5"], "million pixels"),
+        (["no_such_folder"], "flight.toml: does not exist"),
+    ],
+)
+def test_impossible_inputs_are_one_line(flight: Path, arguments: list[str], words: str) -> None:
+    result = run(*(str(flight) if word == "FLIGHT" else word for word in arguments))
+    assert result.exit_code == 1
+    assert words in result.stderr
+    assert result.stderr.startswith("kgcp: error: ")
+    assert result.stderr.count("\n") == 1
