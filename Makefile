@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search torture torture sample-flight clean
+.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed torture sample-flight clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -46,12 +46,12 @@ bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed
 	$(BIN)/python -m benchmarks.search $(BENCH)
 	$(BIN)/python -m benchmarks.false_alarms $(PHOTOS)
 
+bench-speed: $(VENV)/.runs ## search and detection as multiples of decoding, jobs, memory, sizes (minutes)
+	$(BIN)/python -m benchmarks.speed --flights ../shared/flights --photos $(PHOTOS) $(BENCH)
+
 bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (half an hour)
 	$(PIP) --editable '.[aat]'
 	$(BIN)/python -m benchmarks.aat_benefit --figure docs/aat_benefit.png $(BENCH)
-
-torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames (a quarter of an hour)
-	$(BIN)/python -m benchmarks.torture $(BENCH)
 
 torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames (a quarter of an hour)
 	$(BIN)/python -m benchmarks.torture $(BENCH)
