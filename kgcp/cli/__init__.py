@@ -82,7 +82,7 @@ class Program(click.Group):
 @click.group(cls=Program, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="kgcp")
 def main() -> None:
-    r"""Measure coded circular targets in aerial frames and make ground control of them.
+    """Measure coded circular targets in aerial frames and make ground control of them.
 
     The usual way through a flight folder:
 
@@ -90,4 +90,4 @@ def main() -> None:
       kgcp detect FLIGHT         find and measure the target in every frame
       kgcp export-gcp FLIGHT     make kinematic ground control points of it
       kgcp bias-report FLIGHT    compare the distances with reference poses
-    """
+    """  # noqa: D301 - \b is click's mark for lines that stay

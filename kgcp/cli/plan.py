@@ -80,7 +80,7 @@ def command(
     plot: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Say what the camera and the target of FLIGHT's flight.toml will give from some heights.
+    """Say what the camera and the target of FLIGHT's flight.toml will give from some heights.
 
     For each height: the ring's radius in the image, how likely it is found, standard deviations of
     distance and centre in one frame, the largest speed for a given motion blur, and the smallest
@@ -89,7 +89,7 @@ def command(
     \b
     Example:
       kgcp plan sample_flight --height 20 --height 40 --exposure 0.0005 --plot plan.png
-    """
+    """  # noqa: D301 - \b is click's mark for lines that stay
     from kgcp.io.flight import read_camera_and_targets
     from kgcp.planning.outlook import Conditions, look_ahead, usual_heights
     from kgcp.printing.new import chosen_targets

@@ -111,7 +111,7 @@ def command(
     is_round: bool,
     as_json: bool,
 ) -> None:
-    r"""Draw targets at true scale, to be printed, cut or engraved.
+    """Draw targets at true scale, to be printed, cut or engraved.
 
     Without --new and --code: those of FLIGHT's flight.toml. With them: new ones, whose codes
     cannot be confused with each other nor with those of FLIGHT, if it is given. targets.toml has
@@ -121,7 +121,7 @@ def command(
     Examples:
       kgcp target sample_flight --format pdf --format dxf --plate 1.2 --holes 8
       kgcp target --new 6 --diameter 0.15 --sheet A4
-    """
+    """  # noqa: D301 - \b is click's mark for lines that stay
     import warnings
 
     from kgcp.errors import KgcpWarning, SettingError

@@ -6,6 +6,7 @@ import io
 import math
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from kgcp.printing.artwork import Plate, draw_target
 from kgcp.printing.shapes import Box, Sheet, Text
 from kgcp.printing.sheets import Paper, lay_out
 from kgcp.settings import DetectSettings
+from kgcp.target.family import check_targets
 from kgcp.target.layout import Ring, Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Miss, Observation
@@ -87,13 +89,17 @@ def test_diameters_are_true_at_600_dpi(rasterise: Callable[[Sheet, int], GreyArr
 
 
 def random_targets(count: int) -> tuple[Target, ...]:
+    """Random codes, but none that flight.toml would not take beside the others."""
     rng = np.random.default_rng(7)
-    targets = []
-    for number in range(count):
+    targets: list[Target] = []
+    while len(targets) < count:
         dots = int(rng.integers(3, 6))
         gaps = 33.0 + (360.0 - dots * 33.0) * rng.dirichlet(np.ones(dots))
         code = tuple(np.round(np.cumsum(gaps) - gaps[0], 1))
-        targets.append(Target(Ring(f"N{number}", 0.12, 0.06, 0.12 / 1.4, 0.12 / 7.0, code)))
+        ring = Ring(f"N{len(targets)}", 0.12, 0.06, 0.12 / 1.4, 0.12 / 7.0, code)
+        with suppress(SettingError):
+            check_targets((*targets, Target(ring)))
+            targets.append(Target(ring))
     return tuple(targets)
 
 
