@@ -21,7 +21,7 @@ _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 1
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around
 
-_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 250, 1000  # of the pixels; in small images
+_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
 
 _Row = npt.NDArray[np.generic]
 
