@@ -104,7 +104,7 @@ def main(
     print(f"\nheights {benefit:.1f} times better with KGCPs and distances (wanted: {_WANTED:g})")
     print(f"scatter within {100 * astray:.0f} % of the prediction (wanted: {100 * _TOLERANCE:.0f})")
     if figure is not None:
-        figure.write_bytes(draw_benefit(trials, settings.length_m))
+        figure.write_bytes(draw_benefit(trials, settings.checks_along_m))
 
 
 if __name__ == "__main__":

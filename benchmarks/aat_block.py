@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.aat_ride import Ride, drive
 from benchmarks.aat_settings import (
     FREE_PARAMETERS,
+    FROM_END_M,
     BlockSettings,
     axes_of,
     faded_covariance,
@@ -37,7 +38,6 @@ _STRIP_HALF_WIDTH_M = 36.0  # tie points: a little more than the frames see
 _BEYOND_ENDS_M = 28.0
 _CHECK_ACROSS_M = 16.0
 _GCP_ACROSS_M = 12.0
-_FROM_END_M = 10.0  # first and last check point and GCP: four frames see them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,8 +186,8 @@ def _lay_points(settings: BlockSettings, rng: np.random.Generator) -> FloatArray
     side = np.where(np.arange(settings.checks) % 2, 1.0, -1.0)
     along_m = np.concatenate(
         (
-            np.linspace(_FROM_END_M, length_m - _FROM_END_M, settings.checks),
-            [_FROM_END_M, length_m - _FROM_END_M],
+            settings.checks_along_m,
+            [FROM_END_M, length_m - FROM_END_M],
             rng.uniform(-_BEYOND_ENDS_M, length_m + _BEYOND_ENDS_M, ties),
         )
     )

@@ -8,9 +8,11 @@ import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from benchmarks.aat_settings import Way
 from benchmarks.aat_table import Trials
+from kgcp.geometry.arrays import FloatArray
 
 # Okabe and Ito's palette, told apart by colour-blind readers and in grey print
 _COLOURS = {
@@ -19,6 +21,7 @@ _COLOURS = {
     Way.KGCPS: "#56B4E9",
     Way.DISTANCES: "#0072B2",
 }
+_COLOURS_IN_FILE = 64
 _LABELS = {
     Way.GNSS: "GNSS only",
     Way.GCPS: "+ 2 classic\nGCPs",
@@ -39,24 +42,26 @@ _STYLE = {
 }
 
 
-def draw_benefit(trials: Trials, length_m: float) -> bytes:
-    """Return the figure as PNG: height errors along the corridor, and their RMS by way."""
+def draw_benefit(trials: Trials, checks_along_m: FloatArray) -> bytes:
+    """Return the figure as PNG: height errors along the corridor (c,), and their RMS by way."""
     with style.context(["default", _STYLE]):
         figure = Figure(figsize=(8.4, 8.0), layout="constrained")
         along, by_way = figure.subplots(2, 1)
-        _draw_along(along, trials, length_m)
+        _draw_along(along, trials, checks_along_m)
         _draw_rms(by_way, trials)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png", metadata={"Software": None})
+    light = io.BytesIO()
+    Image.open(drawn).convert("RGB").quantize(_COLOURS_IN_FILE).save(light, "PNG", optimize=True)
+    return light.getvalue()
 
 
-def _draw_along(axes: Axes, trials: Trials, length_m: float) -> None:
+def _draw_along(axes: Axes, trials: Trials, checks_along_m: FloatArray) -> None:
     for way in (Way.GNSS, Way.DISTANCES):
         for number, trial in enumerate(trials["free", way]):
             up_cm = 100.0 * trial.error_m[:, 2]
             axes.plot(
-                np.linspace(0.0, length_m, len(up_cm)),
+                checks_along_m,
                 up_cm,
                 color=_COLOURS[way],
                 linewidth=1.0,
@@ -67,7 +72,8 @@ def _draw_along(axes: Axes, trials: Trials, length_m: float) -> None:
     axes.set_title("Heights of the check points, free calibration, one line per block", loc="left")
     axes.set_xlabel("along the corridor [m]")
     axes.set_ylabel("height error [cm]")
-    axes.legend(loc="upper right", ncols=2)
+    axes.margins(y=0.15)
+    axes.legend(loc="upper right", ncols=2, borderaxespad=0.0)
 
 
 def _draw_rms(axes: Axes, trials: Trials) -> None:

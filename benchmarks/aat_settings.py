@@ -15,6 +15,7 @@ from kgcp.mapframe import MapFrame
 
 CRS = "EPSG:25832"
 ORIGIN_MAP: FloatArray = np.array([689_412.0, 5_336_208.0, 545.0])
+FROM_END_M = 10.0  # first and last check point and GCP, from the first and last frame
 FREE_PARAMETERS = ("f", "cx", "cy", "k1", "k2")  # of the calibration; f = fx = fy
 
 
@@ -100,6 +101,11 @@ class BlockSettings:
     def length_m(self) -> float:
         """Way of the vehicle from the first frame to the last [m]."""
         return (self.frames - 1) * self.interval_s * self.speed_m_s
+
+    @property
+    def checks_along_m(self) -> FloatArray:
+        """Where the check points are along the corridor: at least four frames see each [m]."""
+        return np.linspace(FROM_END_M, self.length_m - FROM_END_M, self.checks)
 
 
 def random_stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:

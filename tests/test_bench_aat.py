@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.aat_block import Block, project_all, simulate_block
+from benchmarks.aat_figure import draw_benefit
 from benchmarks.aat_kgcps import (
     KgcpSet,
     distance_by_calibration,
@@ -229,3 +230,19 @@ def test_true_predictions_are_called_true() -> None:
     lines = list(table_lines({("free", Way.KGCPS): row}))
     assert len(lines) == 3
     assert "| free | + KGCPs | " in lines[2]
+
+
+def test_the_figure_is_light_and_always_the_same() -> None:
+    rng = np.random.default_rng(7)
+    trials = {
+        (calibration, way): [
+            Trial(np.tile(0.1 * rng.standard_normal(3), (24, 1)), 0.01 * np.eye(72), 0.5, 0.5)
+            for _ in range(20)
+        ]
+        for calibration in ("free", "known")
+        for way in Way
+    }
+    figure = draw_benefit(trials, BlockSettings().checks_along_m)
+    assert figure.startswith(b"\x89PNG")
+    assert len(figure) < 200_000
+    assert draw_benefit(trials, BlockSettings().checks_along_m) == figure
