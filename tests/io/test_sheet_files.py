@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -38,6 +40,7 @@ from kgcp.target.layout import Ring, Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Miss, Observation
 
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DPI = 600
 PX_PER_MM = DPI / 25.4
 RING = Ring("Südtor 1", 0.09, 0.045, 0.0643, 0.0129, (0.0, 47.0, 100.0, 260.0))
@@ -66,26 +69,66 @@ def edges(profile: FloatArray) -> FloatArray:
     return crossings
 
 
+def bare_sheet() -> Sheet:
+    """A target without its legend, which needs no measuring."""
+    bare = replace(draw_target(TARGET, None), box=Box(-46.0, -47.0, 48.0, 49.0))
+    return lay_out(bare, "bare", Paper.FIT, is_tiled=False)[0]
+
+
+def edges_mm(grey: GreyArray, sheet: Sheet, px_per_mm: FloatArray, way_deg: float) -> FloatArray:
+    """Distances of all edges on a line through the centre, from it; negative ones first."""
+    centre = np.array(sheet.centre_mm) * px_per_mm - 0.5
+    reach_mm = np.arange(-50.0, 50.0, 0.02)
+    way = math.radians(way_deg)
+    steps = reach_mm[:, None] * np.array([math.cos(way), math.sin(way)])
+    places = (centre + steps * px_per_mm).astype(np.float32)
+    profile = cv2.remap(grey, places[None, :, 0], places[None, :, 1], cv2.INTER_LINEAR)[0]
+    found = np.interp(edges(profile.astype(float)), np.arange(len(reach_mm)), reach_mm)
+    return np.asarray(found)
+
+
+DIAMETERS_MM = np.array([90.0, 45.0, 27.0, 13.5])
+BETWEEN_DOTS_DEG = (28.0, 122.0, 140.0, 160.0)
+
+
 @pytest.mark.parametrize("rasterise", [raster_of_pdf, raster_of_svg])
 def test_diameters_are_true_at_600_dpi(rasterise: Callable[[Sheet, int], GreyArray]) -> None:
-    artwork = draw_target(TARGET, None)
-    bare = replace(artwork, box=Box(-46.0, -47.0, 48.0, 49.0))  # the legend needs no measuring
-    (sheet,) = lay_out(bare, "bare", Paper.FIT, is_tiled=False)
+    sheet = bare_sheet()
     grey = rasterise(sheet, DPI)
-    scale_x, scale_y = grey.shape[1] / sheet.width_mm, grey.shape[0] / sheet.height_mm
-    assert (scale_x, scale_y) == pytest.approx((PX_PER_MM, PX_PER_MM), rel=1e-3)
-    centre = np.array(sheet.centre_mm) * (scale_x, scale_y) - 0.5
-    reach_mm = np.arange(-50.0, 50.0, 0.02)
-    for direction_deg in (28.0, 122.0, 140.0, 160.0):  # between the dots
-        way = math.radians(direction_deg)
-        steps = reach_mm[:, None] * np.array([math.cos(way), math.sin(way)])
-        places = (centre + steps * (scale_x, scale_y)).astype(np.float32)
-        profile = cv2.remap(grey, places[None, :, 0], places[None, :, 1], cv2.INTER_LINEAR)[0]
-        found_mm = np.interp(edges(profile.astype(float)), np.arange(len(reach_mm)), reach_mm)
-        sizes = np.array([90.0, 45.0, 27.0, 13.5])
+    scale = np.array(grey.shape[::-1]) / (sheet.width_mm, sheet.height_mm)
+    assert scale == pytest.approx([PX_PER_MM, PX_PER_MM], rel=1e-3)
+    for way_deg in BETWEEN_DOTS_DEG:
+        found_mm = edges_mm(grey, sheet, scale, way_deg)
         assert len(found_mm) == 8
-        np.testing.assert_allclose(found_mm[::-1][:4] - found_mm[:4], sizes, atol=0.02)
-        np.testing.assert_allclose(found_mm[:4], -0.5 * sizes, atol=0.03)
+        np.testing.assert_allclose(found_mm[::-1][:4] - found_mm[:4], DIAMETERS_MM, atol=0.02)
+        np.testing.assert_allclose(found_mm[:4], -0.5 * DIAMETERS_MM, atol=0.03)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_browser_draws_the_svg_at_its_true_size(tmp_path: Path) -> None:
+    assert CHROMIUM is not None
+    sheet, picture = bare_sheet(), tmp_path / "seen.png"
+    (tmp_path / "sheet.svg").write_bytes(svg_of(sheet))
+    seen = subprocess.run(
+        [
+            *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
+            *("--enable-logging=stderr", f"--user-data-dir={tmp_path / 'profile'}"),
+            *("--window-size=600,600", f"--screenshot={picture}"),
+            (tmp_path / "sheet.svg").as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert "CONSOLE" not in seen.stderr
+    with Image.open(picture) as opened:
+        grey = np.asarray(opened.convert("L"))
+    css_px_per_mm = np.full(2, 96.0 / 25.4)  # and pages are rounded to whole ones, of 0.26 mm
+    for way_deg in BETWEEN_DOTS_DEG:
+        found_mm = edges_mm(grey, sheet, css_px_per_mm, way_deg)
+        np.testing.assert_allclose(found_mm[:4], -0.5 * DIAMETERS_MM, atol=0.2)
+        np.testing.assert_allclose(found_mm[::-1][:4], 0.5 * DIAMETERS_MM, atol=0.2)
 
 
 def random_targets(count: int) -> tuple[Target, ...]:
