@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
@@ -292,7 +293,32 @@ def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
     assert table(flight) == undisturbed
 
 
-def test_a_frame_that_kills_its_worker_is_a_row(
+def examine_or_die(task: FrameTask, note: FrameNote) -> FrameResult:
+    if note.frame == "f_8.png":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return examine_frame(task, note)
+
+
+def test_a_frame_that_kills_its_worker_costs_no_other(
+    flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("kgcp.looks.examine_frame", examine_or_die)
+        settings = DetectSettings(is_guided=False)  # a second look would start more processes
+        detect_flight(read_flight(flight), settings, flight / "kgcp", jobs=1)
+    table_path = flight / "kgcp" / "detections.parquet"
+    rows = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
+    assert rows.index[rows["status"] == "unreadable"].to_list() == ["f_8.png"]
+    assert rows.loc["f_8.png", "reason"] == "worker_died"
+    table_path.write_bytes(undisturbed)
+    others = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
+    measured = (others["status"] == "measured") & ~others["guided"].astype(bool)
+    first = others.index[measured & (others.index != "f_8.png")]
+    assert len(first) > FRAMES // 3
+    pd.testing.assert_frame_equal(rows.loc[first], others.loc[first])
+
+
+def test_who_is_lost_is_tried_again_by_the_next_run(
     flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def lossy(

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 
-FRAMES = 40
+FRAMES, FEW = 40, 4
 FLIGHT = """\
 [camera]
 width = 640
@@ -34,17 +34,25 @@ code_deg = [0, 43, 78, 180]
 """
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Frames of rough ground: many, so that a run can be stopped in their midst."""
-    folder = tmp_path_factory.mktemp("stopping")
+def rough_ground(folder: Path, frames: int) -> Path:
     (folder / "frames").mkdir()
     (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
     rng = np.random.default_rng(3)
-    for number in range(FRAMES):
+    for number in range(frames):
         noise = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)), (0, 0), 1.0 + number % 3)
         assert cv2.imwrite(str(folder / "frames" / f"{number:02d}.jpg"), noise.astype(np.uint8))
     return folder
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Many frames, so that a run can be stopped in their midst."""
+    return rough_ground(tmp_path_factory.mktemp("stopping"), FRAMES)
+
+
+@pytest.fixture(scope="module")
+def short_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rough_ground(tmp_path_factory.mktemp("short"), FEW)
 
 
 def run(flight: Path, out: Path, *options: str) -> Result:
@@ -82,24 +90,24 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     assert f"{FRAMES} frames in" in result.stderr
 
 
-def test_what_is_said_can_be_chosen(flight: Path, tmp_path: Path) -> None:
-    quiet = run(flight, tmp_path / "a", "--quiet")
+def test_what_is_said_can_be_chosen(short_flight: Path, tmp_path: Path) -> None:
+    quiet = run(short_flight, tmp_path / "a", "--quiet")
     assert (quiet.exit_code, quiet.output) == (0, "")
-    told = run(flight, tmp_path / "b", "--log-json", "--restart", "--json")
+    told = run(short_flight, tmp_path / "b", "--log-json", "--restart", "--json")
     events = [json.loads(line) for line in told.stderr.splitlines()]
     assert [event["event"] for event in events[-2:]] == ["progress", "summary"]
     assert events[-1]["reasons"] == json.loads(told.stdout)["reasons"]
-    profiled = run(flight, tmp_path / "c", "--profile")
+    profiled = run(short_flight, tmp_path / "c", "--profile")
     for stage in ("first look", "table", "workers: io.frames.read_grey"):
         assert f" s  {stage}\n" in profiled.stderr
     tables = {(tmp_path / name / "detections.parquet").read_bytes() for name in "abc"}
     assert len(tables) == 1
 
 
-def test_the_run_is_recorded_beside_the_table(flight: Path, tmp_path: Path) -> None:
-    run(flight, tmp_path, "--min-radius", "8")
+def test_the_run_is_recorded_beside_the_table(short_flight: Path, tmp_path: Path) -> None:
+    run(short_flight, tmp_path, "--min-radius", "8")
     record = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
-    assert record["frames"] == sum(record["status"].values()) == FRAMES
+    assert record["frames"] == sum(record["status"].values()) == FEW
     assert record["settings"]["min_radius_px"] == 8.0
     assert record["versions"].keys() >= {"kgcp", "python", "numpy", "opencv"}
     assert record["host"]["cores"] >= 1
