@@ -41,9 +41,9 @@ def _is_first(
 ) -> npt.NDArray[np.bool_]:
     """Tell which circles are like no clearer one that is kept."""
     first = np.ones(len(radii), np.bool_)
-    position = np.empty(len(radii), np.intp)
-    for i in range(len(by_row)):
-        position[by_row[i]] = i
+    position, rank = np.empty(len(radii), np.intp), np.empty(len(radii), np.intp)
+    for i in range(len(radii)):
+        position[by_row[i]], rank[order[i]] = i, i
     for one in order:
         if not first[one]:
             continue
@@ -56,9 +56,7 @@ def _is_first(
                 if abs(y) > reach:
                     break
                 x = centres[other, 0] - centres[one, 0]
-                if x * x + y * y <= reach * reach and (
-                    abs(math.log(radii[other] / radii[one])) <= alike
-                ):
-                    first[other] = False
+                if x * x + y * y <= reach * reach and rank[other] > rank[one]:
+                    first[other] &= abs(math.log(radii[other] / radii[one])) > alike
                 place += step
     return first
