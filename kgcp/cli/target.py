@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from kgcp.cli.options import json_option
+
+if TYPE_CHECKING:
+    from kgcp.target.layout import Target
 
 # Named here, not imported, because the modules that know them take numpy; a test compares.
 FORMATS = ("pdf", "svg", "dxf", "png")
@@ -122,22 +127,23 @@ def command(
       kgcp target sample_flight --format pdf --format dxf --plate 1.2 --holes 8
       kgcp target --new 6 --diameter 0.15 --sheet A4
     """  # noqa: D301 - \b is click's mark for lines that stay
-    import warnings
-
-    from kgcp.errors import KgcpWarning, SettingError
+    from kgcp.errors import SettingError
     from kgcp.io.flight import read_printed_targets
     from kgcp.io.sheets.write import check_stems, write_sheets
     from kgcp.io.target_text import write_target_tables
     from kgcp.printing.artwork import Plate, draw_target
-    from kgcp.printing.codes import LEAST_DISTANCE, least_apart
     from kgcp.printing.new import chosen_targets, new_targets
     from kgcp.printing.sheets import Paper, lay_out
 
     is_new = bool(new_count or codes)
-    if flight is None and not is_new:
-        flight = Path()
+    if names and is_new:
+        raise SettingError("target", "stands beside --new or --code", "give one of them")
+    if diameter_m is not None and not is_new:
+        raise SettingError("diameter", "stands without --new or --code", "give one of them, too")
     if (is_round or hole_mm is not None) and plate_m is None:
         raise SettingError("plate", "is missing beside --round or --holes", "give its width")
+    if flight is None and not is_new:
+        flight = Path()
     known = () if flight is None else read_printed_targets(flight)
     if is_new:
         targets = new_targets(known, diameter_m, codes, new_count or 0, dots)
@@ -156,7 +162,38 @@ def command(
         for path in write_sheets(sheets, target.name, folder, formats, dpi)
     ]
     files.append(write_target_tables(targets, folder))
+    sheets_of = {target.name: len(sheets) for target, sheets in zip(targets, layouts, strict=True)}
+    _tell(targets, known, sheets_of, files, as_json=as_json)
+
+
+def _tell(
+    targets: Sequence[Target],
+    known: Sequence[Target],
+    sheets_of: Mapping[str, int],
+    files: Sequence[Path],
+    *,
+    as_json: bool,
+) -> None:
+    """Say what was written, and how well the codes can be told apart."""
+    import json
+    import warnings
+
+    from kgcp.errors import KgcpWarning
+    from kgcp.printing.codes import LEAST_DISTANCE, least_apart
+
     apart = least_apart([target.ring for target in dict.fromkeys((*targets, *known))])
+    if as_json:
+        told = [
+            {"name": t.name, "code_deg": t.ring.code_deg, "sheets": sheets_of[t.name]}
+            for t in targets
+        ]
+        paths = [str(path) for path in files]
+        click.echo(json.dumps({"targets": told, "dots_apart": apart, "files": paths}))
+    for target in targets:
+        code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
+        count = sheets_of[target.name]
+        click.echo(f"{target.name}: code [{code}], {count} sheet{'s'[: count > 1]}", err=True)
+    click.echo(f"codes at least {apart:.1f} dots apart, turned or mirrored", err=True)
     if apart < LEAST_DISTANCE:
         warnings.warn(
             f"turned or mirrored, codes are only {apart:.1f} dots apart: a dirty dot may give one"
@@ -164,21 +201,5 @@ def command(
             KgcpWarning,
             stacklevel=2,
         )
-    if as_json:
-        import json
-
-        summary = {
-            "targets": [
-                {"name": target.name, "code_deg": target.ring.code_deg, "sheets": len(sheets)}
-                for target, sheets in zip(targets, layouts, strict=True)
-            ],
-            "dots_apart": apart,
-            "files": [str(path) for path in files],
-        }
-        click.echo(json.dumps(summary))
-    for target, sheets in zip(targets, layouts, strict=True):
-        code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
-        click.echo(f"{target.name}: code [{code}], {len(sheets)} sheet(s)", err=True)
-    click.echo(f"codes at least {apart:.1f} dots apart, turned or mirrored", err=True)
     for path in files:
         click.echo(f"wrote {path}", err=True)

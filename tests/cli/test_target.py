@@ -84,7 +84,7 @@ def test_one_target_in_tiles_on_a_plate(flight: Path, tmp_path: Path) -> None:
     formats = ("--format", "png", "--format", "svg")
     result = run(flight, "--target", "A", *options, *formats, "--dpi", "30", "--out", out)
     assert result.exit_code == 0, result.output
-    assert "A: code [0, 43, 78.25, 180], 6 sheet(s)" in result.stderr
+    assert "A: code [0, 43, 78.25, 180], 6 sheets" in result.stderr
     assert len(list(out.glob("target_A_r?c?.png"))) == 6
     assert len(list(out.glob("target_A_r?c?.svg"))) == 6
 
@@ -124,6 +124,8 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
         (["FLIGHT", "--sheet", "A4", "--plate", "0.25"], "A4 is smaller; give --tiled"),
         (["FLIGHT", "--tiled"], "'fit' is one sheet"),
         (["FLIGHT", "--format", "png", "--dpi", "2400", "--plate", "0.5"], "million pixels"),
+        (["FLIGHT", "--target", "A", "--new", "1"], "target: stands beside --new"),
+        (["FLIGHT", "--diameter", "0.3"], "diameter: stands without --new"),
         (["no_such_folder"], "flight.toml: does not exist"),
     ],
 )
