@@ -39,7 +39,8 @@ def main(flights: Path | None, photos: Path | None, frames: int) -> None:
                 print(cost_line(costs), flush=True)
         print(jobs_line(sources[0], work), flush=True)
         print(help_line(), flush=True)
-        print("\n".join(size_lines(photograph_of(photographs, sources[0]), work)), flush=True)
+        for line in size_lines(photograph_of(photographs, sources[0]), work):
+            print(line, flush=True)
 
 
 if __name__ == "__main__":
