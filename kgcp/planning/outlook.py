@@ -33,11 +33,12 @@ TILT_DEG = 6.0
 """Of the plate against the viewing ray; more hardly matters, frontal views are better."""
 GAIN = 0.85
 """Exposure relative to the one at which a perfect white clips."""
-SCATTER = {True: (1.0, 1.1), False: (1.25, 1.1)}
+SCATTER = {True: (1.0, 1.1), False: (1.4, 1.2)}
 """RMS error over bound, of distance and centre, by whether the camera's response is linear.
 
-`python -m benchmarks.planning`, seed 1: 0.98 and 1.08 of 55 targets in clean, exposure_sweep,
-blurred, oblique and far; 1.24 and 1.12 of 11 in consumer (tone curve, sharpening, JPEG).
+`python -m benchmarks.planning`: 0.98 and 1.08 of 55 targets in clean, exposure_sweep, blurred,
+oblique and far; 1.37 and 1.22 of 38 in consumer (tone curve, sharpening, JPEG), which are 11 of
+seed 1 and 27 of `--flights 30 --seed 2`.
 """
 FOUND = ((6.0, 48, 52), (7.0, 52, 54), (8.0, 43, 44), (9.0, 300, 300))
 """Radius from which on [px], rings found, rings shown.
