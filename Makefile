@@ -49,7 +49,7 @@ bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed
 bench-speed: $(VENV)/.runs ## search and detection as multiples of decoding, jobs, memory, sizes (minutes)
 	$(BIN)/python -m benchmarks.speed --flights ../shared/flights --photos $(PHOTOS) $(BENCH)
 
-bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (half an hour)
+bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (ten minutes)
 	$(PIP) --editable '.[aat]'
 	$(BIN)/python -m benchmarks.aat_benefit --figure docs/aat_benefit.png $(BENCH)
 

@@ -85,9 +85,11 @@ def calibration_of(camera: Camera) -> gtsam.Cal3DS2:
 
 def add_block(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, block: Block) -> None:
     """Add all image points and camera positions; start near the truth, by the old calibration."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, block.settings.sd_tie_px)
-    sights = block.sights
+    sights, settings = block.sights, block.settings
+    mark = gtsam.noiseModel.Isotropic.Sigma(2, settings.sd_mark_px)
+    tie = gtsam.noiseModel.Isotropic.Sigma(2, settings.sd_tie_px)
     for frame, point, pixel in zip(sights.frame, sights.point, sights.pixels, strict=True):
+        noise = mark if point < sights.checks + sights.gcps else tie
         graph.add(gtsam.GeneralSFMFactor2Cal3DS2(pixel, noise, X(int(frame)), L(int(point)), C(0)))
     for index, (view, centre) in enumerate(zip(block.views, block.gnss_enu_m, strict=True)):
         values.insert(X(index), gtsam.Pose3(gtsam.Rot3(view.enu_from_camera), centre))

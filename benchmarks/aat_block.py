@@ -175,7 +175,8 @@ def _look(
     if not kept[:special].all():
         raise ValueError("a check point or GCP is seen in fewer than three frames")
     frame, point = np.nonzero(seen[:, kept])
-    noise = settings.sd_tie_px * rng.standard_normal((len(frame), 2))
+    sd_px = np.where(point < special, settings.sd_mark_px, settings.sd_tie_px)
+    noise = sd_px[:, None] * rng.standard_normal((len(frame), 2))
     return Sights(
         points[kept], settings.checks, 2, frame, point, pixels[:, kept][frame, point] + noise
     )

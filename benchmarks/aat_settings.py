@@ -51,8 +51,8 @@ class BlockSettings:
         Points on the ground, before those in fewer than three frames are left out.
     seen_share : float
         Of the frames that see a tie point, how many have it measured.
-    sd_tie_px : float
-        Of a tie point's image [px].
+    sd_tie_px, sd_mark_px : float
+        Of the image of a tie point, and of the signalised check points and GCPs [px].
     sd_gnss_m, sd_gnss_drift_m : tuple of float
         Camera positions, horizontal and up: from frame to frame, and the error that they share [m].
     gnss_correlation_s : float
@@ -86,6 +86,7 @@ class BlockSettings:
     checks: int = 24
     seen_share: float = 0.7
     sd_tie_px: float = 0.4
+    sd_mark_px: float = 0.2
     sd_gnss_m: tuple[float, float] = (0.030, 0.050)
     sd_gnss_drift_m: tuple[float, float] = (0.030, 0.050)
     gnss_correlation_s: float = 200.0
