@@ -22,6 +22,7 @@ _HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
 _NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
 _NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
 _HIDDEN_SIGMAS = 4.0  # from there through the next edge
+_SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
 _MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
 _DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
@@ -95,6 +96,8 @@ def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
     """
     imaging, sd_px = seen.imaging, seen.blur.largest_sd_px
     count = seen.points_m.shape[1]
+    if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
+        return np.zeros(count, dtype=bool)
     share, off_edge = np.ones(count), np.full(count, np.inf)
     circles, per_px = imaging.circles, 1.0 / seen.metres_per_px
     small_m = _SMALL_SIGMAS * sd_px * seen.metres_per_px
