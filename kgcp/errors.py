@@ -148,7 +148,7 @@ class Reason(StrEnum):
     WORKER_DIED = (
         "worker_died",
         Status.UNREADABLE,
-        "the process that examined the frame died, repeatedly: memory ran out, or a decoder crashed",
+        "the process that examined the frame died twice: memory ran out, or a decoder crashed",
     )
     TIMED_OUT = (
         "timed_out",
