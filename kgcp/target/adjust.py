@@ -8,12 +8,10 @@ import numpy as np
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT, Light, Parameters, light_of_levels
+from kgcp.target.light import PARAM_COUNT, Parameters
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
-from kgcp.target.pairs import Blur
 from kgcp.target.sample import Sample, choose_sample
 
 _MAX_ROUNDS = 4
@@ -118,24 +116,6 @@ def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, Float
     share = white_share(parameters.pose, sample.rays, parameters.blur, sample.pairs)
     levels, jacobian = sample.imager.linearised(share, parameters.light)
     return Prediction(share.points_m, share.value, levels), jacobian
-
-
-def first_levels(sample: Sample, pose: Pose, blur: Blur) -> Light:
-    """Return black and white as medians of what an approximate pose takes for ink and plate.
-
-    Raises
-    ------
-    Rejection
-        `NO_CONTRAST` if ink is not darker than the plate.
-    """
-    share = white_level(pose, sample.rays, blur, sample.pairs).value
-    tenth = len(share) // 10
-    darkest, brightest = np.partition(share, (tenth, -1 - tenth))[[tenth, -1 - tenth]]
-    black = float(np.median(sample.levels[share <= max(0.1, darkest)]))
-    white = float(np.median(sample.levels[share >= min(0.9, brightest)]))
-    if white - black < 4.0 * sample.imaging.window.levels_per_count:
-        raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
-    return light_of_levels(black, white, sample.imaging.response)
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:

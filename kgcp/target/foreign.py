@@ -9,12 +9,16 @@ import cv2
 import numpy as np
 
 from kgcp.compiled import compiled
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.pose import Pose
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import Light, plateau_levels
+from kgcp.target.light import Light, light_of_levels, plateau_levels
 from kgcp.target.noise import BoolArray
 from kgcp.target.pairs import Blur
+from kgcp.target.plate import plate_points
 
+_BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
 _CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
@@ -41,6 +45,8 @@ class SeenPlate:
         Largest length on the plate that a pixel spans.
     blur : Blur
     light : Light
+    rho_m : (n,) array
+        Distance of the points from the target's centre.
     """
 
     imaging: Imaging
@@ -48,16 +54,12 @@ class SeenPlate:
     metres_per_px: float
     blur: Blur
     light: Light
+    rho_m: FloatArray
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the window."""
         return self.imaging.window.height, self.imaging.window.width
-
-    def smooth(self) -> FloatArray:
-        """Return the grey values (n,), median of three by three."""
-        levels = self.imaging.window.levels.reshape(self.shape).astype(np.float32)
-        return np.asarray(cv2.medianBlur(levels, 3).ravel(), dtype=np.float64)
 
     def levels(self) -> tuple[float, float]:
         """Return the grey values of ink and plate."""
@@ -69,14 +71,54 @@ class SeenPlate:
         return np.asarray(reached.ravel() > 0)
 
 
+def see_plate(
+    imaging: Imaging, points_m: FloatArray, metres_per_px: float, blur: Blur, light: Light
+) -> SeenPlate:
+    """Prepare a window for what is asked of it."""
+    x, y = points_m
+    return SeenPlate(imaging, points_m, metres_per_px, blur, light, np.sqrt(x * x + y * y))
+
+
+def first_levels(imaging: Imaging, pose: Pose) -> Light:
+    """Return black and white as medians of what an approximate pose takes for ink and plate.
+
+    Raises
+    ------
+    Rejection
+        `NO_CONTRAST` if ink is not darker than the plate.
+    """
+    window, circles = imaging.window, imaging.circles
+    x, y = points_m = plate_points(pose, window.rays)
+    share, off_edge_m = np.ones(len(x)), np.full(len(x), np.inf)
+    _fill_plateaus(
+        points_m, circles.centres_m, circles.radii_m, circles.signs, 0.0, share, off_edge_m
+    )
+    inside = x * x + y * y < imaging.outer_radius_m**2
+    black, white = (
+        _median_of_clearest(window.levels[chosen], off_edge_m[chosen])
+        for chosen in (inside & (share < 0.5), inside & (share > 0.5))
+    )
+    if not white - black >= 4.0 * window.levels_per_count:
+        raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
+    return light_of_levels(black, white, imaging.response)
+
+
+def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
+    """Return the median of the levels that are farthest from edges; NaN without any."""
+    if not len(levels):
+        return math.nan
+    first = int(_BLURRED_SHARE * len(levels))
+    return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
+
+
 def reached_by_surroundings(seen: SeenPlate) -> BoolArray:
     """Tell which pixels (n,) of the window blur may mix with something that is not plate."""
     imaging, blur = seen.imaging, seen.blur
     black, white = seen.levels()
     contrast, white = white - black, min(white, 1.0)
-    beyond = np.hypot(*seen.points_m) / imaging.outer_radius_m - 1.0
+    beyond = seen.rho_m / imaging.outer_radius_m - 1.0
     outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
-    foreign = outside & (np.abs(seen.smooth() - white) > _FOREIGN_CONTRAST * contrast)
+    foreign = outside & (np.abs(imaging.window.smooth - white) > _FOREIGN_CONTRAST * contrast)
     reach = _FOREIGN_SIGMAS * blur.largest_sd_px
     half = int(np.ceil(reach))
     columns, rows = np.meshgrid(*2 * [np.arange(-half, half + 1)])
@@ -105,15 +147,16 @@ def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
         seen.points_m, circles.centres_m, circles.radii_m, circles.signs, small_m, share, off_edge
     )
     off_edge = off_edge * per_px - slack_px
-    beyond = (np.hypot(*seen.points_m) - imaging.outer_radius_m) * per_px - slack_px
+    beyond = (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px
     black, white = seen.levels()
     contrast = min(white, 1.0) - black
-    off_level = np.abs(seen.smooth() - (black + contrast * share))
+    off_level = np.abs(imaging.window.smooth - (black + contrast * share))
     tested = (off_edge > _CLEAR_SIGMAS * sd_px) & (beyond < 0.0)
     other = tested & (off_level > _HIDDEN_CONTRAST * contrast)
     near = (off_edge > _NO_EDGE_SIGMAS * sd_px) & (beyond < _NO_EDGE_OUTSIDE_SIGMAS * sd_px)
     other |= near & (off_level > _NO_EDGE_CONTRAST * contrast)
-    other = _without_dots(seen, other)
+    if other.any():
+        other = _without_dots(seen, other)
     found = int(np.count_nonzero(other))
     if not found or found > _MAX_HIDDEN * np.count_nonzero(tested | near):
         return np.zeros(count, dtype=bool)
@@ -131,8 +174,7 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(
         other.reshape(seen.shape).astype(np.uint8)
     )
-    rho_m = np.hypot(*seen.points_m)
-    beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
+    beside = (seen.rho_m > radii_m[0]) | (seen.rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
     hides = np.bincount(labels.ravel(), weights=beside) > 0
     hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2

@@ -10,7 +10,7 @@ from kgcp.target.noise import Censoring
 from kgcp.target.plate import Circles
 from kgcp.target.window import Window
 
-_FEW_PIXELS = 600  # enough to come near the minimum, at a fraction of the time
+_FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 
 
 @dataclass(frozen=True, slots=True, eq=False)

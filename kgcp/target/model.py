@@ -16,9 +16,10 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit, Unknowns, adjust, approach, first_levels, minimise
+from kgcp.target.adjust import Fit, Unknowns, adjust, approach, minimise
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
+from kgcp.target.foreign import first_levels
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import PARAM_COUNT, Param, Parameters
@@ -37,7 +38,7 @@ _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/me
 _SPILT_PX = (0.7, 1.4)  # by which edges may be displaced
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
-_HOPELESS = 200.0  # of log-likelihood: the mirrored pose needs no better value than this
+_HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose is fitted no better
 
 _PRIOR_SD = {
     Param.BLUR_DIFFERENCE: 0.5,
@@ -161,7 +162,7 @@ def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
 def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
     """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
     rough = _rough_fit(imaging, pose)
-    other = _mirrored_fit(rough)
+    other = _mirrored_fit(rough, _UNLIKELY)
     near = other.parameters if other.total < rough.total else rough.parameters
     best = _adjust_with_streak(imaging, near)
     other = _mirrored_fit(best)
@@ -188,9 +189,8 @@ def _rough_fit(imaging: Imaging, pose: Pose) -> Fit:
 
 
 def _approach(imaging: Imaging, pose: Pose) -> Fit:
+    light = first_levels(imaging, pose)
     few = imaging.few_pixels
-    sample = choose_sample(imaging, pose, _START_BLUR, None, most=few)
-    light = first_levels(sample, pose, _START_BLUR)
     sample = choose_sample(imaging, pose, _START_BLUR, light, most=few, slack_px=_START_SLACK_PX)
     unknowns = _unknowns(imaging.response, has_streak=False)
     return approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
@@ -235,7 +235,7 @@ def _advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior |
     return of_image + worse - better
 
 
-def _mirrored_fit(fit: Fit) -> Fit:
+def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
     parameters = fit.parameters
     mirrored = Parameters(parameters.pose.mirrored(), parameters.blur, parameters.light)
     linear = None
@@ -249,7 +249,7 @@ def _mirrored_fit(fit: Fit) -> Fit:
             enough=_MIRRORED_GAIN,
             linear=linear,
         )
-        if other.total - fit.total > _HOPELESS:
+        if other.total - fit.total > hopeless:
             break
         mirrored, linear = other.parameters, (other.prediction, other.jacobian)
     return other

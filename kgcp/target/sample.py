@@ -13,7 +13,7 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
-from kgcp.target.foreign import SeenPlate, hidden_pixels, reached_by_surroundings
+from kgcp.target.foreign import hidden_pixels, reached_by_surroundings, see_plate
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import PARAM_COUNT, Imager, Light
 from kgcp.target.noise import Censoring
@@ -87,7 +87,7 @@ def choose_sample(
     points = plate_points(pose, window.rays)
     zone = _zones(imaging, points, blur, scale)
     if light is not None:
-        seen = SeenPlate(imaging, points, scale, blur, light)
+        seen = see_plate(imaging, points, scale, blur, light)
         zone[reached_by_surroundings(seen) | hidden_pixels(seen, slack_px)] = _Zone.UNUSED
     near, flat = np.flatnonzero(zone == _Zone.NEAR), np.flatnonzero(zone == _Zone.FLAT)
     index = np.concatenate((near, flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]))

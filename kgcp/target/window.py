@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from kgcp.errors import Reason, Rejection
@@ -26,6 +27,8 @@ class Window:
         The rectangle in the frame [px].
     levels : (n,) array
         Grey values, 0…1 of the data type's range.
+    smooth : (n,) array
+        The same, median of three by three.
     levels_per_count : float
         One grey value's step.
     rays : (6, n) array
@@ -38,6 +41,7 @@ class Window:
     width: int
     height: int
     levels: FloatArray
+    smooth: FloatArray
     levels_per_count: float
     rays: FloatArray
 
@@ -81,12 +85,14 @@ def cut_window(grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: 
     rays = rays_of_window(
         camera, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)
     )
+    part = grey[y0:y1, x0:x1].astype(np.float32) / scale
     return Window(
         x0=x0,
         y0=y0,
         width=x1 - x0,
         height=y1 - y0,
         levels=grey[y0:y1, x0:x1].ravel().astype(np.float64) / scale,
+        smooth=cv2.medianBlur(part, 3).ravel().astype(np.float64),
         levels_per_count=1.0 / scale,
         rays=rays,
     )
