@@ -24,10 +24,11 @@ from kgcp.io.flight import read_flight
 from kgcp.io.frames import list_frames
 from kgcp.io.simulated import write_simulated_flight
 from kgcp.planning.bound import Bound
+from kgcp.processes import use_one_core_each
 from kgcp.settings import DetectSettings, Method
 from kgcp.synthetic.flight import FlightPlan, FramePlan, frame_name, plan_flight
 from kgcp.synthetic.presets import SimulationSettings, preset
-from kgcp.workers import ordered_map, usable_cores, use_one_core_each
+from kgcp.workers import ordered_map, usable_cores
 
 PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far")
 _FRAMES = 36

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from kgcp.workers import use_one_core_each
+from kgcp.processes import use_one_core_each
 
 
 @click.command()

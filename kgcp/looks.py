@@ -32,10 +32,11 @@ from kgcp.expectations import Sightings
 from kgcp.io.detections import FrameResult
 from kgcp.io.journal import Journal
 from kgcp.io.journal_text import fingerprint
+from kgcp.processes import LocalPool
 from kgcp.profiling import profiled
 from kgcp.target.expected import Expectation
 from kgcp.target.observation import is_unreadable
-from kgcp.workers import Inline, LocalPool, Loss, careful_map
+from kgcp.workers import Inline, Loss, careful_map
 
 _REASONS = {Loss.DIED: Reason.WORKER_DIED, Loss.LATE: Reason.TIMED_OUT}
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
-import multiprocessing.connection
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
+    ALL_COMPLETED,
     FIRST_COMPLETED,
     BrokenExecutor,
     Executor,
@@ -17,33 +15,25 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
 from enum import Enum, auto
 from itertools import islice
 from typing import Any, TypeVar
 
 from kgcp.errors import KgcpError
+from kgcp.processes import use_one_core_each
+from kgcp.stops import stops_held
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _STARTS = 3  # of a process, before it counts as impossible
+_TURN_S = 0.2  # of waiting, after which a signal is heeded
 _TRIES = 2  # of an item alone: the first death may have come before its turn
 
 
 def usable_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def use_one_core_each() -> None:
-    """Tell numeric libraries not to start threads, here if not loaded yet and in new processes.
-
-    The processes are the parallelism: threads inside them only wait for each other.
-    """
-    for variable in _THREAD_VARIABLES:
-        os.environ.setdefault(variable, "1")
 
 
 def ordered_map(
@@ -80,12 +70,19 @@ def ordered_map(
         initializer=start,
         initargs=start_arguments,
     )
+    chunks = (items[i : i + items_per_task] for i in range(0, len(items), items_per_task))
     try:
-        with _interrupts_held():
-            results = pool.map(function, items, chunksize=items_per_task)
-        yield from results
+        with stops_held():
+            futures = [pool.submit(_each, function, chunk) for chunk in chunks]
+        for future in futures:
+            yield from _settled(future).result()
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        with stops_held():
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _each(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    return [function(item) for item in items]
 
 
 class Loss(Enum):
@@ -106,40 +103,6 @@ class Inline(Executor):
         except Exception as error:  # it belongs to who asks for the result
             future.set_exception(error)
         return future
-
-
-class LocalPool(ProcessPoolExecutor):
-    """Processes of this machine, none of which outlives this one or works too long on one item.
-
-    They hold one end of a pipe and end when the other one closes, however that happens.
-
-    Parameters
-    ----------
-    jobs : int
-        Processes.
-    limit_s : float
-        Time for one call [s], after which the kernel ends its process: also inside a decoder.
-    """
-
-    def __init__(self, jobs: int, limit_s: float) -> None:
-        use_one_core_each()
-        context = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
-        self._limit_s = limit_s
-        self._held, self._leash = context.Pipe(duplex=False)
-        super().__init__(jobs, context, initializer=_begin, initargs=(self._held,))
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
-        """Let a process make a call within the limit of time."""
-        with _interrupts_held():
-            return super().submit(_within, self._limit_s, fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002 - the base class's signature
-        """End the processes; with `cancel_futures` in the midst of their work."""
-        if cancel_futures:
-            self._leash.close()
-        super().shutdown(wait, cancel_futures=cancel_futures)
-        self._leash.close()
-        self._held.close()
 
 
 def careful_map(
@@ -182,9 +145,9 @@ def careful_map(
                 pending[_submitted(pool, function, item)] = item
             if not pending:
                 break
-            done, _ = wait(pending, return_when=FIRST_COMPLETED)
+            done = _done_of(pending, FIRST_COMPLETED)
             if any(map(_is_broken, done)):
-                done, _ = wait(pending)
+                done = _done_of(pending, ALL_COMPLETED)
             suspects = [pending.pop(future) for future in done if _is_broken(future)]
             for future in done & pending.keys():
                 yield pending.pop(future), future.result()
@@ -208,7 +171,25 @@ def _submitted(pool: Executor, function: Callable[[Item], Result], item: Item) -
 
 
 def _is_broken(future: Future[Any]) -> bool:
-    return isinstance(future.exception(), BrokenExecutor)
+    return isinstance(_settled(future).exception(), BrokenExecutor)
+
+
+def _settled(future: Future[Result]) -> Future[Result]:
+    _done_of((future,), ALL_COMPLETED)
+    return future
+
+
+def _done_of(futures: Collection[Future[Result]], awaited: str) -> set[Future[Result]]:
+    """Wait as `wait` does, in short turns between which a signal may stop the work.
+
+    It may not inside `wait`, which would keep the futures' locks, for which the executor then
+    waits for ever.
+    """
+    while True:
+        with stops_held():
+            done, pending = wait(futures, timeout=_TURN_S, return_when=awaited)
+        if not pending or (done and awaited == FIRST_COMPLETED):
+            return done
 
 
 def _one_by_one(
@@ -253,38 +234,3 @@ def _ready(start: Callable[[int], Executor]) -> Executor:
 
 def _nothing(_: None) -> None:
     pass
-
-
-def _begin(leash: multiprocessing.connection.Connection) -> None:
-    """Set up a worker: it ends by its parent's will, by its parent's end, and by its alarm."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    threading.Thread(target=_end_with, args=(leash,), daemon=True).start()
-
-
-def _end_with(leash: multiprocessing.connection.Connection) -> None:
-    leash.poll(None)  # nothing is ever sent: until the other end is closed
-    os._exit(1)
-
-
-def _within(
-    limit_s: float,
-    function: Callable[..., Any],
-    *args: Any,  # noqa: ANN401 - those of any function
-    **kwargs: Any,  # noqa: ANN401
-) -> Any:  # noqa: ANN401
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
-        return function(*args, **kwargs)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back while processes are started, who inherit it: the parent stops them."""
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)

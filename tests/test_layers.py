@@ -24,6 +24,8 @@ LAYERS = (
     ("kgcps", "printing", "synthetic", "views"),
     ("guide", "orientation", "planning"),
     ("bias", "consistency", "selection"),
+    ("stops",),
+    ("processes",),
     ("profiling", "workers"),
     ("io",),
     ("examine", "expectations", "tally"),
@@ -40,6 +42,8 @@ LIBRARIES = {
     "settings": set(),
     "compiled": {"numba"},
     "profiling": set(),
+    "stops": set(),
+    "processes": set(),
     "workers": set(),
     "geometry": {"numpy", "scipy"},
     "target": {"numpy", "scipy", "cv2"},
@@ -121,8 +125,8 @@ def test_parts_use_only_the_libraries_of_their_layer(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    # `workers` asks the system for its cores, and that is all
-    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["workers"]],
+    # `processes` and `workers` ask the system for ends and cores, and that is all
+    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["processes"]],
     ids=names,
 )
 def test_nothing_below_io_knows_files(path: Path) -> None:

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.workers import Inline, LocalPool, Loss, careful_map
+from kgcp.processes import LocalPool
+from kgcp.workers import Inline, Loss, careful_map
 
 DEADLY, UNLUCKY, SLOW = 3, 5, 7
 LIMIT_S = 1.5

@@ -126,7 +126,7 @@ def command(
 
     Example: kgcp detect sample_flight --jobs 2
     """
-    from kgcp.workers import use_one_core_each
+    from kgcp.processes import use_one_core_each
 
     use_one_core_each()  # before numpy is loaded
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
-_SHORTEST_STAGE_S = 0.005  # that is worth a line
+_SHORTEST_STAGE_S = 0.0005  # of which digits show
 
 
 class Terminated(KeyboardInterrupt):
@@ -120,7 +120,7 @@ def report_stages(summary: SurveySummary) -> None:
     """Print the time per stage."""
     for stage, seconds in summary.stages_s.items():
         if seconds >= _SHORTEST_STAGE_S:
-            click.echo(f"{seconds:10.2f} s  {stage}", err=True)
+            click.echo(f"{seconds:10.3f} s  {stage}", err=True)
 
 
 def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float) -> None:

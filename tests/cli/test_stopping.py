@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 
-FRAMES, FEW = 40, 4
+FRAMES, FEW = 240, 4
 FLIGHT = """\
 [camera]
 width = 640
@@ -38,9 +38,14 @@ def rough_ground(folder: Path, frames: int) -> Path:
     (folder / "frames").mkdir()
     (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
     rng = np.random.default_rng(3)
+    kinds = []
+    for blur_px in (1.0, 2.0, 3.0):
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)), (0, 0), blur_px)
+        is_written, coded = cv2.imencode(".jpg", noise.astype(np.uint8))
+        assert is_written
+        kinds.append(coded.tobytes())
     for number in range(frames):
-        noise = cv2.GaussianBlur(rng.uniform(0, 255, (480, 640)), (0, 0), 1.0 + number % 3)
-        assert cv2.imwrite(str(folder / "frames" / f"{number:02d}.jpg"), noise.astype(np.uint8))
+        (folder / "frames" / f"{number:03d}.jpg").write_bytes(kinds[number % len(kinds)])
     return folder
 
 

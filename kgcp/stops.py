@@ -1,0 +1,37 @@
+"""Signals that stop the program, held back where they would do harm."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stops_held() -> Iterator[None]:
+    """Hold SIGINT and SIGTERM back while locks are taken; they come when the block ends.
+
+    An exception that a signal's handler raises between two lines of an executor's code leaves a
+    lock behind, for which another thread then waits for ever. Processes started in the block
+    inherit that Ctrl-C is none of their business.
+    """
+    if threading.current_thread() is not threading.main_thread():  # where no handler runs
+        yield
+        return
+    came: list[int] = []
+    handlers: dict[signal.Signals, Any] = {}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for stop in _STOPS:
+            handlers[stop] = signal.signal(stop, lambda number, _: came.append(number))
+        yield
+    finally:
+        for stop, handler in handlers.items():
+            signal.signal(stop, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number in came:
+            signal.raise_signal(number)
