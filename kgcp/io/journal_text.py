@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from kgcp.errors import Reason
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.io.detections import FrameResult
 from kgcp.io.exif import Exif
@@ -30,7 +31,7 @@ from kgcp.target.observation import (
 _RECORDS: dict[str, type] = {
     each.__name__: each
     for each in (
-        *(FrameResult, Exif, Observation, Miss, Pose),
+        *(FrameResult, Exif, Observation, Miss, Pose, Ellipse),
         *(Appearance, Uncertainty, CommonUncertainty, Alternative),
     )
 }

@@ -199,9 +199,8 @@ def miss_of(
     ring = next(ring for ring in target.rings if ring.name == best.ring)
     best = explain(grey, ring, best, settings.min_radius_px)
     outlines = {one.outline for one in considered}
-    return Miss(
-        target.name, best.reason or Reason.CODE_MISMATCH, best.detail, best.score, len(outlines)
-    )
+    reason = best.reason or Reason.CODE_MISMATCH
+    return Miss(target.name, reason, best.detail, best.score, len(outlines), best.outline)
 
 
 def _check_main_ring(grey: GreyArray, camera: Camera, main: Ring, observation: Observation) -> None:

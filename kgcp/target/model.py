@@ -102,7 +102,7 @@ def measure_by_model(
         `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
     pose = _without_edge_shift(start)
-    imaging = _imaging(grey, camera, target, pose)
+    imaging = imaging_of(grey, camera, target, pose)
     poses = fit_both_poses(imaging, pose)
     if prior is not None:
         poses = _choose_by_prior(imaging, poses, prior)
@@ -123,7 +123,7 @@ def _without_edge_shift(start: Observation) -> Pose:
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
-def _imaging(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
@@ -164,7 +164,7 @@ def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
     rough = _rough_fit(imaging, pose)
     other = _mirrored_fit(rough, _UNLIKELY)
     near = other.parameters if other.total < rough.total else rough.parameters
-    best = _adjust_with_streak(imaging, near)
+    best = adjust_with_streak(imaging, near)
     other = _mirrored_fit(best)
     if other.total < best.total:
         best = adjust(imaging, other.parameters, best.unknowns)
@@ -196,15 +196,15 @@ def _approach(imaging: Imaging, pose: Pose) -> Fit:
     return approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
 
 
-def _adjust_with_streak(imaging: Imaging, start: Parameters) -> Fit:
-    """Adjust with a Gaussian blur, or with a streak as soon as that is elongated enough."""
+def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
+    """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
     streak = _streak_of(start.blur)
     if streak is None:
-        best = adjust(imaging, start, _unknowns(imaging.response, has_streak=False))
+        best = adjust(imaging, start, _unknowns(imaging.response, has_streak=False, moves=moves))
         streak, start = _streak_of(best.parameters.blur), best.parameters
         if streak is None:
             return best
-    unknowns = _unknowns(imaging.response, has_streak=True)
+    unknowns = _unknowns(imaging.response, has_streak=True, moves=moves)
     streaked = Parameters(start.pose, streak, start.light)
     near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
     return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
@@ -255,12 +255,12 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
     return other
 
 
-def _unknowns(response: Response, *, has_streak: bool) -> Unknowns:
+def _unknowns(response: Response, *, has_streak: bool, moves: bool = True) -> Unknowns:
     free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_RESPONSE[response]]
     precision = np.zeros(PARAM_COUNT)
     for param, sd in _PRIOR_SD.items():
         precision[param] = sd**-2 if param in free else 0.0
-    return Unknowns(np.array(sorted(free)), np.zeros(PARAM_COUNT), precision)
+    return Unknowns(np.array(sorted(free)[0 if moves else 6 :]), np.zeros(PARAM_COUNT), precision)
 
 
 def _streak_of(blur: Blur) -> Blur | None:

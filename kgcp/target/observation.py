@@ -160,6 +160,8 @@ class Miss:
         Normalised cross-correlation of the best candidate, if there was one.
     candidates : int
         Rings that were compared with the target's, but for those of other measured targets.
+    outline : Ellipse or None
+        Outer edge of the best candidate, if there was one [px].
     """
 
     target: str
@@ -167,6 +169,7 @@ class Miss:
     detail: str = ""
     score: float | None = None
     candidates: int = 0
+    outline: Ellipse | None = None
 
 
 Outcome = Observation | Miss

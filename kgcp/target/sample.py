@@ -97,16 +97,37 @@ def choose_sample(
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
     if len(index) < 4 * PARAM_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
-    rays, clip = window.rays[:, index], imaging.censoring
+    return replace(_sample(imaging, pose, blur, points, index, scale), is_thinned=is_thinned)
+
+
+def whole_plate(imaging: Imaging, pose: Pose, blur: Blur) -> Sample:
+    """Return all pixels of the ring and its border, whatever they show: to be looked at."""
+    rays = imaging.window.rays
+    points = plate_points(pose, rays)
+    reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
+    index = np.flatnonzero(np.hypot(*points) < reach_m)
+    return _sample(imaging, pose, blur, points, index, largest_metres_per_px(pose, rays))
+
+
+def _sample(
+    imaging: Imaging,
+    pose: Pose,
+    blur: Blur,
+    points_m: FloatArray,
+    index: IndexArray,
+    metres_per_px: float,
+) -> Sample:
+    window, clip = imaging.window, imaging.censoring
+    rays = window.rays[:, index]
     return Sample(
         imaging=imaging,
         index=index,
-        is_thinned=is_thinned,
+        is_thinned=False,
         levels=window.levels[index],
         rays=rays,
-        imager=_imager(imaging, points, index),
+        imager=_imager(imaging, points_m, index),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
-        pairs=_pairs(imaging, pose, blur, rays, points[:, index], scale),
+        pairs=_pairs(imaging, pose, blur, rays, points_m[:, index], metres_per_px),
     )
 
 
