@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+
+_WRITERS = 8  # at a time: a disk confirms several files as quickly as one
 
 
 @contextmanager
@@ -50,3 +53,16 @@ def write_bytes(path: Path, content: bytes) -> None:
             temporary.write_bytes(content)
     except OSError as error:
         raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+
+
+def write_all(contents: Mapping[Path, bytes]) -> None:
+    """Write files, each as `write_bytes` does.
+
+    Raises
+    ------
+    KgcpError
+        If one of them cannot be written.
+    """
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        for _ in pool.map(write_bytes, contents, contents.values()):
+            pass

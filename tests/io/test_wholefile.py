@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.io.wholefile import whole_file, write_bytes
+from kgcp.io.wholefile import whole_file, write_all, write_bytes
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -40,3 +40,13 @@ def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
     write_bytes(tmp_path / "a.txt", b"content")
     assert elsewhere.read_bytes() == b"precious"
     assert (tmp_path / "a.txt").read_bytes() == b"content"
+
+
+def test_many_files_are_written_or_the_one_that_cannot_be_is_named(tmp_path: Path) -> None:
+    contents = {tmp_path / "many" / f"{number}.txt": b"%d" % number for number in range(50)}
+    write_all(contents)
+    assert {path: path.read_bytes() for path in (tmp_path / "many").iterdir()} == contents
+    (tmp_path / "7.txt" / "occupied").mkdir(parents=True)
+    with pytest.raises(KgcpError, match=r"7\.txt: cannot be written"):
+        write_all({tmp_path / f"{number}.txt": b"" for number in range(9)})
+    assert not [*tmp_path.glob(".*.part")]

@@ -125,17 +125,19 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
         If there are no points, the format cannot hold them, or a file cannot be written.
     """
     from kgcp.errors import KgcpError
-    from kgcp.io.wholefile import write_bytes
+    from kgcp.io.wholefile import write_all
 
     if not points.kgcps:
         raise KgcpError(f"{name}: no point is left to write; select less strictly")
     module = import_module(f"{__name__}.{FORMATS[name].module}")
     files: Mapping[str, str | bytes] = module.files(points)
-    written = [folder / file_name for file_name in files]
-    for path, content in zip(written, files.values(), strict=True):
-        write_bytes(path, content.encode("utf-8") if isinstance(content, str) else content)
-    _remove_stale(folder, FORMATS[name].files, set(written))
-    return written
+    contents = {
+        folder / file_name: content.encode("utf-8") if isinstance(content, str) else content
+        for file_name, content in files.items()
+    }
+    write_all(contents)
+    _remove_stale(folder, FORMATS[name].files, set(contents))
+    return [*contents]
 
 
 def _remove_stale(folder: Path, patterns: tuple[str, ...], written: set[Path]) -> None:
