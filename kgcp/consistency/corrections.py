@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from kgcp.geometry.arrays import FloatArray
 
@@ -173,7 +173,7 @@ def _correction(
     names = tuple(UNKNOWNS[other].name for other in alike)
     if math.isnan(sd):
         return Correction(unknown.name, None, None, None, names)
-    probability = float(2.0 * student.sf(abs(value) / sd, freedom))
+    probability = float(2.0 * stdtr(freedom, -abs(value) / sd))
     return Correction(unknown.name, value * unknown.factor, sd * unknown.factor, probability, names)
 
 

@@ -124,11 +124,11 @@ def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estima
     columns = np.concatenate(
         (system.design, system.offset[:, :, None], system.common[:, :, None]), axis=2
     )[kept]
+    every = whiten(
+        time_s[kept], system.fading[kept], system.white[kept], np.array(_CORRELATIONS_S), columns
+    )
     trials = []
-    for correlation_s in _CORRELATIONS_S:
-        whitened, log_det = whiten(
-            time_s[kept], system.fading[kept], system.white[kept], correlation_s, columns
-        )
+    for correlation_s, whitened, log_det in zip(_CORRELATIONS_S, *every, strict=True):
         rows = whitened.reshape(-1, columns.shape[2])
         found = estimate(rows, has_deviations=system.has_deviations)
         misfit = found.chi2_after

@@ -178,8 +178,12 @@ def _reference(
 ) -> ReferencePoses:
     n = len(names)
     turn = Rotation.from_rotvec(_SD_REFERENCE_DEG * rng.standard_normal((n, 3)), degrees=True)
-    grid = np.array([_FRAME.grid_rotation(point) for point in centre])
-    photo = np.swapaxes(grid, 1, 2) @ turn.as_matrix() @ attitude @ CAMERA_FROM_PHOTO
+    photo = (
+        np.swapaxes(_FRAME.grid_rotation(centre), 1, 2)
+        @ turn.as_matrix()
+        @ attitude
+        @ CAMERA_FROM_PHOTO
+    )
     return ReferencePoses(
         names,
         _FRAME.map_from_enu(centre) + _SD_REFERENCE_M * rng.standard_normal((n, 3)),
@@ -316,16 +320,14 @@ def test_whitening_is_the_inverse_root_of_the_full_covariance() -> None:
         for j in range(n):
             share = math.exp(-abs(time_s[i] - time_s[j]) / tau) * factors[i] @ factors[j].T
             full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = share + (white[i] if i == j else 0.0)
-    result, log_det = whiten(time_s, fading, white, tau, columns)
-    whitened = result.reshape(3 * n, 4)
-    assert log_det == pytest.approx(np.linalg.slogdet(full)[1])
+    both, log_det = whiten(time_s, fading, white, np.array([tau, 0.0]), columns)
+    whitened, white_only = both.reshape(2, 3 * n, 4)
     flat = columns.reshape(3 * n, 4)
     np.testing.assert_allclose(
         whitened.T @ whitened, flat.T @ np.linalg.solve(full, flat), rtol=1e-8
     )
-    result, log_det = whiten(time_s, fading, white, 0.0, columns)
-    white_only = result.reshape(3 * n, 4)
     own = np.zeros_like(full)
     for i in range(n):
         own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = fading[i] + white[i]
     np.testing.assert_allclose(white_only.T @ white_only, flat.T @ np.linalg.solve(own, flat))
+    np.testing.assert_allclose(log_det, [np.linalg.slogdet(cov)[1] for cov in (full, own)])
