@@ -49,6 +49,7 @@ def _entry(file: ForeignFile, line: int, row: str) -> Entry:
     name, model, width, height, *params = row.split()
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         if model not in _MODELS:
             raise unsupported(file, f"line {line}", f"the model {model}")
         keys = _MODELS[model]

@@ -7,24 +7,22 @@ count from the middle of the photo, and the coefficients are OpenCV's.
 from __future__ import annotations
 
 import re
-from io import BytesIO
-
-from PIL import Image, UnidentifiedImageError
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.calibrations.entry import Entry
 from kgcp.io.foreign import ForeignFile
+from kgcp.io.imageheader import image_size
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_DATA = rf"(?:[^;<>\"',]{{0,40}};)?\s*(?:{_NUMBER}\s*,\s*){{8}}{_NUMBER}"
+_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+_DATA = rf"(?:[^;<>\"',]{{0,40}};\s*)?(?:{_NUMBER}\s*,\s*){{8}}{_NUMBER}"
 _TAG = re.compile(r"DewarpData\s*(?:=\s*[\"']|>)\s*([^\"'<]*)")
-_BARE = re.compile(rf"\s*({_DATA})\s*")
+_BARE = re.compile(rf"({_DATA})")
 _FLAG = re.compile(r"DewarpFlag\s*(?:=\s*[\"']|>)\s*(\d+)")
 
 
 def matches(file: ForeignFile) -> bool:
     """Whether the content has a DewarpData, or is one."""
-    return _TAG.search(file.text) is not None or _BARE.fullmatch(file.text) is not None
+    return _TAG.search(file.text) is not None or _BARE.fullmatch(file.text.strip()) is not None
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
@@ -35,7 +33,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     KgcpError
         If there are no nine numbers, or the image is dewarped already.
     """
-    found = _TAG.search(file.text) or _BARE.fullmatch(file.text)
+    found = _TAG.search(file.text) or _BARE.fullmatch(file.text.strip())
     if found is None:
         raise file.error("", "has no DewarpData", "name an image as the camera wrote it")
     flag = _FLAG.search(file.text)
@@ -49,6 +47,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = file.numbers(numbers, 9, "DewarpData")
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         x, y = 0.5 * (width - 1) + cx, 0.5 * (height - 1) + cy
         return Camera(width, height, fx, fy, x, y, k1, k2, p1, p2, k3)
 
@@ -57,8 +56,5 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
 
 def _image_size(file: ForeignFile) -> tuple[int, int] | None:
     """Return width and height of the image [px]; None where the file is none."""
-    try:
-        with Image.open(BytesIO(file.path.read_bytes())) as image:
-            return image.size
-    except UnidentifiedImageError:
-        return None
+    with file.path.open("rb") as stream:
+        return image_size(stream)

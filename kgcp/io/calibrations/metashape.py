@@ -68,6 +68,7 @@ def _entry(file: ForeignFile, name: str, element: Element) -> Entry:
     size = file.numbers(f"{width or ''} {height or ''}", 2, f"{where} size")
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         return _camera(file, where, element, width, height)
 
     return Entry(name, (int(size[0]), int(size[1])), convert)

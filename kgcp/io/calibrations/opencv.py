@@ -88,6 +88,7 @@ def matrix_entry(
     (fx, _, cx), (_, fy, cy), _ = matrix
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         return Camera(width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6)
 
     return Entry(name, size, convert)

@@ -92,6 +92,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
         return file.numbers(values.get(key), 1, f"{where} {key}")[0]
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         per_mm = width / width_mm
         if abs(height - per_mm * height_mm) > 1.0:
             raise file.error(
@@ -111,6 +112,7 @@ def _converter(*parameters: float) -> Callable[[int, int], Camera]:
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
 
     def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
         x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
         return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 

@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.exporters.distances import focal_length_note
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -32,7 +33,9 @@ _FOLDER = "metashape"
 _HOWTO = """\
 Agisoft Metashape (Professional)
 
-With the photos added to a chunk, before or after their alignment:
+With the photos added to a chunk, before or after their alignment. The files call cameras by their
+file names; where the chunk's labels lack the extension, only the script finds them, and the others
+need it taken off:
 
 1. File > Import > Import Markers: markers.xml (places in the images, and coordinates).
 2. Reference > Import Reference: markers.csv. Comma, first row 2, columns label, x, y, z and the
@@ -46,8 +49,9 @@ With the photos added to a chunk, before or after their alignment:
 
 Optimise the cameras afterwards. Metashape has one accuracy for all marker projections (Reference >
 Settings, marker accuracy): {mark_px} px is the RMS of these. It ignores correlations, and
-the errors that all distances share (calibration and print: see kgcps.csv).
-"""
+the errors that all distances share (sd_common_distance_m in kgcps.csv).
+
+{focal_length}"""
 
 
 def files(points: MapPoints) -> Mapping[str, str]:
@@ -62,7 +66,11 @@ def files(points: MapPoints) -> Mapping[str, str]:
     label = labels(points.kgcps, _FOLDER)
     script = resources("kgcp.io.exporters").joinpath("scripts/metashape_scale_bars.txt")
     texts = {
-        "HOWTO.txt": _HOWTO.format(crs=points.crs, mark_px=_rms_mark_px(points.kgcps)),
+        "HOWTO.txt": _HOWTO.format(
+            crs=points.crs,
+            mark_px=_rms_mark_px(points.kgcps),
+            focal_length=focal_length_note(points.controls),
+        ),
         "markers.csv": _markers(points, label),
         "markers.xml": _markers_xml(points, names, label),
         "scale_bars.csv": _scale_bars(points.controls, names, label),

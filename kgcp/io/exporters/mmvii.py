@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.exporters.distances import focal_length_note
 from kgcp.io.exporters.local import describe_frame, local_points
 from kgcp.io.exporters.points import (
     MapPoints,
@@ -38,16 +39,17 @@ MMVII-PhgrProj/Topo/kgcp. The bundle adjustment takes points and marks by
 
   MMVII OriBundleAdj ".*JPG" In Out GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]]
 
-and the distances by its option for topographic surveys (MMVII OriBundleAdj help). The factor of the
-points must be positive: only then may distances refer to them. kgcp.obs has
-one line per point: 3 (distance), image, point, metres, standard deviation. Pixel (0, 0) is the
-centre of the top-left pixel. The block must be in the points' frame before:
+and the distances by its option for topographic surveys (MMVII OriBundleAdj help). The factor of
+the points must be positive: only then may distances refer to them. kgcp.obs has one line per mark:
+3 (distance), image, point, metres, standard deviation. Pixel (0, 0) is the centre of the top-left
+pixel. The block must be in the points' frame before:
 
 {frame}
 MMVII reads the covariances, and of the points uses the three standard deviations. It does not
-know of errors that all distances share (calibration and print: see kgcps.csv). Points kept for
+know of errors that all distances share (sd_common_distance_m in kgcps.csv). Points kept for
 checking are not in the files.
-"""
+
+{focal_length}"""
 
 
 def files(points: MapPoints) -> Mapping[str, str]:
@@ -62,7 +64,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
     label = labels(points.kgcps, _FOLDER)
     names = image_names((point.frame for point in points.kgcps), _FOLDER, r'\s*"')
     texts = {
-        "HOWTO.txt": _HOWTO.format(frame=describe_frame(points)),
+        "HOWTO.txt": _HOWTO.format(
+            frame=describe_frame(points), focal_length=focal_length_note(points.controls)
+        ),
         "MesGCP-kgcp.xml": _gcps(points, label),
         "kgcp.obs": _distances(points.controls, names, label),
     }

@@ -80,6 +80,13 @@ class _Worlds:
 
     @classmethod
     def of(cls, file: ForeignFile, chunk: Element) -> _Worlds:
+        """Read the transforms of a chunk and of its components.
+
+        Raises
+        ------
+        KgcpError
+            Naming the transform whose numbers are missing.
+        """
         components = {}
         for component in chunk.iterfind("components/component"):
             similarity = _similarity(file, component)

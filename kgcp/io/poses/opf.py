@@ -117,6 +117,14 @@ class _Scene:
 
     @classmethod
     def of(cls, scene: JsonObject) -> _Scene:
+        """Read a scene reference frame.
+
+        Raises
+        ------
+        KgcpError
+            If something is missing, a scale is not positive, or the CRS is not projected or has
+            axes that OPF's swapping does not bring into the order x, y.
+        """
         transform, said = scene.child("base_to_canonical"), scene.child("crs")
         shift, scale = (
             np.array(transform.vector("shift", 3)),
