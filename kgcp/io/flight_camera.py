@@ -12,6 +12,7 @@ from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.toml_values import TomlTable
 from kgcp.settings import require_range
 
+_NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
 DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
 CAMERA_KEYS = (
     "file",
@@ -54,26 +55,17 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
 
 
 def _inline_camera(table: TomlTable) -> Camera:
+    from kgcp.io.calibrations.entry import camera_of
+
     for key in ("format", "camera"):
         if key in table:
             raise table.error(key, "stands without a file", "give file, too, or delete it")
+    width, height = table.integer("width"), table.integer("height")
+    values = {
+        key: table.number(key, None if key in _NEEDED else 0.0) for key in CALIBRATION_PARAMETERS
+    }
     with table.located():
-        return Camera(
-            width=table.integer("width"),
-            height=table.integer("height"),
-            fx=table.number("fx"),
-            fy=table.number("fy"),
-            cx=table.number("cx"),
-            cy=table.number("cy"),
-            k1=table.number("k1", 0.0),
-            k2=table.number("k2", 0.0),
-            p1=table.number("p1", 0.0),
-            p2=table.number("p2", 0.0),
-            k3=table.number("k3", 0.0),
-            k4=table.number("k4", 0.0),
-            k5=table.number("k5", 0.0),
-            k6=table.number("k6", 0.0),
-        )
+        return camera_of(width, height, values)
 
 
 def _file_camera(table: TomlTable, folder: Path) -> Camera:

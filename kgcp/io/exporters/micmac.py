@@ -64,11 +64,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
 def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:
     local = local_points(points)
     root = ET.Element("DicoAppuisFlottant")
-    done = set()
-    for index, point in enumerate(points.kgcps):
-        if point.is_checkpoint or point.id in done:
-            continue
-        done.add(point.id)
+    for index, point in points.distinct_controls:
         entry = ET.SubElement(root, "OneAppuisDAF")
         add_text(entry, "Pt", " ".join(decimals(value) for value in local.position_m[index]))
         add_text(entry, "NamePt", label[point.id])

@@ -93,11 +93,7 @@ def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:
     root = ET.Element("SetGCP")
     add_text(root, "NameSet", '"kgcp"')
     measures = ET.SubElement(root, "Measures")
-    done = set()
-    for index, point in enumerate(points.kgcps):
-        if point.is_checkpoint or point.id in done:
-            continue
-        done.add(point.id)
+    for index, point in points.distinct_controls:
         entry = ET.SubElement(measures, "el")
         add_text(entry, "Name", f'"{label[point.id]}"')
         add_text(entry, "Pt", " ".join(decimals(value) for value in local.position_m[index]))

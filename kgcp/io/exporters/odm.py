@@ -34,7 +34,9 @@ from kgcp.orientation import CameraPrior
 
 FILE_NAME = "gcp_list.txt"
 _WGS84_UTM = re.compile(r"32([67])(\d\d)")
-_NOTE = "# from kgcp: each moving point is seen in one image only; run ODM with --force-gps"
+_NOTE = """\
+# x (easting or longitude), y, height [m], pixel x, y, image, point
+# from kgcp: each moving point is seen in one image only; run ODM with --force-gps"""
 _CAMERA_FROM_BODY: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """ODM's body: x towards the top of the image, y to its right, z along the view."""
 

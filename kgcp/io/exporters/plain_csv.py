@@ -6,10 +6,8 @@ import csv
 import io
 from collections.abc import Mapping
 
-import numpy as np
-
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters.points import MapPoints, upper
+from kgcp.io.exporters.points import METRE_DECIMALS, MapPoints, decimals, deviations, pixel, upper
 from kgcp.io.times import format_time
 
 COLUMNS = (
@@ -35,9 +33,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
                 "" if point.time_s is None else format_time(point.time_s),
                 *points.xyz(point.position_map),
                 *_covariance(point.cov_m2, 3),
-                *(f"{value:.7f}" for value in point.centre_px),
+                *pixel(point),
                 *_covariance(point.centre_cov_px2, 2),
-                f"{point.distance_m:.5f}",
+                decimals(point.distance_m, METRE_DECIMALS),
                 _text(point.sd_distance_m),
                 _text(point.sd_common_distance_m),
                 *_covariance(point.cov_common_m2, 3),
@@ -53,7 +51,7 @@ def _covariance(cov: FloatArray | None, size: int) -> tuple[str, ...]:
     """Return deviations, then the covariances above the diagonal, row by row."""
     if cov is None:
         return ("",) * (size * (size + 1) // 2)
-    values = (*np.sqrt(np.diag(cov)), *upper(cov, 1))
+    values = (*deviations(cov), *upper(cov, 1))
     return tuple(_text(float(value)) for value in values)
 
 

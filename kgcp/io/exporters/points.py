@@ -55,6 +55,15 @@ class MapPoints:
         """The points that are not kept for checking."""
         return tuple(point for point in self.kgcps if not point.is_checkpoint)
 
+    @property
+    def distinct_controls(self) -> tuple[tuple[int, Kgcp], ...]:
+        """The controls, static ones once, with their places among all points."""
+        firsts: dict[str, tuple[int, Kgcp]] = {}
+        for index, point in enumerate(self.kgcps):
+            if not point.is_checkpoint:
+                firsts.setdefault(point.id, (index, point))
+        return tuple(firsts.values())
+
     def xyz(self, position_map: FloatArray, *, height_factor: float = 1.0) -> tuple[str, str, str]:
         """Return map coordinates as text, to 0.1 µm; z times `height_factor`."""
         decimals = DEGREE_DECIMALS if _is_geographic(self.crs) else METRE_DECIMALS

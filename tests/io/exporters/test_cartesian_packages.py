@@ -6,7 +6,7 @@ import csv
 import re
 import runpy
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +22,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters import colmap, export, micmac, mmvii
 from kgcp.io.exporters.points import MapPoints
 
+Factory = Callable[..., MapPoints]
 _GRID = Transformer.from_crs("EPSG:4258", "EPSG:25831", always_xy=True)
 
 
@@ -148,6 +149,25 @@ def test_local_distances_are_true_where_those_of_the_grid_are_not(points: MapPoi
     entries = _mmvii_points(mmvii.files(replace(points, kgcps=two))).values()
     first, second = (_numbers(entry, "Pt") for entry in entries)
     assert np.linalg.norm(second - first) == pytest.approx(80.0 / 0.9996, abs=1e-5)
+
+
+def test_feet_become_metres(make_points: Factory) -> None:
+    """US survey feet have 1200/3937 m; ellipsoidal heights are metres whatever the grid counts.
+
+    Between the standard parallels of EPSG:2263, 40° 40′ and 41° 2′, the cone's scale is below 1 by
+    (11′)²/2 = 5e-6 at most; 100 m of height stretch lengths by 100 / 6.38e6.
+    """
+    one = make_points().kgcps[0]
+    ends = ([984000.0, 200000.0, 100.0], [985000.0, 200000.0, 100.0], [984000.0, 200000.0, 110.0])
+    kgcps = tuple(
+        replace(one, id=f"K{number}", frame=f"{number}.jpg", position_map=np.array(end))
+        for number, end in enumerate(ends)
+    )
+    entries = _mmvii_points(mmvii.files(make_points("EPSG:2263", kgcps))).values()
+    first, second, above = (_numbers(entry, "Pt") for entry in entries)
+    expected = 1000.0 * 1200.0 / 3937.0 * (1.0 + 100.0 / 6.38e6)
+    assert np.linalg.norm(second - first) == pytest.approx(expected, rel=6e-6)
+    assert above[2] - first[2] == pytest.approx(10.0, abs=1e-5)
 
 
 def test_names_that_break_the_lines_are_refused(points: MapPoints) -> None:

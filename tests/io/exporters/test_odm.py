@@ -38,6 +38,13 @@ def test_odm_reads_the_same_points_and_pixels(points: MapPoints) -> None:
         np.testing.assert_allclose([*map(float, row[3:5])], point.centre_px, atol=1e-6, rtol=0)
 
 
+def test_the_list_says_in_which_order_its_columns_are(points: MapPoints) -> None:
+    _, order, note = _lines(points)[:3]
+    assert order == "# x (easting or longitude), y, height [m], pixel x, y, image, point"
+    assert note.startswith("#")
+    assert "--force-gps" in note
+
+
 def test_odm_merges_static_targets_but_not_alike_points(points: MapPoints) -> None:
     places: dict[tuple[str, ...], set[str]] = {}
     for row in _rows(points):

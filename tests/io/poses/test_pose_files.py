@@ -23,7 +23,36 @@ SAMPLES: dict[str, Any] = {
         '<document><chunk><cameras><camera label="a.jpg"><transform>'
         "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"
     ),
+    "odm": {
+        "type": "FeatureCollection",
+        "features": [
+            {
+                "type": "Feature",
+                "properties": {
+                    "filename": "a.jpg",
+                    "rotation": [0, 0, 0],
+                    "translation": [500000.0, 0.0, 3.0],
+                },
+                "geometry": {"type": "Point", "coordinates": [3.0, 0.0, 3.0]},
+            }
+        ],
+    },
+    "opf": {
+        "format": "application/opf-calibrated-cameras+json",
+        "cameras": [{"id": 7, "position": [1, 2, 3], "orientation_deg": [0, 0, 0]}],
+    },
 }
+OPF_PARTS: dict[str, dict[str, object]] = {
+    "camera_list": {"cameras": [{"id": 7, "uri": "a.jpg"}]},
+    "scene_reference_frame": {
+        "crs": {"definition": "EPSG:32631"},
+        "base_to_canonical": {"shift": [0, 0, 0], "scale": [1, 1, 1], "swap_xy": False},
+    },
+}
+
+
+def test_every_format_has_a_sample() -> None:
+    assert SAMPLES.keys() == FORMATS.keys()
 
 
 @pytest.mark.parametrize("form", sorted(SAMPLES))
@@ -31,7 +60,10 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
     path = tmp_path / "poses"
     sample = SAMPLES[form]
     path.write_text(sample if isinstance(sample, str) else json.dumps(sample))
-    stated = None if form in {"csv", "pix4d"} else "EPSG:32631"
+    for name, part in OPF_PARTS.items():
+        kind = {"format": f"application/opf-{name.replace('_', '-')}+json"}
+        (tmp_path / f"{name}.json").write_text(json.dumps({**part, **kind}))
+    stated = "EPSG:32631" if form in {"colmap", "metashape", "opensfm"} else None
     named = read_reference_poses(path, PoseNotation(form, stated), crs="EPSG:32631")
     found = read_reference_poses(path, PoseNotation(None, stated), crs="EPSG:32631")
     assert found.frames == named.frames == ("a.jpg",)
