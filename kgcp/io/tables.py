@@ -111,5 +111,8 @@ def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
 def read_detections(path: Path) -> pd.DataFrame:
     """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
     if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; run 'kgcp detect' on this flight first")
+        raise KgcpError(
+            f"{path}: does not exist; run 'kgcp detect' on this flight first, or name with"
+            " --detections what it wrote elsewhere"
+        )
     return read_table(path, DETECTION_COLUMNS)
