@@ -13,7 +13,7 @@ from pyproj.transformer import TransformerGroup
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.mapframe import MapFrame, parse_crs
+from kgcp.mapframe import MapFrame, missing_grids, parse_crs
 
 COMMAND_LINE = "--crs"
 
@@ -109,14 +109,7 @@ def best_transformer(source: CRS, target: CRS, where: str) -> Transformer:
         return Transformer.from_crs(
             source, target, always_xy=True, only_best=True, allow_ballpark=False
         )
-    missing = sorted(
-        {
-            grid.short_name
-            for operation in known.unavailable_operations[:1]
-            for grid in operation.grids
-            if not grid.available
-        }
-    )
+    missing = missing_grids(known)
     if missing:
         raise KgcpError(
             f"{where} needs the grid {', '.join(missing)}, which is not installed; install it with"

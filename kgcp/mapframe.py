@@ -22,6 +22,8 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 
 FLIGHT_TOML = "flight.toml: crs"
+WGS84_3D = "EPSG:4979"
+"""Longitude, latitude and ellipsoidal height of WGS 84."""
 _JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
 
 
@@ -222,12 +224,7 @@ def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS, where: str) -> Tran
         return Transformer.from_crs(
             source, geodetic, always_xy=True, only_best=True, allow_ballpark=False
         )
-    missing = [
-        grid.short_name
-        for operation in known.unavailable_operations[:1]
-        for grid in operation.grids
-        if not grid.available
-    ]
+    missing = missing_grids(known)
     if not missing:
         raise KgcpError(
             f"{where} {crs!r}: no way is known from its heights to ellipsoidal ones;"
@@ -238,6 +235,12 @@ def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS, where: str) -> Tran
         f" install it with 'pyproj sync --file {missing[0]}', or give ellipsoidal heights and the"
         " horizontal CRS alone"
     )
+
+
+def missing_grids(known: TransformerGroup) -> list[str]:
+    """Return the names of the grids that the best of these operations lacks, sorted."""
+    grids = (grid for operation in known.unavailable_operations[:1] for grid in operation.grids)
+    return sorted({grid.short_name for grid in grids if not grid.available})
 
 
 def _explain(crs: str, error: ProjError, where: str) -> str:

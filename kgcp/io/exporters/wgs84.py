@@ -8,9 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.mapchange import best_transformer
-from kgcp.mapframe import parse_crs
-
-_WGS84 = "EPSG:4979"
+from kgcp.mapframe import WGS84_3D, parse_crs
 
 
 def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> FloatArray:
@@ -26,7 +24,7 @@ def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> Flo
     if not positions:
         return np.empty((0, 3))
     to_wgs84 = best_transformer(
-        parse_crs(crs), parse_crs(_WGS84), f"{where}: the way from {crs!r} to WGS 84"
+        parse_crs(crs), parse_crs(WGS84_3D), f"{where}: the way from {crs!r} to WGS 84"
     )
     x, y, z = np.array(positions).T
     return np.column_stack(to_wgs84.transform(x, y, z, errcheck=True))

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.io.foreign import ForeignFile, JsonObject
-from kgcp.io.poses.source import WGS84_3D, SourcePoses, photo_rotation
-from kgcp.mapframe import MapFrame
+from kgcp.io.poses.source import SourcePoses, photo_rotation
+from kgcp.mapframe import WGS84_3D, MapFrame
 
 _TOPOCENTRIC = "reconstruction.topocentric.json"
 _REFERENCE = "reference_lla.json"

@@ -11,7 +11,6 @@ from kgcp.geometry.reference import CAMERA_FROM_PHOTO
 from kgcp.io.foreign import ForeignFile
 from kgcp.mapframe import MapFrame
 
-WGS84_3D = "EPSG:4979"
 _MAX_DISTORTION = 1e-3
 
 
