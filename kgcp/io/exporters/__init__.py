@@ -108,7 +108,7 @@ FORMATS: Mapping[str, Format] = {
     "geopackage": Format(
         "geopackage",
         ("geopackage/kgcps.gpkg", "geopackage/HOWTO.txt"),
-        "a map in the flight's own CRS",
+        "a map in the CRS of the points",
     ),
 }
 """By the name on the command line."""

@@ -28,10 +28,10 @@ Camera orientations
 
 camera_priors.csv: for every image in which the plate on the vehicle was measured and its two
 possible poses can be told apart, the position of the projection centre in {crs}
-(x is easting or longitude, z height) and omega, phi, kappa in degrees against the map's
-axes: R(camera > map) = Rx(omega) Ry(phi) Rz(kappa), camera axes x right, y up, z backward. sd_ and
-cov_ are the covariance of all six, metres and degrees; empty where the trajectory or the
-measurement has no deviations.
+(x is easting or longitude; z {heights}) and omega, phi, kappa in
+degrees against the map's axes: R(camera > map) = Rx(omega) Ry(phi) Rz(kappa), camera axes x right,
+y up, z backward. sd_ and cov_ are the covariance of all six, metres and degrees; empty where the
+trajectory or the measurement has no deviations.
 
 They are priors, for packages that take no points or to start an adjustment with. They come from
 the vehicle's attitude and how the plate lies in the image, and an error of 0.5 degrees moves the
@@ -64,7 +64,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
         writer.writerow((prior.frame, *xyz, *angles, *_covariance(cov), points.crs))
     return {
         "camera_priors/camera_priors.csv": stream.getvalue(),
-        "camera_priors/HOWTO.txt": _HOWTO.format(crs=points.crs),
+        "camera_priors/HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights),
     }
 
 

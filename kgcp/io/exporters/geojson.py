@@ -14,7 +14,7 @@ GeoJSON
 
 Open kgcps.geojson in QGIS or any web map. It is for looking at: WGS 84, longitude and latitude in
 degrees, height above the ellipsoid in metres, as RFC 7946 prescribes. The properties x, y, z are
-the coordinates in the flight's own CRS, which the property crs names; standard deviations in
+the coordinates in the CRS that the property crs names; standard deviations in
 metres along its axes; (0, 0) px is the centre of the top-left pixel.
 No package for aerial triangulation reads control points from it.
 """

@@ -41,9 +41,10 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
 _HOWTO = """\
 GeoPackage
 
-Open kgcps.gpkg in QGIS or any GIS: one layer of points with heights, in the flight's own CRS.
-The attributes x, y, z repeat the coordinates; standard deviations are in metres along the map's
-axes; role is control or check; (0, 0) px is the centre of the top-left pixel.
+Open kgcps.gpkg in QGIS or any GIS: one layer of points in {crs}, z is
+{heights}. The attributes x, y, z repeat the coordinates; standard deviations
+are in metres along the map's axes; role is control or check; (0, 0) px is the centre of the
+top-left pixel.
 No package for aerial triangulation reads control points from it.
 """
 
@@ -62,7 +63,8 @@ def files(points: MapPoints) -> Mapping[str, str | bytes]:
         content = connection.serialize()
     finally:
         connection.close()
-    return {"geopackage/kgcps.gpkg": content, "geopackage/HOWTO.txt": _HOWTO}
+    how_to = _HOWTO.format(crs=points.crs, heights=points.heights)
+    return {"geopackage/kgcps.gpkg": content, "geopackage/HOWTO.txt": how_to}
 
 
 def _add_systems(connection: sqlite3.Connection, text: str, crs: CRS) -> int:

@@ -40,7 +40,8 @@ need it taken off:
 1. File > Import > Import Markers: markers.xml (places in the images, and coordinates).
 2. Reference > Import Reference: markers.csv. Comma, first row 2, columns label, x, y, z and the
    three accuracies [m]; the coordinate system is {crs}, x is easting or
-   longitude. The accuracies come only by this file. Points kept for checking have enabled = 0.
+   longitude, z is {heights}.
+   The accuracies come only by this file. Points kept for checking have enabled = 0.
 3. Tools > Run Script: add_scale_bars.py, which reads scale_bars.csv beside it and adds a scale bar
    from every marker to the camera that saw it, with its length and accuracy [m].
 4. cameras.csv, if it is here, has the cameras' positions [m] and angles from the plate and its
@@ -68,6 +69,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     texts = {
         "HOWTO.txt": _HOWTO.format(
             crs=points.crs,
+            heights=points.heights,
             mark_px=_rms_mark_px(points.kgcps),
             focal_length=focal_length_note(points.controls),
         ),

@@ -55,9 +55,12 @@ geo.txt, if it is here, has camera positions from the plate and its vehicle's at
 the images that show the target. How good they are, their accuracies say. Use it with --geo PATH
 only where the images' own positions are worse; other images keep their own.
 
+z is {heights}, written in metres. ODM uses it as it is, and the
+images' own heights, too: where these are of another kind, the two are tens of metres apart.
+
 ODM ignores: standard deviations of points and of marks (all points weigh the same), distances,
-the CRS's vertical part. Heights are used as they are, in metres. Of the two accuracies in geo.txt
-it takes the larger one for all three axes. Points kept for checking are not in the list.
+the CRS's vertical part. Of the two accuracies in geo.txt it takes the larger one for all three
+axes. Points kept for checking are not in the list.
 """
 
 
@@ -70,7 +73,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If the CRS has no form that ODM reads, an image's name has white space, or two images in
         different folders have the same name.
     """
-    texts = {FILE_NAME: _gcp_list(points), "odm/HOWTO.txt": _HOWTO}
+    texts = {FILE_NAME: _gcp_list(points), "odm/HOWTO.txt": _HOWTO.format(heights=points.heights)}
     if points.priors:
         texts["odm/geo.txt"] = _geo(points)
     return texts

@@ -37,8 +37,9 @@ project.opf names the two files beside it:
   camera_list.json            the images, as paths relative to the folder of the frames: copy the
                               three files there, or put the images beside them
   input_control_points.json   points in {crs}, in the order of its own
-                              axes, with three standard deviations each; their marks with
-                              accuracies [px]; points kept for checking have is_checkpoint.
+                              axes, z {heights},
+                              with three standard deviations each; their marks with accuracies
+                              [px]; points kept for checking have is_checkpoint.
 
 OPF holds no correlations. Its scale constraints join two control points and no cameras: the
 distances find no place in it.
@@ -69,7 +70,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     }
     texts = {f"{name}.json": json.dumps(part, indent=1) + "\n" for name, part in parts.items()}
     texts["project.opf"] = _project(texts)
-    texts["HOWTO.txt"] = _HOWTO.format(crs=points.crs)
+    texts["HOWTO.txt"] = _HOWTO.format(crs=points.crs, heights=points.heights)
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 
 

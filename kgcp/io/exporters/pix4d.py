@@ -27,9 +27,10 @@ _FOLDER = "pix4d"
 _HOWTO = """\
 PIX4Dmatic, PIX4Dmapper
 
-1. Import ground control points: gcps.csv, coordinate system {crs}
-   with heights as it defines them (ellipsoidal, unless it is compound). The columns have the axis
-   order of the CRS's own definition: {order} first.
+1. Import ground control points: gcps.csv, coordinate system {crs},
+   z is {heights}: choose it as such, or points and images are
+   tens of metres apart. The columns have the axis order of the CRS's own definition:
+   {order} first. The two accuracies are metres.
    checkpoints.csv, if it is here, has the points kept for checking: import it as check points.
 2. Import marks: marks.csv. Image name, label, x, y, accuracy [px]; image directory off or the
    folder that holds the images, zoom level off.
@@ -52,7 +53,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     checks = [point for point in points.kgcps if point.is_checkpoint]
     order = "latitude or northing" if points.is_north_first else "longitude or easting"
     texts = {
-        "HOWTO.txt": _HOWTO.format(crs=points.crs, order=order),
+        "HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights, order=order),
         "gcps.csv": _points(points, points.controls),
         "marks.csv": _marks(points),
     }

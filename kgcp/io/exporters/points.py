@@ -51,6 +51,14 @@ class MapPoints:
         return _parsed(self.crs)
 
     @property
+    def heights(self) -> str:
+        """What z is, in words for a HOWTO."""
+        crs = self.parsed_crs
+        unit = crs.axis_info[2].unit_name if len(crs.axis_info) > 2 else "metre"
+        kind = crs.sub_crs_list[1].name if crs.is_compound else "ellipsoidal height"
+        return f"{kind} [{unit}]"
+
+    @property
     def controls(self) -> tuple[Kgcp, ...]:
         """The points that are not kept for checking."""
         return tuple(point for point in self.kgcps if not point.is_checkpoint)

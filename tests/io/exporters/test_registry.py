@@ -17,7 +17,17 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.reference import CAMERA_FROM_PHOTO, rotation_from_opk
-from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, camera_priors, export, opf
+from kgcp.io.exporters import (
+    DEFAULT_FORMATS,
+    FORMATS,
+    camera_priors,
+    export,
+    geopackage,
+    metashape,
+    odm,
+    opf,
+    pix4d,
+)
 from kgcp.io.exporters.points import MapPoints
 from kgcp.mapframe import MapFrame
 from kgcp.orientation import CameraPrior
@@ -141,3 +151,21 @@ def test_packages_that_take_distances_are_told_what_these_hang_on(
         assert "wrong by 0.1 %, all distances are wrong by 0.1 %" in text
         assert "leave the calibration free" in text
         assert words in text
+
+
+@pytest.mark.parametrize(
+    ("crs", "heights"),
+    [
+        ("EPSG:25831", "ellipsoidal height [metre]"),
+        ("EPSG:2263", "ellipsoidal height [metre]"),  # though the grid has feet
+        ("EPSG:25831+5773", "EGM96 height [metre]"),
+        ("EPSG:2263+6360", "NAVD88 height (ftUS) [US survey foot]"),
+        ("EPSG:4326", "ellipsoidal height [metre]"),
+    ],
+)
+def test_how_tos_say_what_heights_are(points: MapPoints, crs: str, heights: str) -> None:
+    for module in (odm, metashape, pix4d, opf, camera_priors, geopackage):
+        priors = () if module is odm else points.priors  # its angles need a geoid's grid
+        texts = module.files(replace(points, crs=crs, priors=priors))
+        (how_to,) = [text for path, text in texts.items() if path.endswith("HOWTO.txt")]
+        assert heights in str(how_to), module.__name__
