@@ -97,7 +97,7 @@ def _reference_states(flight: Flight, target: Target, sightings: Sightings) -> F
         files.append(flight.trajectory_file)
     if flight.crs is None or not all(path is not None and path.is_file() for path in files):
         return None
-    poses = read_flight_poses(flight)
+    poses = read_flight_poses(flight, sightings.frames)
     return (
         None
         if poses is None

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
+from kgcp.crew import Crew
 from kgcp.errors import KgcpError, Reason
 from kgcp.examine import (
     FrameNote,
@@ -32,16 +30,11 @@ from kgcp.expectations import Sightings
 from kgcp.io.detections import FrameResult
 from kgcp.io.journal import Journal
 from kgcp.io.journal_text import fingerprint
-from kgcp.processes import LocalPool
-from kgcp.profiling import profiled
 from kgcp.target.expected import Expectation
 from kgcp.target.observation import is_unreadable
-from kgcp.workers import Inline, Loss, careful_map
+from kgcp.workers import Loss
 
 _REASONS = {Loss.DIED: Reason.WORKER_DIED, Loss.LATE: Reason.TIMED_OUT}
-
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
 
 
 class Watcher(Protocol):
@@ -52,48 +45,6 @@ class Watcher(Protocol):
 
     def progress(self, done: int, total: int, found: int) -> None:
         """Hear how many looks are done, of how many, and how many frames show a target."""
-
-
-@dataclass(frozen=True, slots=True)
-class Crew:
-    """Who does the work.
-
-    Attributes
-    ----------
-    jobs : int
-        Worker processes; 0 works in this one.
-    limit_s : float
-        Time for one look at one frame [s]; no limit in this process.
-    stages_s : Counter of float, or None
-        Takes the time of all workers by stage [s]; None: it is not measured.
-    """
-
-    jobs: int
-    limit_s: float
-    stages_s: Counter[str] | None = None
-
-    def map(
-        self, function: Callable[[_Item], FrameResult], items: Iterable[_Item]
-    ) -> Generator[tuple[_Item, FrameResult | Loss]]:
-        """Yield items and results as they come."""
-        if self.stages_s is None:
-            yield from self._map(function, items)
-            return
-        with closing(self._map(partial(profiled, function), items)) as results:
-            for item, result in results:
-                if isinstance(result, Loss):
-                    yield item, result
-                else:
-                    self.stages_s.update(result.stages_s)
-                    yield item, result.result
-
-    def _map(
-        self, function: Callable[[_Item], _Result], items: Iterable[_Item]
-    ) -> Generator[tuple[_Item, _Result | Loss]]:
-        return careful_map(function, items, start=self._start, jobs=self.jobs, limit_s=self.limit_s)
-
-    def _start(self, jobs: int) -> Executor:
-        return Inline() if self.jobs == 0 else LocalPool(jobs, self.limit_s)
 
 
 class Looks:

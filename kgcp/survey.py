@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from kgcp import __version__
+from kgcp.crew import Crew, hired
 from kgcp.examine import Debug, FrameNote, FrameTask
 from kgcp.expectations import expectations, with_expectations
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
@@ -22,7 +23,7 @@ from kgcp.io.locking import locked
 from kgcp.io.poses import read_flight_poses
 from kgcp.io.runrecord import versions, write_run_record
 from kgcp.io.tables import Row, write_table
-from kgcp.looks import Crew, Looks, Watcher
+from kgcp.looks import Looks, Watcher
 from kgcp.settings import DetectSettings
 from kgcp.tally import Stopwatch, SurveySummary, Tally
 from kgcp.target.expected import Expectation
@@ -46,12 +47,13 @@ def detect_flight(
     settings: DetectSettings,
     out: Path,
     *,
-    jobs: int,
+    jobs: int | None,
     watcher: Watcher | None = None,
     debug: Debug | None = None,
     is_restart: bool = False,
     frame_timeout_s: float = FRAME_TIMEOUT_S,
     is_profiled: bool = False,
+    scheduler: str | None = None,
 ) -> SurveySummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
@@ -64,9 +66,9 @@ def detect_flight(
     settings : DetectSettings
     out : Path
         Folder of the results.
-    jobs : int
-        Worker processes; 0 works in this one, without a limit of time. The table does not depend
-        on it.
+    jobs : int or None
+        Worker processes; 0 works in this one, without a limit of time; None: as many as there are
+        cores, or as the scheduler has threads. The table does not depend on it.
     watcher : Watcher, optional
         Who is told how the work goes.
     debug : Debug, optional
@@ -77,14 +79,19 @@ def detect_flight(
         Time for one look at one frame [s].
     is_profiled : bool
         Whether to measure what the workers spend their time on, at the price of some.
+    scheduler : str, optional
+        Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
+        frames, and the folder of pictures, where they are seen here.
 
     Raises
     ------
     KgcpError
         If there are no frames, the times file or that of the reference poses is bad, `out` cannot
-        be written or is another process's, or the frames vanish.
+        be written or is another process's, the scheduler is of no use, or the frames vanish.
     """
     stopwatch = Stopwatch()
+    if scheduler is not None:
+        flight, debug = _seen_from_elsewhere(flight, debug)
     with stopwatch.stage("preparation"):
         frames = list_frames(flight.frames_folder)
         times = {}
@@ -102,8 +109,10 @@ def detect_flight(
     with (
         locked(out / ".detections.lock"),
         Journal(out / ".detections.journal", _making(task), is_new=is_restart) as journal,
+        hired(
+            *(jobs, frame_timeout_s, scheduler, (flight.frames_folder,)), is_profiled=is_profiled
+        ) as crew,
     ):
-        crew = Crew(jobs, frame_timeout_s, Counter() if is_profiled else None)
         looks = Looks(task, notes, journal, crew, watcher or Nobody())
         with stopwatch.stage("first look"):
             looks.look()
@@ -121,20 +130,32 @@ def detect_flight(
                 _rows(looks, expected, tally),
                 _provenance(flight, settings),
             )
-        stopwatch.stages_s["journal, within these"] = journal.seconds
-        for stage, seconds in (crew.stages_s or Counter()).most_common():
-            stopwatch.stages_s[f"workers: {stage}"] = seconds
         is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
         summary = tally.summary(
             kept=looks.kept,
             frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
             guide_problem=guide_problem,
-            stages_s=stopwatch.stages_s,
+            stages_s=_stages_s(stopwatch, journal, crew),
         )
-        record = {**asdict(summary), "jobs": jobs, "settings": asdict(settings)}
+        record = {**asdict(summary), "jobs": crew.jobs, "settings": asdict(settings)}
         write_run_record(out / "run.json", record)
         journal.remove()
     return summary
+
+
+def _seen_from_elsewhere(flight: Flight, debug: Debug | None) -> tuple[Flight, Debug | None]:
+    """Name folders as they are called in whatever folder another process works."""
+    flight = replace(flight, frames_folder=flight.frames_folder.absolute())
+    return flight, None if debug is None else replace(debug, folder=debug.folder.absolute())
+
+
+def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, float]:
+    workers = (crew.stages_s or Counter()).most_common()
+    return {
+        **stopwatch.stages_s,
+        "journal, within these": journal.seconds,
+        **{f"workers: {stage}": seconds for stage, seconds in workers},
+    }
 
 
 def _take_notes(
@@ -149,7 +170,7 @@ def _take_notes(
         path = flight.reference_file
         priors = normal_priors(
             frames,
-            read_flight_poses(flight) if path is not None and path.is_file() else None,
+            read_flight_poses(flight, frames) if path is not None and path.is_file() else None,
             level_sd_deg=flight.vehicle.level_sd_deg,
             plumb_sd_deg=flight.plumb_sd_deg,
         )

@@ -92,6 +92,10 @@ class Loss(Enum):
     LATE = auto()  # it took longer than it may
 
 
+class Overdue(BrokenExecutor):
+    """A worker has ended because its call took longer than it may."""
+
+
 class Inline(Executor):
     """Works in this process, at once: its end is the end of all."""
 
@@ -129,7 +133,8 @@ def careful_map(
     jobs : int
         Workers.
     limit_s : float
-        What the executor allows for an item [s]: who dies later was late.
+        What the executor allows for an item [s]: who dies later was late. Infinite for one that
+        raises `Overdue`.
 
     Raises
     ------
@@ -210,7 +215,8 @@ def _one_by_one(
                     break
                 pool.shutdown(wait=True, cancel_futures=True)
                 pool = None
-                if time.monotonic() - began_s >= limit_s:
+                is_overdue = isinstance(future.exception(), Overdue)
+                if is_overdue or time.monotonic() - began_s >= limit_s:
                     yield item, Loss.LATE
                     break
             else:

@@ -22,7 +22,7 @@ _DEFAULTS = DetectSettings()
     type=click.IntRange(0, 256),
     default=None,
     help="Worker processes; 0 works in this one, which a broken decoder may end."
-    "  [default: the usable cores]",
+    "  [default: the usable cores, or all of the scheduler's]",
 )
 @click.option(
     "--method",
@@ -89,6 +89,12 @@ _DEFAULTS = DetectSettings()
     help="Give a frame up that takes longer than this [s].",
 )
 @click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Let a Dask cluster work, for example tcp://10.0.0.1:8786; local:4 is one on this machine."
+    " Needs kgcp[dask], there and here.",
+)
+@click.option(
     "--profile", "is_profiled", is_flag=True, help="Print the time per stage, which costs some."
 )
 @click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
@@ -110,6 +116,7 @@ def command(
     debug_frames: str,
     frame_timeout: float,
     *,
+    scheduler: str | None,
     is_guided: bool,
     is_restart: bool,
     is_profiled: bool,
@@ -126,6 +133,8 @@ def command(
 
     Example: kgcp detect sample_flight --jobs 2
     """
+    if scheduler is not None and jobs == 0:
+        raise click.UsageError("--jobs 0 works in this process, --scheduler in others: give one")
     from kgcp.processes import use_one_core_each
 
     use_one_core_each()  # before numpy is loaded
@@ -133,7 +142,6 @@ def command(
     from kgcp.examine import Debug
     from kgcp.io.flight import read_flight
     from kgcp.survey import detect_flight
-    from kgcp.workers import usable_cores
 
     settings = DetectSettings(
         method=Method(method),
@@ -148,12 +156,13 @@ def command(
     with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
         summary = detect_flight(
             *(the_flight, settings, folder),
-            jobs=usable_cores() if jobs is None else jobs,
+            jobs=jobs,
             watcher=log,
             debug=None if debug is None else Debug(debug, debug_frames),
             is_restart=is_restart,
             frame_timeout_s=frame_timeout,
             is_profiled=is_profiled,
+            scheduler=scheduler,
         )
     seconds = time.perf_counter() - start
     report(summary, folder / "detections.parquet", seconds, log, as_json=as_json)
