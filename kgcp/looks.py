@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from kgcp.crew import Crew
 from kgcp.errors import KgcpError, Reason
@@ -35,6 +35,8 @@ from kgcp.target.observation import is_unreadable
 from kgcp.workers import Loss
 
 _REASONS = {Loss.DIED: Reason.WORKER_DIED, Loss.LATE: Reason.TIMED_OUT}
+
+_Result = TypeVar("_Result")
 
 
 class Watcher(Protocol):
@@ -141,6 +143,16 @@ class Looks:
     def results(self) -> Iterator[FrameResult]:
         """Yield the last result of every frame, in the frames' order."""
         return map(self._journal.read, self._keys)
+
+    def through(
+        self, function: Callable[[FrameResult], _Result]
+    ) -> Iterator[tuple[int, FrameResult, _Result | Loss]]:
+        """Yield what workers make of the last result of every frame, with its row, as it comes."""
+        self._total += len(self._keys)
+        with closing(self._crew.map(function, self.results())) as made:
+            for result, one in made:
+                self._advance(1)
+                yield self._rows[result.frame], result, one
 
     def _second_look(self, row: int, expected: Mapping[str, Expectation]) -> SecondLook:
         return SecondLook(self._notes[row], self._journal.read(self._keys[row]), expected)

@@ -10,9 +10,11 @@ from pathlib import Path
 
 from kgcp import __version__
 from kgcp.crew import Crew, hired
+from kgcp.errors import KgcpError
 from kgcp.examine import Debug, FrameNote, FrameTask
 from kgcp.expectations import expectations, with_expectations
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
+from kgcp.io.contact_sheet import ContactSheet
 from kgcp.io.detections import detection_rows
 from kgcp.io.flight import Flight
 from kgcp.io.frames import list_frames
@@ -24,6 +26,7 @@ from kgcp.io.poses import read_flight_poses
 from kgcp.io.runrecord import versions, write_run_record
 from kgcp.io.tables import Row, write_table
 from kgcp.looks import Looks, Watcher
+from kgcp.overlays import draw_overlay
 from kgcp.settings import DetectSettings
 from kgcp.tally import Stopwatch, SurveySummary, Tally
 from kgcp.target.expected import Expectation
@@ -50,6 +53,7 @@ def detect_flight(
     jobs: int | None,
     watcher: Watcher | None = None,
     debug: Debug | None = None,
+    overlay: Path | None = None,
     is_restart: bool = False,
     frame_timeout_s: float = FRAME_TIMEOUT_S,
     is_profiled: bool = False,
@@ -73,6 +77,8 @@ def detect_flight(
         Who is told how the work goes.
     debug : Debug, optional
         Pictures to draw.
+    overlay : Path, optional
+        Folder of a contact sheet of all rings, to be made after the table.
     is_restart : bool
         Whether to begin anew, whatever an interrupted run has left.
     frame_timeout_s : float
@@ -98,6 +104,7 @@ def detect_flight(
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
         notes = _take_notes(flight, frames, times)
+        sheet = None if overlay is None else _sheet(flight, overlay)
     task = FrameTask(
         flight.frames_folder,
         flight.camera,
@@ -123,6 +130,8 @@ def detect_flight(
                 expected, guide_problem = expectations(flight, looks.sightings)
                 looks.look_again(expected)
         tally = Tally(times)
+        if sheet is not None:
+            sheet.clear()
         with stopwatch.stage("table"):
             write_table(
                 out / "detections.parquet",
@@ -130,10 +139,15 @@ def detect_flight(
                 _rows(looks, expected, tally),
                 _provenance(flight, settings),
             )
+        not_drawn = 0
+        if sheet is not None:
+            with stopwatch.stage("overlay"):
+                not_drawn = draw_overlay(sheet, flight.name, looks, task)
         is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
         summary = tally.summary(
             kept=looks.kept,
             frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
+            not_drawn=not_drawn,
             guide_problem=guide_problem,
             stages_s=_stages_s(stopwatch, journal, crew),
         )
@@ -141,6 +155,15 @@ def detect_flight(
         write_run_record(out / "run.json", record)
         journal.remove()
     return summary
+
+
+def _sheet(flight: Flight, folder: Path) -> ContactSheet:
+    if folder.resolve().is_relative_to(flight.frames_folder.resolve()):
+        raise KgcpError(
+            f"{folder}: is among the frames, where pictures would be taken for frames;"
+            " choose another --overlay"
+        )
+    return ContactSheet(folder)
 
 
 def _seen_from_elsewhere(flight: Flight, debug: Debug | None) -> tuple[Flight, Debug | None]:

@@ -38,6 +38,8 @@ class SurveySummary:
         Frames that a run before, which did not end, had examined.
     guided : int
         Rows measured by a second look only.
+    not_drawn : int
+        Rings that are not in the contact sheet, since their frame could not be read again.
     guide_problem : str or None
         Why reference poses and trajectory could not say where to look again, if they could not.
     stages_s : dict of float
@@ -53,6 +55,7 @@ class SurveySummary:
     frames_without_attitude: int
     kept: int
     guided: int
+    not_drawn: int
     guide_problem: str | None
     stages_s: Mapping[str, float]
 
@@ -116,6 +119,7 @@ class Tally:
         *,
         kept: int,
         frames_without_attitude: int,
+        not_drawn: int,
         guide_problem: str | None,
         stages_s: Mapping[str, float],
     ) -> SurveySummary:
@@ -130,6 +134,7 @@ class Tally:
             frames_without_attitude=frames_without_attitude,
             kept=kept,
             guided=self._guided,
+            not_drawn=not_drawn,
             guide_problem=guide_problem,
             stages_s=dict(stages_s),
         )

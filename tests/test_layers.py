@@ -32,6 +32,7 @@ LAYERS = (
     ("cluster", "examine", "expectations", "tally"),
     ("crew",),
     ("looks",),
+    ("overlays",),
     ("delivery", "survey", "report"),
     ("cli",),
     ("__main__",),

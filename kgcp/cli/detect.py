@@ -75,6 +75,13 @@ _DEFAULTS = DetectSettings()
     help="Draw these frames only, for example 'east/*_01?.jpg'.",
 )
 @click.option(
+    "--overlay",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Write a contact sheet to DIR/index.html: every ring with its fitted contours, what the"
+    " fit leaves, and the values.",
+)
+@click.option(
     "--restart",
     "is_restart",
     is_flag=True,
@@ -116,6 +123,7 @@ def command(
     debug_frames: str,
     frame_timeout: float,
     *,
+    overlay: Path | None,
     scheduler: str | None,
     is_guided: bool,
     is_restart: bool,
@@ -159,12 +167,13 @@ def command(
             jobs=jobs,
             watcher=log,
             debug=None if debug is None else Debug(debug, debug_frames),
+            overlay=overlay,
             is_restart=is_restart,
             frame_timeout_s=frame_timeout,
             is_profiled=is_profiled,
             scheduler=scheduler,
         )
     seconds = time.perf_counter() - start
-    report(summary, folder / "detections.parquet", seconds, log, as_json=as_json)
+    report(summary, folder / "detections.parquet", overlay, seconds, log, as_json=as_json)
     if is_profiled:
         report_stages(summary)

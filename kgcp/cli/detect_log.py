@@ -103,17 +103,28 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
     raise Terminated
 
 
-def report(summary: SurveySummary, table: Path, seconds: float, log: Log, *, as_json: bool) -> None:
+def report(
+    summary: SurveySummary,
+    table: Path,
+    overlay: Path | None,
+    seconds: float,
+    log: Log,
+    *,
+    as_json: bool,
+) -> None:
     """Print what became of the frames; with `as_json` also to stdout."""
     frames_per_s = (summary.frames - summary.kept) / seconds
     numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
+    files = {"table": str(table)}
+    if overlay is not None:
+        files["overlay"] = str(overlay / "index.html")
     if as_json:
-        click.echo(json.dumps({**numbers, "table": str(table)}))
+        click.echo(json.dumps({**numbers, **files}))
     if log.is_json:
-        log.event("summary", **numbers, table=str(table))
+        log.event("summary", **numbers, **files)
     elif not log.is_quiet:
         _report_in_words(summary, seconds, frames_per_s)
-        click.echo(f"wrote {table}", err=True)
+        click.echo(f"wrote {' and '.join(files.values())}", err=True)
 
 
 def report_stages(summary: SurveySummary) -> None:
@@ -136,6 +147,8 @@ def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float
         click.echo(f"{summary.guided} of them measured by a second look", err=True)
     if summary.guide_problem is not None:
         click.echo(f"no second look by the reference: {summary.guide_problem}", err=True)
+    if summary.not_drawn:
+        click.echo(f"{summary.not_drawn} rings not drawn: their frames are not there", err=True)
     if summary.frames_without_time:
         click.echo(
             f"{summary.frames_without_time} frames have no time: name a times file in flight.toml"
