@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.anyfile import is_sound, read_lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,31 +87,28 @@ def read_csv_columns(
         With the line: missing file or column, a cell that is not a finite number, a short row.
     """
     rows = _read_rows(path, toml_key)
-    if not rows:
+    first = next(rows, None)
+    if first is None:
         raise KgcpError(f"{path}: is empty; its first line names the columns {key}, …")
-    header = [name.strip() for name in rows[0][1]]
-    _check_header(header, (key, *required), f"{path}, line {rows[0][0]}")
+    header = [name.strip() for name in first[1]]
+    _check_header(header, (key, *required), f"{path}, line {first[0]}")
     names = tuple(name for name in (*required, *optional) if name in header)
-    places = [header.index(name) for name in names]
-    numbers = np.empty((len(rows) - 1, len(names)))
-    for index, (line, cells) in enumerate(rows[1:]):
+    places, key_place = [header.index(name) for name in names], header.index(key)
+    lines, keys, numbers = [], [], array("d")
+    for line, cells in rows:
         if len(cells) != len(header):
             raise KgcpError(
                 f"{path}, line {line}: has {len(cells)} cells, the first line has {len(header)};"
                 " repair the line"
             )
-        numbers[index] = [
+        lines.append(line)
+        keys.append(cells[key_place].strip())
+        numbers.extend(
             _number(cells[place], f"{path}, line {line}: {name}")
             for place, name in zip(places, names, strict=True)
-        ]
-    key_place = header.index(key)
-    return CsvColumns(
-        path,
-        tuple(line for line, _ in rows[1:]),
-        tuple(cells[key_place].strip() for _, cells in rows[1:]),
-        names,
-        numbers,
-    )
+        )
+    block = np.array(numbers).reshape(len(lines), len(names))
+    return CsvColumns(path, tuple(lines), tuple(keys), names, block)
 
 
 def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> None:
@@ -125,15 +123,12 @@ def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> N
         raise KgcpError(f"{where}: names {doubled[0]} twice; keep one of them")
 
 
-def _read_rows(path: Path, toml_key: str) -> list[tuple[int, list[str]]]:
-    """Return the rows that are not blank, with their line numbers."""
-    if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; flight.toml names it under {toml_key}")
+def _read_rows(path: Path, toml_key: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows that are not blank, with their line numbers."""
+    reader = csv.reader(read_lines(path, toml_key))
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            return [(reader.line_num, cells) for cells in reader if any(map(str.strip, cells))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        yield from ((reader.line_num, cells) for cells in reader if any(map(str.strip, cells)))
+    except csv.Error as error:
         raise KgcpError(f"{path}: is not a readable CSV file ({error}); repair it") from error
 
 
@@ -141,7 +136,7 @@ def _number(text: str, where: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+        value = float("nan")
+    if not is_sound(value):
         raise KgcpError(f"{where} is {text.strip()!r}; give a finite number")
     return value

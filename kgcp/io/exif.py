@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from kgcp.errors import SettingError
+from kgcp.io.anyfile import is_file
+from kgcp.io.imageheader import FORMATS
 from kgcp.io.times import parse_time
 
 
@@ -48,8 +51,11 @@ def read_exif(path: Path) -> Exif:
 
     Whatever is damaged or absent is None; nothing is raised.
     """
+    if not is_file(path):  # opening a pipe would wait for ever
+        return Exif()
     try:
-        tags = _exif_tags(path)
+        with warnings.catch_warnings(action="ignore"):
+            tags = _exif_tags(path)
     except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
         return Exif()
     return Exif(
@@ -64,7 +70,7 @@ def _exif_tags(path: Path) -> Mapping[int, Any]:
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # the limit guards decoding; aerial cameras exceed it
     try:
-        with Image.open(path) as image:
+        with Image.open(path, "r", (*FORMATS, "TIFF")) as image:
             # The method of the base class: that of PNG would decode all pixels.
             exif = Image.Image.getexif(image)
             return {**exif, **exif.get_ifd(IFD.Exif)}

@@ -9,6 +9,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
+from kgcp.io.anyfile import is_file, is_folder, read_bytes
 from kgcp.io.flight_camera import (
     CAMERA_KEYS,
     read_calibration_covariance,
@@ -27,6 +28,7 @@ from kgcp.target.layout import Target
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format")
+_MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,7 @@ def read_flight(folder: Path) -> Flight:
         )
     return Flight(
         folder=folder,
-        name=table.text("name") if "name" in table else folder.resolve().name,
+        name=table.name("name") if "name" in table else folder.resolve().name,
         crs=table.text("crs") if "crs" in table else None,
         frames_folder=frames_folder,
         times_file=times_file,
@@ -159,14 +161,17 @@ def _read_toml(path: Path) -> tuple[TomlTable, str]:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
+    except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
+        raise KgcpError(f"{path}: is not TOML that can be read ({error}); write it anew") from error
     return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
 
 
 def _read_text(path: Path) -> str:
-    if not path.is_file():
+    if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
+    data = read_bytes(path, "FLIGHT", _MOST_BYTES)
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
 
@@ -175,10 +180,10 @@ def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, Ti
     """Return the frames' folder, the times file and its format, all but the last by default."""
     table = flight.table("frames", FRAMES_KEYS, required=False)
     name = table.text("folder") if "folder" in table else "frames"
-    if not (folder / name).is_dir():
+    if not is_folder(folder / name):
         raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
     default = folder / "frames.csv"
-    times = default if default.is_file() else None
+    times = default if is_file(default) else None
     if "times" in table:
         times = table.existing_file("times", folder)
     times_format = None

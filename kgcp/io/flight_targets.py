@@ -37,7 +37,7 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
     ]
     plates = [table for table in tables if "replica_of" not in table]
     replicas = [table for table in tables if "replica_of" in table]
-    names = [table.text("name") for table in plates]
+    names = [table.name("name") for table in plates]
     for table in replicas:
         if table.text("replica_of") not in names:
             problem = f"{table.text('replica_of')!r} is not the name of a plate"
@@ -74,7 +74,7 @@ def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
 def _read_ring(table: TomlTable) -> Ring:
     with table.located():
         return Ring(
-            name=table.text("name"),
+            name=table.name("name"),
             outer_diameter_m=table.number("outer_diameter_m"),
             inner_diameter_m=table.number("inner_diameter_m"),
             code_diameter_m=table.number("code_diameter_m"),
@@ -89,4 +89,4 @@ def _read_replicas(plate: Ring, tables: Sequence[TomlTable]) -> Iterator[Ring]:
     own = [table for table in tables if table.text("replica_of") == plate.name]
     for table in sorted(own, key=lambda table: -table.number("scale")):
         with table.located():
-            yield plate.scaled(table.text("name"), table.number("scale"), table.numbers("code_deg"))
+            yield plate.scaled(table.name("name"), table.number("scale"), table.numbers("code_deg"))

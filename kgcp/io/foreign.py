@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-# Calibrations and poses are the user's own files, like flight.toml; expat fetches nothing.
+# expat fetches nothing, and declarations of entities, which may multiply, are refused below.
 from xml.etree import ElementTree as ET
 
 from kgcp.errors import KgcpError
+from kgcp.io.anyfile import is_sound, read_bytes
+
+_ENTITY = re.compile(r"<!\s*ENTITY")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,12 +49,7 @@ class ForeignFile:
         KgcpError
             If it cannot be read.
         """
-        if not path.is_file():
-            raise KgcpError(f"{path}: does not exist; flight.toml names it under {toml_key}")
-        try:
-            text = path.read_bytes().decode("utf-8-sig", errors="replace")
-        except OSError as error:
-            raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+        text = read_bytes(path, toml_key).decode("utf-8-sig", errors="replace")
         return cls(path, text, _json(text), _xml(text))
 
     @property
@@ -70,7 +70,7 @@ class ForeignFile:
             values = tuple(float(word) for word in words)
         except ValueError:
             values = ()
-        if len(values) != count or not all(map(_is_finite, values)):
+        if len(values) != count or not all(map(is_sound, values)):
             found = " ".join(words) or "nothing"
             shown = found if len(found) <= 60 else f"{found[:57]}..."
             kind = "a finite number" if count == 1 else f"{count} finite numbers"
@@ -146,15 +146,11 @@ class JsonObject:
         )
 
     def _finite(self, key: str, value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not is_sound(value):
             raise self.file.error(
-                self.where, f"{key!r} is {value!r}, no finite number", "export it again"
+                self.where, f"{key!r} is {reprlib.repr(value)}, no finite number", "export it again"
             )
         return float(value)
-
-
-def _is_finite(value: float) -> bool:
-    return abs(value) < float("inf")
 
 
 def _json(text: str) -> object:
@@ -167,7 +163,7 @@ def _json(text: str) -> object:
 
 
 def _xml(text: str) -> ET.Element | None:
-    if text.lstrip()[:1] != "<":
+    if text.lstrip()[:1] != "<" or _ENTITY.search(text):
         return None
     try:
         return ET.fromstring(text)  # noqa: S314 - see the import

@@ -17,7 +17,9 @@ import numpy as np
 from kgcp.errors import KgcpError, Reason, Rejection, SettingError
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.anyfile import is_file, is_folder, read_lines
 from kgcp.io.exif import Exif, read_exif
+from kgcp.io.imageheader import image_size, upright
 from kgcp.io.times import parse_time
 
 __all__ = ["Exif", "list_frames", "read_exif", "read_frame_times", "read_grey"]
@@ -30,6 +32,10 @@ FRAME_SUFFIXES = frozenset(
 _RAW_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _UNDECODED = re.compile("[\\udc80-\\udcff]")  # how bytes that are not UTF-8 come from the system
+
+# Of a file: text takes most space, ten characters for a colour of 16 bits; metadata come on top.
+_MOST_BYTES_PER_PIXEL = 32
+_MOST_METADATA_BYTES = 1 << 26
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
@@ -48,7 +54,7 @@ def list_frames(folder: Path) -> list[str]:
     KgcpError
         If the folder is missing or unreadable, holds no image, or a name is not UTF-8.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise KgcpError(f"{folder}: is not a folder; correct [frames] folder in flight.toml")
     frames = []
     for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
@@ -91,32 +97,51 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
     ------
     Rejection
         `decode_failed`: not an image, damaged in whole or in part (also where the decoder would
-        fill the gap), or of another depth; `wrong_size`: not the camera's.
+        fill the gap), or of another depth; `wrong_size`: not the camera's, which is known before
+        anything is decoded.
     """
-    try:
-        encoded = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise Rejection(Reason.DECODE_FAILED, str(error.strerror)) from error
-    grey = _decode(encoded)
+    grey = _decode(_encoded(path, camera))
     if grey.dtype not in (np.uint8, np.uint16):
         raise Rejection(Reason.DECODE_FAILED, f"pixels are {grey.dtype}, not of 8 or 16 bits")
     height, width = grey.shape
+    _require_size(width, height, camera)
+    return grey
+
+
+def _encoded(path: Path, camera: Camera) -> bytes:
+    """Return the content of an image file, once its header says that it may be a frame."""
+    if os.path.lexists(path) and not is_file(path):  # opening a pipe would wait for ever
+        raise Rejection(Reason.DECODE_FAILED, "is no regular file")
+    try:
+        with path.open("rb") as stream:
+            found, size = image_size(stream), os.fstat(stream.fileno()).st_size
+            if found is None:
+                raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that begin like no image")
+            _require_size(*found, camera)
+            most = _MOST_BYTES_PER_PIXEL * camera.width * camera.height + _MOST_METADATA_BYTES
+            if size > most:
+                raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
+            return upright(stream)
+    except OSError as error:
+        raise Rejection(Reason.DECODE_FAILED, str(error.strerror)) from error
+
+
+def _require_size(width: int, height: int, camera: Camera) -> None:
     if (width, height) != (camera.width, camera.height):
         raise Rejection(
             Reason.WRONG_SIZE,
             f"{width} x {height} px, the camera has {camera.width} x {camera.height}",
         )
-    return grey
 
 
-def _decode(encoded: np.ndarray[tuple[int], np.dtype[np.uint8]]) -> GreyArray:
-    size = encoded.size
-    if encoded[:2].tobytes() == _JPEG_START:
+def _decode(encoded: bytes) -> GreyArray:
+    size = len(encoded)
+    if encoded.startswith(_JPEG_START):
         # A truncated file gets an end: then every version of the decoder notices what is missing.
-        encoded = np.append(encoded, np.frombuffer(_JPEG_END, dtype=np.uint8))
+        encoded += _JPEG_END
     grey = None
     with _collected_stderr() as messages, suppress(cv2.error):
-        grey = cv2.imdecode(encoded, _RAW_GREY)
+        grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
     if grey is None:
         raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are no whole image")
     for message in messages:
@@ -165,21 +190,16 @@ def read_frame_times(path: Path) -> dict[str, float]:
     KgcpError
         For a missing file or column, a bad time or a frame named twice, with the line's number.
     """
+    reader = csv.DictReader(read_lines(path, "[frames] times"))
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file)
-            missing = {"frame", "time"} - set(reader.fieldnames or ())
-            if missing:
-                raise KgcpError(
-                    f"{path}: has no column {' and '.join(sorted(missing))};"
-                    " start it with the line 'frame,time'"
-                )
-            return _collect_times(path, reader)
-    except OSError as error:
-        raise KgcpError(
-            f"{path}: {error.strerror}; correct [frames] times in flight.toml"
-        ) from error
-    except (csv.Error, UnicodeDecodeError) as error:
+        missing = {"frame", "time"} - set(reader.fieldnames or ())
+        if missing:
+            raise KgcpError(
+                f"{path}: has no column {' and '.join(sorted(missing))};"
+                " start it with the line 'frame,time'"
+            )
+        return _collect_times(path, reader)
+    except csv.Error as error:
         raise KgcpError(f"{path}: is not CSV in UTF-8 ({error}); export it again") from error
 
 

@@ -10,13 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from kgcp.errors import KgcpError
+from kgcp.io.anyfile import is_file, read_lines
 from kgcp.io.frames import read_frame_times
 from kgcp.io.gpstime import clock_from_week, unix_from_gps, unwrap_week
 from kgcp.io.rtklib_pos import looks_like_solution, read_solution
 
 _HEAD = 4096
 # Number, GPS seconds of the week, [week]; positions and their deviations follow.
-_MARK = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+\[\s*(\d+)\s*\](?:\s|$)")
+_MARK = re.compile(r"(\d{1,9})\s+(\d{1,9}(?:\.\d*)?)\s+\[\s*(\d{1,9})\s*\](?:\s|$)")
 _LAST_NUMBER = re.compile(r"(.*?)(\d+)\D*")
 
 
@@ -62,11 +63,10 @@ def read_times(
 
 def recognise(path: Path) -> TimesFormat:
     """Tell the format of frame times by the content; what is no other is CSV."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD)
-    except OSError:
+    if not is_file(path):
         return TimesFormat.CSV  # whose reader says what is wrong
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
     if _MARK.match(head.decode("utf-8-sig", errors="replace").lstrip()):
         return TimesFormat.MRK
     return TimesFormat.RTKLIB if looks_like_solution(head) else TimesFormat.CSV
@@ -80,7 +80,7 @@ def _read_marks(path: Path) -> dict[int, float]:
     """
     numbers, clocks = [], []
     first_lines: dict[int, int] = {}
-    for line, row in enumerate(_lines(path), start=1):
+    for line, row in enumerate(read_lines(path, "[frames] times"), start=1):
         if not row.strip():
             continue
         match = _MARK.match(row.strip())
@@ -102,15 +102,6 @@ def _read_marks(path: Path) -> dict[int, float]:
         raise KgcpError(f"{path}: holds no marks; give the Timestamp.MRK of this flight")
     times = unix_from_gps(unwrap_week(np.array(clocks)))
     return dict(zip(numbers, times.tolist(), strict=True))
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise KgcpError(
-            f"{path}: is not a readable text ({error}); correct [frames] times in flight.toml"
-        ) from error
 
 
 def _join_by_number(path: Path, marks: dict[int, float], frames: Sequence[str]) -> dict[str, float]:
@@ -139,7 +130,7 @@ def _join_by_number(path: Path, marks: dict[int, float], frames: Sequence[str]) 
 
 
 def _join_by_order(path: Path, frames: Sequence[str]) -> dict[str, float]:
-    solution = read_solution(path)
+    solution = read_solution(path, "[frames] times")
     if len(solution.time_s) != len(frames):
         raise KgcpError(
             f"{path}: has {len(solution.time_s)} events for {len(frames)} frames, and nothing tells"

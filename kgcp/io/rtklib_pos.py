@@ -12,10 +12,11 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.anyfile import LARGEST, read_lines
 from kgcp.io.gpstime import TimeSystem, clock_from_week, unix_from_clock, unwrap_week
 
 _COLUMNS = re.compile(r"%\s*(GPST|UTC|JST)\b(.*)")
-_NAME = re.compile(r"([A-Za-z][\w-]*)(?:\(([^)]*)\))?")
+_NAME = re.compile(r"([A-Za-z][\w-]*)(?:\(([^()]*)\))?")
 _HEIGHTS = re.compile(r"lat/lon/height=(\w+)/(\w+)")
 _DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})\s+(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)")
 _JST_AHEAD_S = 9.0 * 3600.0
@@ -53,15 +54,15 @@ def looks_like_solution(head: bytes) -> bool:
     return text.startswith("%") or _DATE.match(text) is not None
 
 
-def read_solution(path: Path) -> Solution:
-    """Read the rows of a solution file by its own header.
+def read_solution(path: Path, toml_key: str) -> Solution:
+    """Read the rows of a solution file, which flight.toml names under a key, by its own header.
 
     Raises
     ------
     KgcpError
         Naming the line: no header, a row that is too short, or a cell that is not a number.
     """
-    rows = _rows(path)
+    rows = _rows(path, toml_key)
     header = next((match for _, row in rows if (match := _COLUMNS.match(row))), None)
     if header is None:
         raise KgcpError(
@@ -82,12 +83,9 @@ def read_solution(path: Path) -> Solution:
     )
 
 
-def _rows(path: Path) -> list[tuple[int, str]]:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise KgcpError(f"{path}: is not a readable text ({error}); export it again") from error
-    return [(number, row.strip()) for number, row in enumerate(lines, start=1) if row.strip()]
+def _rows(path: Path, toml_key: str) -> list[tuple[int, str]]:
+    lines = enumerate(read_lines(path, toml_key), start=1)
+    return [(number, row.strip()) for number, row in lines if row.strip()]
 
 
 def _layout(header: str) -> tuple[list[str], list[tuple[int, int]], int]:
@@ -122,18 +120,18 @@ def _split(
                     f" {width}; repair the line"
                 )
             cells[index] = [float(text) for text in texts[:width]]
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise KgcpError(
                 f"{path}, line {line}: is not a time and numbers ({error}); repair the line"
             ) from error
-    lost = np.flatnonzero(~np.isfinite(np.column_stack((clocks, cells))).all(axis=1))
+    in_weeks = ~np.isnan(weeks)
+    if in_weeks.any():
+        clocks = np.where(in_weeks, clock_from_week(weeks, clocks), clocks)
+    lost = np.flatnonzero(~(np.abs(np.column_stack((clocks, cells))) < LARGEST).all(axis=1))
     if lost.size:
         line = data[lost[0]][0]
         raise KgcpError(f"{path}, line {line}: holds a number that is not finite; delete it")
-    in_weeks = np.isfinite(weeks)
-    if in_weeks.any():
-        clocks = unwrap_week(np.where(in_weeks, clock_from_week(weeks, clocks), clocks))
-    return clocks, cells
+    return unwrap_week(clocks) if in_weeks.any() else clocks, cells
 
 
 def _cells(text: str, separator: str | None) -> list[str]:

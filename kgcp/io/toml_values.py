@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import math
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from datetime import date, datetime
 from pathlib import Path
 
 from kgcp.errors import KgcpError, SettingError
+from kgcp.io.anyfile import LARGEST, is_file
 
 _TYPE_NAMES = {
     bool: "a boolean",
@@ -20,6 +21,8 @@ _TYPE_NAMES = {
     list: "a list",
     dict: "a table",
 }
+_LONGEST_NAME = 200
+_CONTROLS = ("Cc", "Zl", "Zp")  # Unicode's: control characters, ends of lines and paragraphs
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +80,15 @@ class TomlTable:
             raise self.error(key, "is empty", "give a text or delete the line")
         return value
 
+    def name(self, key: str) -> str:
+        """Return what something is called: one line that may stand in any table or page."""
+        value = self.text(key)
+        if len(value) > _LONGEST_NAME or any(map(_is_control, value)):
+            problem = f"{value[:20]!r} is no name"
+            remedy = f"give at most {_LONGEST_NAME} characters on one line, none of control"
+            raise self.error(key, problem, remedy)
+        return value
+
     def choice(self, key: str, words: Sequence[str]) -> str:
         """Return one of the given words."""
         word = self.text(key)
@@ -90,6 +102,8 @@ class TomlTable:
         value = self._required(key, "give it as a whole number")
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._wrong_type(key, value, "a whole number")
+        if abs(value) >= LARGEST:
+            raise self.error(key, "is too large", "give a number in range")
         return value
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -128,7 +142,7 @@ class TomlTable:
     def existing_file(self, key: str, folder: Path) -> Path:
         """Return a file that lies in the folder or below it."""
         path = folder / self.text(key)
-        if not path.is_file():
+        if not is_file(path):
             raise self.error(key, f"{self.text(key)!r} does not exist", "create or correct it")
         return path
 
@@ -170,14 +184,15 @@ class TomlTable:
     def _finite(self, key: str, value: object) -> float:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise self._wrong_type(key, value, "a number")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
-            raise self.error(key, f"{value} is not a finite number", "give a number in range")
-        return number
+        if not abs(value) < LARGEST:
+            shown = f"{value} is" if isinstance(value, float) else "is"  # integers have any length
+            raise self.error(key, f"{shown} not a finite number", "give a number in range")
+        return float(value)
 
     def _wrong_type(self, key: str, value: object, wanted: str) -> KgcpError:
         kind = _TYPE_NAMES.get(type(value), "a date or time")
         return self.error(key, f"is {kind}", f"give {wanted}")
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in _CONTROLS

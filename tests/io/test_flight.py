@@ -184,7 +184,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         # numbers that are none
         ("fx = 2300.0", "fx = inf", "fx: inf is not a finite number"),
         ("fx = 2300.0", "fx = nan", "fx: nan is not a finite number"),
-        ("fx = 2300.0", f"fx = 1{400 * '0'}", "fx: 10+ is not a finite number"),
+        ("fx = 2300.0", f"fx = 1{400 * '0'}", "fx: is not a finite number"),
         ("122]", "nan]", "post position_m: nan is not a finite number"),
         # impossible values
         ("fx = 2300.0", "fx = -1", r"fx: -1 px is out of range; give a value above 0"),

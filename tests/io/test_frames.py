@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
@@ -92,9 +93,15 @@ class TestReadGrey:
         assert grey.dtype == dtype
         np.testing.assert_allclose(grey, luma, atol=2e-4 * np.iinfo(dtype).max + 1.0)
 
-    def test_the_orientation_tag_is_not_applied(self, tmp_path: Path) -> None:
-        from PIL import Image
+    @pytest.mark.parametrize("is_big", [False, True])
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_nor_is_that_of_a_tiff(self, tmp_path: Path, orientation: int, *, is_big: bool) -> None:
+        image = textured()
+        path = tmp_path / "frame.tif"
+        Image.fromarray(image).save(path, tiffinfo={274: orientation}, big_tiff=is_big)
+        np.testing.assert_array_equal(read_grey(path, CAMERA), image)
 
+    def test_the_orientation_tag_is_not_applied(self, tmp_path: Path) -> None:
         image = textured()
         path = tmp_path / "turned.png"
         exif = Image.Exif()
@@ -192,7 +199,7 @@ class TestFrameTimes:
             ("frame,time\n,1\n", r"frames.csv:2: lacks a frame or a time"),
             ("frame,time\na.jpg,\n", r"frames.csv:2: time: '' is not a time"),
             ("frame,time\na.jpg,2026-05-04T09:30:05\n", r"frames.csv:2: .* no time zone"),
-            (b"frame,time\n\xe9.jpg,1\n", "not CSV in UTF-8"),
+            (b"frame,time\n\xe9.jpg,1\n", "no text in UTF-8"),
         ],
     )
     def test_a_bad_file_is_an_error_with_its_line(
@@ -203,5 +210,5 @@ class TestFrameTimes:
         assert "\n" not in str(caught.value)
 
     def test_a_missing_file_is_an_error(self, tmp_path: Path) -> None:
-        with pytest.raises(KgcpError, match=r"\[frames\] times in flight.toml"):
+        with pytest.raises(KgcpError, match=r"does not exist; .* \[frames\] times"):
             read_frame_times(tmp_path / "frames.csv")

@@ -141,7 +141,9 @@ def test_accuracies_of_something_else_are_refused(
     smrmsg = write(tmp_path, content, name="smrmsg.out")
     with pytest.raises(KgcpError, match=f"smrmsg.out: .*{words}"):
         read_sbet(path, _with_accuracies(smrmsg))
-    with pytest.raises(KgcpError, match=r"gone\.out: does not exist; correct \[vehicle\] acc"):
+    with pytest.raises(
+        KgcpError, match=r"gone\.out: does not exist; flight.toml names it under \[vehicle\] acc"
+    ):
         read_sbet(path, _with_accuracies(tmp_path / "gone.out"))
 
 

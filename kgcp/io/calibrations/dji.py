@@ -17,7 +17,7 @@ _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _DATA = rf"(?:[^;<>\"',]{{0,40}};\s*)?(?:{_NUMBER}\s*,\s*){{8}}{_NUMBER}"
 _TAG = re.compile(r"DewarpData\s*(?:=\s*[\"']|>)\s*([^\"'<]*)")
 _BARE = re.compile(rf"({_DATA})")
-_FLAG = re.compile(r"DewarpFlag\s*(?:=\s*[\"']|>)\s*(\d+)")
+_FLAG = re.compile(r"DewarpFlag\s*(?:=\s*[\"']|>)\s*([0-9]+)")
 
 
 def matches(file: ForeignFile) -> bool:
@@ -37,7 +37,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     if found is None:
         raise file.error("", "has no DewarpData", "name an image as the camera wrote it")
     flag = _FLAG.search(file.text)
-    if flag is not None and int(flag[1]):
+    if flag is not None and flag[1].strip("0"):
         raise file.error(
             "",
             "is dewarped already (DewarpFlag), so that its DewarpData describes another image",

@@ -17,7 +17,7 @@ from kgcp.io.foreign import ForeignFile
 
 _TEXT_HEAD = re.compile(r"\s*fileName\s+imageWidth\s+imageHeight\b")
 _LAST_OF_HEAD = re.compile(r"camera model\b")
-_CAM_HEAD = re.compile(r"^\s*Pix4D camera calibration file\s+(\S+)", re.MULTILINE)
+_CAM_HEAD = re.compile(r"^[^\S\n]*Pix4D camera calibration file\s+(\S+)", re.MULTILINE)
 _SENSOR = re.compile(r"sensor width of\s+([\d.eE+-]+)\s*x\s*([\d.eE+-]+)\s*mm")
 _BLOCK_LINES = 10
 
@@ -86,7 +86,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
     if sensor is None:
         raise file.error(where, "does not say its sensor width", "export it from Pix4D again")
     width_mm, height_mm = file.numbers(f"{sensor[1]} {sensor[2]}", 2, where)
-    values = dict(re.findall(r"^\s*([A-Z]\w*)\s+(\S+)\s*$", block, re.MULTILINE))
+    values = dict(re.findall(r"^[^\S\n]*([A-Z]\w*)[^\S\n]+(\S+)[^\S\n]*$", block, re.MULTILINE))
 
     def number(key: str) -> float:
         return file.numbers(values.get(key), 1, f"{where} {key}")[0]

@@ -18,7 +18,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.foreign import ForeignFile
 from kgcp.io.poses.source import SourcePoses, photo_rotation
 
-_LINE = re.compile(r"\s*\d+(\s+[-+.\deE]+){7}\s+\d+\s+(\S.*?)\s*")
+_LINE = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+(\S.*)")
 
 
 def matches(file: ForeignFile) -> bool:
@@ -53,7 +53,7 @@ def _image_rows(file: ForeignFile) -> list[tuple[int, str]]:
     """Return every other line; those of the points count even where they are empty."""
     lines = list(enumerate(file.text.splitlines(), start=1))
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
-    return [(number, line) for number, line in rows[::2] if line.strip()]
+    return [(number, line.strip()) for number, line in rows[::2] if line.strip()]
 
 
 def _pose(file: ForeignFile, where: str, row: str) -> tuple[str, FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.trajectory import Trajectory
+from kgcp.io.anyfile import require_file
 from kgcp.io.rtklib_pos import looks_like_solution
 from kgcp.io.trajectories.axes import convert_positions, map_axes_ecef, turn_covariances
 from kgcp.io.trajectories.course import attitude_from_course
@@ -23,6 +24,7 @@ from kgcp.io.trajectories.tum import read_tum
 __all__ = ["TrajectoryFormat", "TrajectoryNotation", "read_trajectory", "recognise"]
 
 _HEAD = 4096
+_KEY = "[vehicle] trajectory"
 _CONTRACT = TrajectoryNotation()
 
 
@@ -78,10 +80,12 @@ def recognise(path: Path) -> TrajectoryFormat:
     KgcpError
         If the file is missing, empty, or of no known format.
     """
-    if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; flight.toml names it under [vehicle] trajectory")
-    with path.open("rb") as stream:
-        head = stream.read(_HEAD)
+    require_file(path, _KEY)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+    except OSError as error:
+        raise KgcpError(f"{path}: {error.strerror}; make it readable") from error
     if not head.strip():
         raise KgcpError(f"{path}: is empty; give a trajectory")
     if looks_like_sbet(head, path.stat().st_size):
@@ -125,8 +129,6 @@ def _refuse_foreign_keys(kind: TrajectoryFormat, notation: TrajectoryNotation) -
 def _read(
     path: Path, kind: TrajectoryFormat, notation: TrajectoryNotation, flight_crs: str
 ) -> Epochs:
-    if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; flight.toml names it under [vehicle] trajectory")
     match kind:
         case TrajectoryFormat.SBET:
             return read_sbet(path, notation)

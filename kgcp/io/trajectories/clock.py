@@ -15,7 +15,7 @@ from kgcp.io.gpstime import TimeSystem, clock_from_date, unix_from_clock, weekda
 from kgcp.io.times import parse_time
 from kgcp.io.trajectories.notation import TrajectoryNotation
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def times_from_texts(

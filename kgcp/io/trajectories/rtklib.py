@@ -29,7 +29,7 @@ def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
         As `kgcp.io.rtklib_pos.read_solution`, and for vectors from a base, heights above a geoid
         or a datum that the file does not define.
     """
-    solution = read_solution(path)
+    solution = read_solution(path, "[vehicle] trajectory")
     check_times(path, solution.time_s, lambda row: f"line {solution.lines[row]}")
     if "e-baseline" in solution.columns:
         raise KgcpError(

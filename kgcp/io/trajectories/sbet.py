@@ -8,6 +8,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.anyfile import LARGEST, read_bytes
 from kgcp.io.gpstime import unwrap_week
 from kgcp.io.trajectories.clock import times_from_week
 from kgcp.io.trajectories.epochs import Epochs, check_times
@@ -17,6 +18,7 @@ GEOGRAPHIC_3D = "EPSG:4979"
 _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, heading, wander, …
 _ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
 _DOUBLE = 8
+_MOST_BYTES = (1 << 30) - 1  # ten hours at 200 Hz
 _MAX_WANDER_RAD = 1e-6
 _TINY = 1e-12  # zeros, and what other bytes are as doubles
 
@@ -45,7 +47,7 @@ def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
         If the file is cut or holds impossible values, flight.toml lacks the day or the time
         system, or does not say what the wander angle means where it is not zero.
     """
-    records = _read_records(path, _RECORD)
+    records = _read_records(path, _RECORD, "trajectory")
     _check_values(path, records)
     seconds = records[:, 0]
     time_s = times_from_week(path, seconds, notation)
@@ -63,13 +65,8 @@ def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
     )
 
 
-def _read_records(path: Path, columns: int) -> FloatArray:
-    if not path.is_file():
-        raise KgcpError(f"{path}: does not exist; correct [vehicle] accuracies in flight.toml")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise KgcpError(f"{path}: cannot be read ({error.strerror}); make it readable") from error
+def _read_records(path: Path, columns: int, key: str) -> FloatArray:
+    data = read_bytes(path, f"[vehicle] {key}", _MOST_BYTES)
     size = columns * _DOUBLE
     if not data or len(data) % size:
         raise KgcpError(
@@ -81,7 +78,7 @@ def _read_records(path: Path, columns: int) -> FloatArray:
 
 
 def _check_values(path: Path, records: FloatArray) -> None:
-    finite = np.isfinite(records[:, [0, 1, 2, 3, 7, 8, 9, 10]]).all(axis=1)
+    finite = (np.abs(records[:, [0, 1, 2, 3, 7, 8, 9, 10]]) < LARGEST).all(axis=1)
     on_earth = (np.abs(records[:, 1]) <= np.pi / 2.0) & (np.abs(records[:, 2]) <= 2.0 * np.pi)
     wrong = np.flatnonzero(~(finite & on_earth))
     if wrong.size:
@@ -109,7 +106,7 @@ def _attitude_deg(path: Path, records: FloatArray, wander: Wander | None) -> Flo
 
 def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return deviations of east, north, up [m] and roll, pitch, heading [deg] at these seconds."""
-    records = _read_records(path, _ACCURACY)
+    records = _read_records(path, _ACCURACY, "accuracies")
     own, wanted = unwrap_week(records[:, 0]), unwrap_week(seconds)
     steps = np.diff(own)
     if len(own) < 2 or steps.min() <= 0.0:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.trajectory import ENU_FROM_NED
+from kgcp.io.anyfile import is_sound, read_lines
 from kgcp.io.trajectories.axes import level_axes_ecef, map_axes_ecef
 from kgcp.io.trajectories.clock import times_from_texts
 from kgcp.io.trajectories.epochs import Epochs, check_times
@@ -48,12 +49,8 @@ def read_tum(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epoch
 
 
 def _read_rows(path: Path) -> tuple[list[int], list[str], FloatArray]:
-    try:
-        rows = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise KgcpError(f"{path}: is not a readable text ({error}); export it again") from error
     lines, texts, numbers = [], [], []
-    for line, row in enumerate(rows, start=1):
+    for line, row in enumerate(read_lines(path, "[vehicle] trajectory"), start=1):
         cells = row.split()
         if not cells or cells[0].startswith("#"):
             continue
@@ -61,7 +58,7 @@ def _read_rows(path: Path) -> tuple[list[int], list[str], FloatArray]:
             values = [float(cell) for cell in cells]
         except ValueError:
             values = []
-        if len(values) != _CELLS or not np.isfinite(values).all():
+        if len(values) != _CELLS or not all(map(is_sound, values)):
             raise KgcpError(
                 f"{path}, line {line}: is not the eight numbers timestamp tx ty tz qx qy qz qw;"
                 " repair the line"

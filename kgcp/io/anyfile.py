@@ -1,0 +1,101 @@
+"""Files from elsewhere, which may be anything: pipes, devices, far too large, or no text at all.
+
+What a flight names is opened if it is a regular file, or a link to one, and is read with a limit,
+so that nothing waits for ever or fills the memory before somebody has looked at it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TextIO
+
+from kgcp.errors import KgcpError
+
+MOST_BYTES = 1 << 29
+"""Of a file that is read as a whole: a large reconstruction has a tenth of it."""
+_LONGEST_LINE = 1 << 20  # characters
+LARGEST = 1e15
+"""What no coordinate, angle, time or parameter reaches: more of it would overflow somewhere."""
+
+
+def is_file(path: Path) -> bool:
+    """Return whether this is a regular file; names that the system refuses are none."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises where a name is too long
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether this is a folder; names that the system refuses are none."""
+    return os.path.isdir(path)  # noqa: PTH112 - as above
+
+
+def is_sound(value: float) -> bool:
+    """Return whether a number is finite and not absurd."""
+    return abs(value) < LARGEST
+
+
+def require_file(path: Path, toml_key: str) -> None:
+    """Refuse what is no regular file.
+
+    Raises
+    ------
+    KgcpError
+        With the key of flight.toml that names it.
+    """
+    if is_file(path):
+        return
+    problem = "is no regular file" if os.path.lexists(path) else "does not exist"
+    raise KgcpError(f"{path}: {problem}; flight.toml names it under {toml_key}")
+
+
+def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
+    """Return the content of a file of at most `most` bytes.
+
+    Raises
+    ------
+    KgcpError
+        If it is no regular file, cannot be read or is larger.
+    """
+    require_file(path, toml_key)
+    try:
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            data = stream.read(most + 1) if size <= most else b""
+    except OSError as error:
+        raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+    if max(size, len(data)) > most:
+        raise KgcpError(
+            f"{path}: has {size} bytes, and what {toml_key} names has at most {most};"
+            " name the right file"
+        )
+    return data
+
+
+def read_lines(path: Path, toml_key: str) -> Iterator[str]:
+    """Yield the lines of a text in UTF-8, with their ends, as they are read.
+
+    Raises
+    ------
+    KgcpError
+        Naming the line: if it is no regular file, cannot be read, or is no text.
+    """
+    require_file(path, toml_key)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            yield from _bounded_lines(path, stream)
+    except UnicodeDecodeError as error:
+        raise KgcpError(
+            f"{path}: is no text in UTF-8 ({error.reason}); save it as UTF-8"
+        ) from error
+    except OSError as error:
+        raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+
+
+def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
+    number = 0
+    while line := stream.readline(_LONGEST_LINE):
+        number += 1
+        if len(line) == _LONGEST_LINE or "\0" in line:
+            raise KgcpError(f"{path}, line {number}: is no line of text; name a text file")
+        yield line
