@@ -14,9 +14,15 @@ _AXES = {"forward": 0, "right": 1, "down": 2}
 
 
 def advice(found: Consistency) -> tuple[str, ...]:
-    """Return one line per correction that is more than chance; none where all is well."""
+    """Return one line per correction that is due; none where all is well.
+
+    It is due where it is more than chance, and more than what flight.toml itself calls uncertain.
+    """
     lines = [
-        _line(correction) for correction in found.estimate.corrections if correction.is_significant
+        _line(correction)
+        for correction in found.estimate.corrections
+        if correction.is_significant
+        and abs(correction.value or 0.0) > found.stated_sd.get(correction.name, 0.0)
     ]
     factor = found.estimate.variance_factor
     if factor > _TANGLED_CHI2:

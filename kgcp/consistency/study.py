@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from kgcp.consistency.whitening import whiten
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.reference import ReferencePoses
+from kgcp.settings import VehicleSettings
 from kgcp.target.sighting import Sighting
 from kgcp.views import Views
 
@@ -62,11 +63,14 @@ class Consistency:
         Corrections that explain them.
     correlation_s : float
         Over which the trajectory's errors seem to fade: the likeliest of a few times [s].
+    stated_sd : mapping of str to float
+        How well flight.toml says that unknowns are known, by their names and in their units.
     """
 
     discrepancies: tuple[Discrepancy, ...]
     estimate: Estimate
     correlation_s: float
+    stated_sd: Mapping[str, float]
 
 
 def study_consistency(
@@ -109,10 +113,19 @@ def study_consistency(
     if np.count_nonzero(~outlier) < MIN_POINTS:
         return None
     found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), system, ~outlier)
-    offset_s = whereabouts.carrier.settings.time_offset_s
+    settings = whereabouts.carrier.settings
     return Consistency(
-        _discrepancies(meetings, system, outlier, found, offset_s), found, correlation_s
+        _discrepancies(meetings, system, outlier, found, settings.time_offset_s),
+        found,
+        correlation_s,
+        _stated_sd(settings),
     )
+
+
+def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
+    names = (f"lever_arm_{axis}_m" for axis in ("forward", "right", "down"))
+    of_arm = dict(zip(names, settings.sd_lever_arm_m, strict=True))
+    return {"time_offset_s": settings.sd_time_s, **of_arm}
 
 
 def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estimate, float]:

@@ -261,6 +261,18 @@ def test_advice_names_key_and_amount_and_heeding_it_ends_it() -> None:
     assert advice(Flight(seed=1).study()) == ()
 
 
+def test_what_flight_toml_itself_calls_uncertain_needs_no_correction() -> None:
+    """8 cm are found just as well, but within 10 cm nobody has claimed anything else."""
+    flight = Flight(lever_m=_LEVER + _TO_THE_RIGHT, seed=1)
+    for sd_m, lines in ((0.05, 1), (0.1, 0)):
+        vague = replace(flight.settings, sd_lever_arm_m=(0.0, sd_m, 0.0))
+        found = replace(flight, settings=vague).study()
+        assert len(advice(found)) == lines
+        assert [one.name for one in found.estimate.corrections if one.is_significant] == [
+            "lever_arm_right_m"
+        ]
+
+
 def test_a_known_readout_is_taken_into_account() -> None:
     found = Flight(readout_s=0.03, seed=2).study(replace(_CAMERA, readout_s=0.03))
     assert advice(found) == ()
