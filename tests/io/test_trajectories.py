@@ -175,6 +175,18 @@ def test_feet_of_the_grid_are_not_those_of_heights(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory.position_map[0], expected, rtol=0, atol=1e-8)
 
 
+def test_a_csv_may_be_earth_centred(tmp_path: Path) -> None:
+    # On the equator at Greenwich, 100 m above the ellipsoid: X is up, Y east and Z north.
+    rows = [f"{second},6378237,{9 * second},0,1,2,3,0.03,0.01,0.02" for second in (0, 1)]
+    path = _write(tmp_path, f"{_HEADER},sd_x,sd_y,sd_z", *rows)
+    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryNotation(crs="EPSG:4978"))
+    np.testing.assert_allclose(trajectory.position_map[0], [0.0, 0.0, 100.0], atol=1e-6)
+    np.testing.assert_allclose(trajectory.position_map[1, 0], np.degrees(9.0 / 6378237), rtol=1e-9)
+    assert trajectory.sd_position_m is not None
+    np.testing.assert_allclose(trajectory.sd_position_m[0], [0.01, 0.02, 0.03], rtol=1e-6)
+    np.testing.assert_allclose(trajectory.attitude_deg[0], [1, 2, 3])  # of the level there
+
+
 def test_a_crs_of_no_datum_has_no_exact_way(tmp_path: Path) -> None:
     path = _write(tmp_path, _HEADER, "0,5e5,5e6,100,1,2,3", "1,5e5,5e6,100,1,2,3")
     local = "+proj=utm +zone=32 +ellps=GRS80 +type=crs"

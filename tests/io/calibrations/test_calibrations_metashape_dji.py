@@ -169,6 +169,10 @@ def test_a_photo_of_dji_brings_its_calibration_and_size(
     path = tmp_path / "DJI_0001.JPG"
     Image.new("L", (WIDTH, HEIGHT), 90).save(path, "JPEG", xmp=XMP.encode())
     check(read_calibration(path, SILENT), partial(dji_px, brown=brown))
+    upright = Image.Exif()
+    upright[0x0112] = 6  # to be turned by a viewer; the calibration is the sensor's
+    Image.new("L", (WIDTH, HEIGHT), 90).save(path, "JPEG", xmp=XMP.encode(), exif=upright)
+    check(read_calibration(path, SILENT), partial(dji_px, brown=brown))
     dewarped = XMP.replace('DewarpFlag="0"', 'DewarpFlag="1"')
     Image.new("L", (WIDTH, HEIGHT), 90).save(path, "JPEG", xmp=dewarped.encode())
     with pytest.raises(KgcpError, match="is dewarped already"):
