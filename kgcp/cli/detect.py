@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
-from kgcp.cli.options import flight_argument, json_option, out_option
+from kgcp.cli.options import flight_place_argument, json_option, out_place_option
 from kgcp.settings import DetectSettings, Method
+
+if TYPE_CHECKING:
+    from kgcp.io.stores import StoredFolder
 
 _DEFAULTS = DetectSettings()
 
 
 @click.command()
-@flight_argument
-@out_option
+@flight_place_argument
+@out_place_option
 @click.option(
     "--jobs",
     type=click.IntRange(0, 256),
@@ -112,8 +116,8 @@ _DEFAULTS = DetectSettings()
 )
 @json_option
 def command(
-    flight: Path,
-    out: Path | None,
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
     jobs: int | None,
     method: str,
     min_radius: float,
@@ -149,6 +153,7 @@ def command(
 
     from kgcp.examine import Debug
     from kgcp.io.flight import read_flight
+    from kgcp.io.staging import workplace
     from kgcp.survey import detect_flight
 
     settings = DetectSettings(
@@ -158,12 +163,15 @@ def command(
         false_alarm=false_alarm,
         is_guided=is_guided,
     )
-    the_flight = read_flight(flight)
-    folder = out or the_flight.folder / "kgcp"
     start = time.perf_counter()
-    with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
+    with (
+        log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log,
+        stopping(log),
+        workplace(flight, out) as place,
+    ):
+        the_flight = read_flight(place.flight)
         summary = detect_flight(
-            *(the_flight, settings, folder),
+            *(the_flight, settings, place.out),
             jobs=jobs,
             watcher=log,
             debug=None if debug is None else Debug(debug, debug_frames),
@@ -172,8 +180,10 @@ def command(
             frame_timeout_s=frame_timeout,
             is_profiled=is_profiled,
             scheduler=scheduler,
+            stored_frames=place.frames_of(the_flight),
         )
     seconds = time.perf_counter() - start
-    report(summary, folder / "detections.parquet", overlay, seconds, log, as_json=as_json)
+    table = place.named(place.out / "detections.parquet")
+    report(summary, table, overlay, seconds, log, as_json=as_json)
     if is_profiled:
         report_stages(summary)

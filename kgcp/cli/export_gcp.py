@@ -91,11 +91,12 @@ def command(
     from kgcp.io.flight import read_flight
     from kgcp.io.kgcp_table import kgcp_row
     from kgcp.io.provenance import provenance
+    from kgcp.io.results import results_folder
     from kgcp.io.tables import write_table
     from kgcp.selection import Selection
 
     the_flight = read_flight(flight)
-    folder = out or the_flight.folder / "kgcp"
+    folder = out or results_folder(the_flight.folder)
     source = detections or folder / "detections.parquet"
     made = prepare(the_flight, source, Selection(**selection), crs)
     table = folder / "kgcps.parquet"

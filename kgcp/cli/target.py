@@ -129,6 +129,7 @@ def command(
     """  # noqa: D301 - \b is click's mark for lines that stay
     from kgcp.errors import SettingError
     from kgcp.io.flight import read_printed_targets
+    from kgcp.io.results import results_folder
     from kgcp.io.sheets.write import check_stems, write_sheets
     from kgcp.io.target_text import write_target_tables
     from kgcp.printing.artwork import Plate, draw_target
@@ -155,7 +156,7 @@ def command(
         lay_out(draw_target(target, plate), target.name, Paper(paper), is_tiled=is_tiled)
         for target in targets
     ]
-    folder = out or (Path("targets") if flight is None else flight / "kgcp" / "targets")
+    folder = out or (Path("targets") if flight is None else results_folder(flight) / "targets")
     files = [
         path
         for target, sheets in zip(targets, layouts, strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +111,7 @@ def read_flight(folder: Path) -> Flight:
         )
     return Flight(
         folder=folder,
-        name=table.name("name") if "name" in table else folder.resolve().name,
+        name=table.name("name") if "name" in table else _name_of(folder),
         crs=table.text("crs") if "crs" in table else None,
         frames_folder=frames_folder,
         times_file=times_file,
@@ -152,6 +153,11 @@ def read_camera_and_targets(
     table, _ = _read_toml(folder / "flight.toml")
     camera = table.table("camera", CAMERA_KEYS)
     return read_camera(camera, folder), read_calibration_covariance(camera), read_targets(table)
+
+
+def _name_of(folder: Path) -> str:
+    """Return a folder's own name, as far as it is text."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def _read_toml(path: Path) -> tuple[TomlTable, str]:

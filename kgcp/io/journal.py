@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import Self
 
 from kgcp.errors import KgcpError
+from kgcp.io.anyfile import is_file
 from kgcp.io.detections import FrameResult
 from kgcp.io.journal_text import from_text, to_text
 from kgcp.io.wholefile import whole_file
@@ -29,6 +30,7 @@ _LARGEST_PART = 1000  # results, all of which are in memory until it is written
 _CHECKSUM = 8  # hexadecimal digits
 _OFFSET_BITS = 40
 _DIGITS = 7  # of the parts' numbers
+_LONGEST_LINE = 1 << 26  # bytes: what is longer is no result
 
 
 class Journal:
@@ -159,12 +161,12 @@ class Journal:
 
     def _find_results(self) -> None:
         """Index the whole lines of all parts; what else is there counts as not done."""
-        for path in sorted(self._folder.glob(f"part-{'[0-9]' * _DIGITS}.txt")):
+        for path in filter(is_file, sorted(self._folder.glob(f"part-{'[0-9]' * _DIGITS}.txt"))):
             number = int(path.stem.partition("-")[2])
             self._parts = max(self._parts, number)
             offset = 0
             with path.open("rb") as stream:
-                for line in stream:
+                while line := stream.readline(_LONGEST_LINE):
                     body = line[_CHECKSUM + 1 :]
                     if line[:_CHECKSUM] == f"{zlib.crc32(body):0{_CHECKSUM}x}".encode():
                         key = body.partition(b" ")[0].decode(errors="replace")
@@ -183,6 +185,8 @@ class Journal:
 
 def _read_header(folder: Path) -> Mapping[str, str] | None:
     """Return by what the results in a journal were made; None if there is none."""
+    if not is_file(folder / _HEADER):
+        return None
     try:
         header = json.loads((folder / _HEADER).read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError, RecursionError):

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
+from kgcp.io.anyfile import is_file
 from kgcp.io.columns import DETECTION_COLUMNS, Column, ColumnType
 from kgcp.io.wholefile import whole_file
 
@@ -28,6 +29,7 @@ _ARROW_TYPES = {
     ColumnType.TIME: pa.timestamp("us", tz="UTC"),
     ColumnType.NUMBERS: pa.list_(pa.float64()),
 }
+_KEYS = ("frame", "target", "instance", "status")  # no row is without
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _ROWS_PER_GROUP = 4096  # of the file's row groups: so many are in memory at once
 
@@ -90,27 +92,41 @@ def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
     Raises
     ------
     KgcpError
-        If the file is missing, not Parquet, or lacks declared columns.
+        If the file is missing, not Parquet, lacks declared columns, or has others in their place.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise KgcpError(f"{path}: does not exist; run the command that writes it first")
     try:
         table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        reason = str(error).splitlines()[0]
+    except (OSError, pa.ArrowException) as error:
+        reason = (str(error).splitlines() or ["damaged"])[0]
         raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error
     missing = [column.name for column in columns if column.name not in table.column_names]
     if missing:
         raise KgcpError(
             f"{path}: lacks the columns {', '.join(missing)}; remake it with this version of kgcp"
         )
+    _check_columns(path, table, columns)
     frame: pd.DataFrame = table.to_pandas()
     return frame
 
 
+def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column]) -> None:
+    """Refuse columns of other types than are written, and gaps among keys."""
+    for column in columns:
+        places = table.schema.get_all_field_indices(column.name)
+        found = table.schema.field(places[0]).type
+        wanted = _ARROW_TYPES[column.type]
+        if len(places) > 1 or found != wanted:
+            problem = "is there twice" if len(places) > 1 else f"is of {found}, not {wanted}"
+            raise KgcpError(f"{path}: the column {column.name} {problem}; remake it with kgcp")
+        if column.name in _KEYS and table.column(column.name).null_count:
+            raise KgcpError(f"{path}: the column {column.name} has gaps; remake it with kgcp")
+
+
 def read_detections(path: Path) -> pd.DataFrame:
     """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
-    if not path.is_file():
+    if not is_file(path):
         raise KgcpError(
             f"{path}: does not exist; run 'kgcp detect' on this flight first, or name with"
             " --detections what it wrote elsewhere"

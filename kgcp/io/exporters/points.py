@@ -175,13 +175,13 @@ def image_names(
     Raises
     ------
     KgcpError
-        If a name has one of these characters, or two frames have the same name.
+        If a name has one of these characters or one of control, or two frames have the same name.
     """
     names: dict[str, str] = {}
     owners: dict[str, str] = {}
     for frame in frames:
         name = frame if keep_folder else PurePosixPath(frame).name
-        if refused and re.search(f"[{refused}]", name):
+        if re.search(f"[{refused}\\x00-\\x1f\\x7f-\\x9f\\u2028\\u2029]", name):
             what = "white space" if re.search(r"\s", name) else "a character"
             raise KgcpError(
                 f"{where}: frame {frame!r} has {what} in its name, which separates the columns;"
