@@ -24,6 +24,8 @@ from kgcp.geometry.arrays import FloatArray
 FLIGHT_TOML = "flight.toml: crs"
 WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
+FARTHEST = 1e5
+"""Metres or feet from the Earth's surface, where no vehicle and no aircraft is."""
 _JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
 
 

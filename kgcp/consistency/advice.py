@@ -10,6 +10,7 @@ from kgcp.consistency.corrections import Correction
 from kgcp.consistency.study import Consistency
 
 _TANGLED_CHI2 = 3.0  # of χ² over its degrees of freedom: disagreement without a single culprit
+_FARTHEST_M = 100.0  # what a second and some metres of lever arm make of a vehicle's place
 _AXES = {"forward": 0, "right": 1, "down": 2}
 
 
@@ -17,7 +18,14 @@ def advice(found: Consistency) -> tuple[str, ...]:
     """Return one line per correction that is due; none where all is well.
 
     It is due where it is more than chance, and more than what flight.toml itself calls uncertain.
+    Where maps or clocks do not belong together, none of them means anything.
     """
+    distance_m = math.hypot(*rms_m(found))
+    strange = [
+        one for one in found.estimate.corrections if one.is_significant and not one.is_credible
+    ]
+    if strange or distance_m > _FARTHEST_M:
+        return (_mismatch(distance_m),)
     lines = [
         _line(correction)
         for correction in found.estimate.corrections
@@ -39,6 +47,14 @@ def rms_m(found: Consistency) -> tuple[float, float, float]:
     kept = np.array([one.offset_m for one in found.discrepancies if not one.is_outlier])
     along, across, up = np.sqrt(np.mean(kept**2, axis=0)).tolist()
     return along, across, up
+
+
+def _mismatch(distance_m: float) -> str:
+    return (
+        f"vehicle and camera put the target {distance_m:.0f} m apart, which no correction explains:"
+        " check in flight.toml that [vehicle] crs and [reference] crs are those of the files, and"
+        " that all times are of one clock (GPS time is 18 s ahead of UTC: [vehicle] time_system)"
+    )
 
 
 def _line(correction: Correction) -> str:

@@ -70,6 +70,8 @@ class Correction:
         Of an estimate as large by chance, where nothing is wrong (Student's t, both sides).
     tangled_with : tuple of str
         Unknowns that look alike in this flight: the estimate holds if they are right.
+    is_credible : bool
+        Whether the estimate is within the unknown's limit; beyond, something else is wrong.
     """
 
     name: str
@@ -77,6 +79,7 @@ class Correction:
     sd: float | None
     probability: float | None
     tangled_with: tuple[str, ...]
+    is_credible: bool
 
     @property
     def is_significant(self) -> bool:
@@ -172,9 +175,16 @@ def _correction(
     alike = sorted(set().union(*(group for group in tangles if index in group)) - {index})
     names = tuple(UNKNOWNS[other].name for other in alike)
     if math.isnan(sd):
-        return Correction(unknown.name, None, None, None, names)
+        return Correction(unknown.name, None, None, None, names, is_credible=True)
     probability = float(2.0 * stdtr(freedom, -abs(value) / sd))
-    return Correction(unknown.name, value * unknown.factor, sd * unknown.factor, probability, names)
+    return Correction(
+        unknown.name,
+        value * unknown.factor,
+        sd * unknown.factor,
+        probability,
+        names,
+        is_credible=abs(value) <= unknown.limit,
+    )
 
 
 def _separable(normal: FloatArray) -> tuple[list[int], list[frozenset[int]]]:

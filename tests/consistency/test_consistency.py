@@ -273,6 +273,14 @@ def test_what_flight_toml_itself_calls_uncertain_needs_no_correction() -> None:
         ]
 
 
+def test_clocks_that_do_not_belong_together_are_named_instead_of_corrections() -> None:
+    """Three seconds at 15 m/s are more than anybody's time_offset_s is wrong by."""
+    (line,) = advice(Flight(time_offset_s=-3.0, seed=1).study())
+    assert re.search(r"put the target \d+ m apart, which no correction explains", line)
+    assert "GPS time is 18 s ahead of UTC" in line
+    assert "crs" in line
+
+
 def test_a_known_readout_is_taken_into_account() -> None:
     found = Flight(readout_s=0.03, seed=2).study(replace(_CAMERA, readout_s=0.03))
     assert advice(found) == ()

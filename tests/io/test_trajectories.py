@@ -217,6 +217,10 @@ def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
     rows = ("0,9,45,100,1,2,3", "1,9,450,100,1,2,3")
     with pytest.raises(KgcpError, match=r"vehicle.csv: the point \(9, 450, 100\) of epoch 2"):
         read_trajectory(_write(tmp_path, _HEADER, *rows), _CRS, TrajectoryNotation(crs="EPSG:4258"))
+    # easting and northing taken for Earth-centred coordinates lie a thousand kilometres deep
+    grid = _write(tmp_path, _HEADER, "0,689586,5336250,547,1,2,3", "1,689587,5336250,547,1,2,3")
+    with pytest.raises(KgcpError, match=r"epoch 1 has no place .* which is 'EPSG:4978' now"):
+        read_trajectory(grid, _CRS, TrajectoryNotation(crs="EPSG:4978"))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from kgcp.io.foreign import ForeignFile
 from kgcp.io.poses.notation import PoseNotation
 from kgcp.io.poses.source import SourcePoses, from_geocentric, from_level
 from kgcp.mapchange import MapChange
-from kgcp.mapframe import FLIGHT_TOML, MapFrame, parse_crs
+from kgcp.mapframe import FARTHEST, FLIGHT_TOML, MapFrame, parse_crs
 
 REFERENCE_CRS = "flight.toml: [reference] crs"
 _REMEDY = "align it to a map and give [reference] crs, that of its coordinates"
@@ -47,12 +47,20 @@ def on_the_map(
     ------
     KgcpError
         If nothing says of which map the coordinates are, flight.toml says so of a file that says
-        it itself, or no exact way leads from there to the flight's CRS.
+        it itself, no exact way leads from there to the flight's CRS, or a pose comes to lie far
+        from the Earth's surface.
     """
     placed = _placed(file, _shifted(file, source, notation), notation.crs)
     if placed.crs is not None and not _is_same(placed.crs, crs):
         where = f"{file.path}: crs" if notation.crs is None else REFERENCE_CRS
         placed = _moved(file, placed, MapFrame.at(placed.crs, placed.position[0], where), crs)
+    high = np.flatnonzero(np.abs(placed.position[:, 2]) > FARTHEST)
+    if high.size:
+        raise file.error(
+            f"pose of {source.names[high[0]]!r}",
+            f"comes to lie at a height of {placed.position[high[0], 2]:.0f}",
+            "correct [reference] crs, that of the file's coordinates",
+        )
     return ReferencePoses(
         frames=frames,
         position_map=placed.position,

@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.mapchange import best_transformer
-from kgcp.mapframe import MapFrame, parse_crs
+from kgcp.mapframe import FARTHEST, MapFrame, parse_crs
 
 VEHICLE_CRS = "flight.toml: [vehicle] crs"
 _STEP_M, _STEP_DEG = 10.0, 1e-4  # curvature cancels in the central difference
@@ -23,7 +23,8 @@ def convert_positions(path: Path, position: FloatArray, source: str, target: str
     Raises
     ------
     KgcpError
-        If no operation is known, its grid is not installed, or a point is out of its domain.
+        If no operation is known, its grid is not installed, or a point is out of its domain or
+        far from the Earth's surface.
     """
     transformer = best_transformer(
         parse_crs(source, VEHICLE_CRS),
@@ -31,7 +32,10 @@ def convert_positions(path: Path, position: FloatArray, source: str, target: str
         f"{path}: the way of its positions from {source!r} to the flight's crs {target!r}",
     )
     converted = np.column_stack(transformer.transform(*position.T))
-    lost = np.flatnonzero(~np.isfinite(converted).all(axis=1))
+    found = np.isfinite(converted).all(axis=1)
+    if not parse_crs(target).is_geocentric:
+        found &= np.abs(converted[:, 2]) < FARTHEST
+    lost = np.flatnonzero(~found)
     if lost.size:
         where = ", ".join(f"{value:.10g}" for value in position[lost[0]])
         raise KgcpError(

@@ -136,6 +136,11 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
             PoseNotation(crs="EPSG:0"),
             r"flight.toml: \[reference\] crs 'EPSG:0' cannot be used",
         ),
+        (
+            "1 1 0 0 0 -4001 -2 -4900001 1 a.JPG\n\n",  # a grid's coordinates, cut by their offset
+            PoseNotation(crs="EPSG:4978"),
+            r"pose of 'a.JPG': comes to lie at a height of -\d{7}; correct \[reference\] crs",
+        ),
     ],
 )
 def test_a_colmap_model_without_a_map_is_refused(
