@@ -10,13 +10,29 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Self
 
+_LONGEST_LINE = 1500  # characters: what is wrong stands at the beginning, the remedy at the end
+
+
+def one_line(text: str) -> str:
+    """Return a message as one line that no terminal obeys: it may quote whatever a file holds."""
+    if len(text) > _LONGEST_LINE:
+        text = f"{text[: _LONGEST_LINE // 2]} … {text[-_LONGEST_LINE // 2 :]}"
+    unbroken = (" " if character.isspace() else character for character in text)
+    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in unbroken)
+
 
 class KgcpError(Exception):
     """Something the user can put right. The text is one line: what, where, what to do."""
 
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
 
 class KgcpWarning(UserWarning):
     """Something the user should know while the work goes on. The text is one line."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class SettingError(KgcpError):

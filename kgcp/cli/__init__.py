@@ -25,15 +25,6 @@ COMMANDS = {
 
 _EXIT_KNOWN_ERROR = 1  # 2 is click's own, for wrong usage
 _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells count
-_LONGEST_LINE = 1500  # characters: what is wrong stands at the beginning, the remedy at the end
-
-
-def _one_line(text: str) -> str:
-    """Return a message as one line that no terminal obeys: it may quote whatever a file holds."""
-    if len(text) > _LONGEST_LINE:
-        text = f"{text[: _LONGEST_LINE // 2]} … {text[-_LONGEST_LINE // 2 :]}"
-    unbroken = (" " if character.isspace() else character for character in text)
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in unbroken)
 
 
 @contextmanager
@@ -51,7 +42,7 @@ def _one_line_warnings() -> Iterator[None]:
             line: str | None = None,
         ) -> None:
             if issubclass(category, KgcpWarning):
-                click.echo(f"kgcp: warning: {_one_line(str(message))}", err=True)
+                click.echo(f"kgcp: warning: {message}", err=True)
             else:
                 show(message, category, filename, lineno, file, line)
 
@@ -80,7 +71,7 @@ class Program(click.Group):
             with _one_line_warnings():
                 return super().invoke(ctx)
         except KgcpError as error:
-            click.echo(f"kgcp: error: {_one_line(str(error))}", err=True)
+            click.echo(f"kgcp: error: {error}", err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
             click.echo("kgcp: interrupted; files written so far are whole", err=True)

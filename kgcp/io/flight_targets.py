@@ -19,6 +19,7 @@ PLATE_KEYS = (
     "position_m",
     "sd_position_m",
 )
+_MOST_TARGETS = 200  # each is compared with every other
 REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
 
 
@@ -31,9 +32,11 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
         Naming file, target, key and remedy: if a key or value is wrong, a replica's plate is
         not there, or `check_targets` cannot tell two targets apart.
     """
+    written = flight.tables("target")
+    if len(written) > _MOST_TARGETS:
+        raise flight.error("target", f"has {len(written)} tables", f"give at most {_MOST_TARGETS}")
     tables = [
-        _target_table(flight, index, values)
-        for index, values in enumerate(flight.tables("target"), start=1)
+        _target_table(flight, index, values) for index, values in enumerate(written, start=1)
     ]
     plates = [table for table in tables if "replica_of" not in table]
     replicas = [table for table in tables if "replica_of" in table]

@@ -8,7 +8,6 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from kgcp.errors import SettingError
-from kgcp.geometry.arrays import FloatArray
 from kgcp.target.layout import Ring, Target
 
 _SAME_SHAPE = 0.1  # relative; ellipses of small targets do not show finer differences
@@ -40,7 +39,8 @@ def check_targets(targets: Sequence[Target]) -> None:
 
 def same_shape(first: Ring, second: Ring) -> bool:
     """Whether two rings look alike but for their size and code."""
-    return bool(np.allclose(_proportions(first), _proportions(second), rtol=_SAME_SHAPE, atol=0.0))
+    pairs = zip(_proportions(first), _proportions(second), strict=True)
+    return all(abs(one - other) <= _SAME_SHAPE * other for one, other in pairs)
 
 
 def codes_coincide(first: Ring, second: Ring) -> bool:
@@ -48,19 +48,16 @@ def codes_coincide(first: Ring, second: Ring) -> bool:
     if len(first.code_deg) != len(second.code_deg):
         return False
     tolerance_deg = min(first.dot_half_angle_deg, second.dot_half_angle_deg)
-    here = np.asarray(first.code_deg)
-    for shift in range(len(here)):
-        there = np.roll(second.code_deg, shift)
-        offsets = np.mod(there - here, 360.0)
-        offsets = np.mod(offsets - offsets[0] + 180.0, 360.0) - 180.0  # about the first dot's
-        if np.ptp(offsets) <= 2.0 * tolerance_deg:
-            return True
-    return False
+    here, count = np.asarray(first.code_deg), len(first.code_deg)
+    there = np.asarray(second.code_deg)[np.add.outer(np.arange(count), np.arange(count)) % count]
+    offsets = there - here
+    offsets = np.mod(offsets - offsets[:, :1] + 180.0, 360.0) - 180.0  # about the first dot's
+    return bool(np.ptp(offsets, axis=1).min() <= 2.0 * tolerance_deg)
 
 
-def _proportions(ring: Ring) -> FloatArray:
+def _proportions(ring: Ring) -> tuple[float, ...]:
     inner = (ring.inner_diameter_m, ring.code_diameter_m, ring.dot_diameter_m)
-    return np.array(inner) / ring.outer_diameter_m
+    return tuple(length / ring.outer_diameter_m for length in inner)
 
 
 def _check_nesting(target: Target) -> None:

@@ -14,6 +14,8 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.settings import require_range
 
+_MOST_DOTS = 100  # a code is compared degree by degree
+
 
 @dataclass(frozen=True, slots=True)
 class Ring:
@@ -73,6 +75,9 @@ class Ring:
             )
         if not self.code_deg:
             raise SettingError("code_deg", "is empty", "give the direction of at least one dot")
+        if len(self.code_deg) > _MOST_DOTS:
+            problem = f"has {len(self.code_deg)} dots"
+            raise SettingError("code_deg", problem, f"give at most {_MOST_DOTS}")
         for angle in self.code_deg:
             require_range("code_deg", angle, -360.0, 360.0, unit="deg")
         angles = np.sort(np.mod(self.code_deg, 360.0))
