@@ -1,4 +1,4 @@
-"""Numbers that describe residuals: spread, moving statistics, rates with confidence, ranks."""
+"""Numbers that describe residuals: spread, moving statistics, rates with confidence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from kgcp.geometry.arrays import FloatArray
 
 _Z_95 = 1.959963984540054
 _MIN_IN_WINDOW = 3
-_MIN_FOR_RANKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,32 +94,3 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     half = _Z_95 * spread / (1.0 + z2 / trials)
     # rounding must not push a rate of 0 or 1 out of its own interval
     return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
-
-
-@dataclass(frozen=True, slots=True)
-class RankCorrelation:
-    """Spearman's rank correlation.
-
-    Attributes
-    ----------
-    count : int
-        Pairs.
-    rho : float
-        −1…1.
-    p_value : float
-        Chance of a |rho| at least as large without any relation.
-    """
-
-    count: int
-    rho: float
-    p_value: float
-
-
-def rank_correlation(x: FloatArray, y: FloatArray) -> RankCorrelation | None:
-    """Correlate the ranks of x and y (n,); None for fewer than 8 pairs or a constant."""
-    from scipy.stats import spearmanr  # takes longer to import than the rest of the command
-
-    if len(x) < _MIN_FOR_RANKS or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
-        return None
-    result = spearmanr(x, y)
-    return RankCorrelation(len(x), float(result.statistic), float(result.pvalue))

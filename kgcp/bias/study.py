@@ -13,6 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.reference import ReferencePoses
+from kgcp.settings import Method
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
 from kgcp.views import Views, visible_pixel
@@ -55,6 +56,31 @@ class Attempt:
     exposure: Exposure
 
 
+@dataclass(frozen=True, slots=True)
+class ReferenceSds:
+    """Standard deviations of a reference distance, by where they come from.
+
+    Attributes
+    ----------
+    pose_m : float
+        Of the camera's reference position, taken as independent from frame to frame [m].
+    place_m : float
+        Of the trajectory, attitude included: an error that lasts for a while [m].
+    common_m : float
+        Of lever arm and synchronisation, or of a static target's position: one error in all
+        frames [m].
+    """
+
+    pose_m: float
+    place_m: float
+    common_m: float
+
+    @property
+    def total_m(self) -> float:
+        """All three together [m]."""
+        return math.hypot(self.pose_m, self.place_m, self.common_m)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
     """One attempt against the reference.
@@ -62,10 +88,10 @@ class Comparison:
     Attributes
     ----------
     attempt : Attempt
-    reference_distance_m : float
-        Between the reference projection centre and the target's place at that time [m].
-    sd_reference_m : float or None
-        Its standard deviation [m]; None where trajectory or poses have none.
+    camera_m, place_m : (3,) array
+        Reference projection centre, and the target's place at that time, in the ENU frame [m].
+    sds : ReferenceSds or None
+        Of the distance between the two; None where trajectory or poses have none.
     expected_px : (2,) array
         Where the reference pose puts the centre in the raw image [px]; NaN behind the camera.
     expected_radius_px : float
@@ -73,10 +99,16 @@ class Comparison:
     """
 
     attempt: Attempt
-    reference_distance_m: float
-    sd_reference_m: float | None
+    camera_m: FloatArray
+    place_m: FloatArray
+    sds: ReferenceSds | None
     expected_px: FloatArray
     expected_radius_px: float
+
+    @property
+    def reference_distance_m(self) -> float:
+        """Between reference projection centre and target [m]."""
+        return math.dist(self.camera_m, self.place_m)
 
     @property
     def residual_m(self) -> float | None:
@@ -114,6 +146,8 @@ class BiasStudy:
 
     Attributes
     ----------
+    method : Method
+        How the distances were measured.
     measured : tuple of Comparison
         With a residual, in the frames' order.
     chances : tuple of Comparison
@@ -127,6 +161,7 @@ class BiasStudy:
         Of the frames whose target cannot be placed.
     """
 
+    method: Method
     measured: tuple[Comparison, ...]
     chances: tuple[Comparison, ...]
     attitudes_agree: bool
@@ -149,6 +184,7 @@ def study_bias(
     whereabouts: Whereabouts,
     camera: Camera,
     targets: Sequence[Target],
+    method: Method,
 ) -> BiasStudy:
     """Compare every attempt with the reference.
 
@@ -164,6 +200,8 @@ def study_bias(
         To know whether the target was in the frame.
     targets : sequence of Target
         Of the flight.
+    method : Method
+        Of the measurement.
 
     Raises
     ------
@@ -171,7 +209,8 @@ def study_bias(
         If nothing was measured, no measured frame has a pose, or as `Whereabouts.places`.
     """
     ours = _with_measured_target(attempts)
-    posed = [attempt for attempt in ours if attempt.frame in set(poses.frames)]
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    posed = [attempt for attempt in ours if attempt.frame in rows]
     if not any(attempt.sighting for attempt in posed):
         raise KgcpError(_no_pose(ours, poses))
     times = [
@@ -179,7 +218,6 @@ def study_bias(
         for attempt in posed
     ]
     places = whereabouts.places([attempt.target for attempt in posed], times)
-    rows = {frame: row for row, frame in enumerate(poses.frames)}
     views = Views.of(poses, whereabouts.frame)
     diameters = {target.name: target.ring.outer_diameter_m for target in targets}
     compared = [
@@ -190,10 +228,11 @@ def study_bias(
     measured = tuple(one for one in compared if one.attempt.sighting is not None)
     agree = 2 * sum(one.is_astray for one in measured) < len(measured)
     return BiasStudy(
+        method=method,
         measured=measured,
         chances=tuple(one for one in compared if not agree or one.is_whole_in(camera)),
         attitudes_agree=agree,
-        frames_without_pose=tuple(sorted({one.frame for one in ours} - set(poses.frames))),
+        frames_without_pose=tuple(sorted({one.frame for one in ours} - rows.keys())),
         absences=tuple(place for place in places if isinstance(place, Absence)),
     )
 
@@ -226,16 +265,28 @@ def _compare(
     camera: Camera, views: Views, row: int, attempt: Attempt, place: Place, diameter_m: float
 ) -> Comparison:
     """Compare one attempt with the pose in `row`."""
-    sight = place.position_m - views.centre_m[row]
+    centre = views.centre_m[row]
+    sight = place.position_m - centre
     distance = float(np.linalg.norm(sight))
-    sd = None
-    if place.cov_m2 is not None and views.cov_m2 is not None:
-        direction = sight / distance
-        sd = math.sqrt(direction @ (place.cov_m2 + views.cov_m2[row]) @ direction)
     return Comparison(
         attempt=attempt,
-        reference_distance_m=distance,
-        sd_reference_m=sd,
+        camera_m=centre,
+        place_m=place.position_m,
+        sds=_reference_sds(sight / distance, place, views, row),
         expected_px=visible_pixel(camera, sight @ views.enu_from_camera[row]),
         expected_radius_px=0.5 * diameter_m * camera.mean_focal_px / distance,
     )
+
+
+def _reference_sds(
+    direction: FloatArray, place: Place, views: Views, row: int
+) -> ReferenceSds | None:
+    """Return the deviations along a line of sight."""
+    if place.cov_m2 is None or views.cov_m2 is None:
+        return None
+    pose = float(direction @ views.cov_m2[row] @ direction)
+    whole = float(direction @ place.cov_m2 @ direction)
+    common = whole  # of a target that stands still
+    if place.common_m is not None:
+        common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
+    return ReferenceSds(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))

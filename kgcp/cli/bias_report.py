@@ -13,13 +13,23 @@ from kgcp.cli.options import detections_option, flight_argument, json_option, ou
 @flight_argument
 @out_option
 @detections_option
+@click.option(
+    "--reexpose",
+    metavar="N",
+    type=click.IntRange(0, 1000),
+    default=12,
+    show_default=True,
+    help="Measure N frames, near and far, again with darker and brighter grey values.",
+)
 @json_option
-def command(flight: Path, out: Path | None, detections: Path | None, *, as_json: bool) -> None:
+def command(
+    flight: Path, out: Path | None, detections: Path | None, reexpose: int, *, as_json: bool
+) -> None:
     """Compare the measured distances of FLIGHT with reference poses of the camera.
 
-    Writes FLIGHT/kgcp/bias_report.html, its figures as PNG, and bias.parquet. Needs 'kgcp detect'
-    before it, and in flight.toml a crs, [reference] poses, and a [vehicle] or targets with
-    position_m.
+    Writes FLIGHT/kgcp/bias_report.html, its figures as PNG, bias_summary.json and bias.parquet.
+    Needs 'kgcp detect' before it, and in flight.toml a crs, [reference] poses, and a [vehicle] or
+    targets with position_m.
 
     Example: kgcp bias-report sample_flight
     """
@@ -27,13 +37,16 @@ def command(flight: Path, out: Path | None, detections: Path | None, *, as_json:
     from kgcp.errors import KgcpError
     from kgcp.io.flight import read_flight
     from kgcp.io.poses import read_flight_poses
-    from kgcp.io.sightings import read_attempts
+    from kgcp.io.results import results_folder
+    from kgcp.io.sightings import read_attempts, read_settings
     from kgcp.io.whereabouts import read_whereabouts
     from kgcp.report.write import write_report
 
     the_flight = read_flight(flight)
-    folder = out or the_flight.folder / "kgcp"
-    attempts = read_attempts(detections or folder / "detections.parquet", the_flight.targets)
+    folder = out or results_folder(the_flight.folder)
+    table = detections or folder / "detections.parquet"
+    attempts = read_attempts(table, the_flight.targets)
+    settings = read_settings(table)
     poses = read_flight_poses(the_flight, [attempt.frame for attempt in attempts])
     if poses is None:
         raise KgcpError(
@@ -41,13 +54,15 @@ def command(flight: Path, out: Path | None, detections: Path | None, *, as_json:
             " with the camera's poses from an adjustment"
         )
     whereabouts = read_whereabouts(the_flight)
-    study = study_bias(attempts, poses, whereabouts, the_flight.camera, the_flight.targets)
-    report = write_report(study, the_flight, folder)
+    study = study_bias(
+        attempts, poses, whereabouts, the_flight.camera, the_flight.targets, settings.method
+    )
+    report = write_report(study, the_flight, settings, folder, reexpose)
     if as_json:
         import json
 
         click.echo(json.dumps(report.summary()))
-    for sentence in report.verdict:
+    for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:
         click.echo(f"wrote {path}", err=True)

@@ -125,7 +125,12 @@ BIAS_COLUMNS = (
     Column("time", _TIME, "mid-exposure, UTC"),
     Column("distance_m", _NUMBER, "measured in the image [m]"),
     Column("sd_distance_m", _NUMBER, "its standard deviation [m]"),
+    Column(
+        "one_edge_distance_m", _NUMBER, "as the outer edge alone gives it, exposure and all [m]"
+    ),
+    Column("two_edge_distance_m", _NUMBER, "without the displacement of the edges [m]"),
     Column("reference_distance_m", _NUMBER, "between reference camera position and target [m]"),
+    Column("sd_reference_distance_m", _NUMBER, "its standard deviation [m]"),
     Column("residual_m", _NUMBER, "distance_m − reference_distance_m [m]"),
     Column("residual_percent", _NUMBER, "residual in percent of the reference distance"),
     *_EXPOSURE,

@@ -6,10 +6,12 @@ from dataclasses import asdict
 
 import numpy as np
 
+from kgcp.bias.edges import edge_distances
 from kgcp.bias.study import Comparison
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.tables import Row, time_cell
 from kgcp.kgcps import Kgcp
+from kgcp.settings import Method
 
 
 def kgcp_row(point: Kgcp) -> Row:
@@ -35,16 +37,20 @@ def kgcp_row(point: Kgcp) -> Row:
     }
 
 
-def bias_row(measured: Comparison) -> Row:
-    """Return the row of one comparison that has a residual."""
+def bias_row(measured: Comparison, method: Method) -> Row:
+    """Return the row of one comparison that has a residual, measured by some method."""
     seen = measured.attempt.sighting
+    edges = edge_distances(measured, method)
     return {
         "frame": measured.attempt.frame,
         "target": measured.attempt.target,
         "time": time_cell(measured.attempt.time_s),
         "distance_m": None if seen is None else seen.distance_m,
         "sd_distance_m": None if seen is None else seen.sd_distance_m,
+        "one_edge_distance_m": None if edges is None else edges.one_m,
+        "two_edge_distance_m": None if edges is None else edges.two_m,
         "reference_distance_m": measured.reference_distance_m,
+        "sd_reference_distance_m": None if measured.sds is None else measured.sds.total_m,
         "residual_m": measured.residual_m,
         "residual_percent": measured.residual_percent,
         **asdict(measured.attempt.exposure),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from kgcp.bias.study import Attempt, Exposure
@@ -15,6 +17,7 @@ from kgcp.errors import KgcpError, Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.io.tables import read_detections
+from kgcp.settings import DetectSettings, Method
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
 
@@ -43,6 +46,27 @@ def read_attempts(path: Path, targets: Sequence[Target]) -> list[Attempt]:
     readable = table[table["status"] != Status.UNREADABLE.value]
     ordered = readable.sort_values(["frame", "target", "instance"])
     return [_attempt(row, numbers[row["frame"]]) for row in ordered.to_dict("records")]
+
+
+def read_settings(path: Path) -> DetectSettings:
+    """Read the settings that a table of detections was made with; the defaults for what it lacks.
+
+    Raises
+    ------
+    KgcpError
+        If the table does not tell them in this version's words.
+    """
+    text = (pq.read_schema(path).metadata or {}).get(b"kgcp.settings", b"{}")
+    try:
+        values = json.loads(text)
+        known = {field.name for field in fields(DetectSettings)} & values.keys()
+        settings = DetectSettings(**{name: values[name] for name in known})
+        return replace(settings, method=Method(settings.method))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise KgcpError(
+            f"{path}: its settings are not of this version of kgcp ({error});"
+            " run 'kgcp detect' on this flight again"
+        ) from error
 
 
 def _attempt(row: _Row, number: int) -> Attempt:

@@ -1,112 +1,75 @@
-"""The numbers of the bias report: what the study says, per range of distance and per exposure."""
+"""The numbers of the bias report: what the study says, as far as it goes into figures and words."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.bias.statistics import RankCorrelation, Spread, rank_correlation, wilson_interval
+from kgcp.bias.edges import edge_distances
+from kgcp.bias.residuals import QUANTITIES, ROUNDING, Quantity, Residuals, in_time, varies
+from kgcp.bias.slopes import Slope, fit_slope
+from kgcp.bias.statistics import Spread
 from kgcp.bias.study import BiasStudy, Comparison
-from kgcp.geometry.arrays import FloatArray
-
-BIN_M = 10.0
-_NEAR_M = 50.0  # the paper states its accuracy below and above
-_BIASED_SIGMAS = 3.0
-_RELATED_P = 0.01
-_RELATED_RHO = 0.3
-_ROUNDING = 1e-9  # a quantity that varies by less does not vary
-
-QUANTITIES = {
-    "black": "level of black",
-    "white": "level of white",
-    "saturated": "share of clipped pixels",
-    "edge_shift_px": "edge shift δ [px]",
-    "blur_px": "edge spread σ [px]",
-    "exposure_time_s": "exposure time [s]",
-    "iso": "ISO",
-    "f_number": "f-number",
-}
-"""Exposure columns → axis labels."""
-
-
-@dataclass(frozen=True, slots=True)
-class RangeRow:
-    """Residuals of one range of reference distances, in percent and metres.
-
-    Attributes
-    ----------
-    label : str
-        The range.
-    percent, metres : Spread
-        Of the residuals.
-    sd_reference_percent : float or None
-        Mean standard deviation of the reference distances [%]; None where none is known.
-    """
-
-    label: str
-    percent: Spread
-    metres: Spread
-    sd_reference_percent: float | None
-
-    @property
-    def is_biased(self) -> bool:
-        """Whether the mean error stands out from its own noise and that of the reference.
-
-        Errors of a trajectory and of reference poses last for many frames: averaging is not
-        trusted to lessen them.
-        """
-        sd_mean = self.percent.sd_mean
-        if sd_mean is None:
-            return False
-        sd = math.hypot(sd_mean, self.sd_reference_percent or 0.0)
-        return abs(self.percent.mean) > _BIASED_SIGMAS * sd
-
-
-@dataclass(frozen=True, slots=True)
-class DetectionRate:
-    """Detections among the chances of one range of distances, with Wilson's 95 % interval."""
-
-    low_m: float
-    high_m: float
-    detected: int
-    frames: int
-    confidence_low: float
-    confidence_high: float
-
-    @property
-    def rate(self) -> float:
-        """Share of frames in which the target was found."""
-        return self.detected / self.frames
+from kgcp.bias.terms import Regression, regress
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.report.ranges import (
+    DetectionRate,
+    RangeRow,
+    range_rows,
+    rates_by_distance,
+    rates_by_radius,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Influence:
-    """Residuals against one exposure quantity.
+    """One exposure quantity that varies, and what follows it.
 
     Attributes
     ----------
-    label : str
-        What it is, with its unit.
-    values, residual_percent : (n,) array
-        Pairs of the frames that have the quantity.
-    correlation : RankCorrelation or None
-        None for fewer than 8 pairs or a constant.
+    quantity : Quantity
+    rows : (m,) array of int
+        Of the measurements that have it.
+    values : (m,) array
+        As in the detections.
+    residual : Slope or None
+        Of the error [%], without scale and offset, by the quantity's own unit.
+    edge_shift : Slope or None
+        Of δ [px], the same; None for δ itself.
     """
 
-    label: str
+    quantity: Quantity
+    rows: IndexArray
     values: FloatArray
-    residual_percent: FloatArray
-    correlation: RankCorrelation | None
+    residual: Slope | None
+    edge_shift: Slope | None
 
-    @property
-    def is_clear(self) -> bool:
-        """Whether the residual follows this quantity beyond chance."""
-        found = self.correlation
-        return found is not None and found.p_value < _RELATED_P and abs(found.rho) > _RELATED_RHO
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeNumbers:
+    """Distances by one edge against those by two.
+
+    Attributes
+    ----------
+    rows : (m,) array of int
+        Of the measurements that have both.
+    one_m, two_m : (m,) array
+        Residuals [m].
+    one_percent, two_percent : Spread
+        Of the residuals [%].
+    regression : Regression or None
+        Of the distances by one edge.
+    """
+
+    rows: IndexArray
+    one_m: FloatArray
+    two_m: FloatArray
+    one_percent: Spread
+    two_percent: Spread
+    regression: Regression | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,17 +78,32 @@ class BiasNumbers:
 
     Attributes
     ----------
-    distance_m, residual_m, residual_percent : (n,) array
-        Of the trusted measurements.
+    compared : tuple of Comparison
+        The n trusted measurements, in time.
+    data : Residuals
+        Theirs.
+    residual_percent : (n,) array
+        Of the reference distance.
+    explained_percent : (n,) array
+        What scale and offset explain of it; 0 without a regression.
+    sd_m : (n,) array
+        Reported standard deviations of the residuals, of measurement and reference; NaN where
+        the measurement has none.
     total : RangeRow
     halves : tuple of RangeRow
         Below and above 50 m.
     bins : tuple of RangeRow
         Per 10 m.
-    rates : tuple of DetectionRate
-        Per 10 m.
+    rates, radius_rates : tuple of DetectionRate
+        Per 10 m, and per radius of the ring.
+    regression : Regression or None
+        None where there is too little for one.
+    edges : EdgeNumbers or None
+        None where no measurement has δ.
     influences : tuple of Influence
         Of the exposure quantities that vary.
+    standardised : Spread or None
+        Of residuals over reported deviations.
     sd_reference_m : float or None
         Median standard deviation of the reference distances.
     astray : tuple of str
@@ -138,14 +116,20 @@ class BiasNumbers:
         As in the study.
     """
 
-    distance_m: FloatArray
-    residual_m: FloatArray
+    compared: tuple[Comparison, ...]
+    data: Residuals
     residual_percent: FloatArray
+    explained_percent: FloatArray
+    sd_m: FloatArray
     total: RangeRow
     halves: tuple[RangeRow, ...]
     bins: tuple[RangeRow, ...]
     rates: tuple[DetectionRate, ...]
+    radius_rates: tuple[DetectionRate, ...]
+    regression: Regression | None
+    edges: EdgeNumbers | None
     influences: tuple[Influence, ...]
+    standardised: Spread | None
     sd_reference_m: float | None
     astray: tuple[str, ...]
     detected: int
@@ -160,42 +144,48 @@ class BiasNumbers:
             return (self.total,)
         return tuple(half for half in self.halves if half.is_biased)
 
+    @property
+    def is_displaced(self) -> bool:
+        """Whether exposure displaces edges: δ differs from 0 by more than rounding."""
+        shift = self.data.exposure["edge_shift_px"]
+        return bool(np.any(np.abs(shift[np.isfinite(shift)]) > ROUNDING))
+
+    @property
+    def standardised_residuals(self) -> FloatArray:
+        """Residuals (n,) over their reported deviations; NaN where there is none."""
+        return self.data.residual_m / self.sd_m
+
 
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
     """Reduce a study to its numbers; at least one trusted measurement is needed."""
-    trusted = study.trusted
-    distance = np.array([one.reference_distance_m for one in trusted])
-    residual = np.array([one.residual_m for one in trusted], dtype=np.float64)
-    percent = 100.0 * residual / distance
-    sds = np.array([one.sd_reference_m for one in trusted], dtype=np.float64)  # NaN: not known
-    known = np.isfinite(sds)
-    edges = np.unique(np.floor(distance / BIN_M)) * BIN_M
-
-    def rows(*ranges: tuple[str, float, float]) -> tuple[RangeRow, ...]:
-        insides = [(distance >= low) & (distance < high) for _, low, high in ranges]
-        return tuple(
-            RangeRow(
-                label,
-                Spread.of(percent[inside]),
-                Spread.of(residual[inside]),
-                _mean_or_none((100.0 * sds / distance)[inside & known]),
-            )
-            for (label, _, _), inside in zip(ranges, insides, strict=True)
-            if inside.any()
-        )
-
-    (total,) = rows(("over all distances", 0.0, math.inf))
+    compared = in_time(study.trusted)
+    data = Residuals.of(compared, _measured_m(compared))
+    percent = 100.0 * data.residual_m / data.distance_m
+    regression = regress(data)
+    explained = np.zeros_like(percent)
+    if regression is not None:
+        explained = 100.0 * regression.systematic_m / data.distance_m
+    sd_reference = np.array([one.sds.total_m if one.sds else np.nan for one in compared])
+    sd = _reported_sd_m(compared)
+    total, halves, bins = range_rows(data.distance_m, data.residual_m, sd_reference)
     detected = [study.trusts(one) for one in study.chances]
+    scaled = (data.residual_m / sd)[np.isfinite(sd)]
     return BiasNumbers(
-        distance_m=distance,
-        residual_m=residual,
+        compared=tuple(compared),
+        data=data,
         residual_percent=percent,
+        explained_percent=explained,
+        sd_m=sd,
         total=total,
-        halves=rows(("below 50 m", 0.0, _NEAR_M), ("50 m and more", _NEAR_M, math.inf)),
-        bins=rows(*((f"{low:.0f}–{low + BIN_M:.0f} m", low, low + BIN_M) for low in edges)),
-        rates=_rates(np.array([one.reference_distance_m for one in study.chances]), detected),
-        influences=_influences(trusted, percent),
-        sd_reference_m=float(np.median(sds[known])) if known.any() else None,
+        halves=halves,
+        bins=bins,
+        rates=rates_by_distance([one.reference_distance_m for one in study.chances], detected),
+        radius_rates=rates_by_radius([one.expected_radius_px for one in study.chances], detected),
+        regression=regression,
+        edges=_edges(study, compared),
+        influences=_influences(data, percent - explained),
+        standardised=Spread.of(scaled) if scaled.size else None,
+        sd_reference_m=_median(sd_reference[np.isfinite(sd_reference)]),
         astray=tuple(one.attempt.frame for one in study.measured if not study.trusts(one)),
         detected=sum(detected),
         chances=len(detected),
@@ -204,41 +194,62 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
     )
 
 
-def _mean_or_none(values: FloatArray) -> float | None:
-    return float(values.mean()) if values.size else None
+def _measured_m(compared: Sequence[Comparison]) -> FloatArray:
+    return np.array([one.attempt.sighting.distance_m for one in compared if one.attempt.sighting])
 
 
-def _rates(distance_m: FloatArray, detected: Sequence[bool]) -> tuple[DetectionRate, ...]:
-    found: Counter[int] = Counter()
-    tried: Counter[int] = Counter()
-    for distance, hit in zip(distance_m, detected, strict=True):
-        tried[int(distance // BIN_M)] += 1
-        found[int(distance // BIN_M)] += hit
-    return tuple(
-        DetectionRate(
-            BIN_M * step,
-            BIN_M * (step + 1),
-            found[step],
-            tried[step],
-            *wilson_interval(found[step], tried[step]),
-        )
-        for step in sorted(tried)
+def _reported_sd_m(compared: Sequence[Comparison]) -> FloatArray:
+    """Return what measurement and reference say of their deviations, errors in common included."""
+    seen = [one.attempt.sighting for one in compared]
+    own = np.array([np.nan if one is None else one.sd_distance_m for one in seen], dtype=float)
+    common = np.array([(one and one.sd_common_distance_m) or 0.0 for one in seen])
+    reference = np.array([one.sds.total_m if one.sds else 0.0 for one in compared])
+    return np.asarray(np.sqrt(own**2 + common**2 + reference**2))
+
+
+def _median(values: FloatArray) -> float | None:
+    return float(np.median(values)) if values.size else None
+
+
+def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | None:
+    pairs = [edge_distances(one, study.method) for one in compared]
+    rows = np.flatnonzero([pair is not None for pair in pairs])
+    if not rows.size:
+        return None
+    with_both = [compared[row] for row in rows.tolist()]
+    one_m, two_m = np.array([(pair.one_m, pair.two_m) for pair in pairs if pair is not None]).T
+    by_one = Residuals.of(with_both, one_m)
+    return EdgeNumbers(
+        rows=rows,
+        one_m=by_one.residual_m,
+        two_m=two_m - by_one.distance_m,
+        one_percent=Spread.of(100.0 * by_one.residual_m / by_one.distance_m),
+        two_percent=Spread.of(100.0 * (two_m / by_one.distance_m - 1.0)),
+        regression=regress(by_one),
     )
 
 
-def _influences(trusted: Sequence[Comparison], percent: FloatArray) -> tuple[Influence, ...]:
+def _influences(data: Residuals, percent: FloatArray) -> tuple[Influence, ...]:
+    sd_percent = 100.0 * np.sqrt(data.noise.white + data.noise.lasting) / data.distance_m
+    shift = data.exposure["edge_shift_px"]
     influences = []
-    for name, label in QUANTITIES.items():
-        column = np.array(
-            [getattr(one.attempt.exposure, name) for one in trusted], dtype=np.float64
-        )
-        known = np.isfinite(column)
-        values = column[known]
-        if len(values) > 1 and np.ptp(values) > _ROUNDING:
-            residual = percent[known]
-            influences.append(
-                Influence(label, values, residual, rank_correlation(values, residual))
+    for quantity in QUANTITIES:
+        column = data.exposure[quantity.name]
+        x = quantity.measure(column)
+        rows = np.flatnonzero(np.isfinite(x))
+        if not varies(x[rows]):
+            continue
+        both = rows[np.isfinite(shift[rows])]
+        own = quantity.name == "edge_shift_px" or not varies(shift[both])
+        influences.append(
+            Influence(
+                quantity,
+                rows,
+                column[rows],
+                fit_slope(x[rows], percent[rows], sd_percent[rows]),
+                None if own else fit_slope(x[both], shift[both], np.ones(len(both))),
             )
+        )
     return tuple(influences)
 
 

@@ -3,24 +3,68 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
-from kgcp.report.numbers import BiasNumbers, RangeRow
+from kgcp.bias.residuals import QUANTITIES
+from kgcp.bias.study import Comparison
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.columns import BIAS_COLUMNS
+from kgcp.report import words
+from kgcp.report.canvas import MARK_STEPS, Picture
+from kgcp.report.closeups import Closeup
+from kgcp.report.numbers import BiasNumbers
+from kgcp.report.reexpose import Reexposed
+from kgcp.report.summary import Json, finite
+from kgcp.report.verdict import LIMITS, Verdict
+
+_DIGITS = 7  # significant, of the values in the page; bias.parquet has all
 
 
-def render_page(flight_name: str, numbers: BiasNumbers, figures: Mapping[str, bytes]) -> str:
-    """Return the page.
+@dataclass(frozen=True, slots=True, eq=False)
+class Content:
+    """All that a page shows.
 
-    Parameters
+    Attributes
     ----------
-    flight_name : str
-        Goes into the title.
+    name : str
+        Of the flight.
     numbers : BiasNumbers
-    figures : mapping of str to bytes
-        Figure name (`error`, `rate`, `exposure`) to PNG; a missing one is left out of the page.
+    verdict : Verdict
+    pictures : mapping of str to Picture
+        By the name of the figure; one that is missing is left out of the page.
+    rows : sequence of mapping
+        Of `bias.parquet`, for the measurements in time.
+    closeups : sequence of Closeup
+    worst : sequence of int
+        Rows of the largest deviations, the largest first.
+    deviations : (n,) array
+        What scale and offset leave of the errors, over its standard deviation.
+    reexposed : sequence of Reexposed
+    summary : mapping
+        What `bias_summary.json` holds.
     """
+
+    name: str
+    numbers: BiasNumbers
+    verdict: Verdict
+    pictures: Mapping[str, Picture]
+    rows: Sequence[Mapping[str, object]]
+    closeups: Sequence[Closeup]
+    worst: Sequence[int]
+    deviations: FloatArray
+    reexposed: Sequence[Reexposed]
+    summary: Json
+
+
+def render_page(content: Content) -> str:
+    """Return the page."""
     environment = Environment(
         loader=PackageLoader("kgcp.report"),
         autoescape=True,
@@ -31,92 +75,76 @@ def render_page(flight_name: str, numbers: BiasNumbers, figures: Mapping[str, by
     environment.filters["signed"] = _signed
     environment.filters["fixed"] = lambda value, digits: f"{value:.{digits}f}"
     images = {
-        name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
-        for name, png in figures.items()
+        name: f"data:image/png;base64,{base64.b64encode(one.png).decode('ascii')}"
+        for name, one in content.pictures.items()
     }
     template = environment.get_template("bias_report.html")
     return template.render(
-        name=flight_name, numbers=numbers, images=images, verdict=verdict(numbers)
+        content=content,
+        numbers=content.numbers,
+        verdict=content.verdict,
+        images=images,
+        data=_embedded(_data(content)),
+        limits=LIMITS,
+        words=words,
     )
 
 
 def _signed(value: float, digits: int) -> str:
-    rounded = round(value, digits) + 0.0  # −0.000 would look like a finding
-    return f"{rounded:+.{digits}f}".replace("-", "−")
+    return words.minus(f"{value:+.{digits}f}")
 
 
-def verdict(numbers: BiasNumbers) -> list[str]:
-    """Return the findings in a few sentences, the most important first."""
-    return [
-        *_accuracy(numbers),
-        _bias(numbers),
-        *_detection(numbers),
-        *_exposure(numbers),
-        *_reservations(numbers),
-    ]
+def _embedded(data: Json) -> Markup:
+    """Return JSON that may stand in a script element, whatever names it holds."""
+    text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"))
+    # ASCII already; without these three no text can end the element or begin a comment
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)  # noqa: S704  nothing in it is markup any more
 
 
-def _accuracy(numbers: BiasNumbers) -> list[str]:
-    parts = [f"{_rms(row)} {row.label} ({row.percent.count})" for row in numbers.halves]
-    frames = "frame" if numbers.total.percent.count == 1 else "frames"
-    return [
-        f"Distance error (RMS) over {numbers.total.percent.count} {frames}: {'; '.join(parts)}."
-    ]
+def _data(content: Content) -> Json:
+    names = [column.name for column in BIAS_COLUMNS]
+    return {
+        "columns": {name: [_cell(row[name]) for row in content.rows] for name in names},
+        "deviations": [_cell(one) for one in content.deviations.tolist()],
+        "labels": {quantity.name: quantity.label for quantity in QUANTITIES},
+        "steps": MARK_STEPS,
+        "pictures": {
+            name: [one.rows.tolist(), one.places.ravel().tolist()]
+            for name, one in content.pictures.items()
+            if one.rows.size
+        },
+        "closeups": {str(one.row): _closeup(one) for one in content.closeups},
+        "summary": content.summary,
+    }
 
 
-def _rms(row: RangeRow) -> str:
-    return f"{row.percent.rms:.3f} % ({1000.0 * row.metres.rms:.0f} mm)"
+def _cell(value: object) -> object:
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}")
+    if isinstance(value, datetime):
+        return value.isoformat().replace("+00:00", "Z")
+    return value
 
 
-def _bias(numbers: BiasNumbers) -> str:
-    if numbers.total.percent.count == 1:
-        return "One frame says nothing about bias."
-    if not numbers.biased:
-        known = numbers.total.sd_reference_percent is not None
-        beyond = "noise and the reference's own errors" if known else "noise"
-        return f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
-    sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
-    parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
-    return f"Biased: distances are measured {'; '.join(parts)}."
+def _closeup(one: Closeup) -> Json:
+    return {
+        "width": one.width,
+        "height": one.height,
+        "jpeg": one.jpeg,
+        "circles": [np.round(circle, 1).ravel().tolist() for circle in one.circles],
+    }
 
 
-def _mean(row: RangeRow) -> str:
-    sd_mean = row.percent.sd_mean
-    noise = "" if sd_mean is None else f" ± {sd_mean:.3f}"
-    return f"{row.percent.mean:+.3f}{noise} %".replace("-", "−")
+def deviations_of(numbers: BiasNumbers) -> FloatArray:
+    """Return what scale and offset leave of the errors (n,), over its standard deviation."""
+    noise = numbers.data.noise
+    left = numbers.residual_percent - numbers.explained_percent
+    sd = 100.0 * np.sqrt(noise.white + noise.lasting) / numbers.data.distance_m
+    return np.asarray(left / sd)
 
 
-def _detection(numbers: BiasNumbers) -> list[str]:
-    if not numbers.chances:
-        return []
-    share = 100.0 * numbers.detected / numbers.chances
-    kind = "the target fully in view" if numbers.attitudes_agree else "a reference pose"
-    return [
-        f"Detected in {numbers.detected} of {numbers.chances} frames with {kind} ({share:.1f} %)."
-    ]
-
-
-def _exposure(numbers: BiasNumbers) -> list[str]:
-    clear = [influence.label for influence in numbers.influences if influence.is_clear]
-    return [f"The error follows the exposure: {', '.join(clear)}."] if clear else []
-
-
-def _reservations(numbers: BiasNumbers) -> list[str]:
-    """Say what speaks against taking the numbers at face value."""
-    sentences = []
-    if numbers.sd_reference_m is not None:
-        sentences.append(
-            f"The reference distance itself is known to {1000.0 * numbers.sd_reference_m:.0f} mm"
-            " (median sd)."
-        )
-    if numbers.astray:
-        sentences.append(
-            f"{len(numbers.astray)} measurements are not where the target must be and are left out"
-            " of the statistics."
-        )
-    if not numbers.attitudes_agree:
-        sentences.append(
-            "The reference attitudes do not lead to the measured points: check omega, phi, kappa;"
-            " distances do not depend on them."
-        )
-    return sentences
+def frames_of(compared: Sequence[Comparison]) -> list[str]:
+    """Return the names of the frames."""
+    return [one.attempt.frame for one in compared]

@@ -2,25 +2,54 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from kgcp.bias.study import BiasStudy
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, Rejection
 from kgcp.io.columns import BIAS_COLUMNS
 from kgcp.io.flight import Flight
+from kgcp.io.frames import read_grey
 from kgcp.io.kgcp_table import bias_row
 from kgcp.io.provenance import provenance
 from kgcp.io.tables import write_table
 from kgcp.io.wholefile import write_bytes
-from kgcp.report.figures import detection_rate, error_against_distance, error_against_exposure
+from kgcp.report.canvas import Picture
+from kgcp.report.closeups import SPREAD, Closeup, closeup, evenly, largest
+from kgcp.report.exposure_figures import (
+    change_by_reexposure,
+    error_against_exposure,
+    one_edge_against_two,
+)
+from kgcp.report.figures import (
+    detection_rate,
+    error_against_distance,
+    error_in_time,
+    error_over_image,
+    flight_map,
+    standardised_histogram,
+)
 from kgcp.report.numbers import BiasNumbers, bias_numbers
-from kgcp.report.page import render_page, verdict
+from kgcp.report.page import Content, deviations_of, frames_of, render_page
+from kgcp.report.reexpose import Reexposed, measure_again
+from kgcp.report.summary import Json, finite, summary_of
+from kgcp.report.verdict import Verdict, judge
+from kgcp.settings import DetectSettings
 
 FIGURE_FILES = {
     "error": "bias_error.png",
     "rate": "bias_detection_rate.png",
     "exposure": "bias_exposure.png",
+    "edges": "bias_edges.png",
+    "reexposure": "bias_reexposure.png",
+    "standardised": "bias_standardised.png",
+    "time": "bias_time.png",
+    "image": "bias_image.png",
+    "map": "bias_map.png",
 }
 
 
@@ -28,28 +57,30 @@ FIGURE_FILES = {
 class Report:
     """What was written, and what it says."""
 
-    numbers: BiasNumbers
-    verdict: tuple[str, ...]
+    numbers: Json
+    verdict: Verdict
     files: tuple[Path, ...]
 
-    def summary(self) -> dict[str, object]:
-        """Return the main numbers for machines: percent, metres, counts, paths."""
-        numbers = self.numbers
-        return {
-            "compared": numbers.total.percent.count,
-            "residual_percent": asdict(numbers.total.percent),
-            "residual_m": asdict(numbers.total.metres),
-            "biased": [row.label for row in numbers.biased],
-            "detected": numbers.detected,
-            "frames_with_target": numbers.chances,
-            "astray": len(numbers.astray),
-            "left_out": dict(numbers.left_out),
-            "files": [str(path) for path in self.files],
-        }
+    def summary(self) -> Json:
+        """Return all numbers for machines, and the paths of the files."""
+        return {**self.numbers, "files": [str(path) for path in self.files]}
 
 
-def write_report(study: BiasStudy, flight: Flight, folder: Path) -> Report:
-    """Write bias.parquet, the figures and bias_report.html into a folder.
+def write_report(
+    study: BiasStudy, flight: Flight, settings: DetectSettings, folder: Path, reexpose: int
+) -> Report:
+    """Write bias.parquet, bias_summary.json, the figures and bias_report.html into a folder.
+
+    Parameters
+    ----------
+    study : BiasStudy
+    flight : Flight
+        Its frames, where they are, give the close-ups.
+    settings : DetectSettings
+        Of the detections, to measure frames again.
+    folder : Path
+    reexpose : int
+        How many frames to measure again, with darker and brighter grey values.
 
     Raises
     ------
@@ -62,26 +93,97 @@ def write_report(study: BiasStudy, flight: Flight, folder: Path) -> Report:
             " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
         )
     table = folder / "bias.parquet"
-    write_table(table, BIAS_COLUMNS, map(bias_row, study.measured), provenance(flight))
+    rows = (bias_row(one, study.method) for one in study.measured)
+    write_table(table, BIAS_COLUMNS, rows, provenance(flight))
+    content = _content(study, flight, settings, reexpose)
+    files = {FIGURE_FILES[name]: one.png for name, one in content.pictures.items()}
+    text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
+    files["bias_summary.json"] = f"{text}\n".encode()
+    files["bias_report.html"] = render_page(content).encode()
+    for name, data in files.items():
+        write_bytes(folder / name, data)
+    for name in set(FIGURE_FILES.values()) - files.keys():
+        (folder / name).unlink(missing_ok=True)  # of an earlier run: not of these numbers
+    paths = (table, *(folder / name for name in files))
+    return Report(content.summary, content.verdict, paths)
+
+
+def _content(study: BiasStudy, flight: Flight, settings: DetectSettings, reexpose: int) -> Content:
     numbers = bias_numbers(study)
-    figures = _figures(numbers)
-    page = render_page(flight.name, numbers, figures)
-    contents = {FIGURE_FILES[name]: png for name, png in figures.items()}
-    contents["bias_report.html"] = page.encode("utf-8")
-    for name, content in contents.items():
-        write_bytes(folder / name, content)
-    files = (table, *(folder / name for name in contents))
-    return Report(numbers, tuple(verdict(numbers)), files)
+    deviations = deviations_of(numbers)
+    spread, worst = evenly(numbers.data.distance_m, SPREAD), largest(deviations)
+    again = evenly(numbers.data.distance_m, reexpose)
+    closeups, reexposed = _look(numbers, flight, settings, [*spread, *worst], again)
+    verdict = judge(numbers)
+    return Content(
+        name=flight.name,
+        numbers=numbers,
+        verdict=verdict,
+        pictures=_pictures(numbers, flight, reexposed),
+        rows=[bias_row(one, study.method) for one in numbers.compared],
+        closeups=closeups,
+        worst=worst,
+        deviations=deviations,
+        reexposed=reexposed,
+        summary=summary_of(numbers, verdict, reexposed, frames_of(numbers.compared)),
+    )
 
 
-def _figures(numbers: BiasNumbers) -> dict[str, bytes]:
-    figures = {
-        "error": error_against_distance(
-            numbers.distance_m, numbers.residual_m, numbers.residual_percent
-        )
-    }
-    if numbers.rates:
-        figures["rate"] = detection_rate(numbers.rates)
+def _look(
+    numbers: BiasNumbers,
+    flight: Flight,
+    settings: DetectSettings,
+    shown: list[int],
+    again: list[int],
+) -> tuple[list[Closeup], list[Reexposed]]:
+    """Make close-ups of some rows and measure some again, as far as their frames are there."""
+    closeups: list[Closeup] = []
+    reexposed: list[Reexposed] = []
+    targets = {target.name: target for target in flight.targets}
+    for row in dict.fromkeys([*shown, *again]):
+        one = numbers.compared[row]
+        seen = one.attempt.sighting
+        if seen is None:
+            continue
+        try:
+            grey = read_grey(flight.frames_folder / seen.frame, flight.camera)
+        except Rejection:
+            continue  # the page says of which frames there is no close-up
+        target, radius = targets[seen.target], float(numbers.data.radius_px[row])
+        if row in shown and (picture := closeup(grey, flight.camera, target, seen, row)):
+            closeups.append(picture)
+        if row in again:
+            reexposed += measure_again(
+                grey, flight.camera, target, settings, seen.centre_px, radius, row
+            )
+    return closeups, reexposed
+
+
+def _pictures(
+    numbers: BiasNumbers, flight: Flight, reexposed: list[Reexposed]
+) -> Mapping[str, Picture]:
+    pictures = {"error": error_against_distance(numbers)}
+    if numbers.chances:
+        pictures["rate"] = detection_rate(numbers)
     if numbers.influences:
-        figures["exposure"] = error_against_exposure(numbers.influences)
-    return figures
+        pictures["exposure"] = error_against_exposure(numbers)
+    if numbers.edges is not None and numbers.is_displaced:
+        pictures["edges"] = one_edge_against_two(numbers, numbers.edges)
+    if reexposed:
+        pictures["reexposure"] = change_by_reexposure(reexposed)
+    if numbers.standardised is not None:
+        pictures["standardised"] = standardised_histogram(numbers)
+    pictures["time"] = _in_time(numbers)
+    centre = np.array(
+        [one.attempt.sighting.centre_px for one in numbers.compared if one.attempt.sighting]
+    )
+    pictures["image"] = error_over_image(numbers, centre, flight.camera)
+    pictures["map"] = flight_map(numbers)
+    return pictures
+
+
+def _in_time(numbers: BiasNumbers) -> Picture:
+    times = np.array([one.attempt.time_s for one in numbers.compared], dtype=np.float64)
+    if not np.isfinite(times).all():
+        return error_in_time(numbers, np.arange(float(len(times))), "frame, in order")
+    return error_in_time(numbers, (times - times[0]) / 60.0, "time since the first [min]")

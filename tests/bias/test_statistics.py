@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kgcp.bias.statistics import Spread, moving_statistics, rank_correlation, wilson_interval
+from kgcp.bias.statistics import Spread, moving_statistics, wilson_interval
 
 
 def test_spread_of_known_numbers() -> None:
@@ -71,13 +71,3 @@ def test_windows_with_too_few_values_stay_empty() -> None:
     assert np.isnan(moving.mean[at_35])
     assert np.isnan(moving.mean[-1])
     assert moving.mean[0] == pytest.approx(2.0)
-
-
-def test_rank_correlation_knows_monotone_from_constant() -> None:
-    x = np.arange(20.0)
-    rising = rank_correlation(x, np.exp(x))
-    assert rising is not None
-    assert rising.rho == pytest.approx(1.0)
-    assert rising.p_value < 1e-6
-    assert rank_correlation(x, np.zeros(20)) is None
-    assert rank_correlation(x[:5], x[:5]) is None
