@@ -14,6 +14,7 @@ from typing import Self
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.crs import GeographicCRS
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
@@ -211,6 +212,12 @@ def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
     while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed
         parsed = parsed.source_crs
     return parsed if parsed.is_compound else parsed.to_3d()
+
+
+def geographic_of(geocentric: CRS) -> str:
+    """Return the geographic CRS, with ellipsoidal heights, of a geocentric one's datum."""
+    geographic = GeographicCRS(name=geocentric.name, datum=geocentric.datum)
+    return str(geographic.to_3d().to_string())
 
 
 def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS, where: str) -> Transformer:

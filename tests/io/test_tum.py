@@ -59,6 +59,17 @@ def test_headings_are_of_the_grid_and_become_true_ones(
     assert (trajectory.sd_position_m, trajectory.sd_attitude_deg) == (None, None)
 
 
+def test_quaternions_may_be_against_the_earth_s_axes(tmp_path: Path) -> None:
+    # On the equator at Greenwich X is up, Y east and Z north; the vehicle heads for the east.
+    body = Rotation.from_matrix(np.column_stack(([0, 1, 0], [0, 0, -1], [-1, 0, 0])))
+    quaternion = " ".join(f"{value:.15f}" for value in body.as_quat())
+    path = tmp_path / "vehicle.txt"
+    path.write_text(f"0 6378237 0 0 {quaternion}\n1 6378237 9 0 {quaternion}\n")
+    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryNotation(crs="EPSG:4978"))
+    assert_allclose(trajectory.position_map[0], [0.0, 0.0, 100.0], atol=1e-6)
+    assert_allclose(trajectory.attitude_deg[0], [0.0, 0.0, 90.0], atol=1e-9)
+
+
 def test_roll_is_right_side_down_and_pitch_nose_up(tmp_path: Path) -> None:
     # Heading grid east; then 10 degrees of pitch about the right side (south), then 20 of roll
     # about the nose: q = EAST · (pitch about y) · (roll about x), written out by hand.

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pyproj.crs import GeographicCRS
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
@@ -15,7 +14,7 @@ from kgcp.io.foreign import ForeignFile
 from kgcp.io.poses.notation import PoseNotation
 from kgcp.io.poses.source import SourcePoses, from_geocentric, from_level
 from kgcp.mapchange import MapChange
-from kgcp.mapframe import FARTHEST, FLIGHT_TOML, MapFrame, parse_crs
+from kgcp.mapframe import FARTHEST, FLIGHT_TOML, MapFrame, geographic_of, parse_crs
 
 REFERENCE_CRS = "flight.toml: [reference] crs"
 _REMEDY = "align it to a map and give [reference] crs, that of its coordinates"
@@ -122,8 +121,9 @@ def _stated(source: SourcePoses, crs: str) -> SourcePoses:
     """Return poses whose coordinates are of a CRS that flight.toml states."""
     parsed = parse_crs(crs, REFERENCE_CRS)
     if parsed.is_geocentric:
-        geodetic = GeographicCRS(name=parsed.name, datum=parsed.datum).to_3d().to_string()
-        return from_geocentric(source.names, source.position, source.frame_from_photo, geodetic)
+        return from_geocentric(
+            source.names, source.position, source.frame_from_photo, geographic_of(parsed)
+        )
     if parsed.is_geographic and source.unreferenced is not None:
         raise KgcpError(
             f"{REFERENCE_CRS} {crs!r} counts degrees, but the poses are in a Cartesian frame;"

@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.mapchange import best_transformer
-from kgcp.mapframe import FARTHEST, MapFrame, parse_crs
+from kgcp.mapframe import FARTHEST, MapFrame, geographic_of, parse_crs
 
 VEHICLE_CRS = "flight.toml: [vehicle] crs"
 _STEP_M, _STEP_DEG = 10.0, 1e-4  # curvature cancels in the central difference
@@ -65,9 +65,15 @@ def map_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
 
 
 def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
-    """Return east, north, up at positions (n, 3) of a map, as columns in ECEF, (n, 3, 3)."""
-    frame = MapFrame.at(crs, position[0])
-    axes: FloatArray = frame.ecef_from_enu @ frame.level_rotations(frame.enu_from_map(position))
+    """Return east, north, up at positions (n, 3) of a CRS, as columns in ECEF, (n, 3, 3)."""
+    parsed = parse_crs(crs, VEHICLE_CRS)
+    if parsed.is_geocentric:
+        frame = MapFrame.at(geographic_of(parsed), np.zeros(3), VEHICLE_CRS)
+        enu = (position - frame.origin_ecef_m) @ frame.ecef_from_enu
+    else:
+        frame = MapFrame.at(crs, position[0], VEHICLE_CRS)
+        enu = frame.enu_from_map(position)
+    axes: FloatArray = frame.ecef_from_enu @ frame.level_rotations(enu)
     return axes
 
 

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.rtklib_pos import Solution, read_solution
 from kgcp.io.trajectories.epochs import Epochs, check_times
 from kgcp.io.trajectories.notation import TrajectoryNotation
-from kgcp.io.trajectories.sbet import GEOGRAPHIC_3D
+from kgcp.mapframe import WGS84_3D
 
 GEOCENTRIC = "EPSG:4978"
 # Of each kind of solution: its columns in the order x, y, z, their deviations, and the roots of
@@ -51,7 +51,7 @@ def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
         cov = _covariances(_block(solution, deviations), _block(solution, roots))
     return Epochs(
         time_s=solution.time_s,
-        crs=notation.crs or (GEOCENTRIC if geocentric else GEOGRAPHIC_3D),
+        crs=notation.crs or (GEOCENTRIC if geocentric else WGS84_3D),
         position=_block(solution, position),
         attitude_deg=None,
         sd_position_m=None if cov is None else np.sqrt(np.diagonal(cov, axis1=1, axis2=2)),

@@ -13,8 +13,8 @@ from kgcp.io.gpstime import unwrap_week
 from kgcp.io.trajectories.clock import times_from_week
 from kgcp.io.trajectories.epochs import Epochs, check_times
 from kgcp.io.trajectories.notation import TrajectoryNotation, Wander
+from kgcp.mapframe import WGS84_3D
 
-GEOGRAPHIC_3D = "EPSG:4979"
 _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, heading, wander, …
 _ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
 _DOUBLE = 8
@@ -57,7 +57,7 @@ def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
         sd_position_m, sd_attitude_deg = _read_accuracies(notation.accuracies_file, seconds)
     return Epochs(
         time_s=time_s,
-        crs=notation.crs or GEOGRAPHIC_3D,
+        crs=notation.crs or WGS84_3D,
         position=np.column_stack((np.degrees(records[:, [2, 1]]), records[:, 3])),
         attitude_deg=_attitude_deg(path, records, notation.wander),
         sd_position_m=sd_position_m,
