@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -256,6 +257,53 @@ def test_the_format_may_be_named_instead(tmp_path: Path) -> None:
             read_trajectory(path, _CRS, TrajectoryNotation(format=kind))
         with pytest.raises(KgcpError, match=r"does not exist; .*\[vehicle\] trajectory"):
             read_trajectory(tmp_path / "gone", _CRS, TrajectoryNotation(format=kind))
+
+
+# Two epochs on the meridian of zone 32, 0.5 s and 1e-5 degrees apart, heading north.
+_SAME_PLACES: dict[TrajectoryFormat, tuple[bytes, TrajectoryNotation]] = {
+    TrajectoryFormat.CSV: (
+        f"{_HEADER}\n1777887000,9,45,100,0,0,0\n1777887000.5,9,45.00001,100,0,0,0\n".encode(),
+        TrajectoryNotation(crs="EPSG:4979"),
+    ),
+    TrajectoryFormat.SBET: (
+        b"".join(
+            struct.pack("<17d", second, np.radians(lat), np.radians(9.0), 100.0, *[0.0] * 13)
+            for second, lat in ((120618.0, 45.0), (120618.5, 45.00001))
+        ),
+        TrajectoryNotation(time_system=TimeSystem.GPS, first_day=date(2026, 5, 4)),
+    ),
+    TrajectoryFormat.RTKLIB: (
+        (
+            b"% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  GPST latitude(deg) longitude(deg)"
+            b" height(m) Q\n2417 120618.0 45.0 9.0 100.0 1\n2417 120618.5 45.00001 9.0 100.0 1\n"
+        ),
+        TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0)),
+    ),
+    TrajectoryFormat.TUM: (
+        "".join(
+            f"{time} 9 {lat} 100 {np.sqrt(0.5)} {np.sqrt(0.5)} 0 0\n"
+            for time, lat in ((1777887000.0, 45.0), (1777887000.5, 45.00001))
+        ).encode(),
+        TrajectoryNotation(crs="EPSG:4979"),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", TrajectoryFormat)
+def test_all_formats_say_the_same_recognised_or_named(
+    tmp_path: Path, kind: TrajectoryFormat
+) -> None:
+    content, notation = _SAME_PLACES[kind]
+    path = tmp_path / "vehicle"
+    path.write_bytes(content)
+    for stated in (notation, replace(notation, format=kind)):
+        trajectory = read_trajectory(path, _CRS, stated)
+        np.testing.assert_allclose(trajectory.time_s, 1777887000.0 + np.array([0.0, 0.5]))
+        arc_m = 0.9996 * 4984944.378  # to 45 degrees, on the zone's meridian
+        np.testing.assert_allclose(trajectory.position_map[0], [5e5, arc_m, 100.0], atol=1e-3)
+        step_m = np.diff(trajectory.position_map[:, 1])
+        np.testing.assert_allclose(step_m, 0.9996 * 1.11131777, rtol=1e-6)  # 6 367 381.8 m · 1e-5°
+        np.testing.assert_allclose(trajectory.attitude_deg, 0.0, atol=1e-6)
 
 
 _COURSE = TrajectoryNotation(course_sd_deg=(2.0, 1.5, 3.0))
