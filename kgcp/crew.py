@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from kgcp.io.stores import StoredFolder
 from kgcp.processes import LocalPool
 from kgcp.profiling import profiled
 from kgcp.workers import Inline, Loss, careful_map, usable_cores
@@ -74,7 +75,7 @@ def hired(
     jobs: int | None,
     limit_s: float,
     scheduler: str | None,
-    folders: tuple[Path, ...],
+    frames: Path | StoredFolder,
     *,
     is_profiled: bool,
 ) -> Iterator[Crew]:
@@ -87,8 +88,8 @@ def hired(
     limit_s : float
     scheduler : str or None
         As `kgcp.cluster.connected` takes it; None: this machine works alone.
-    folders : tuple of Path
-        Absolute; what other machines must see under the same names.
+    frames : Path or StoredFolder
+        Where they are; other machines must see a folder under the same, absolute, name.
     is_profiled : bool
 
     Raises
@@ -102,5 +103,6 @@ def hired(
         return
     from kgcp.cluster import connected
 
+    folders = (frames,) if isinstance(frames, Path) else ()
     with connected(scheduler, limit_s, folders) as cluster:
         yield Crew(jobs or cluster.jobs, limit_s, stages_s, cluster.executor)

@@ -17,6 +17,7 @@ from kgcp.io.debug_pictures import write_debug_picture
 from kgcp.io.detections import FrameResult
 from kgcp.io.exif import Exif
 from kgcp.io.frames import read_exif, read_grey
+from kgcp.io.stores import StoredFolder, at_hand
 from kgcp.settings import DetectSettings
 from kgcp.target.common import common_uncertainty
 from kgcp.target.expected import Expectation, look_again
@@ -47,7 +48,7 @@ class Debug:
 class FrameTask:
     """What a worker needs to know to examine any frame of a flight."""
 
-    frames_folder: Path
+    frames_folder: Path | StoredFolder
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     targets: tuple[Target, ...]
@@ -95,11 +96,13 @@ class SecondLook:
 def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     """Read and measure one frame; whatever a frame can do wrong becomes its result."""
     cv2.setNumThreads(0)  # the processes are the parallelism
-    path = task.frames_folder / note.frame
-    exif = read_exif(path)
+    place = task.frames_folder / note.frame
+    exif = Exif()
     outcomes: tuple[Outcome, ...]
     try:
-        grey = read_grey(path, task.camera)
+        with at_hand(task.frames_folder, note.frame) as path:
+            exif = read_exif(path)
+            grey = read_grey(path, task.camera)
         examination = examine(grey, task.camera, task.targets, task.settings, note.prior)
         outcomes = tuple(_with_common_uncertainty(task, one) for one in examination.outcomes)
         _draw(task, note.frame, grey, examination)
@@ -111,20 +114,20 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     reference = task.camera.time_reference
     if time_s is not None and reference is not TimeReference.MIDDLE:
         is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
-        time_s = _mid_exposure_s(time_s, exif, reference, path) if is_readable else None
+        time_s = _mid_exposure_s(time_s, exif, reference, place) if is_readable else None
     return FrameResult(note.frame, time_s, exif, outcomes)
 
 
 def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
     cv2.setNumThreads(0)
-    path = task.frames_folder / look.note.frame
     try:
-        grey = read_grey(path, task.camera)
+        with at_hand(task.frames_folder, look.note.frame) as path:
+            grey = read_grey(path, task.camera)
     except Rejection as rejection:
         raise KgcpError(
-            f"{path}: could be read, and cannot any more ({rejection.detail}); put it back, and the"
-            " same command goes on"
+            f"{task.frames_folder / look.note.frame}: could be read, and cannot any more"
+            f" ({rejection.detail}); put it back, and the same command goes on"
         ) from rejection
     found = {
         outcome.target: outcome
@@ -202,10 +205,12 @@ def _draw(
         write_debug_picture(task.debug.folder, frame, grey, examination, expected)
 
 
-def _mid_exposure_s(time_s: float, exif: Exif, reference: TimeReference, path: Path) -> float:
+def _mid_exposure_s(
+    time_s: float, exif: Exif, reference: TimeReference, place: Path | StoredFolder
+) -> float:
     if exif.exposure_time_s is None:
         raise KgcpError(
-            f"{path}: has no exposure time in EXIF, which [camera] time_reference ="
+            f"{place}: has no exposure time in EXIF, which [camera] time_reference ="
             f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
             " of mid-exposure and delete time_reference"
         )

@@ -30,6 +30,7 @@ from kgcp.expectations import Sightings
 from kgcp.io.detections import FrameResult
 from kgcp.io.journal import Journal
 from kgcp.io.journal_text import fingerprint
+from kgcp.io.stores import stamps_of
 from kgcp.target.expected import Expectation
 from kgcp.target.observation import is_unreadable
 from kgcp.workers import Loss
@@ -80,7 +81,8 @@ class Looks:
         self._task, self._notes, self._journal = task, notes, journal
         self._crew, self._watcher = crew, watcher
         self._rows = {note.frame: row for row, note in enumerate(notes)}
-        self._keys = [_key(task.frames_folder, note) for note in notes]
+        stamps = stamps_of(task.frames_folder, [note.frame for note in notes])
+        self._keys = [_key(note, stamp) for note, stamp in zip(notes, stamps, strict=True)]
         self._done, self._total = 0, len(notes)
         self.sightings = Sightings(task.targets, [note.frame for note in notes])
         self.kept = sum(key in journal for key in self._keys)
@@ -169,6 +171,8 @@ class Looks:
     def _require_frame(self, result: FrameResult) -> None:
         """Stop where frames cannot be read because they are gone, with the disk they were on."""
         path = self._task.frames_folder / result.frame
+        if not isinstance(path, Path):  # of a store, whoever cannot read has told why
+            return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
             raise KgcpError(
                 f"{path}: has vanished; when the frames are there again, the same command goes on"
@@ -189,12 +193,7 @@ class Looks:
             )
 
 
-def _key(folder: Path, note: FrameNote) -> str:
-    try:
-        status = (folder / note.frame).stat()
-        file = (status.st_size, status.st_mtime_ns)
-    except OSError:
-        file = None
+def _key(note: FrameNote, file: tuple[int, int] | None) -> str:
     name = fingerprint(note.frame)[:16]
     return f"first-{name}-{fingerprint(file, note.time_s, note.prior)[:16]}"
 

@@ -14,6 +14,7 @@ from kgcp.io.contact_sheet import Card, ContactSheet
 from kgcp.io.detections import FrameResult
 from kgcp.io.frames import read_grey
 from kgcp.io.overlay_pictures import Pictures, Scene, draw_scene
+from kgcp.io.stores import at_hand
 from kgcp.looks import Looks
 from kgcp.target.observation import Miss, Observation, Outcome
 from kgcp.target.residuals import contours_px, residuals_of
@@ -79,7 +80,8 @@ def sketch_frame(task: FrameTask, result: FrameResult) -> list[Sketch]:
     if not any(map(_has_place, result.outcomes)):
         return [Sketch(_card(result.frame, one)) for one in _in_order(result)]
     try:
-        grey = read_grey(task.frames_folder / result.frame, task.camera)
+        with at_hand(task.frames_folder, result.frame) as path:
+            grey = read_grey(path, task.camera)
     except Rejection as rejection:
         return _lost(result, str(rejection))
     return [_sketch(task, grey, result.frame, outcome) for outcome in _in_order(result)]

@@ -17,13 +17,13 @@ from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.contact_sheet import ContactSheet
 from kgcp.io.detections import detection_rows
 from kgcp.io.flight import Flight
-from kgcp.io.frames import list_frames
 from kgcp.io.frametimes import read_times
 from kgcp.io.journal import Journal
 from kgcp.io.journal_text import fingerprint, to_text
 from kgcp.io.locking import locked
 from kgcp.io.poses import read_flight_poses
 from kgcp.io.runrecord import versions, write_run_record
+from kgcp.io.stores import StoredFolder, frames_below
 from kgcp.io.tables import Row, write_table
 from kgcp.looks import Looks, Watcher
 from kgcp.overlays import draw_overlay
@@ -58,6 +58,7 @@ def detect_flight(
     frame_timeout_s: float = FRAME_TIMEOUT_S,
     is_profiled: bool = False,
     scheduler: str | None = None,
+    stored_frames: StoredFolder | None = None,
 ) -> SurveySummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
@@ -88,6 +89,8 @@ def detect_flight(
     scheduler : str, optional
         Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
         frames, and the folder of pictures, where they are seen here.
+    stored_frames : StoredFolder, optional
+        Where the frames are, if not in the flight's folder.
 
     Raises
     ------
@@ -99,14 +102,14 @@ def detect_flight(
     if scheduler is not None:
         flight, debug = _seen_from_elsewhere(flight, debug)
     with stopwatch.stage("preparation"):
-        frames = list_frames(flight.frames_folder)
+        frames = frames_below(stored_frames or flight.frames_folder)
         times = {}
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
         notes = _take_notes(flight, frames, times)
         sheet = None if overlay is None else _sheet(flight, overlay)
     task = FrameTask(
-        flight.frames_folder,
+        stored_frames or flight.frames_folder,
         flight.camera,
         flight.calibration_covariance,
         flight.targets,
@@ -117,7 +120,7 @@ def detect_flight(
         locked(out / ".detections.lock"),
         Journal(out / ".detections.journal", _making(task), is_new=is_restart) as journal,
         hired(
-            *(jobs, frame_timeout_s, scheduler, (flight.frames_folder,)), is_profiled=is_profiled
+            *(jobs, frame_timeout_s, scheduler, task.frames_folder), is_profiled=is_profiled
         ) as crew,
     ):
         looks = Looks(task, notes, journal, crew, watcher or Nobody())

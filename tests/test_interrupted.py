@@ -330,7 +330,7 @@ def test_who_is_lost_is_tried_again_by_the_next_run(
             yield item, Loss.DIED if is_deadly else Loss.LATE if is_hopeless else function(item)
 
     with monkeypatch.context() as patch:
-        patch.setattr("kgcp.looks.careful_map", lossy)
+        patch.setattr("kgcp.crew.careful_map", lossy)
         stop(flight, FRAMES)
         summary = detect(flight)
     assert summary.kept == FRAMES - 1, "who has died is tried again by the next run"

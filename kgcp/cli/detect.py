@@ -163,25 +163,22 @@ def command(
         false_alarm=false_alarm,
         is_guided=is_guided,
     )
-    start = time.perf_counter()
-    with (
-        log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log,
-        stopping(log),
-        workplace(flight, out) as place,
-    ):
+    with workplace(flight, out) as place:
         the_flight = read_flight(place.flight)
-        summary = detect_flight(
-            *(the_flight, settings, place.out),
-            jobs=jobs,
-            watcher=log,
-            debug=None if debug is None else Debug(debug, debug_frames),
-            overlay=overlay,
-            is_restart=is_restart,
-            frame_timeout_s=frame_timeout,
-            is_profiled=is_profiled,
-            scheduler=scheduler,
-            stored_frames=place.frames_of(the_flight),
-        )
+        start = time.perf_counter()
+        with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
+            summary = detect_flight(
+                *(the_flight, settings, place.out),
+                jobs=jobs,
+                watcher=log,
+                debug=None if debug is None else Debug(debug, debug_frames),
+                overlay=overlay,
+                is_restart=is_restart,
+                frame_timeout_s=frame_timeout,
+                is_profiled=is_profiled,
+                scheduler=scheduler,
+                stored_frames=place.frames_of(the_flight),
+            )
     seconds = time.perf_counter() - start
     table = place.named(place.out / "detections.parquet")
     report(summary, table, overlay, seconds, log, as_json=as_json)

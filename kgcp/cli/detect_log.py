@@ -105,7 +105,7 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
 
 def report(
     summary: SurveySummary,
-    table: Path,
+    table: str,
     overlay: Path | None,
     seconds: float,
     log: Log,
@@ -115,7 +115,7 @@ def report(
     """Print what became of the frames; with `as_json` also to stdout."""
     frames_per_s = (summary.frames - summary.kept) / seconds
     numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
-    files = {"table": str(table)}
+    files = {"table": table}
     if overlay is not None:
         files["overlay"] = str(overlay / "index.html")
     if as_json:

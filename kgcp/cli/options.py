@@ -2,8 +2,12 @@
 
 flight_argument : `flight`, Path
     The flight folder; the current folder by default.
+flight_place_argument : `flight`, Path or StoredFolder
+    The same, which may be a URL.
 out_option : `out`, Path or None
     Folder of the results; None means FLIGHT/kgcp.
+out_place_option : `out`, Path, StoredFolder or None
+    The same, which may be a URL.
 detections_option : `detections`, Path or None
     The table of `kgcp detect`; None means the one in the results' folder.
 json_option : `as_json`, bool
@@ -16,13 +20,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from kgcp.io.stores import StoredFolder
+
+
+def _place(
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    value: str | None,
+) -> Path | StoredFolder | None:
+    """Tell the URL of a folder, `s3://…`, `gs://…` or `file://…`, from its path."""
+    if value is None or "://" not in value:
+        return None if value is None else Path(value)
+    from kgcp.io.stores import parsed_url
+
+    return parsed_url(value)
+
 
 flight_argument = click.argument(
     "flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), default="."
 )
+
+flight_place_argument = click.argument("flight", metavar="[FLIGHT]", callback=_place, default=".")
 
 out_option = click.option(
     "--out",
@@ -30,6 +53,14 @@ out_option = click.option(
     type=click.Path(path_type=Path),
     default=None,
     help="Folder of the results.  [default: FLIGHT/kgcp]",
+)
+
+out_place_option = click.option(
+    "--out",
+    metavar="FOLDER",
+    callback=_place,
+    default=None,
+    help="Folder of the results, here or in an object store.  [default: FLIGHT/kgcp]",
 )
 
 detections_option = click.option(
