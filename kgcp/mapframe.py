@@ -143,10 +143,16 @@ class MapFrame:
         Raises
         ------
         KgcpError
-            If the map's axes are left-handed.
+            If the map's axes are left-handed, or there are none at a point.
         """
         jacobian = self.map_axes_enu(enu)
-        rows = jacobian / np.linalg.norm(jacobian, axis=-1, keepdims=True)
+        lengths = np.linalg.norm(jacobian, axis=-1, keepdims=True)
+        if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # deep inside the Earth, say
+            raise KgcpError(
+                f"{self._where} {self.crs!r} has no directions at a point of its file;"
+                " give the CRS of the coordinates"
+            )
+        rows = jacobian / lengths
         left, _, right = np.linalg.svd(rows)
         enu_from_grid: FloatArray = np.swapaxes(left @ right, -1, -2)
         if np.any(np.linalg.det(enu_from_grid) < 0.0):

@@ -14,6 +14,7 @@ from kgcp.io.anyfile import is_file, read_lines
 from kgcp.io.frames import read_frame_times
 from kgcp.io.gpstime import clock_from_week, unix_from_gps, unwrap_week
 from kgcp.io.rtklib_pos import looks_like_solution, read_solution
+from kgcp.io.times import is_in_calendar
 
 _HEAD = 4096
 # Number, GPS seconds of the week, [week]; positions and their deviations follow.
@@ -54,11 +55,15 @@ def read_times(
         Naming file and line: it is missing or wrong, or its marks cannot be told to frames.
     """
     kind = times_format or recognise(path)
+    if kind is TimesFormat.CSV:
+        return read_frame_times(path)
     if kind is TimesFormat.MRK:
-        return _join_by_number(path, _read_marks(path), frames)
-    if kind is TimesFormat.RTKLIB:
-        return _join_by_order(path, frames)
-    return read_frame_times(path)
+        times = _join_by_number(path, _read_marks(path), frames)
+    else:
+        times = _join_by_order(path, frames)
+    if not all(map(is_in_calendar, times.values())):
+        raise KgcpError(f"{path}: has weeks that no calendar has; give the file of this flight")
+    return times
 
 
 def recognise(path: Path) -> TimesFormat:

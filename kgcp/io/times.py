@@ -9,6 +9,8 @@ from kgcp.errors import SettingError
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _SECOND = timedelta(seconds=1)
+_EARLIEST_S = datetime(1, 1, 3, tzinfo=UTC).timestamp()
+_LATEST_S = datetime(9999, 12, 29, tzinfo=UTC).timestamp()
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 _REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
 
@@ -34,14 +36,14 @@ def parse_time(text: str) -> float:
     """
     text = text.strip()
     if _NUMBER.fullmatch(text):
-        return _in_calendar(float(text), text)
+        return _in_calendar(float(text), f"{text} is no date when read as Unix seconds")
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         raise SettingError("time", f"{text!r} is not a time", _REMEDY) from None
     if moment.tzinfo is None:
         raise SettingError("time", f"{text!r} names no time zone", _REMEDY)
-    return (moment - _EPOCH) / _SECOND
+    return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is no date of a flight")
 
 
 def format_time(unix_s: float) -> str:
@@ -50,11 +52,13 @@ def format_time(unix_s: float) -> str:
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-def _in_calendar(unix_s: float, text: str) -> float:
+def is_in_calendar(unix_s: float) -> bool:
+    """Return whether Unix seconds are a date, and will be if a day is added or taken off."""
+    return _EARLIEST_S <= unix_s <= _LATEST_S
+
+
+def _in_calendar(unix_s: float, problem: str) -> float:
     """Refuse seconds that no calendar date has: milliseconds, mostly."""
-    try:
-        format_time(unix_s)
-    except OverflowError:
-        problem = f"{text} is no date when read as Unix seconds"
-        raise SettingError("time", problem, _REMEDY) from None
+    if not is_in_calendar(unix_s):
+        raise SettingError("time", problem, _REMEDY)
     return unix_s
