@@ -14,7 +14,7 @@ from kgcp.cli.options import (
     out_option,
     selection_options,
 )
-from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export
+from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export, not_renewed
 
 if TYPE_CHECKING:
     from kgcp.carrier import Carrier
@@ -107,7 +107,8 @@ def command(
         written += write_consistency(folder, made.consistency, provenance(the_flight))
     points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
     more, left_out = _export(points, formats, folder)
-    _report(made, [*written, *more], left_out, as_json=as_json)
+    written += more
+    _report(made, written, left_out, not_renewed(folder, written), as_json=as_json)
 
 
 def _export(
@@ -131,7 +132,12 @@ def _export(
 
 
 def _report(
-    made: Delivery, written: list[Path], left_out: dict[str, str], *, as_json: bool
+    made: Delivery,
+    written: list[Path],
+    left_out: dict[str, str],
+    older: tuple[str, ...],
+    *,
+    as_json: bool,
 ) -> None:
     from collections import Counter
 
@@ -147,6 +153,7 @@ def _report(
             "advice": _advice(made.consistency),
             "files": [*map(str, written)],
             "left_out": left_out,
+            "not_renewed": older,
         }
         click.echo(json.dumps(summary))
     of_these = f" ({checks} to check)" if checks else ""
@@ -162,6 +169,8 @@ def _report(
         click.echo(f"wrote {path}", err=True)
     for name, reason in left_out.items():
         click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
+    if older:
+        click.echo(f"not renewed, of an earlier export: {', '.join(older)}", err=True)
 
 
 def _named(written: list[Path]) -> list[str]:

@@ -221,6 +221,15 @@ def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder
     assert '"my%20f_0.jpg"' in (flight.out / "opf/camera_list.json").read_text(encoding="utf-8")
 
 
+def test_files_of_an_earlier_export_are_mentioned(flight: FlightFolder) -> None:
+    flight.run("export-gcp", "--format", "odm", "--format", "micmac")
+    result = flight.run("export-gcp", "--format", "csv", "--min-spacing", "30", "--json")
+    assert json.loads(result.stdout)["not_renewed"] == ["odm", "micmac"]
+    assert "not renewed, of an earlier export: odm, micmac" in result.stderr
+    result = flight.run("export-gcp", "--format", "odm", "--format", "micmac", "--format", "csv")
+    assert "not renewed" not in result.stderr
+
+
 def test_formats_are_listed_with_their_files() -> None:
     result = CliRunner().invoke(main, ["export-gcp", "--list-formats"])
     assert result.exit_code == 0

@@ -7,7 +7,7 @@ for. Where a package needs several files they have a folder of their own, with a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -146,3 +146,16 @@ def _remove_stale(folder: Path, patterns: tuple[str, ...], written: set[Path]) -
         for path in folder.glob(pattern.strip("[]")):
             if path not in written:
                 path.unlink()
+
+
+def not_renewed(folder: Path, written: Iterable[Path]) -> tuple[str, ...]:
+    """Return the formats of which an earlier export has left files that were not written now."""
+    new = set(written)
+    patterns = {
+        name: [pattern.strip("[]") for pattern in form.files] for name, form in FORMATS.items()
+    }
+    return tuple(
+        name
+        for name, files in patterns.items()
+        if any(path not in new for pattern in files for path in folder.glob(pattern))
+    )
