@@ -115,5 +115,6 @@ def test_the_commands_of_the_readme_exist() -> None:
 
 def test_the_make_targets_of_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in re.findall(r"\bmake ([a-z-]+)", "\n".join(p.read_text() for p in PAGES)):
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for target in re.findall(r"(?:`|^ {4})make ([a-z-]+)", text, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target

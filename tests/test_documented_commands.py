@@ -1,0 +1,162 @@
+"""Every command that README, docs or help show is run, on a flight of a few frames."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from kgcp.cli import COMMANDS, main
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg")
+OF_OTHERS = {"--force-gps", "--gcp", "--tilt", "--wander"}  # OpenDroneMap's, and of benchmarks/
+HERE = "sample_flight"
+# Not run here: there is no cluster, and frames of that camera take seconds to render.
+READ_ONLY = {"--scheduler", "consumer"}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A command as it stands somewhere."""
+
+    where: str
+    arguments: tuple[str, ...]
+
+
+def code_blocks(text: str) -> Iterator[str]:
+    """Blocks between fences, and those that are indented."""
+    fenced = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    yield from fenced.findall(text)
+    yield from re.findall(r"(?:^(?: {4}.*)?\n)+", fenced.sub("", text), re.MULTILINE)
+
+
+def calls(text: str, where: str) -> Iterator[Shown]:
+    joined = re.sub(r"\\\n\s*", " ", text)
+    for line in joined.splitlines():
+        match = re.match(r"\s*(?:\$ |Examples?: )?(?:\.venv/bin/)?kgcp (\S.*)$", line)
+        if match:
+            words = shlex.split(match[1], comments=True)
+            yield Shown(where, tuple(HERE if word == "FLIGHT" else word for word in words))
+
+
+def shown_on_pages() -> Iterator[Shown]:
+    for page in PAGES:
+        for block in code_blocks(page.read_text(encoding="utf-8")):
+            yield from calls(block, page.name)
+
+
+def shown_by_help(name: str) -> list[Shown]:
+    text = command_of(name).help or ""
+    assert "Example" in text
+    return list(calls(text.partition("Example")[2].join(("Example", "")), f"{name} --help"))
+
+
+def command_of(name: str) -> click.Command:
+    command = main.get_command(click.Context(main), name)
+    assert command is not None, name
+    return command
+
+
+def options_of(command: click.Command) -> set[str]:
+    return {
+        name
+        for parameter in command.params
+        if isinstance(parameter, click.Option)
+        for name in (*parameter.opts, *parameter.secondary_opts)
+    } | {"-h", "--help"}
+
+
+def all_shown() -> list[Shown]:
+    """Each command once, with or without a FLIGHT, in the order of the work."""
+    everything = [*shown_on_pages(), *(one for name in COMMANDS for one in shown_by_help(name))]
+    first = {
+        tuple(word for word in one.arguments if word != HERE): one for one in reversed(everything)
+    }
+    rank = list(COMMANDS)
+    return sorted(first.values(), key=lambda one: rank.index(one.arguments[0]))
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The sample flight with few frames, measured; it is also the current folder's flight."""
+    folder = tmp_path_factory.mktemp("shown")
+    flight = folder / HERE
+    (flight / "frames").mkdir(parents=True)
+    for path in (ROOT / HERE).glob("*.*"):
+        shutil.copy(path, flight)
+    for name in FRAMES:
+        shutil.copy(ROOT / HERE / "frames" / name, flight / "frames")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kgcp.crew.usable_cores", lambda: 0)  # in this process
+        patch.chdir(folder)
+        assert CliRunner().invoke(main, ["detect", HERE], catch_exceptions=False).exit_code == 0
+        shutil.copytree(flight, folder, dirs_exist_ok=True)
+        yield folder
+
+
+def lightened(arguments: tuple[str, ...]) -> list[str]:
+    """The same command with less to do: in this process, and with one frame to simulate."""
+    words = list(arguments)
+    for option, value in (("--jobs", "1" if words[0] == "simulate" else "0"), ("--frames", "1")):
+        if option in words:
+            words[words.index(option) + 1] = value
+    return words
+
+
+@pytest.mark.parametrize(
+    "shown", all_shown(), ids=lambda one: f"{one.where}: kgcp {' '.join(one.arguments)}"
+)
+def test_what_is_shown_runs(shown: Shown, workspace: Path) -> None:
+    name, *arguments = shown.arguments
+    lighter = lightened(shown.arguments)
+    if lighter != [name, *arguments] or READ_ONLY & set(arguments):
+        command_of(name).make_context(name, list(arguments))  # as it stands
+    if READ_ONLY & set(arguments):
+        return
+    before = set(workspace.iterdir())
+    result = CliRunner().invoke(main, lighter, catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+    for path in set(workspace.iterdir()) - before:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def test_every_command_is_shown_to_newcomers() -> None:
+    readme = [one.arguments[0] for one in shown_on_pages() if one.where == "README.md"]
+    assert set(readme) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_an_example_and_explains_every_option(name: str) -> None:
+    assert {one.arguments[0] for one in shown_by_help(name)} == {name}
+    assert all(
+        option.help for option in command_of(name).params if isinstance(option, click.Option)
+    )
+    text = CliRunner().invoke(main, [name, "--help"]).stdout
+    assert "\\b" not in text
+    assert "\b" not in text
+
+
+def test_options_in_the_text_exist_and_are_tested() -> None:
+    """Every option that is spoken of is one, and some test or shown command uses it."""
+    existing = set().union(*(options_of(command_of(name)) for name in COMMANDS))
+    existing |= options_of(main)
+    tried = "\n".join(
+        path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")
+    )
+    used = {word for one in all_shown() for word in one.arguments}
+    for page in PAGES:
+        spans = re.findall(r"`((?:kgcp |--)[^`\n]*)`", page.read_text(encoding="utf-8"))
+        for option in re.findall(r"(?<!\S)--[a-z][a-z-]*", "\n".join(spans)):
+            if option not in OF_OTHERS:
+                assert option in existing, f"{page.name}: {option}"
+                is_tried = option in used or re.search(rf"{option}\b(?!-)", tried)
+                assert is_tried, f"{page.name}: {option}"
