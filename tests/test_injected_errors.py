@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
 from click.testing import CliRunner
 
 from kgcp.cli import main
@@ -16,14 +16,6 @@ from kgcp.survey import detect_flight
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_flight"
 Corrections = dict[str, dict[str, float | bool | None]]
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sample") / "flight"
-    shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("kgcp"))
-    detect_flight(read_flight(folder), DetectSettings(), folder / "kgcp", jobs=0)
-    return folder
 
 
 def corrections(flight: Path, old: str, new: str) -> tuple[Corrections, list[str]]:
@@ -42,41 +34,61 @@ def corrections(flight: Path, old: str, new: str) -> tuple[Corrections, list[str
     return by_name, json.loads(result.stdout)["advice"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "name", "missing", "key", "sd_simulated"),
-    [
-        (
-            "[vehicle]\n",
-            "[vehicle]\ntime_offset_s = -0.025\n",
-            "time_offset_s",
-            0.025,
-            "[vehicle] time_offset_s",
-            0.001,
-        ),
-        (
-            "[-0.8, 0.15, -1.95]",
-            "[-0.8, 0.07, -1.95]",
-            "lever_arm_right_m",
-            0.08,
-            "[vehicle] lever_arm_m[1]",
-            0.003,
-        ),
-        ("[camera]\n", "[camera]\nreadout_s = 0.03\n", "readout_s", -0.03, "[camera] readout_s", 0),
-    ],
+@dataclass(frozen=True)
+class Injection:
+    """Words of flight.toml, what is written instead, and what that ought to be called."""
+
+    old: str
+    new: str
+    name: str
+    missing: float
+    key: str
+    sd_simulated: float
+
+
+INJECTIONS = (
+    Injection(
+        "[vehicle]\n",
+        "[vehicle]\ntime_offset_s = -0.025\n",
+        "time_offset_s",
+        0.025,
+        "[vehicle] time_offset_s",
+        0.001,
+    ),
+    Injection(
+        "[-0.8, 0.15, -1.95]",
+        "[-0.8, 0.07, -1.95]",
+        "lever_arm_right_m",
+        0.08,
+        "[vehicle] lever_arm_m[1]",
+        0.003,
+    ),
+    Injection(
+        "[camera]\n",
+        "[camera]\nreadout_s = 0.03\n",
+        "readout_s",
+        -0.03,
+        "[camera] readout_s",
+        0.0,
+    ),
 )
-def test_what_is_wrong_in_flight_toml_is_named_with_its_amount(
-    flight: Path, old: str, new: str, name: str, missing: float, key: str, sd_simulated: float
-) -> None:
+
+
+def test_what_is_wrong_in_flight_toml_is_named_with_its_amount(tmp_path: Path) -> None:
+    flight = tmp_path / "flight"
+    shutil.copytree(SAMPLE, flight, ignore=shutil.ignore_patterns("kgcp"))
+    detect_flight(read_flight(flight), DetectSettings(), flight / "kgcp", jobs=0)
     before, no_advice = corrections(flight, "[vehicle]\n", "[vehicle]\n")
     assert no_advice == []
-    after, (line,) = corrections(flight, old, new)
-    assert key in line
-    value, sd = after[name]["value"], after[name]["sd"]
-    assert isinstance(value, float)
-    assert isinstance(sd, float)
-    assert abs(value - missing) < 3.0 * (sd**2 + sd_simulated**2) ** 0.5
-    assert sd < 0.1 * abs(missing)
-    already = before[name]["value"]  # by the errors that the flight was simulated with
-    assert isinstance(already, float)
-    assert abs(value - already - missing) < sd
-    assert [other for other, one in after.items() if one["is_significant"]] == [name]
+    for one in INJECTIONS:
+        after, (line,) = corrections(flight, one.old, one.new)
+        assert one.key in line
+        value, sd = after[one.name]["value"], after[one.name]["sd"]
+        assert isinstance(value, float)
+        assert isinstance(sd, float)
+        assert abs(value - one.missing) < 3.0 * (sd**2 + one.sd_simulated**2) ** 0.5
+        assert sd < 0.1 * abs(one.missing)
+        already = before[one.name]["value"]  # by the errors that the flight was simulated with
+        assert isinstance(already, float)
+        assert abs(value - already - one.missing) < sd
+        assert [name for name, found in after.items() if found["is_significant"]] == [one.name]
