@@ -18,3 +18,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
     return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
+
+
+def inlined(function: _Function) -> _Function:
+    """Compile a function into those that call it, which leave out what they do not use."""
+    made = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
+    return cast("_Function", made)

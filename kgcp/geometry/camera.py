@@ -14,10 +14,8 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.lens import Lens, distort_points, distort_slopes, undistort_points
 from kgcp.settings import require_range
-
-_MAX_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
 
 
 class Response(StrEnum):
@@ -106,10 +104,12 @@ class Camera:
 
     def distort(self, normalised: FloatArray) -> FloatArray:
         """Map normalised coordinates (n, 2) to raw pixels (n, 2)."""
-        distorted = self._distorted(normalised)
-        return np.stack(
-            (self.fx * distorted[..., 0] + self.cx, self.fy * distorted[..., 1] + self.cy), axis=-1
-        )
+        pixels = np.empty(normalised.shape)
+        points = np.asarray(normalised, dtype=np.float64).reshape(-1, 2)
+        distort_points(self._lens, points, pixels.reshape(-1, 2))
+        pixels *= (self.fx, self.fy)
+        pixels += (self.cx, self.cy)
+        return pixels
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Map raw pixels (n, 2) to normalised coordinates (n, 2).
@@ -117,73 +117,21 @@ class Camera:
         Newton's method with the analytic Jacobian, to 1e-13; points that the distortion model
         cannot reach (beyond its fold) come back as NaN.
         """
-        pixels = np.asarray(pixels, dtype=np.float64)
-        wanted = np.stack(
-            ((pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy), axis=-1
-        )
-        if not self._is_distorted:
-            return wanted
-        normalised = wanted.copy()
-        step = np.full_like(wanted, np.inf)
-        with np.errstate(all="ignore"):  # points beyond the fold diverge and become NaN below
-            for _ in range(_MAX_NEWTON_STEPS):
-                error = self._distorted(normalised) - wanted
-                step = _solve_2x2(self._distorted_jacobian(normalised), error)
-                normalised = normalised - step
-                if not np.any(np.abs(step) > _NEWTON_TOLERANCE):
-                    break
-            lost = ~np.all(np.abs(step) <= _NEWTON_TOLERANCE, axis=-1)
-        normalised[lost] = np.nan
+        plane = (np.asarray(pixels) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not any(self._lens):
+            return plane
+        normalised = np.empty(plane.shape)
+        undistort_points(self._lens, plane.reshape(-1, 2), normalised.reshape(-1, 2))
         return normalised
 
     def distort_jacobian(self, normalised: FloatArray) -> FloatArray:
         """Return the derivatives (n, 2, 2) of `distort`: rows x, y [px], columns the input."""
-        scale = np.array([[self.fx], [self.fy]])
-        jacobian: FloatArray = self._distorted_jacobian(normalised) * scale
-        return jacobian
+        slopes = np.empty((*normalised.shape, 2))
+        points = np.asarray(normalised, dtype=np.float64).reshape(-1, 2)
+        distort_slopes(self._lens, points, slopes.reshape(-1, 2, 2))
+        slopes *= np.array([[self.fx], [self.fy]])
+        return slopes
 
     @property
-    def _is_distorted(self) -> bool:
-        return any((self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6))
-
-    def _radial(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the radial factor and its derivative with respect to r²."""
-        above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        below = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
-        slope_above = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3)
-        slope_below = self.k4 + r2 * (2.0 * self.k5 + 3.0 * r2 * self.k6)
-        factor = above / below
-        return factor, (slope_above - factor * slope_below) / below
-
-    def _distorted(self, normalised: FloatArray) -> FloatArray:
-        x, y = normalised[..., 0], normalised[..., 1]
-        r2 = x * x + y * y
-        factor, _ = self._radial(r2)
-        xy2 = 2.0 * x * y
-        return np.stack(
-            (
-                x * factor + self.p1 * xy2 + self.p2 * (r2 + 2.0 * x * x),
-                y * factor + self.p1 * (r2 + 2.0 * y * y) + self.p2 * xy2,
-            ),
-            axis=-1,
-        )
-
-    def _distorted_jacobian(self, normalised: FloatArray) -> FloatArray:
-        x, y = normalised[..., 0], normalised[..., 1]
-        factor, slope = self._radial(x * x + y * y)
-        p1, p2 = self.p1, self.p2
-        off_diagonal = 2.0 * (slope * x * y + p1 * x + p2 * y)
-        xx = factor + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        yy = factor + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        first = np.stack((xx, off_diagonal), axis=-1)
-        second = np.stack((off_diagonal, yy), axis=-1)
-        return np.stack((first, second), axis=-2)
-
-
-def _solve_2x2(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve (n, 2, 2) systems by Cramer's rule: far faster than LAPACK on tiny matrices."""
-    a, b = matrix[..., 0, 0], matrix[..., 0, 1]
-    c, d = matrix[..., 1, 0], matrix[..., 1, 1]
-    determinant = a * d - b * c
-    x, y = right[..., 0], right[..., 1]
-    return np.stack((d * x - b * y, a * y - c * x), axis=-1) / determinant[..., None]
+    def _lens(self) -> Lens:
+        return (self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)

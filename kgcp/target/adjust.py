@@ -126,7 +126,7 @@ def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:
 def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | None = None) -> Fit:
     """Estimate the unknowns, in rounds: pixels, noise and outliers are settled anew in each.
 
-    With at most so many pixels, where `most` is given.
+    With at most so many pixels, where `most` is given; where there are more, only roughly.
 
     Raises
     ------
@@ -137,7 +137,8 @@ def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | 
     for _ in range(_MAX_ROUNDS):
         pose, blur, light = parameters.pose, parameters.blur, parameters.light
         sample = choose_sample(imaging, pose, blur, light, most=most, slack_px=_SLACK_PX)
-        fit = _fit_with_noise(sample, parameters, unknowns, steps=_STEPS, enough=_LAST_GAIN)
+        enough = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
+        fit = _fit_with_noise(sample, parameters, unknowns, steps=_STEPS, enough=enough)
         if _is_settled(parameters, fit):
             break
         parameters = fit.parameters
@@ -209,17 +210,18 @@ def minimise(
             damped = _solve(_damped(normal, damping), gradient)
             step[unknowns.free] = damped
             candidate = parameters.moved(step)
-            is_large = 0.5 * float(gradient @ damped) > _LARGE_GAIN
-            if is_large and number < steps - 1:
+            promised = 0.5 * float(gradient @ damped)
+            if promised > _LARGE_GAIN and number < steps - 1:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian
             trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
             trial_total = trial.total + unknowns.penalty(candidate)
-            if trial_total <= total + _NEGLIGIBLE or damping > _MAX_DAMPING:
+            is_better = trial_total <= total + _NEGLIGIBLE
+            if is_better or promised < enough or damping > _MAX_DAMPING:
                 break
             damping *= 10.0
-        if trial_total > total + _NEGLIGIBLE:
+        if not is_better:
             break
         gain, total = total - trial_total, trial_total
         if attempt_jacobian is not jacobian:

@@ -7,8 +7,9 @@ from scipy.special import ndtri
 
 from kgcp.geometry.camera import Camera
 from kgcp.target.adjust import Fit
+from kgcp.target.imager import share_at
 from kgcp.target.layout import Target
-from kgcp.target.light import plateau_levels, share_at
+from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Appearance
 from kgcp.target.window import contour_px, semi_major_axis_px
 

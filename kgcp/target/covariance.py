@@ -22,7 +22,8 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit, noise_of
-from kgcp.target.light import plateau_levels, share_at
+from kgcp.target.imager import share_at
+from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Uncertainty
 
 _ARC_PX = 6.0
@@ -58,10 +59,10 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     scaled = fit.jacobian[fit.unknowns.free] / fit.sd
     circle, arc = _nearest_edges(fit)
     count = int(arc.max()) + 1
-    scores = scaled * fit.misfit.score
-    sums = np.stack([np.bincount(arc, weights=row, minlength=count) for row in scores])
+    sums = np.zeros((len(scaled), count))
+    _add_by_arc(scaled, fit.misfit.score, arc, sums)
     used = int(np.count_nonzero(np.bincount(arc, minlength=count)))
-    correction = used / max(used - len(scores), 0.25 * used)
+    correction = used / max(used - len(scaled), 0.25 * used)
     robust = (correction * inverse @ (sums @ sums.T) @ inverse)[:6, :6]
     plain = inverse[:6, :6]
     inflation = max(1.0, float(np.trace(np.linalg.solve(plain, robust))) / 6.0)
@@ -153,14 +154,23 @@ def _number_arcs(
         nearest = np.inf
         for c in range(len(radii_m)):
             x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
-            off_edge = abs(math.sqrt(x * x + y * y) - radii_m[c])
-            if off_edge < nearest:
-                nearest, circle[i] = off_edge, c
+            square, far = x * x + y * y, radii_m[c] + nearest
+            if square < far * far:
+                off_edge = abs(math.sqrt(square) - radii_m[c])
+                if off_edge < nearest:
+                    nearest, circle[i] = off_edge, c
         c = circle[i]
         x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
         turn = math.atan2(y, x) / (2.0 * math.pi)
         turn -= math.floor(turn)
         arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
+
+
+@compiled
+def _add_by_arc(scaled: FloatArray, score: FloatArray, arc: IndexArray, sums: FloatArray) -> None:
+    for k in range(scaled.shape[0]):
+        for i in range(scaled.shape[1]):
+            sums[k, arc[i]] += scaled[k, i] * score[i]
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:

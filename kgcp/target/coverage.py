@@ -66,7 +66,7 @@ def _views(pose: Pose, rays: FloatArray) -> FloatArray:
 
 
 def _rendered(views: FloatArray, blur: Blur, pairs: EdgePairs, rows: int) -> FloatArray:
-    out = np.empty((rows, views.shape[1]))
+    out = np.zeros((rows, views.shape[1]))
     out[0] = pairs.background
     render(views, blur.vector, pairs.circles, pairs.starts, pairs.members, out)
     return out

@@ -19,6 +19,7 @@ from kgcp.target.pairs import Blur
 from kgcp.target.plate import plate_points
 
 _BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
+_ENOUGH_PIXELS = 4000  # for a median
 _CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
@@ -88,19 +89,29 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
         `NO_CONTRAST` if ink is not darker than the plate.
     """
     window, circles = imaging.window, imaging.circles
-    x, y = points_m = plate_points(pose, window.rays)
-    share, off_edge_m = np.ones(len(x)), np.full(len(x), np.inf)
+    some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
+    levels = window.levels[some]
+    x, y = points_m = plate_points(pose, window.rays[:, some])
+    share, off_edge_m = np.ones(len(x)), np.empty(len(x))
     _fill_plateaus(
         points_m, circles.centres_m, circles.radii_m, circles.signs, 0.0, share, off_edge_m
     )
     inside = x * x + y * y < imaging.outer_radius_m**2
     black, white = (
-        _median_of_clearest(window.levels[chosen], off_edge_m[chosen])
+        _median_of_clearest(levels[chosen], off_edge_m[chosen])
         for chosen in (inside & (share < 0.5), inside & (share > 0.5))
     )
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
     return light_of_levels(black, white, imaging.response)
+
+
+def _uneven(step: int, width: int) -> int:
+    """Return a step of about this size that does not stay in the same columns of a window."""
+    step = max(1, step)
+    while step > 1 and math.gcd(step, width) > 1:
+        step -= 1
+    return step
 
 
 def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
@@ -140,7 +151,7 @@ def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
     count = seen.points_m.shape[1]
     if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
         return np.zeros(count, dtype=bool)
-    share, off_edge = np.ones(count), np.full(count, np.inf)
+    share, off_edge = np.ones(count), np.empty(count)
     circles, per_px = imaging.circles, 1.0 / seen.metres_per_px
     small_m = _SMALL_SIGMAS * sd_px * seen.metres_per_px
     _fill_plateaus(
@@ -195,12 +206,17 @@ def _fill_plateaus(
 ) -> None:
     """Fill in the white share without blur, and the distance to the nearest edge or small disc."""
     for i in range(points_m.shape[1]):
+        nearest = np.inf
         for c in range(len(radii_m)):
             dx, dy = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
-            inward = radii_m[c] - math.sqrt(dx * dx + dy * dy)
-            if inward > 0.0:
+            square, radius = dx * dx + dy * dy, radii_m[c]
+            is_inside = square < radius * radius
+            if is_inside:
                 share[i] += signs[c]
-            off = abs(inward)
-            if inward > 0.0 and radii_m[c] < small_m:
-                off = 0.0
-            off_edge_m[i] = min(off_edge_m[i], off)
+            if is_inside and radius < small_m:
+                nearest = 0.0
+            limit = radius - nearest if is_inside else radius + nearest
+            is_farther = square < limit * limit if is_inside else square > limit * limit
+            if not is_farther or limit < 0.0:  # roots are what costs here
+                nearest = min(nearest, abs(radius - math.sqrt(square)))
+        off_edge_m[i] = nearest

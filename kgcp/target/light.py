@@ -11,15 +11,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
-from kgcp.target.coverage import WhiteShare
 from kgcp.target.pairs import Blur
-from kgcp.target.sharpening import Mask
 
 
 class Param(IntEnum):
@@ -44,10 +43,6 @@ PARAM_COUNT = 19
 _NO_POSE = (0.0,) * 6
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
-# The gradient of the light is left out: over a whole ring, it is flat over the mask.
-_FILTERED = [*range(9), Param.BLACK, Param.WHITE]
-_STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
-_TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +77,7 @@ class Light:
         return (*levels, self.tone_1, self.tone_2, self.tone_3, self.sharpening)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Parameters:
     """Everything that the adjustment estimates."""
 
@@ -102,129 +97,13 @@ class Parameters:
         blur = Blur(mean + difference, mean - difference, xy, *streak)
         return Parameters(self.pose.moved(step[:6]), blur, Light(*values[Param.BLACK :]))
 
-    @property
+    @cached_property
     def nuisance_vector(self) -> FloatArray:
         """All parameters (19,) in the order of `Param`, with zeros for the pose."""
         blur, light = self.blur, self.light
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
         values = (mean, difference, blur.xy, blur.streak_x, blur.streak_y, *light.values)
         return np.array((*_NO_POSE, *values))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Imager:
-    """From white share to grey value, for the n pixels of one sample.
-
-    Attributes
-    ----------
-    offsets : (2, n) array
-        From the target's centre, in ring radii.
-    response : Response
-        `linear` and `srgb` are applied as known; `unknown` uses the tone parameters.
-    mask : Mask or None
-        Of the camera's sharpening; None: it does not sharpen.
-    plateau : (q,) array
-        White share of the mask's other pixels as if there were no blur; empty without a mask.
-    """
-
-    offsets: FloatArray
-    response: Response
-    mask: Mask | None
-    plateau: FloatArray
-
-    def levels(self, share: FloatArray, light: Light) -> FloatArray:
-        """Return the modelled grey values (n,) before clipping."""
-        core = light.black + (light.white - light.black) * tone_curve(share, light)
-        value = encoded(core * self._lit(light), self.response)
-        if self.mask is None:
-            return value
-        core = self._plateau_core(light)
-        layers = np.concatenate((value, encoded(core, self.response)))[:, None]
-        return value + light.sharpening * self.mask.detail(layers)[:, 0]
-
-    def linearised(self, share: WhiteShare, light: Light) -> tuple[FloatArray, FloatArray]:
-        """Return the grey values (n,) and their Jacobian (19, n)."""
-        t = share.value
-        arch = t * (1.0 - t)
-        tone = tone_curve(t, light)
-        slope = _tone_slope(t, light)
-        contrast = light.white - light.black
-        gain = self._lit(light)
-        core = light.black + contrast * tone
-        value = core * gain
-        if self.response is Response.SRGB:
-            encoding = _srgb_slope(value)
-            value, gain, core = srgb_encoded(value), gain * encoding, core * encoding
-        jacobian = np.empty((PARAM_COUNT, len(t)))
-        np.multiply(share.jacobian, gain * contrast * slope, out=jacobian[:11])
-        jacobian[Param.BLACK] = gain * (1.0 - tone)
-        jacobian[Param.WHITE] = gain * tone
-        np.multiply(self.offsets, core, out=jacobian[Param.SLOPE_X : Param.SLOPE_Y + 1])
-        jacobian[Param.TONE_1 :] = 0.0
-        if self.response is Response.UNKNOWN:
-            jacobian[Param.TONE_1] = gain * contrast * arch
-            jacobian[Param.TONE_2] = jacobian[Param.TONE_1] * (2.0 * t - 1.0)
-            jacobian[Param.TONE_3] = jacobian[Param.TONE_2] * (2.0 * t - 1.0)
-        if self.mask is None:
-            return value, jacobian
-        detail = self._detail(self.mask, value, jacobian, light)
-        jacobian[Param.SHARPENING] = detail
-        return value + light.sharpening * detail, jacobian
-
-    def _lit(self, light: Light) -> FloatArray:
-        lit: FloatArray = 1.0 + light.slope_x * self.offsets[0]
-        lit += light.slope_y * self.offsets[1]
-        return lit
-
-    def _plateau_core(self, light: Light) -> FloatArray:
-        """Return the light without blur; its gradient hardly changes over the mask."""
-        return light.black + (light.white - light.black) * self.plateau
-
-    def _detail(
-        self, mask: Mask, value: FloatArray, jacobian: FloatArray, light: Light
-    ) -> FloatArray:
-        """Sharpen the rows of a Jacobian, and return what the mask adds to the grey values."""
-        rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
-        if jacobian[_STREAK_ROWS].any():
-            rows += _STREAK_ROWS
-        core = self._plateau_core(light)
-        gain = _srgb_slope(core) if self.response is Response.SRGB else 1.0
-        bright = gain * self.plateau
-        count = len(value)
-        layers = np.zeros((count + len(core), 1 + len(rows)))
-        layers[:count, 0], layers[count:, 0] = value, encoded(core, self.response)
-        layers[:count, 1:] = jacobian[rows].T
-        layers[count:, 1 + rows.index(Param.BLACK)] = gain - bright
-        layers[count:, 1 + rows.index(Param.WHITE)] = bright
-        detail = mask.detail(layers)
-        jacobian[rows] += light.sharpening * detail[:, 1:].T
-        return detail[:, 0]
-
-
-def tone_curve(share: FloatArray, light: Light) -> FloatArray:
-    """Return the tone curve (n,) between ink (0) and plate (1), at white shares (n,)."""
-    arch, lean = share * (1.0 - share), 2.0 * share - 1.0
-    tone: FloatArray = share + arch * (light.tone_1 + lean * (light.tone_2 + lean * light.tone_3))
-    return tone
-
-
-def share_at(level: float, light: Light, response: Response) -> float:
-    """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
-    share = np.linspace(0.0, 1.0, 401)
-    core = light.black + (light.white - light.black) * tone_curve(share, light)
-    grey = np.maximum.accumulate(encoded(core, response))
-    return float(np.interp(level, grey, share))
-
-
-def _tone_slope(share: FloatArray, light: Light) -> FloatArray:
-    arch, lean = share * (1.0 - share), 2.0 * share - 1.0
-    slope: FloatArray = (
-        1.0
-        - light.tone_1 * lean
-        + light.tone_2 * (6.0 * arch - 1.0)
-        + light.tone_3 * lean * (8.0 * arch - 1.0)
-    )
-    return slope
 
 
 def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
@@ -260,6 +139,7 @@ def srgb_encoded(light: FloatArray) -> FloatArray:
     return np.where(light > 0.0031308, 1.055 * safe ** (1.0 / 2.4) - 0.055, 12.92 * light)
 
 
-def _srgb_slope(light: FloatArray) -> FloatArray:
+def srgb_slope(light: FloatArray) -> FloatArray:
+    """Return the derivative of `srgb_encoded`."""
     safe = np.maximum(light, 0.0031308)
     return np.where(light > 0.0031308, 1.055 / 2.4 * safe ** (1.0 / 2.4 - 1.0), 12.92)

@@ -7,7 +7,6 @@ are adjusted; the one that fits better is reported, the other one kept with how 
 from __future__ import annotations
 
 import contextlib
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +15,15 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit, Unknowns, adjust, approach, minimise
+from kgcp.target.adjust import Fit, adjust, approach, minimise
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
 from kgcp.target.foreign import first_levels
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
-from kgcp.target.light import PARAM_COUNT, Param, Parameters
+from kgcp.target.light import Parameters
 from kgcp.target.noise import find_censoring
+from kgcp.target.nuisance import adjust_with_streak, unknowns_of
 from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
@@ -36,28 +36,8 @@ _MARGIN_PX = 12.0
 _START_BLUR, _START_SLACK_PX = Blur(0.5, 0.5, 0.0), 1.5
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 _SPILT_PX = (0.7, 1.4)  # by which edges may be displaced
-_SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
 _HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose is fitted no better
-
-_PRIOR_SD = {
-    Param.BLUR_DIFFERENCE: 0.5,
-    Param.BLUR_XY: 0.5,
-    Param.SLOPE_X: 0.05,
-    Param.SLOPE_Y: 0.05,
-    Param.TONE_1: 0.7,
-    Param.TONE_2: 0.5,
-    Param.TONE_3: 0.5,
-    Param.SHARPENING: 0.7,
-}
-_ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
-_GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
-_STREAK = [Param.STREAK_X, Param.STREAK_Y]
-_OF_RESPONSE = {
-    Response.LINEAR: [],
-    Response.SRGB: [Param.SHARPENING],
-    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,22 +172,8 @@ def _approach(imaging: Imaging, pose: Pose) -> Fit:
     light = first_levels(imaging, pose)
     few = imaging.few_pixels
     sample = choose_sample(imaging, pose, _START_BLUR, light, most=few, slack_px=_START_SLACK_PX)
-    unknowns = _unknowns(imaging.response, has_streak=False)
+    unknowns = unknowns_of(imaging.response, has_streak=False)
     return approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
-
-
-def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
-    """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
-    streak = _streak_of(start.blur)
-    if streak is None:
-        best = adjust(imaging, start, _unknowns(imaging.response, has_streak=False, moves=moves))
-        streak, start = _streak_of(best.parameters.blur), best.parameters
-        if streak is None:
-            return best
-    unknowns = _unknowns(imaging.response, has_streak=True, moves=moves)
-    streaked = Parameters(start.pose, streak, start.light)
-    near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
-    return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
 def _choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
@@ -253,26 +219,6 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
             break
         mirrored, linear = other.parameters, (other.prediction, other.jacobian)
     return other
-
-
-def _unknowns(response: Response, *, has_streak: bool, moves: bool = True) -> Unknowns:
-    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_RESPONSE[response]]
-    precision = np.zeros(PARAM_COUNT)
-    for param, sd in _PRIOR_SD.items():
-        precision[param] = sd**-2 if param in free else 0.0
-    return Unknowns(np.array(sorted(free)[0 if moves else 6 :]), np.zeros(PARAM_COUNT), precision)
-
-
-def _streak_of(blur: Blur) -> Blur | None:
-    """Read an elongated Gaussian as a streak of uniform motion; None if it is too short."""
-    difference, mean = 0.5 * (blur.xx - blur.yy), 0.5 * (blur.xx + blur.yy)
-    half_range = math.hypot(difference, blur.xy)
-    length = math.sqrt(24.0 * half_range)
-    if length < _SHORTEST_STREAK_PX:
-        return None
-    direction = 0.5 * math.atan2(blur.xy, difference)
-    across = mean - half_range
-    return Blur(across, across, 0.0, length * math.cos(direction), length * math.sin(direction))
 
 
 def _observation(

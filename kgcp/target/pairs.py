@@ -111,8 +111,9 @@ def pair_edges(
     sd_m = blur.largest_sd_px * metres_per_px
     reach_m = REACH_SIGMAS * sd_m + _SLACK_PX * metres_per_px
     sharpest_m = blur.smallest_sd_px * metres_per_px
-    rules = [quadrature_for(radius / sd_m, radius / sharpest_m) for radius in circles.radii_m]
-    table = np.column_stack((circles.centres_m.T, circles.radii_m, circles.signs, rules))
+    rules = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
+    columns = (circles.centres_m.T, circles.radii_m, circles.signs, rules.astype(np.float64))
+    table: FloatArray = np.column_stack(columns)
     count = points_m.shape[1]
     starts, background = np.zeros(count + 1, dtype=np.intp), np.ones(count)
     members = np.empty(count * len(table), dtype=np.intp)
@@ -133,10 +134,10 @@ def _pair(
     for i in range(points_m.shape[1]):
         for c in range(circles.shape[0]):
             dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
-            inward = circles[c, 2] - math.sqrt(dx * dx + dy * dy)
-            if inward > reach_m:
+            square, within = dx * dx + dy * dy, circles[c, 2] - reach_m
+            if within > 0.0 and square < within * within:
                 background[i] += circles[c, 3]
-            elif inward >= -reach_m:
+            elif square <= (circles[c, 2] + reach_m) ** 2:
                 members[found] = c
                 found += 1
         starts[i + 1] = found

@@ -17,7 +17,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 
 
 class Quadrature(IntEnum):
@@ -40,17 +40,16 @@ _LARGEST_RATIOS = (1.6, 2.6, 4.0, 6.2, 10.5, np.inf)  # of the radius to σ
 _STRAIGHT_RATIO = 6.0
 
 
-def quadrature_for(radius_over_whole: float, radius_over_sigma: float) -> Quadrature:
-    """Return the cheapest rule whose error stays below 3e-4 of the contrast.
+def quadrature_for(radius_over_whole: FloatArray, radius_over_sigma: FloatArray) -> IndexArray:
+    """Return the cheapest rules (c,) whose error stays below 3e-4 of the contrast.
 
     Parameters
     ----------
-    radius_over_whole, radius_over_sigma : float
-        Radius of the disc, by the standard deviation with the streak and without.
+    radius_over_whole, radius_over_sigma : (c,) arrays
+        Radii of discs, by the standard deviation with the streak and without.
     """
-    if radius_over_whole > _STRAIGHT_RATIO:
-        return Quadrature.EDGE
-    return Quadrature(int(np.searchsorted(_LARGEST_RATIOS, radius_over_sigma)))
+    by_chords = np.searchsorted(_LARGEST_RATIOS, radius_over_sigma)
+    return np.where(radius_over_whole > _STRAIGHT_RATIO, Quadrature.EDGE, by_chords)
 
 
 def _chords(count: int) -> FloatArray:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.special import ndtr
 
-from kgcp.compiled import compiled
+from kgcp.compiled import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.target.quadrature import CHORD_COUNTS, CHORDS, Quadrature
 
@@ -27,7 +27,7 @@ _Blur = tuple[float, float, float, float, float]  # on the plate: xx, xy, yy [mÂ
 _Contribution = tuple[float, float, float, float, float, float, float, float, float]
 
 
-@compiled
+@inlined
 def normal(z: float) -> tuple[float, float]:
     """Return the standard normal distribution function, to 1e-9, and its density.
 
@@ -44,7 +44,7 @@ def normal(z: float) -> tuple[float, float]:
     return below + density * h * slope, density * (1.0 + h * (h * (bend - h * third) - at))
 
 
-@compiled
+@inlined
 def smeared_normal(z: float, half: float) -> tuple[float, float, float]:
     """Return the mean of the normal distribution function from z âˆ’ half to z + half.
 
@@ -62,7 +62,7 @@ def smeared_normal(z: float, half: float) -> tuple[float, float, float]:
     return mean, (below_high - below_low) / (2.0 * half), by_half
 
 
-@compiled
+@inlined
 def chord_profile(
     x: float,
     y: float,
@@ -136,7 +136,7 @@ def chord_profile(
     )
 
 
-@compiled
+@inlined
 def edge_profile(
     rho: float, radius: float, radial: float, tangential: float, smear: float
 ) -> _EdgeProfile:
@@ -166,14 +166,14 @@ def edge_profile(
     return value, -by_depth, by_variance, d_tangential, by_half / (2.0 * sd)
 
 
-@compiled
+@inlined
 def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float, float]:
     """Return the blur's covariance along a direction, across it and mixed."""
     along = (xx * x + 2.0 * xy * y) * x + yy * y * y
     return along, xx + yy - along, (yy - xx) * x * y + xy * (x * x - y * y)
 
 
-@compiled
+@inlined
 def _small(dx: float, dy: float, radius: float, blur: _Blur, rule: int) -> _Contribution:
     """Return what a circle adds that is small against blur or streak.
 
@@ -209,7 +209,7 @@ def _small(dx: float, dy: float, radius: float, blur: _Blur, rule: int) -> _Cont
     )
 
 
-@compiled
+@inlined
 def _large(dx: float, dy: float, radius: float, blur: _Blur) -> _Contribution:
     """Return what a circle adds that is large against the blur, as `_small` does.
 
@@ -266,7 +266,7 @@ def render(
         derivatives on the plate. That a turn of the plate changes the blur on it is left out: of
         second order.
     """
-    total = np.zeros(9)
+    is_level = out.shape[0] == 1
     for i in range(views.shape[1]):
         xx, xy, yx, yy = views[2, i], views[3, i], views[4, i], views[5, i]
         side_x, side_y = blur[0] * xx + blur[2] * xy, blur[2] * xx + blur[1] * xy
@@ -277,17 +277,18 @@ def render(
             xx * blur[3] + xy * blur[4],
             yx * blur[3] + yy * blur[4],
         )
-        total[:] = 0.0
         for m in range(starts[i], starts[i + 1]):
             c = members[m]
             dx, dy = views[0, i] - circles[c, 0], views[1, i] - circles[c, 1]
             radius, sign, rule = circles[c, 2], circles[c, 3], circles[c, 4]
-            if rule == _EDGE:
-                part = _large(dx, dy, radius, there)
+            if is_level and rule == _EDGE:
+                out[0, i] += sign * _large(dx, dy, radius, there)[0]
+            elif is_level:
+                out[0, i] += sign * _small(dx, dy, radius, there, int(rule))[0]
             else:
-                part = _small(dx, dy, radius, there, int(rule))
-            for k in range(9):
-                total[k] += sign * part[k]
-        out[0, i] += total[0]
-        for k in range(1, out.shape[0]):
-            out[k, i] = total[k]
+                if rule == _EDGE:
+                    part = _large(dx, dy, radius, there)
+                else:
+                    part = _small(dx, dy, radius, there, int(rule))
+                for k in range(9):
+                    out[k, i] += sign * part[k]

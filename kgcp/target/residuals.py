@@ -13,7 +13,8 @@ from kgcp.target.adjust import predict
 from kgcp.target.foreign import first_levels
 from kgcp.target.layout import Target
 from kgcp.target.light import Parameters, plateau_levels
-from kgcp.target.model import adjust_with_streak, imaging_of
+from kgcp.target.model import imaging_of
+from kgcp.target.nuisance import adjust_with_streak
 from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
 from kgcp.target.sample import whole_plate

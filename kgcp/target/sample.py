@@ -14,8 +14,9 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
 from kgcp.target.foreign import hidden_pixels, reached_by_surroundings, see_plate
+from kgcp.target.imager import Imager
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT, Imager, Light
+from kgcp.target.light import PARAM_COUNT, Light
 from kgcp.target.noise import Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
 from kgcp.target.plate import largest_metres_per_px, plate_points

@@ -6,11 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
 _REACH_SIGMAS = 2.5  # of the mask
+
+SingleArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,20 +40,43 @@ class Mask:
     along_columns: IndexArray
     kernel: FloatArray
 
-    def detail(self, layers: FloatArray) -> FloatArray:
-        """Return what the mask adds at full strength (n, k).
+    def detail(self, values: FloatArray) -> FloatArray:
+        """Return what the mask adds at full strength (n,).
 
         Parameters
         ----------
-        layers : (n + q, k) array
-            Values of the modelled pixels, then of the others, layer by layer.
+        values : (n + q,) array
+            Of the modelled pixels, then of the others.
         """
-        between = np.empty((len(self.along_rows), layers.shape[1]))
-        _add_up(layers, self.along_rows, self.kernel, between)
-        smooth = np.empty((len(self.along_columns), layers.shape[1]))
-        _add_up(between, self.along_columns, self.kernel, smooth)
-        detail: FloatArray = layers[: len(smooth)] - smooth
-        return detail
+        between, smooth = np.empty(len(self.along_rows)), np.empty(len(self.along_columns))
+        _smooth(values, self.along_rows, self.kernel, between)
+        _smooth(between, self.along_columns, self.kernel, smooth)
+        return values[: len(smooth)] - smooth
+
+    def sharpen(
+        self, jacobian: FloatArray, rows: IndexArray, others: FloatArray, strength: float
+    ) -> None:
+        """Sharpen some rows of a Jacobian (…, n).
+
+        In single precision, which is enough for derivatives and takes half the time.
+
+        Parameters
+        ----------
+        jacobian : (…, n) array
+            Changed in place.
+        rows : (k,) array of int
+        others : (2, q) array
+            Values of the first two of these rows at the other pixels, where the rest is 0.
+        strength : float
+        """
+        count = len(self.along_columns)
+        layers = np.zeros((count + others.shape[1], len(rows)), dtype=np.float32)
+        between = np.empty((len(self.along_rows), len(rows)), dtype=np.float32)
+        kernel = self.kernel.astype(np.float32)
+        _stack(jacobian, rows, layers)
+        layers[count:, :2] = others.T
+        _smooth_layers(layers, self.along_rows, kernel, between)
+        _add_detail(layers, between, self.along_columns, kernel, rows, strength, jacobian)
 
 
 def unsharp_mask(width: int, height: int, index: IndexArray, sigma_px: float) -> Mask:
@@ -88,12 +114,54 @@ def _numbered(pixels: IndexArray, size: int, first: IndexArray) -> tuple[IndexAr
 
 
 @compiled
-def _add_up(source: FloatArray, at: IndexArray, kernel: FloatArray, out: FloatArray) -> None:
-    """Add up weighted rows of a table: out[i] = Σ kernel[j] · source[at[i, j]]."""
+def _smooth(source: FloatArray, at: IndexArray, kernel: FloatArray, out: FloatArray) -> None:
+    """Add up weighted values: out[i] = Σ kernel[j] · source[at[i, j]]."""
     for i in range(at.shape[0]):
-        for k in range(source.shape[1]):
-            out[i, k] = 0.0
+        total = 0.0
+        for j in range(at.shape[1]):
+            total += kernel[j] * source[at[i, j]]
+        out[i] = total
+
+
+@compiled
+def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
+    """Put all that belongs to a pixel side by side."""
+    for i in range(jacobian.shape[1]):
+        for k in range(len(rows)):
+            layers[i, k] = jacobian[rows[k], i]
+
+
+@compiled
+def _smooth_layers(
+    source: SingleArray, at: IndexArray, kernel: SingleArray, out: SingleArray
+) -> None:
+    """Do as `_smooth` for every layer."""
+    for i in range(at.shape[0]):
+        out[i] = 0.0
         for j in range(at.shape[1]):
             row, weight = at[i, j], kernel[j]
             for k in range(source.shape[1]):
                 out[i, k] += weight * source[row, k]
+
+
+@compiled
+def _add_detail(
+    layers: SingleArray,
+    between: SingleArray,
+    at: IndexArray,
+    kernel: SingleArray,
+    rows: IndexArray,
+    strength: float,
+    jacobian: FloatArray,
+) -> None:
+    """Smooth along columns, and add what that takes away."""
+    detail = np.empty(len(rows), dtype=np.float32)
+    for i in range(at.shape[0]):
+        for k in range(len(rows)):
+            detail[k] = layers[i, k]
+        for j in range(at.shape[1]):
+            row, weight = at[i, j], kernel[j]
+            for k in range(len(rows)):
+                detail[k] -= weight * between[row, k]
+        for k in range(len(rows)):
+            jacobian[rows[k], i] += strength * detail[k]

@@ -87,21 +87,22 @@ def check_code(fit: Fit, ring: Ring) -> None:
     with np.errstate(invalid="ignore"):  # NaN where the frame ends: says nothing
         extra = float(np.nanmax(np.append(excess[between], 0.0)))
         missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
-    moved = max(_displacement(excess, off_deg, ring) for off_deg in off_dot_deg.T)
+    moved = _largest_displacement(excess, off_dot_deg, ring)
     if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
         light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
         raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
 
 
-def _displacement(excess: FloatArray, off_deg: FloatArray, ring: Ring) -> float:
+def _largest_displacement(excess: FloatArray, off_dot_deg: FloatArray, ring: Ring) -> float:
     """Return the light that is too much on one side of a dot and too little on the other."""
     reach_deg = 2.0 * ring.dot_half_angle_deg
-    left = excess[(off_deg < 0.0) & (off_deg >= -reach_deg)]
-    right = excess[(off_deg > 0.0) & (off_deg <= reach_deg)]
-    sides = [np.nan_to_num(side) for side in (left, right)]
-    most = [float(side.max(initial=0.0)) for side in sides]
-    lack = [float(-side.min(initial=0.0)) for side in sides]
-    return max(min(most[0], lack[1]), min(most[1], lack[0]))
+    left = (off_dot_deg < 0.0) & (off_dot_deg >= -reach_deg)
+    right = (off_dot_deg > 0.0) & (off_dot_deg <= reach_deg)
+    known = np.nan_to_num(excess)[:, None]
+    most_left, most_right = (np.max(known * side, axis=0) for side in (left, right))
+    lack_left, lack_right = (np.max(-known * side, axis=0) for side in (left, right))
+    moved = np.maximum(np.minimum(most_left, lack_right), np.minimum(most_right, lack_left))
+    return float(moved.max())
 
 
 def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:

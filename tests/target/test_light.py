@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import WhiteShare
+from kgcp.target.imager import Imager
 from kgcp.target.light import (
     PARAM_COUNT,
-    Imager,
     Light,
     Param,
     Parameters,

@@ -48,12 +48,16 @@ def test_the_normal_distribution() -> None:
     np.testing.assert_allclose(density, expected, rtol=0.0, atol=1e-8)
 
 
+def rule_for(ratio_whole: float, ratio_sigma: float) -> Quadrature:
+    return Quadrature(quadrature_for(np.array([ratio_whole]), np.array([ratio_sigma]))[0])
+
+
 @settings(deadline=None)
 @given(ratio=st.floats(0.1, 60.0), sigma=st.floats(0.3, 3.0))
 def test_every_disc_is_the_noncentral_chi_square(ratio: float, sigma: float) -> None:
     radius = ratio * sigma
     rho = np.linspace(max(1e-3, radius - 4.0 * sigma), radius + 4.0 * sigma, 41)
-    rule = quadrature_for(ratio, ratio)
+    rule = rule_for(ratio, ratio)
     if rule is Quadrature.EDGE:
         level = edge(rho, radius, sigma**2, sigma**2, 0.0)[0]
     else:
@@ -85,7 +89,7 @@ def test_a_streak_is_the_mean_of_shifted_discs(radius: float, length: float) -> 
     """Against the noncentral χ² distribution, averaged over the exposure."""
     sigma = 0.7
     whole = np.hypot(sigma, length / np.sqrt(12.0))
-    rule = quadrature_for(radius / whole, radius / sigma)
+    rule = rule_for(radius / whole, radius / sigma)
     assert rule is not Quadrature.EDGE
     shifts = length * ((np.arange(600) + 0.5) / 600 - 0.5)
     for y in (0.0, 0.6 * radius, 0.97 * radius, radius + sigma):
@@ -102,7 +106,7 @@ def test_anisotropic_blur_against_random_shifts() -> None:
     covariance = np.array([[0.9, 0.5], [0.5, 1.6]])
     shifts = rng.multivariate_normal(np.zeros(2), covariance, size=400_000)
     radius = 2.2
-    rule = quadrature_for(2.2 / np.sqrt(1.6), 2.2 / np.sqrt(1.6))
+    rule = rule_for(2.2 / np.sqrt(1.6), 2.2 / np.sqrt(1.6))
     for rho in (0.5, 1.8, 2.4, 3.5):
         covered = np.hypot(rho + shifts[:, 0], shifts[:, 1]) <= radius
         expected = covered.mean()

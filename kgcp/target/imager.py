@@ -1,0 +1,148 @@
+"""From white share to grey value, for all pixels of a sample, with derivatives; compiled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.compiled import compiled
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Response
+from kgcp.target.coverage import WhiteShare
+from kgcp.target.light import PARAM_COUNT, Light, Param, encoded, srgb_slope
+from kgcp.target.sharpening import Mask
+
+# The gradient of the light is left out: over a whole ring, it is flat over the mask.
+_FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
+_STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
+_TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imager:
+    """From white share to grey value, for the n pixels of one sample.
+
+    Attributes
+    ----------
+    offsets : (2, n) array
+        From the target's centre, in ring radii.
+    response : Response
+        `linear` and `srgb` are applied as known; `unknown` uses the tone parameters.
+    mask : Mask or None
+        Of the camera's sharpening; None: it does not sharpen.
+    plateau : (q,) array
+        White share of the mask's other pixels as if there were no blur; empty without a mask.
+    """
+
+    offsets: FloatArray
+    response: Response
+    mask: Mask | None
+    plateau: FloatArray
+
+    def levels(self, share: FloatArray, light: Light) -> FloatArray:
+        """Return the modelled grey values (n,) before clipping."""
+        value = np.empty(len(share))
+        _expose(share, self.offsets, light.values, value)
+        value = encoded(value, self.response)
+        if self.mask is None:
+            return value
+        return value + light.sharpening * self._detail(self.mask, value, light)
+
+    def linearised(self, share: WhiteShare, light: Light) -> tuple[FloatArray, FloatArray]:
+        """Return the grey values (n,) and their Jacobian (19, n)."""
+        value = np.empty(len(share.value))
+        jacobian = np.empty((PARAM_COUNT, len(value)))
+        has_tone = self.response is Response.UNKNOWN
+        _expose_with_slopes(
+            share.value, share.jacobian, self.offsets, light.values, has_tone, value, jacobian
+        )
+        if self.response is Response.SRGB:
+            jacobian *= srgb_slope(value)
+            value = encoded(value, self.response)
+        if self.mask is None:
+            return value, jacobian
+        self._sharpen(self.mask, jacobian, light)
+        detail = self._detail(self.mask, value, light)
+        jacobian[Param.SHARPENING] = detail
+        return value + light.sharpening * detail, jacobian
+
+    def _core_of_plateau(self, light: Light) -> FloatArray:
+        """Return the light without blur; its gradient hardly changes over the mask."""
+        return light.black + (light.white - light.black) * self.plateau
+
+    def _detail(self, mask: Mask, value: FloatArray, light: Light) -> FloatArray:
+        """Return what the mask adds to the grey values at full strength."""
+        others = encoded(self._core_of_plateau(light), self.response)
+        return mask.detail(np.concatenate((value, others)))
+
+    def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
+        """Sharpen the rows of a Jacobian."""
+        rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
+        if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
+            rows += _STREAK_ROWS
+        others = np.stack((1.0 - self.plateau, self.plateau))
+        if self.response is Response.SRGB:
+            others *= srgb_slope(self._core_of_plateau(light))
+        mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
+
+
+def tone_curve(share: FloatArray, light: Light) -> FloatArray:
+    """Return the grey values (n,) before any encoding at white shares (n,), in even light."""
+    value = np.empty(len(share))
+    _expose(share, np.zeros((2, len(share))), light.values, value)
+    return value
+
+
+def share_at(level: float, light: Light, response: Response) -> float:
+    """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
+    share = np.linspace(0.0, 1.0, 401)
+    grey = np.maximum.accumulate(encoded(tone_curve(share, light), response))
+    return float(np.interp(level, grey, share))
+
+
+@compiled
+def _expose(
+    share: FloatArray, offsets: FloatArray, light: tuple[float, ...], value: FloatArray
+) -> None:
+    """Fill in black + (white − black) · tone(share), times the gradient of the light."""
+    black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
+    for i in range(len(share)):
+        t = share[i]
+        lean = 2.0 * t - 1.0
+        tone = t + t * (1.0 - t) * (tone_1 + lean * (tone_2 + lean * tone_3))
+        lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
+        value[i] = (black + (white - black) * tone) * lit
+
+
+@compiled
+def _expose_with_slopes(
+    share: FloatArray,
+    by_geometry: FloatArray,
+    offsets: FloatArray,
+    light: tuple[float, ...],
+    has_tone: bool,  # noqa: FBT001 - compiled functions have no keywords
+    value: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Do as `_expose`, with derivatives by geometry (11, n), then in the order of `Param`."""
+    black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
+    contrast = white - black
+    for i in range(len(share)):
+        t = share[i]
+        arch, lean = t * (1.0 - t), 2.0 * t - 1.0
+        tone = t + arch * (tone_1 + lean * (tone_2 + lean * tone_3))
+        slope = 1.0 - tone_1 * lean
+        slope += tone_2 * (6.0 * arch - 1.0) + tone_3 * lean * (8.0 * arch - 1.0)
+        lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
+        core = black + contrast * tone
+        value[i] = core * lit
+        gain = contrast * lit
+        for k in range(11):
+            jacobian[k, i] = gain * slope * by_geometry[k, i]
+        jacobian[11, i] = lit * (1.0 - tone)
+        jacobian[12, i] = lit * tone
+        jacobian[13, i], jacobian[14, i] = core * offsets[0, i], core * offsets[1, i]
+        bend = gain * arch if has_tone else 0.0
+        jacobian[15, i], jacobian[16, i], jacobian[17, i] = bend, bend * lean, bend * lean * lean
+        jacobian[18, i] = 0.0

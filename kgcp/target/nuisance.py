@@ -1,0 +1,72 @@
+"""What is estimated besides the pose, and how: light by the response, blur round or as a streak."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kgcp.geometry.camera import Response
+from kgcp.target.adjust import Fit, Unknowns, adjust
+from kgcp.target.imaging import Imaging
+from kgcp.target.light import PARAM_COUNT, Param, Parameters
+from kgcp.target.pairs import Blur
+
+_SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
+
+_PRIOR_SD = {
+    Param.BLUR_DIFFERENCE: 0.5,
+    Param.BLUR_XY: 0.5,
+    Param.SLOPE_X: 0.05,
+    Param.SLOPE_Y: 0.05,
+    Param.TONE_1: 0.7,
+    Param.TONE_2: 0.5,
+    Param.TONE_3: 0.5,
+    Param.SHARPENING: 0.7,
+}
+_WHITE, _WHITE_SD = 1.0, 0.4  # burnt plates of unknown tone: lest white and tone drift together
+_ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
+_GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
+_STREAK = [Param.STREAK_X, Param.STREAK_Y]
+_OF_RESPONSE = {
+    Response.LINEAR: [],
+    Response.SRGB: [Param.SHARPENING],
+    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
+}
+
+
+def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
+    """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
+    streak = _streak_of(start.blur)
+    if streak is None:
+        best = adjust(imaging, start, unknowns_of(imaging.response, has_streak=False, moves=moves))
+        streak, start = _streak_of(best.parameters.blur), best.parameters
+        if streak is None:
+            return best
+    unknowns = unknowns_of(imaging.response, has_streak=True, moves=moves)
+    streaked = Parameters(start.pose, streak, start.light)
+    near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
+    return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
+
+
+def unknowns_of(response: Response, *, has_streak: bool, moves: bool = True) -> Unknowns:
+    """Return which parameters are free, with weak priors on what one frame hardly tells."""
+    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_RESPONSE[response]]
+    mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
+    for param, sd in _PRIOR_SD.items():
+        precision[param] = sd**-2 if param in free else 0.0
+    if response is Response.UNKNOWN:
+        mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
+    return Unknowns(np.array(sorted(free)[0 if moves else 6 :]), mean, precision)
+
+
+def _streak_of(blur: Blur) -> Blur | None:
+    """Read an elongated Gaussian as a streak of uniform motion; None if it is too short."""
+    difference, mean = 0.5 * (blur.xx - blur.yy), 0.5 * (blur.xx + blur.yy)
+    half_range = math.hypot(difference, blur.xy)
+    length = math.sqrt(24.0 * half_range)
+    if length < _SHORTEST_STREAK_PX:
+        return None
+    direction = 0.5 * math.atan2(blur.xy, difference)
+    across = mean - half_range
+    return Blur(across, across, 0.0, length * math.cos(direction), length * math.sin(direction))
