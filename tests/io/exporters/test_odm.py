@@ -127,6 +127,24 @@ def test_yaw_is_against_true_north_and_zero_with_north_on_top(points: MapPoints)
     assert (pitch, roll) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
+def test_yaw_pitch_and_roll_turn_a_camera_as_odm_does(points: MapPoints) -> None:
+    """By opendm/photo.py: NED ← body by yaw, pitch, roll; body x is the image's up, y its right."""
+    yaw, pitch, roll = np.radians([-123.0, 11.0, -7.0])
+    about_z = [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+    about_y = [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+    about_x = [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
+    ned_from_body = np.array(about_z) @ about_y @ about_x
+    body_from_image = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # x right, y up, z back
+    image_from_camera = np.diag([1.0, -1.0, -1.0])
+    enu_from_ned = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    attitude = enu_from_ned @ ned_from_body @ body_from_image @ image_from_camera
+    on_meridian = np.array([500000.0, 4583523.0, 200.0])  # where grid north is true north
+    prior = replace(points.priors[0], map_from_camera=attitude, position_map=on_meridian)
+    lines = str(odm.files(replace(points, priors=(prior,)))["odm/geo.txt"]).splitlines()
+    angles = [*map(float, lines[1].split()[4:7])]
+    np.testing.assert_allclose(angles, [-123.0, 11.0, -7.0], rtol=0, atol=1e-6)
+
+
 def test_no_accuracies_are_made_up(points: MapPoints) -> None:
     prior = replace(points.priors[0], cov=None)
     lines = str(odm.files(replace(points, priors=(prior,)))["odm/geo.txt"]).splitlines()
