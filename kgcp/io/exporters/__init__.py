@@ -86,7 +86,13 @@ FORMATS: Mapping[str, Format] = {
     ),
     "mmvii": Format(
         "mmvii",
-        ("mmvii/MesGCP-kgcp.xml", "mmvii/MesIm-*.xml", "mmvii/kgcp.obs", "mmvii/HOWTO.txt"),
+        (
+            "mmvii/MesGCP-kgcp.xml",
+            "mmvii/CurSysCo.xml",
+            "mmvii/MesIm-*.xml",
+            "mmvii/kgcp.obs",
+            "mmvii/HOWTO.txt",
+        ),
         "MMVII: points and marks with covariances, distances, in a local frame",
     ),
     "colmap": Format(

@@ -73,14 +73,37 @@ def local_cameras(points: MapPoints) -> tuple[FloatArray, FloatArray]:
     return position_m, frame.grid_rotation(position_m)
 
 
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The local frame's origin as PROJ takes it.
+
+    Attributes
+    ----------
+    longitude, latitude, height : str
+        In degrees and metres above the ellipsoid.
+    ellipsoid : str
+        PROJ's parameters of its size.
+    """
+
+    longitude: str
+    latitude: str
+    height: str
+    ellipsoid: str
+
+
+def origin_of(points: MapPoints) -> Origin:
+    """Return the origin of the points' local frame."""
+    frame = local_points(points).frame
+    longitude, latitude, height = frame.geodetic_deg(np.zeros((1, 3)))[0]
+    a, b = frame.semi_axes_m
+    return Origin(f"{longitude:.13f}", f"{latitude:.13f}", f"{height:.7f}", f"+a={a!r} +b={b!r}")
+
+
 def describe_frame(points: MapPoints) -> str:
     """Return lines for a HOWTO that say what the frame is and how to get other points into it."""
-    local = local_points(points)
     crs = points.parsed_crs
-    x, y, z = points.xyz(local.origin_map)
-    lon, lat, h = local.frame.geodetic_deg(np.zeros((1, 3)))[0]
-    a, b = local.frame.semi_axes_m
-    size = f"+a={a!r} +b={b!r}"
+    x, y, z = points.xyz(local_points(points).origin_map)
+    origin = origin_of(points)
     name = crs.name or crs.to_wkt(WktVersion.WKT2_2019)
     return f"""\
 Coordinates are metres east, north and up of an origin, tangent to the ellipsoid of
@@ -88,6 +111,7 @@ Coordinates are metres east, north and up of an origin, tangent to the ellipsoid
 Origin in {points.crs}: x {x}  y {y}  z {z}
 To bring other points (longitude, latitude in degrees, ellipsoidal height of the same
 datum) into this frame, and with cct -I back again:
-  cct -d 6 +proj=pipeline +step +proj=cart {size} \\
-    +step +proj=topocentric {size} +lon_0={lon:.13f} +lat_0={lat:.13f} +h_0={h:.7f}
+  cct -d 6 +proj=pipeline +step +proj=cart {origin.ellipsoid} \\
+    +step +proj=topocentric {origin.ellipsoid} \\
+    +lon_0={origin.longitude} +lat_0={origin.latitude} +h_0={origin.height}
 """

@@ -3,7 +3,9 @@
 By MMVII's Bundle_GCP.cpp, ctopodata.cpp and test data: XML of its serialisation, covariances as
 their upper triangle, row by row; topographic observations as lines `code from to value sigma`, code
 3 a distance, where a name that is no point is looked up among the cameras. MMVII adjusts in
-Cartesian coordinates, so the points are in a local frame.
+Cartesian coordinates, so the points are in a local frame. Topographic observations need to know
+which (Topo.cpp, cSysCo.cpp): CurSysCo beside the points, `RTL*x*y*z*CRS` for east, north, up over
+a point of a CRS.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters.distances import focal_length_note
-from kgcp.io.exporters.local import describe_frame, local_points
+from kgcp.io.exporters.local import describe_frame, local_points, origin_of
 from kgcp.io.exporters.points import (
     MapPoints,
     by_frame,
@@ -33,16 +35,16 @@ _DISTANCE = 3
 _HOWTO = """\
 MMVII (MicMac v2)
 
-Copy MesGCP-kgcp.xml and the MesIm files into MMVII-PhgrProj/ObjCoordWorld/kgcp and
-MMVII-PhgrProj/ObjMesInstr/kgcp (older versions: both into PointsMeasure/kgcp), kgcp.obs into
-MMVII-PhgrProj/Topo/kgcp. The bundle adjustment takes points and marks by
+Copy MesGCP-kgcp.xml and CurSysCo.xml into MMVII-PhgrProj/ObjCoordWorld/kgcp, the MesIm files into
+MMVII-PhgrProj/ObjMesInstr/kgcp (older versions: all of them into PointsMeasure/kgcp), and kgcp.obs
+into MMVII-PhgrProj/Topo/kgcp. Then points, marks and distances go into one adjustment:
 
-  MMVII OriBundleAdj ".*JPG" In Out GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]]
+  MMVII OriBundleAdj ".*JPG" In Out GCP3D=[[kgcp,1]] GCP2D=[[kgcp,1]] TopoDirIn=kgcp
 
-and the distances by its option for topographic surveys (MMVII OriBundleAdj help). The factor of
-the points must be positive: only then may distances refer to them. kgcp.obs has one line per mark:
-3 (distance), image, point, metres, standard deviation. Pixel (0, 0) is the centre of the top-left
-pixel. The block must be in the points' frame before:
+The factor of the points must be positive: only then may distances refer to them. kgcp.obs has one
+line per mark: 3 (distance), image, point, metres, standard deviation. CurSysCo.xml says in which
+frame all this is, which the distances ask for. Pixel (0, 0) is the centre of the top-left pixel.
+The block must be in the points' frame before:
 
 {frame}
 MMVII reads the covariances, and of the points uses the three standard deviations. It does not
@@ -68,6 +70,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
             frame=describe_frame(points), focal_length=focal_length_note(points.controls)
         ),
         "MesGCP-kgcp.xml": _gcps(points, label),
+        "CurSysCo.xml": _system(points),
         "kgcp.obs": _distances(points.controls, names, label),
     }
     for frame, group in by_frame(points.controls).items():
@@ -81,6 +84,15 @@ def _document(root: ET.Element) -> str:
     add_text(wrapper, "Version", '"0.0.0"')
     ET.SubElement(wrapper, "Data").append(root)
     return xml_text(wrapper)
+
+
+def _system(points: MapPoints) -> str:
+    """Return what the frame is; of a PROJ string's axes nobody doubts the order."""
+    origin = origin_of(points)
+    place = f"{origin.longitude}*{origin.latitude}*{origin.height}"
+    root = ET.Element("SysCoData")
+    add_text(root, "Def", f'"RTL*{place}*+proj=longlat {origin.ellipsoid} +no_defs"')
+    return _document(root)
 
 
 def _triangle(cov: FloatArray) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 from pyproj.enums import TransformDirection
+from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
@@ -28,9 +29,9 @@ _GRID = Transformer.from_crs("EPSG:4258", "EPSG:25831", always_xy=True)
 
 def _map_from_local(how_to: str, enu: FloatArray) -> FloatArray:
     """Follow the HOWTO: cct -I with its pipeline, then the CRS's own projection."""
-    match = re.search(r"cct -d 6 (.*?)\\\n(.*?)\n", how_to, re.DOTALL)
+    match = re.search(r"cct -d 6 (.*?)\n[^ ]", how_to, re.DOTALL)
     assert match
-    pipeline = Transformer.from_pipeline(f"{match[1]} {match[2]}")
+    pipeline = Transformer.from_pipeline(match[1].replace("\\\n", " "))
     east, north, up = enu.T
     lon, lat, height = pipeline.transform(east, north, up, direction=TransformDirection.INVERSE)
     return np.column_stack((*_GRID.transform(lon, lat), height))
@@ -137,6 +138,27 @@ def test_mmvii_distances_name_image_and_point(points: MapPoints) -> None:
         assert cells[2] in names
         assert float(cells[3]) == pytest.approx(point.distance_m, abs=1e-9)
         assert float(cells[4]) == pytest.approx(point.sd_distance_m, abs=1e-9)
+
+
+def test_mmvii_knows_the_frame_of_its_points(points: MapPoints) -> None:
+    """By cSysCo.cpp: RTL*x*y*z*CRS, in PROJ's order of axes, is east, north, up over that point."""
+    texts = mmvii.files(points)
+    definition = _bare(_mmvii_data(texts["mmvii/CurSysCo.xml"], "SysCoData"), "Def")
+    kind, *place, crs = definition.split("*")
+    assert kind == "RTL"
+    origin = np.array([float(value) for value in place])
+    to_earth = Transformer.from_crs(crs, "+proj=geocent +ellps=GRS80")
+    shift = np.array(to_earth.transform(origin[0], origin[1], origin[2]))
+    longitude, latitude = np.radians(origin[:2])
+    about_z = Rotation.from_euler("z", longitude + 0.5 * np.pi)
+    turn = (about_z * Rotation.from_euler("x", 0.5 * np.pi - latitude)).as_matrix()
+    entries = _mmvii_points(texts)
+    enu = np.array([_numbers(entry, "Pt") for entry in entries.values()])
+    earth = (enu @ turn.T + shift).T
+    back = Transformer.from_crs("EPSG:4936", "EPSG:4937", always_xy=True).transform(*earth)
+    found = np.column_stack((*_GRID.transform(back[0], back[1]), back[2]))
+    expected = [point.position_map for point in points.controls[:5]]
+    np.testing.assert_allclose(found, expected, atol=1e-6, rtol=0)
 
 
 def test_local_distances_are_true_where_those_of_the_grid_are_not(points: MapPoints) -> None:
