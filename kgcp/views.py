@@ -48,14 +48,21 @@ class Views:
 
 
 def visible_pixel(camera: Camera, point_camera: FloatArray) -> FloatArray:
-    """Project one point (3,) in the camera frame [px].
+    """Project one point (3,) in the camera frame [px], as `visible_pixels`."""
+    (pixel,) = visible_pixels(camera, point_camera[None])
+    return np.asarray(pixel)
+
+
+def visible_pixels(camera: Camera, points_camera: FloatArray) -> FloatArray:
+    """Project points (n, 3) in the camera frame to raw pixels (n, 2).
 
     NaN behind the camera, and beyond the fold of its distortion.
     """
-    if point_camera[2] <= 0.0:
-        return np.full(2, np.nan)
-    normalised = point_camera[:2] / point_camera[2]
-    pixel = camera.distort(normalised)
-    if not np.linalg.norm(camera.undistort(pixel[None])[0] - normalised) < _FOLD_TOLERANCE:
-        return np.full(2, np.nan)
-    return pixel
+    pixels = np.full((len(points_camera), 2), np.nan)
+    ahead = points_camera[:, 2] > 0.0
+    normalised = points_camera[ahead, :2] / points_camera[ahead, 2:]
+    seen = camera.distort(normalised)
+    error = np.linalg.norm(camera.undistort(seen) - normalised, axis=1)
+    seen[~(error < _FOLD_TOLERANCE)] = np.nan
+    pixels[ahead] = seen
+    return pixels

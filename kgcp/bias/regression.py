@@ -65,7 +65,8 @@ class Fit:
     chi2 : float
         Weighted sum of squares that is left.
     moments : (p + 1, p + 1) array
-        Weighted products of the columns, the observations last: enough for any part of the model.
+        Weighted products of the columns, each of unit length, and of the observations: enough for
+        any part of the model.
     """
 
     values: FloatArray
@@ -88,23 +89,27 @@ class Fit:
         return float(self.moments[-1, -1] - right @ np.linalg.solve(normal, right))
 
 
-def fit(design: FloatArray, observed: FloatArray, noise: Noise) -> Fit:
+def fit(design: FloatArray, observed: FloatArray, noise: Noise, *, is_robust: bool = True) -> Fit:
     """Fit design (n, p) to observed (n,), n > p.
 
-    What fits nothing is found first, by Cauchy's weights and the scatter of the rest. Then comes
-    generalised least squares: how long the lasting errors last, and how large they are against
-    the others, is what makes the residuals likeliest (restricted likelihood). The scale of all of
-    them is that of the residuals.
+    What fits nothing is found first, if it shall be, by Cauchy's weights and the scatter of the
+    rest. Then comes generalised least squares: how long the lasting errors last, and how large
+    they are against the others, is what makes the residuals likeliest (restricted likelihood).
+    The scale of all of them is that of the residuals.
     """
-    outlier = find_outliers(design, observed, noise.white + noise.lasting)
+    outlier = np.zeros(len(observed), dtype=bool)
+    if is_robust:
+        outlier = find_outliers(design, observed, noise.white + noise.lasting)
     kept = ~outlier
-    columns = np.column_stack((design, observed))[kept]
+    size = np.linalg.norm(design[kept], axis=0)  # distances and their squares, ones and millionths
+    columns = np.column_stack((design / size, observed))[kept]
     best, correlation_s = _likeliest(columns, noise.kept(kept))
     count = design.shape[1]
     values = np.asarray(np.linalg.solve(best[:count, :count], best[:count, count]), dtype=float)
-    chi2 = float(best[count, count] - best[:count, count] @ values)
+    chi2 = max(0.0, float(best[count, count] - best[:count, count] @ values))
     freedom = len(columns) - count
     cov = np.linalg.inv(best[:count, :count]) * chi2 / freedom
+    values, cov = values / size, cov / np.outer(size, size)
     return Fit(values, cov, outlier, chi2 / freedom, freedom, correlation_s, chi2, best)
 
 

@@ -45,17 +45,20 @@ class Slope:
         return self.height + self.value * offset, np.hypot(self.sd_height, self.sd_value * offset)
 
 
-def fit_slope(x: FloatArray, y: FloatArray, sd: FloatArray) -> Slope | None:
+def fit_slope(
+    x: FloatArray, y: FloatArray, sd: FloatArray, *, is_robust: bool = True
+) -> Slope | None:
     """Fit a line to points (n,) with deviations of y known to a factor; None where x says little.
 
-    Robust; deviations are those of the scatter.
+    Deviations are those of the scatter; robust, unless what is far off the others counts most.
     """
     if len(x) < _MIN_COUNT or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
     weight = sd**-2.0
     middle = float(weight @ x / weight.sum())
     design = np.column_stack((np.ones_like(x), x - middle))
-    found = fit(design, y, Noise(sd**2, np.zeros_like(x), np.arange(len(x), dtype=np.float64)))
+    noise = Noise(sd**2, np.zeros_like(x), np.arange(float(len(x))))
+    found = fit(design, y, noise, is_robust=is_robust)
     kept = ~found.outlier
     if np.ptp(x[kept]) == 0.0 or not found.sds.all():
         return None

@@ -16,7 +16,7 @@ from kgcp.geometry.reference import ReferencePoses
 from kgcp.settings import Method
 from kgcp.target.layout import Target
 from kgcp.target.sighting import Sighting
-from kgcp.views import Views, visible_pixel
+from kgcp.views import Views, visible_pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,10 +220,26 @@ def study_bias(
     places = whereabouts.places([attempt.target for attempt in posed], times)
     views = Views.of(poses, whereabouts.frame)
     diameters = {target.name: target.ring.outer_diameter_m for target in targets}
-    compared = [
-        _compare(camera, views, rows[attempt.frame], attempt, place, diameters[attempt.target])
+    placed = [
+        (attempt, place, rows[attempt.frame])
         for attempt, place in zip(posed, places, strict=True)
         if isinstance(place, Place)
+    ]
+    in_camera = [
+        (place.position_m - views.centre_m[row]) @ views.enu_from_camera[row]
+        for _, place, row in placed
+    ]
+    pixels = visible_pixels(camera, np.reshape(in_camera, (-1, 3)))
+    compared = [
+        _compare(
+            attempt,
+            place,
+            views,
+            row,
+            pixel,
+            0.5 * diameters[attempt.target] * camera.mean_focal_px,
+        )
+        for (attempt, place, row), pixel in zip(placed, pixels, strict=True)
     ]
     measured = tuple(one for one in compared if one.attempt.sighting is not None)
     agree = 2 * sum(one.is_astray for one in measured) < len(measured)
@@ -262,19 +278,23 @@ def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
 
 
 def _compare(
-    camera: Camera, views: Views, row: int, attempt: Attempt, place: Place, diameter_m: float
+    attempt: Attempt,
+    place: Place,
+    views: Views,
+    row: int,
+    expected_px: FloatArray,
+    radius_px_m: float,
 ) -> Comparison:
     """Compare one attempt with the pose in `row`."""
-    centre = views.centre_m[row]
-    sight = place.position_m - centre
+    sight = place.position_m - views.centre_m[row]
     distance = float(np.linalg.norm(sight))
     return Comparison(
         attempt=attempt,
-        camera_m=centre,
+        camera_m=views.centre_m[row],
         place_m=place.position_m,
         sds=_reference_sds(sight / distance, place, views, row),
-        expected_px=visible_pixel(camera, sight @ views.enu_from_camera[row]),
-        expected_radius_px=0.5 * diameter_m * camera.mean_focal_px / distance,
+        expected_px=expected_px,
+        expected_radius_px=radius_px_m / distance,
     )
 
 

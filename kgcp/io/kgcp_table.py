@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import fields
 
 import numpy as np
 
 from kgcp.bias.edges import edge_distances
-from kgcp.bias.study import Comparison
+from kgcp.bias.study import Comparison, Exposure
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.tables import Row, time_cell
 from kgcp.kgcps import Kgcp
 from kgcp.settings import Method
+
+_EXPOSURE = tuple(field.name for field in fields(Exposure))
 
 
 def kgcp_row(point: Kgcp) -> Row:
@@ -53,7 +55,7 @@ def bias_row(measured: Comparison, method: Method) -> Row:
         "sd_reference_distance_m": None if measured.sds is None else measured.sds.total_m,
         "residual_m": measured.residual_m,
         "residual_percent": measured.residual_percent,
-        **asdict(measured.attempt.exposure),
+        **{name: getattr(measured.attempt.exposure, name) for name in _EXPOSURE},
     }
 
 

@@ -247,7 +247,9 @@ def _influences(data: Residuals, percent: FloatArray) -> tuple[Influence, ...]:
                 rows,
                 column[rows],
                 fit_slope(x[rows], percent[rows], sd_percent[rows]),
-                None if own else fit_slope(x[both], shift[both], np.ones(len(both))),
+                None
+                if own
+                else fit_slope(x[both], shift[both], np.ones(len(both)), is_robust=False),
             )
         )
     return tuple(influences)
