@@ -27,11 +27,14 @@ covariance, here from the plate and its vehicle's attitude, for the images that 
 2. python add_pose_priors.py database.db        needs pycolmap (pip install pycolmap)
    It replaces priors of these images, and leaves those of others, such as GPS from EXIF: those are
    WGS 84 and cannot be mixed with these Cartesian ones. Add --only to remove them.
-3. colmap pose_prior_mapper --database_path database.db --image_path frames --output_path sparse
+3. colmap exhaustive_matcher --database_path database.db        or another matcher
+4. colmap pose_prior_mapper --database_path database.db --image_path frames --output_path sparse
    without --overwrite_priors_covariance, which would discard the covariances.
 
-Or, after an ordinary reconstruction: colmap model_aligner --ref_images_path reference.txt
---ref_is_gps 0 (positions alone, all with the same weight).
+Or, after an ordinary reconstruction, by positions alone that all have the same weight; the error is
+how far from its place a camera may lie [m]:
+  colmap model_aligner --input_path sparse/0 --output_path aligned \
+    --ref_images_path reference.txt --ref_is_gps 0 --alignment_max_error 1
 
 {frame}
 The covariances of pose_priors.csv are in these axes [m²].
