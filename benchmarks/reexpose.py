@@ -17,24 +17,16 @@ import pandas as pd
 from benchmarks.bands import RADIUS_BANDS_PX, join_truth, read_truth
 from benchmarks.timing import time_measurement, timing_line
 from kgcp.errors import Rejection
-from kgcp.geometry.arrays import GreyArray
 from kgcp.io.detections import FrameResult, detection_rows
 from kgcp.io.exif import Exif
 from kgcp.io.flight import Flight, read_flight
 from kgcp.io.frames import list_frames, read_grey
 from kgcp.io.tables import Row
+from kgcp.report.reexpose import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Miss
 from kgcp.workers import ordered_map, usable_cores
-
-GAINS = (0.6, 1.6)
-
-
-def reexposed(grey: GreyArray, gain: float) -> GreyArray:
-    """Return a frame with its grey values times `gain`, clipped and rounded."""
-    limit = np.iinfo(grey.dtype).max
-    return np.rint(np.minimum(grey * gain, limit)).astype(grey.dtype)
 
 
 def measure_flight(
