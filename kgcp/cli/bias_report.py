@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import detections_option, flight_argument, json_option, out_option
+from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+
+if TYPE_CHECKING:
+    from kgcp.io.stores import StoredFolder
 
 
 @click.command()
-@flight_argument
-@out_option
+@flight_place_argument
+@out_place_option
 @detections_option
 @click.option(
     "--reexpose",
@@ -23,7 +27,12 @@ from kgcp.cli.options import detections_option, flight_argument, json_option, ou
 )
 @json_option
 def command(
-    flight: Path, out: Path | None, detections: Path | None, reexpose: int, *, as_json: bool
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    detections: Path | None,
+    reexpose: int,
+    *,
+    as_json: bool,
 ) -> None:
     """Compare the measured distances of FLIGHT with reference poses of the camera.
 
@@ -37,32 +46,35 @@ def command(
     from kgcp.errors import KgcpError
     from kgcp.io.flight import read_flight
     from kgcp.io.poses import read_flight_poses
-    from kgcp.io.results import results_folder
     from kgcp.io.sightings import read_attempts, read_settings
+    from kgcp.io.staging import DETECTIONS, workplace
     from kgcp.io.whereabouts import read_whereabouts
     from kgcp.report.write import write_report
 
-    the_flight = read_flight(flight)
-    folder = out or results_folder(the_flight.folder)
-    table = detections or folder / "detections.parquet"
-    attempts = read_attempts(table, the_flight.targets)
-    settings = read_settings(table)
-    poses = read_flight_poses(the_flight, [attempt.frame for attempt in attempts])
-    if poses is None:
-        raise KgcpError(
-            f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses = 'reference.csv'"
-            " with the camera's poses from an adjustment"
+    with workplace(flight, out, (DETECTIONS,)) as place:
+        the_flight = read_flight(place.flight)
+        table = detections or place.out / DETECTIONS
+        attempts = read_attempts(table, the_flight.targets)
+        settings = read_settings(table)
+        poses = read_flight_poses(the_flight, [attempt.frame for attempt in attempts])
+        if poses is None:
+            raise KgcpError(
+                f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses ="
+                " 'reference.csv' with the camera's poses from an adjustment"
+            )
+        whereabouts = read_whereabouts(the_flight)
+        study = study_bias(
+            attempts, poses, whereabouts, the_flight.camera, the_flight.targets, settings.method
         )
-    whereabouts = read_whereabouts(the_flight)
-    study = study_bias(
-        attempts, poses, whereabouts, the_flight.camera, the_flight.targets, settings.method
-    )
-    report = write_report(study, the_flight, settings, folder, reexpose)
+        report = write_report(
+            *(study, the_flight, settings, place.out, reexpose), place.frames_of(the_flight)
+        )
     if as_json:
         import json
 
-        click.echo(json.dumps(report.summary()))
+        summary = report.summary()
+        click.echo(json.dumps({**summary, "files": [*map(place.named, report.files)]}))
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:
-        click.echo(f"wrote {path}", err=True)
+        click.echo(f"wrote {place.named(path)}", err=True)

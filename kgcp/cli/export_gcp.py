@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +10,9 @@ import click
 
 from kgcp.cli.options import (
     detections_option,
-    flight_argument,
+    flight_place_argument,
     json_option,
-    out_option,
+    out_place_option,
     selection_options,
 )
 from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export, not_renewed
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from kgcp.consistency.study import Consistency
     from kgcp.delivery import Delivery
     from kgcp.io.exporters.points import MapPoints
+    from kgcp.io.stores import StoredFolder
 
 ALL = "all"
 MANY = 12
@@ -37,8 +39,8 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 
 
 @click.command()
-@flight_argument
-@out_option
+@flight_place_argument
+@out_place_option
 @click.option(
     "--format",
     "formats",
@@ -66,8 +68,8 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 @detections_option
 @json_option
 def command(
-    flight: Path,
-    out: Path | None,
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
     formats: tuple[str, ...],
     crs: str | None,
     detections: Path | None,
@@ -91,24 +93,25 @@ def command(
     from kgcp.io.flight import read_flight
     from kgcp.io.kgcp_table import kgcp_row
     from kgcp.io.provenance import provenance
-    from kgcp.io.results import results_folder
+    from kgcp.io.staging import DETECTIONS, workplace
     from kgcp.io.tables import write_table
     from kgcp.selection import Selection
 
-    the_flight = read_flight(flight)
-    folder = out or results_folder(the_flight.folder)
-    source = detections or folder / "detections.parquet"
-    made = prepare(the_flight, source, Selection(**selection), crs)
-    table = folder / "kgcps.parquet"
-    metadata = {**provenance(the_flight), "crs": made.crs}
-    write_table(table, KGCP_COLUMNS, map(kgcp_row, made.kgcps), metadata)
-    written = [table]
-    if made.consistency is not None:
-        written += write_consistency(folder, made.consistency, provenance(the_flight))
-    points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
-    more, left_out = _export(points, formats, folder)
-    written += more
-    _report(made, written, left_out, not_renewed(folder, written), as_json=as_json)
+    with workplace(flight, out, (DETECTIONS,)) as place:
+        the_flight = read_flight(place.flight)
+        source = detections or place.out / DETECTIONS
+        made = prepare(the_flight, source, Selection(**selection), crs)
+        table = place.out / "kgcps.parquet"
+        metadata = {**provenance(the_flight), "crs": made.crs}
+        write_table(table, KGCP_COLUMNS, map(kgcp_row, made.kgcps), metadata)
+        written = [table]
+        if made.consistency is not None:
+            written += write_consistency(place.out, made.consistency, provenance(the_flight))
+        points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
+        more, left_out = _export(points, formats, place.out)
+        written += more
+        older = not_renewed(place.out, written)
+    _report(made, written, left_out, older, place.named, as_json=as_json)
 
 
 def _export(
@@ -136,6 +139,7 @@ def _report(
     written: list[Path],
     left_out: dict[str, str],
     older: tuple[str, ...],
+    named: Callable[[object], str],
     *,
     as_json: bool,
 ) -> None:
@@ -151,7 +155,7 @@ def _report(
             "checkpoints": checks,
             "skipped": dict(reasons),
             "advice": _advice(made.consistency),
-            "files": [*map(str, written)],
+            "files": [*map(named, written)],
             "left_out": left_out,
             "not_renewed": older,
         }
@@ -166,7 +170,7 @@ def _report(
     if made.consistency is not None:
         _report_consistency(made.consistency)
     for path in _named(written):
-        click.echo(f"wrote {path}", err=True)
+        click.echo(f"wrote {named(path)}", err=True)
     for name, reason in left_out.items():
         click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
     if older:

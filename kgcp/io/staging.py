@@ -22,6 +22,9 @@ from kgcp.io.frames import FRAME_SUFFIXES
 from kgcp.io.results import NAME, results_folder
 from kgcp.io.stores import StoredFolder
 
+DETECTIONS = "detections.parquet"
+"""What `kgcp detect` makes, and the other commands need."""
+
 
 @dataclass(frozen=True, slots=True)
 class Workplace:

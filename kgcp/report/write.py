@@ -16,6 +16,7 @@ from kgcp.io.flight import Flight
 from kgcp.io.frames import read_grey
 from kgcp.io.kgcp_table import bias_row
 from kgcp.io.provenance import provenance
+from kgcp.io.stores import StoredFolder, at_hand
 from kgcp.io.tables import write_table
 from kgcp.io.wholefile import write_bytes
 from kgcp.report.canvas import Picture
@@ -67,7 +68,12 @@ class Report:
 
 
 def write_report(
-    study: BiasStudy, flight: Flight, settings: DetectSettings, folder: Path, reexpose: int
+    study: BiasStudy,
+    flight: Flight,
+    settings: DetectSettings,
+    folder: Path,
+    reexpose: int,
+    stored_frames: StoredFolder | None = None,
 ) -> Report:
     """Write bias.parquet, bias_summary.json, the figures and bias_report.html into a folder.
 
@@ -81,6 +87,8 @@ def write_report(
     folder : Path
     reexpose : int
         How many frames to measure again, with darker and brighter grey values.
+    stored_frames : StoredFolder, optional
+        Where the frames are, if not in the flight's folder.
 
     Raises
     ------
@@ -95,7 +103,8 @@ def write_report(
     table = folder / "bias.parquet"
     rows = (bias_row(one, study.method) for one in study.measured)
     write_table(table, BIAS_COLUMNS, rows, provenance(flight))
-    content = _content(study, flight, settings, reexpose)
+    frames = stored_frames or flight.frames_folder
+    content = _content(study, flight, settings, frames, reexpose)
     files = {FIGURE_FILES[name]: one.png for name, one in content.pictures.items()}
     text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
     files["bias_summary.json"] = f"{text}\n".encode()
@@ -108,12 +117,18 @@ def write_report(
     return Report(content.summary, content.verdict, paths)
 
 
-def _content(study: BiasStudy, flight: Flight, settings: DetectSettings, reexpose: int) -> Content:
+def _content(
+    study: BiasStudy,
+    flight: Flight,
+    settings: DetectSettings,
+    frames: Path | StoredFolder,
+    reexpose: int,
+) -> Content:
     numbers = bias_numbers(study)
     deviations = deviations_of(numbers)
     spread, worst = evenly(numbers.data.distance_m, SPREAD), largest(deviations)
     again = evenly(numbers.data.distance_m, reexpose)
-    closeups, reexposed = _look(numbers, flight, settings, [*spread, *worst], again)
+    closeups, reexposed = _look(numbers, flight, frames, settings, [*spread, *worst], again)
     verdict = judge(numbers)
     return Content(
         name=flight.name,
@@ -132,6 +147,7 @@ def _content(study: BiasStudy, flight: Flight, settings: DetectSettings, reexpos
 def _look(
     numbers: BiasNumbers,
     flight: Flight,
+    frames: Path | StoredFolder,
     settings: DetectSettings,
     shown: list[int],
     again: list[int],
@@ -146,8 +162,9 @@ def _look(
         if seen is None:
             continue
         try:
-            grey = read_grey(flight.frames_folder / seen.frame, flight.camera)
-        except Rejection:
+            with at_hand(frames, seen.frame) as path:
+                grey = read_grey(path, flight.camera)
+        except (Rejection, KgcpError):
             continue  # the page says of which frames there is no close-up
         target, radius = targets[seen.target], float(numbers.data.radius_px[row])
         if row in shown and (picture := closeup(grey, flight.camera, target, seen, row)):

@@ -107,6 +107,22 @@ def test_a_stored_flight_gives_the_bytes_of_a_local_one(
     assert not any(path.is_file() for path in (tmp_path / "cache").rglob("*"))
 
 
+def test_points_are_made_of_stored_detections(
+    bucket: FileSystem, query: str, flight: Path, expected: bytes
+) -> None:
+    with bucket.open_output_stream("flights/one/kgcp/detections.parquet") as stream:
+        stream.write(expected)
+    command = ["export-gcp", "--format", "csv", "--out"]
+    out = flight.parent / "here"
+    for place in (out, f"s3://flights/one/kgcp{query}"):
+        folder = flight if place == out else f"s3://flights/one{query}"
+        done = CliRunner().invoke(main, [*command, str(place), str(folder)])
+        assert done.exit_code == 0, done.output
+    assert "wrote s3://flights/one/kgcp/kgcps.csv" in done.output
+    for name in ("kgcps.parquet", "kgcps.csv"):
+        assert content(bucket, f"flights/one/kgcp/{name}") == (out / name).read_bytes()
+
+
 class Stop(Nobody):
     def progress(self, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
         if done == FRAMES // 2:
