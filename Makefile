@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed torture sample-flight clean
+.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed torture sample-flight dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -59,6 +59,10 @@ torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames
 sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
 	rm -rf sample_flight
 	$(BIN)/kgcp simulate sample_flight --preset sample
+
+dist: $(BIN)/python ## build wheel and sdist in dist/
+	$(PIP) build
+	$(BIN)/python -m build --outdir dist .
 
 clean: ## remove results and caches (the virtual environment stays)
 	rm -rf sample_flight/kgcp build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
