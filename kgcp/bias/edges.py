@@ -18,10 +18,13 @@ class EdgeDistances:
         As the outer edge alone gives it, displaced by exposure as it is [m].
     two_m : float
         With both edges, whose common displacement drops out [m].
+    one_px : float
+        Radius of the displaced outer edge [px].
     """
 
     one_m: float
     two_m: float
+    one_px: float
 
 
 def edge_distances(one: Comparison, method: Method) -> EdgeDistances | None:
@@ -34,7 +37,9 @@ def edge_distances(one: Comparison, method: Method) -> EdgeDistances | None:
     seen, look = one.attempt.sighting, one.attempt.exposure
     if seen is None or look.edge_shift_px is None or look.radius_px is None:
         return None
-    shift = look.edge_shift_px
     if method is Method.PAPER:  # there the radius is that of the displaced edge
-        return EdgeDistances(seen.distance_m, seen.distance_m / (1.0 + shift / look.radius_px))
-    return EdgeDistances(seen.distance_m / (1.0 - shift / look.radius_px), seen.distance_m)
+        share = look.edge_shift_px / look.radius_px
+        return EdgeDistances(seen.distance_m, seen.distance_m / (1.0 + share), look.radius_px)
+    displaced_px = look.radius_px - look.edge_shift_px
+    one_m = seen.distance_m * look.radius_px / displaced_px
+    return EdgeDistances(one_m, seen.distance_m, displaced_px)

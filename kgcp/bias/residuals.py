@@ -71,7 +71,7 @@ class Residuals:
     Attributes
     ----------
     distance_m, radius_px : (n,) array
-        Reference distance, and the ring's radius in the image.
+        Reference distance, and the radius in the image that gave the measured one.
     residual_m : (n,) array
         Measured minus reference distance.
     noise : Noise
@@ -87,12 +87,28 @@ class Residuals:
     exposure: dict[str, FloatArray]
 
     @classmethod
-    def of(cls, compared: Sequence[Comparison], measured_m: FloatArray) -> Self:
-        """Collect comparisons with a measurement, `in_time`, and measured distances (n,) [m]."""
+    def of(
+        cls,
+        compared: Sequence[Comparison],
+        measured_m: FloatArray,
+        radius_px: FloatArray | None = None,
+    ) -> Self:
+        """Collect comparisons with a measurement, `in_time`.
+
+        Parameters
+        ----------
+        compared : sequence of n Comparison
+        measured_m : (n,) array
+            Measured distances [m].
+        radius_px : (n,) array, optional
+            Radii that gave them; those of the detections if not given.
+        """
         distance = np.array([one.reference_distance_m for one in compared])
-        radius = np.array(
-            [one.attempt.exposure.radius_px or one.expected_radius_px for one in compared]
-        )
+        radius = radius_px
+        if radius is None:
+            radius = np.array(
+                [one.attempt.exposure.radius_px or one.expected_radius_px for one in compared]
+            )
         return cls(
             distance_m=distance,
             radius_px=radius,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -217,8 +217,8 @@ def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | No
     if not rows.size:
         return None
     with_both = [compared[row] for row in rows.tolist()]
-    one_m, two_m = np.array([(pair.one_m, pair.two_m) for pair in pairs if pair is not None]).T
-    by_one = Residuals.of(with_both, one_m)
+    one_m, two_m, one_px = np.array([astuple(pair) for pair in pairs if pair is not None]).T
+    by_one = Residuals.of(with_both, one_m, one_px)
     return EdgeNumbers(
         rows=rows,
         one_m=by_one.residual_m,

@@ -70,8 +70,8 @@ def meaning_of(term: Term) -> str:
         )
     if term.name == "edge_shift_px":
         return (
-            f"Displaced edges are in the distances: of each pixel of δ, {value_of(term)} is left"
-            " (1: all of it, as with one edge; 0: none)."
+            f"Displaced edges are in the distances: {amount(term.value, term.sd, 'px')} of each"
+            " pixel of δ (1: all of it, as with one edge; 0: none)."
         )
     return f"Distances follow {_LABELS[term.name]}: the outer edge moves by {value_of(term)}."
 

@@ -22,14 +22,16 @@ SEEDS = range(5)
 def by(study: BiasStudy, edges: int | None = None) -> Regression:
     """Regress the reported distances, or those by one or two edges."""
     compared = in_time(study.trusted)
-    measured = []
+    measured, radii = [], []
     for one in compared:
         found = edge_distances(one, study.method)
         assert found is not None
         assert one.attempt.sighting is not None
         reported = one.attempt.sighting.distance_m
         measured.append({None: reported, 1: found.one_m, 2: found.two_m}[edges])
-    regression = regress(Residuals.of(compared, np.array(measured)))
+        radii.append(found.one_px)
+    radius = np.array(radii) if edges == 1 else None
+    regression = regress(Residuals.of(compared, np.array(measured), radius))
     assert regression is not None
     return regression
 
