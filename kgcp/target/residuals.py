@@ -34,7 +34,7 @@ class Residuals:
     x0, y0 : int
         The first pixel's place in the frame [px].
     share : (height, width) array
-        Model less grey value; NaN off the ring and its border.
+        Model less grey value; NaN off the ring and its border, as far as that is plate.
     edge_noise : float
         Their median size near edges, without what lies hidden.
     """
@@ -72,7 +72,8 @@ def residuals_of(
     variance = (blur_px or _USUAL_BLUR_PX) ** 2
     start = Parameters(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
     fit = adjust_with_streak(imaging, start, moves=False)
-    sample, light = whole_plate(imaging, pose, fit.parameters.blur), fit.parameters.light
+    light = fit.parameters.light
+    sample = whole_plate(imaging, pose, fit.parameters.blur, light)
     black, white = plateau_levels(light, imaging.response)
     limits = imaging.censoring
     levels = np.clip(predict(sample, fit.parameters).levels, limits.low, limits.high)

@@ -101,13 +101,17 @@ def choose_sample(
     return replace(_sample(imaging, pose, blur, points, index, scale), is_thinned=is_thinned)
 
 
-def whole_plate(imaging: Imaging, pose: Pose, blur: Blur) -> Sample:
-    """Return all pixels of the ring and its border, whatever they show: to be looked at."""
+def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sample:
+    """Return all pixels of the ring and its border, hidden ones too: to be looked at.
+
+    Those that blur mixes with what surrounds the plate are left out.
+    """
     rays = imaging.window.rays
-    points = plate_points(pose, rays)
+    points, scale = plate_points(pose, rays), largest_metres_per_px(pose, rays)
+    seen = see_plate(imaging, points, scale, blur, light)
     reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
-    index = np.flatnonzero(np.hypot(*points) < reach_m)
-    return _sample(imaging, pose, blur, points, index, largest_metres_per_px(pose, rays))
+    index = np.flatnonzero((seen.rho_m < reach_m) & ~reached_by_surroundings(seen))
+    return _sample(imaging, pose, blur, points, index, scale)
 
 
 def _sample(
