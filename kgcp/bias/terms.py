@@ -75,9 +75,7 @@ class Regression:
     exposure_probability : float or None
         Of as large a share by chance (F test); None without such terms.
     systematic_m : (n,) array
-        Scale and offset alone [m].
-    sd_systematic_m : (n,) array
-        Standard deviation of that.
+        What all terms but those of exposure make [m].
     """
 
     terms: tuple[Term, ...]
@@ -90,7 +88,6 @@ class Regression:
     exposure_share: float
     exposure_probability: float | None
     systematic_m: FloatArray
-    sd_systematic_m: FloatArray
 
     def term(self, name: str) -> Term | None:
         """Return the term of a name."""
@@ -224,9 +221,10 @@ def _regression(
 ) -> Regression:
     outlier = np.zeros(len(used), dtype=bool)
     outlier[used] = found.outlier
-    basic = np.column_stack((data.distance_m, np.ones_like(data.distance_m)))
+    basic = _without_exposure(names)
+    design = np.column_stack([columns[name] for name in names])
     share, probability = _share_of_exposure(names, found)
-    left = data.residual_m - np.column_stack([columns[name] for name in names]) @ found.values
+    left = data.residual_m - design @ found.values
     unit = left / np.sqrt(data.noise.white + data.noise.lasting)
     return Regression(
         terms=_terms(names, found),
@@ -238,13 +236,16 @@ def _regression(
         correlation_s=found.correlation_s,
         exposure_share=share,
         exposure_probability=probability,
-        systematic_m=basic @ found.values[:2],
-        sd_systematic_m=np.sqrt(np.einsum("ni,ij,nj->n", basic, found.cov[:2, :2], basic)),
+        systematic_m=design[:, basic] @ found.values[basic],
     )
 
 
+def _without_exposure(names: Sequence[str]) -> list[int]:
+    return [index for index, name in enumerate(names) if index < 2 or name == _DISPLACED]
+
+
 def _share_of_exposure(names: Sequence[str], found: Fit) -> tuple[float, float | None]:
-    others = [index for index, name in enumerate(names) if index < 2 or name == _DISPLACED]
+    others = _without_exposure(names)
     extra = len(names) - len(others)
     if not extra:
         return 0.0, None

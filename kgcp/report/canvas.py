@@ -102,9 +102,13 @@ def scatter(
     label: str | None = None,
     colour: str = BLUE,
     marker: str = "o",
+    among: FloatArray | None = None,
 ) -> Points:
-    """Draw measurements; those far off all others stand at the rim, as triangles."""
-    low, high = _limits(y)
+    """Draw measurements; those far off all others stand at the rim, as triangles.
+
+    All others are these alone, or `among` (m,) if several kinds share a panel.
+    """
+    low, high = _limits(y if among is None else among)
     shown = np.clip(y, low, high)
     size = 4.0 if len(y) <= _FEW else 2.0
     inside = shown == y

@@ -88,9 +88,10 @@ def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
         upper, lower = figure.subplots(2, 1)
         upper.axhline(0.0, color="black", linewidth=0.8)
         one, two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
+        both = np.concatenate((one, two))
         points = [
-            scatter(upper, rows, distance, one, "one edge", VERMILION, "x"),
-            scatter(upper, rows, distance, two, "both edges"),
+            scatter(upper, rows, distance, one, "one edge", VERMILION, "x", both),
+            scatter(upper, rows, distance, two, "both edges", among=both),
         ]
         upper.set_xlabel("reference distance [m]")
         upper.set_ylabel("error [%]")

@@ -12,7 +12,17 @@ from matplotlib.figure import Figure
 from kgcp.bias.statistics import moving_statistics
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.report.canvas import BLUE, GREY, VERMILION, Picture, Points, picture, scatter, sheet
+from kgcp.report.canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    VERMILION,
+    Picture,
+    Points,
+    picture,
+    scatter,
+    sheet,
+)
 from kgcp.report.numbers import BiasNumbers
 from kgcp.report.ranges import DetectionRate
 
@@ -26,16 +36,23 @@ def error_against_distance(numbers: BiasNumbers) -> Picture:
     distance = numbers.data.distance_m
     with sheet(7.0, 7.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
-        metres = _errors(upper, numbers, numbers.data.residual_m, numbers.sd_m)
-        percent = _errors(lower, numbers, numbers.residual_percent, 100.0 * numbers.sd_m / distance)
+        metres = _errors(
+            upper, numbers, numbers.data.residual_m, numbers.sd_m, _systematic_m(numbers)
+        )
+        sd_percent = 100.0 * numbers.sd_m / distance
+        percent = _errors(
+            lower, numbers, numbers.residual_percent, sd_percent, numbers.explained_percent
+        )
         upper.set_ylabel("error [m]")
         lower.set_ylabel("error [% of distance]")
         lower.set_xlabel("reference distance [m]")
-        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=5)
         return picture(figure, [metres, percent])
 
 
-def _errors(axes: Axes, numbers: BiasNumbers, error: FloatArray, sd: FloatArray) -> Points:
+def _errors(
+    axes: Axes, numbers: BiasNumbers, error: FloatArray, sd: FloatArray, fitted: FloatArray
+) -> Points:
     distance = numbers.data.distance_m
     moving = moving_statistics(distance, error, WINDOW_M)
     axes.axhline(0.0, color="black", linewidth=0.8)
@@ -56,7 +73,11 @@ def _errors(axes: Axes, numbers: BiasNumbers, error: FloatArray, sd: FloatArray)
             axes.plot(
                 reported.centre, sign * reported.mean, "--", color=GREY, linewidth=1.4, label=label
             )
-    return scatter(axes, np.arange(len(error)), distance, error, "frame")
+    points = scatter(axes, np.arange(len(error)), distance, error, "frame")
+    if numbers.regression is not None:
+        order = np.argsort(distance)
+        axes.plot(distance[order], fitted[order], color=GREEN, linewidth=1.6, label="fitted")
+    return points
 
 
 def detection_rate(numbers: BiasNumbers) -> Picture:

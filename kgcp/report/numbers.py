@@ -85,7 +85,7 @@ class BiasNumbers:
     residual_percent : (n,) array
         Of the reference distance.
     explained_percent : (n,) array
-        What scale and offset explain of it; 0 without a regression.
+        What the regression explains of it without exposure; 0 without a regression.
     sd_m : (n,) array
         Reported standard deviations of the residuals, of measurement and reference; NaN where
         the measurement has none.

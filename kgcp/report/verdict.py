@@ -122,7 +122,7 @@ def _accuracy(numbers: BiasNumbers, limits: Limits) -> Finding:
         return Finding(
             Grade.UNUSABLE,
             f"{text} That is above {limits.unusable_rms_percent:g} %: something is wrong with"
-            " target, camera, times or reference.",
+            " target, camera, times, reference or exposure.",
             "error",
         )
     if count < limits.min_frames:

@@ -32,7 +32,7 @@
     ];
     for (const [name, label] of Object.entries(data.labels)) {
       const value = columns[name][row];
-      if (value !== null) found.push([label, print(String(Number(value.toPrecision(4))))]);
+      if (value !== null) found.push([label, print(Math.abs(value) < 1e-9 ? "0" : String(Number(value.toPrecision(4))))]);
     }
     return found;
   };
