@@ -20,6 +20,7 @@ from kgcp.target.observation import Miss, Observation, Outcome
 from kgcp.target.residuals import contours_px, residuals_of
 from kgcp.workers import Loss
 
+_LOSSES = {Loss.DIED: "the process that drew it ended twice", Loss.LATE: "it took too long"}
 _TURN = np.linspace(0.0, 2.0 * np.pi, 97)
 
 
@@ -58,7 +59,7 @@ def draw_overlay(sheet: ContactSheet, flight_name: str, looks: Looks, task: Fram
     drawn: dict[int, list[Card]] = {}
     lost = 0
     for row, result, made in looks.through(partial(sketch_frame, task)):
-        sketches = _lost(result, made.name.lower()) if isinstance(made, Loss) else made
+        sketches = _lost(result, _LOSSES[made]) if isinstance(made, Loss) else made
         lost += sum(sketch.is_lost for sketch in sketches)
         drawn[row] = [
             _placed(sheet, sketch, f"{row + 1:06d}-{place}")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -13,14 +15,23 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, Reason
+from kgcp.examine import FrameTask
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.io.contact_sheet import ContactSheet
+from kgcp.io.detections import FrameResult
+from kgcp.io.exif import Exif
 from kgcp.io.overlay_pictures import PICTURE_PX
+from kgcp.looks import Looks
+from kgcp.overlays import draw_overlay
+from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.synthetic.imaging import Optics, Sensor
 from kgcp.synthetic.plate import image_plate
+from kgcp.target.observation import Miss
+from kgcp.workers import Loss
 
 CAMERA = Camera(320, 240, 600.0, 600.0, 158.0, 121.0, k1=-0.05)
 POSE = Pose(np.eye(3), np.array([0.54, -0.36, 9.0]))
@@ -165,3 +176,20 @@ def test_the_paper_s_chain_is_drawn_too(flight: Path, tmp_path: Path) -> None:
     seen = cards(tmp_path / "sheet")[0]
     assert "residuals" in seen
     assert "±" not in seen
+
+
+class _OneLost:
+    """Stands for `Looks`: its only frame ends every process that would draw it."""
+
+    def through(self, _: object) -> Iterator[tuple[int, FrameResult, Loss]]:
+        outline = Ellipse(20.0, 30.0, 6.0, 5.0, 0.1)
+        miss = Miss("A", Reason.CUT, "ring at (20, 30)", 0.9, 1, outline)
+        yield 0, FrameResult("a.png", None, Exif(), (miss,)), Loss.DIED
+
+
+def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:
+    sheet = ContactSheet(tmp_path / "sheet")
+    task = FrameTask(tmp_path, CAMERA, None, (), DetectSettings())
+    assert draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task) == 1
+    (card,) = cards(tmp_path / "sheet")
+    assert "ring at (20, 30) · not drawn: the process that drew it ended twice" in card
