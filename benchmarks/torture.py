@@ -28,7 +28,7 @@ from kgcp.synthetic.flight import plan_flight
 from kgcp.synthetic.presets import preset
 from kgcp.workers import usable_cores
 
-_RENDERED = 100  # frames; further ones are copies, later by a multiple of a break
+_RENDERED = 100  # frames; further ones are links to them, later by a multiple of a break
 _BREAK_S = 1000.0
 _EARLY_S = 4.0  # in which a run starts
 _EARLY, _WORKER = 0.2, 0.5  # share of lives that end while they start, that lose a worker
@@ -49,7 +49,7 @@ class Toll:
         return self.parents + self.workers
 
 
-def make_flight(folder: Path, frames: int, jobs: int) -> None:
+def make_flight(folder: Path, frames: int, jobs: int, *, absent_share: float = 0.1) -> None:
     """Write a flight of small frames, some of which need a second look."""
     far = preset("far")
     settings = replace(
@@ -57,6 +57,7 @@ def make_flight(folder: Path, frames: int, jobs: int) -> None:
         camera=replace(far.camera, width=400, height=300, cx=203.2, cy=147.1),
         frames=min(frames, _RENDERED),
         distance_m=(60.0, 215.0),
+        absent_share=absent_share,
         decoy_share=0.1,
     )
     write_simulated_flight(plan_flight(settings, 3), folder, jobs=jobs, on_frame=lambda: None)
@@ -68,7 +69,7 @@ def make_flight(folder: Path, frames: int, jobs: int) -> None:
         name, turn = names[number % len(names)], number // len(names)
         path = folder / "frames" / f"pass_{turn:03d}" / name
         path.parent.mkdir(exist_ok=True)
-        shutil.copyfile(folder / "frames" / name, path)
+        path.hardlink_to(folder / "frames" / name)
         lines.append(f"{path.parent.name}/{name},{format_time(times[name] + _BREAK_S * turn)}")
     for name in names:
         (folder / "frames" / name).unlink()
