@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.bias.reference import ReferenceSds
 from kgcp.carrier import Absence, Place, Whereabouts
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
@@ -54,31 +55,6 @@ class Attempt:
     time_s: float | None
     sighting: Sighting | None
     exposure: Exposure
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceSds:
-    """Standard deviations of a reference distance, by where they come from.
-
-    Attributes
-    ----------
-    pose_m : float
-        Of the camera's reference position, taken as independent from frame to frame [m].
-    place_m : float
-        Of the trajectory, attitude included: an error that lasts for a while [m].
-    common_m : float
-        Of lever arm and synchronisation, or of a static target's position: one error in all
-        frames [m].
-    """
-
-    pose_m: float
-    place_m: float
-    common_m: float
-
-    @property
-    def total_m(self) -> float:
-        """All three together [m]."""
-        return math.hypot(self.pose_m, self.place_m, self.common_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,21 +268,7 @@ def _compare(
         attempt=attempt,
         camera_m=views.centre_m[row],
         place_m=place.position_m,
-        sds=_reference_sds(sight / distance, place, views, row),
+        sds=ReferenceSds.along(sight / distance, place, views, row),
         expected_px=expected_px,
         expected_radius_px=radius_px_m / distance,
     )
-
-
-def _reference_sds(
-    direction: FloatArray, place: Place, views: Views, row: int
-) -> ReferenceSds | None:
-    """Return the deviations along a line of sight."""
-    if place.cov_m2 is None or views.cov_m2 is None:
-        return None
-    pose = float(direction @ views.cov_m2[row] @ direction)
-    whole = float(direction @ place.cov_m2 @ direction)
-    common = whole  # of a target that stands still
-    if place.common_m is not None:
-        common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
-    return ReferenceSds(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from kgcp.bias.study import Attempt, BiasStudy, Comparison, Exposure, ReferenceSds
+from kgcp.bias.reference import ReferenceSds
+from kgcp.bias.study import Attempt, BiasStudy, Comparison, Exposure
 from kgcp.geometry.pose import Pose
 from kgcp.settings import Method
 from kgcp.target.sighting import Sighting

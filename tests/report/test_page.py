@@ -15,7 +15,8 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from kgcp.bias.study import Attempt, BiasStudy, Comparison, Exposure, ReferenceSds
+from kgcp.bias.reference import ReferenceSds
+from kgcp.bias.study import Attempt, BiasStudy, Comparison, Exposure
 from kgcp.geometry.pose import Pose
 from kgcp.io.columns import BIAS_COLUMNS
 from kgcp.io.flight import read_flight

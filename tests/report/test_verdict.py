@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from kgcp.bias.study import BiasStudy, Comparison, ReferenceSds
+from kgcp.bias.reference import ReferenceSds
+from kgcp.bias.study import BiasStudy, Comparison
 from kgcp.bias.terms import Term
 from kgcp.geometry.arrays import FloatArray
 from kgcp.report.numbers import BiasNumbers, bias_numbers
