@@ -21,7 +21,7 @@ _PER_TERM = 4  # observations that every term of exposure must have
 _KNOWN_SHARE = 0.9  # of the frames that must have a quantity
 _MAX_INFLATION = 25.0  # of a term's variance by the others: a deviation five times larger
 _DISTANCE_LIKE = 1000.0  # the same of what grows with distance alone, and is always looked for
-_DISPLACED = "edge_displacement_px"
+_CURVED = "edge_curvature_px2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +31,11 @@ class Term:
     Attributes
     ----------
     name : str
-        `scale`, `offset_m`, `edge_displacement_px`, or a column of the exposure.
+        `scale`, `offset_m`, `edge_curvature_px2`, or a column of the exposure.
     value, sd : float
-        Estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of the
-        others displacement of the edge in pixels per unit.
+        Estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of
+        `edge_curvature_px2` displacement of the edge times its radius [px²], of the others
+        displacement of the edge in pixels per unit.
     probability : float
         Of a value as large by chance (Student's t, both sides), by Holm's correction for the
         number of terms.
@@ -110,8 +111,8 @@ def regress(data: Residuals) -> Regression | None:
 
     Edges displaced by ε px change a distance by D ε / R, R being the ring's radius in px: which
     with R ∝ 1/D grows with the square of the distance. So each exposure quantity x has the column
-    (x − mean) D / R, and δ, which is a displacement itself, δ D / R. A displacement that is the
-    same in all frames is looked for last, and kept where it is significant.
+    (x − mean) D / R, and δ, which is a displacement itself, δ D / R. Blur displaces curved edges
+    by σ² / 2R, so that D / R² is looked for last, and kept where it is significant.
     """
     if len(data.residual_m) < MIN_COUNT:
         return None
@@ -121,12 +122,12 @@ def regress(data: Residuals) -> Regression | None:
     if "offset_m" not in names:
         return None
     found = _fit(data, columns, names, used)
-    displaced = {**columns, _DISPLACED: data.distance_m / data.radius_px}
-    more, _ = _separable(displaced, used, weight, len(used))
-    if set(more) >= {*names, _DISPLACED} and used.sum() > _PER_TERM * (len(names) + 1):
-        other = _fit(data, displaced, [*names, _DISPLACED], used)
-        if _terms([*names, _DISPLACED], other)[-1].is_significant:
-            names, columns, found = [*names, _DISPLACED], displaced, other
+    curved = {**columns, _CURVED: data.distance_m / data.radius_px**2}
+    more, _ = _separable(curved, used, weight, len(used))
+    if set(more) >= {*names, _CURVED} and used.sum() > _PER_TERM * (len(names) + 1):
+        other = _fit(data, curved, [*names, _CURVED], used)
+        if _terms([*names, _CURVED], other)[-1].is_significant:
+            names, columns, found = [*names, _CURVED], curved, other
     return _regression(data, columns, names, tangled, used, found)
 
 
@@ -155,7 +156,7 @@ def _separable(
     for name, column in columns.items():
         rows = np.column_stack([columns[other] for other in (*names, name)])[used]
         rows = rows * weight[used, None]
-        limit = _DISTANCE_LIKE if name in {"offset_m", _DISPLACED} else _MAX_INFLATION
+        limit = _DISTANCE_LIKE if name in {"offset_m", _CURVED} else _MAX_INFLATION
         if len(names) >= max(2, most) or _inflation(rows) > limit or not column[used].any():
             tangled.append(name)
         else:
@@ -241,7 +242,7 @@ def _regression(
 
 
 def _without_exposure(names: Sequence[str]) -> list[int]:
-    return [index for index, name in enumerate(names) if index < 2 or name == _DISPLACED]
+    return [index for index, name in enumerate(names) if index < 2 or name == _CURVED]
 
 
 def _share_of_exposure(names: Sequence[str], found: Fit) -> tuple[float, float | None]:

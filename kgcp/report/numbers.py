@@ -15,6 +15,7 @@ from kgcp.bias.statistics import Spread
 from kgcp.bias.study import BiasStudy, Comparison
 from kgcp.bias.terms import Regression, regress
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.settings import Method
 from kgcp.report.ranges import (
     DetectionRate,
     RangeRow,
@@ -61,7 +62,7 @@ class EdgeNumbers:
     one_percent, two_percent : Spread
         Of the residuals [%].
     regression : Regression or None
-        Of the distances by one edge.
+        Of the distances by one edge; None, too, where these are what was measured.
     """
 
     rows: IndexArray
@@ -225,7 +226,7 @@ def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | No
         two_m=two_m - by_one.distance_m,
         one_percent=Spread.of(100.0 * by_one.residual_m / by_one.distance_m),
         two_percent=Spread.of(100.0 * (two_m / by_one.distance_m - 1.0)),
-        regression=regress(by_one),
+        regression=None if study.method is Method.PAPER else regress(by_one),
     )
 
 

@@ -170,7 +170,7 @@ def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         if term.name in large and term.is_significant:
             material = abs(term.value) >= large[term.name]
             yield Finding(Grade.LOOK if material else Grade.GOOD, meaning_of(term), "causes")
-        elif term.name == "edge_displacement_px":
+        elif term.name == "edge_curvature_px2":
             yield Finding(Grade.LOOK, meaning_of(term), "causes")
     material = found.is_exposure_significant and found.exposure_share >= limits.exposure_share
     yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(found), "exposure")

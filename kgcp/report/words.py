@@ -10,7 +10,7 @@ from kgcp.bias.terms import Regression, Term
 _LABELS = {
     "scale": "scale",
     "offset_m": "constant offset",
-    "edge_displacement_px": "edges displaced in all frames",
+    "edge_curvature_px2": "curved edges",
 } | {quantity.name: quantity.label for quantity in QUANTITIES}
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
@@ -41,8 +41,8 @@ def value_of(term: Term) -> str:
         return amount(term.value, term.sd, "%", 100.0)
     if term.name == "offset_m":
         return amount(term.value, term.sd, "mm", 1000.0)
-    if term.name == "edge_displacement_px":
-        return amount(term.value, term.sd, "px")
+    if term.name == "edge_curvature_px2":
+        return amount(term.value, term.sd, "px²")
     return amount(term.value, term.sd, f"px per {_PER[term.name]}")
 
 
@@ -63,10 +63,12 @@ def meaning_of(term: Term) -> str:
             " height of the trajectory or datum of the reference poses; from above, the target"
             f" lies {'lower' if side == 'long' else 'higher'} than they say."
         )
-    if term.name == "edge_displacement_px":
+    if term.name == "edge_curvature_px2":
+        way = "into" if side == "long" else "out of"
         return (
-            f"Edges are displaced in all frames alike, by {value_of(term)} "
-            f"{'into' if side == 'long' else 'out of'} the dark ring: blur, sharpening or print."
+            f"Edges are displaced {way} the dark ring the more the smaller it is, by"
+            f" {value_of(term)} over its radius: blur of curved edges, which only"
+            " --method model takes into account, or sharpening."
         )
     if term.name == "edge_shift_px":
         return (

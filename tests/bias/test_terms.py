@@ -96,15 +96,15 @@ def plain(
     return Residuals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
 
 
-def test_edges_displaced_in_all_frames_are_told_from_scale_and_offset() -> None:
+def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
     rng = np.random.default_rng(9)
     distance = np.exp(rng.uniform(2.3, 4.6, 300))
-    residual = 0.05 * distance**2 / 1000.0 + 0.005 * rng.standard_normal(300)
+    residual = 0.5 * distance**3 / 1000.0**2 + 0.005 * rng.standard_normal(300)  # R: 1000 / D
     found = regress(plain(distance, residual, 0.005))
     assert found is not None
-    displaced = found.term("edge_displacement_px")
-    assert displaced is not None
-    assert displaced.value == pytest.approx(0.05, abs=3.0 * displaced.sd)
+    curved = found.term("edge_curvature_px2")
+    assert curved is not None
+    assert curved.value == pytest.approx(0.5, abs=3.0 * curved.sd)
     assert found.exposure_terms == ()
 
 
@@ -113,7 +113,9 @@ def test_of_quantities_that_look_alike_the_less_believed_is_given_up() -> None:
     distance = np.exp(rng.uniform(2.3, 4.6, 100))
     exposure = 0.001 * np.exp(rng.uniform(-1.0, 1.0, 100))
     alike = {"exposure_time_s": exposure, "white": np.log(exposure), "iso": np.full(100, 200.0)}
-    residual = 0.03 * np.log2(exposure) * distance**2 / 1000.0 + 0.01 * rng.standard_normal(100)
+    residual = 0.03 * np.log2(
+        1000.0 * exposure
+    ) * distance**2 / 1000.0 + 0.01 * rng.standard_normal(100)
     found = regress(plain(distance, residual, 0.01, **alike))
     assert found is not None
     assert found.tangled == ("white",)

@@ -203,7 +203,7 @@ def test_amounts_are_rounded_by_their_deviation() -> None:
         ("scale", -0.001, "too small"),
         ("offset_m", 0.03, "lower"),
         ("offset_m", -0.03, "higher"),
-        ("edge_displacement_px", 0.1, "into the dark ring"),
+        ("edge_curvature_px2", 0.5, "into the dark ring"),
         ("edge_shift_px", 1.0, "+1.000 ± 0.010 px of each pixel of δ"),
         ("iso", 0.1, "per doubling"),
     ],
