@@ -15,7 +15,6 @@ from kgcp.bias.statistics import Spread
 from kgcp.bias.study import BiasStudy, Comparison
 from kgcp.bias.terms import Regression, regress
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.settings import Method
 from kgcp.report.ranges import (
     DetectionRate,
     RangeRow,
@@ -23,6 +22,7 @@ from kgcp.report.ranges import (
     rates_by_distance,
     rates_by_radius,
 )
+from kgcp.settings import Method
 
 
 @dataclass(frozen=True, slots=True, eq=False)
