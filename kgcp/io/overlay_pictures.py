@@ -19,7 +19,7 @@ PICTURE_PX, THUMBNAIL_PX = 400, 160
 """Width of either half of a picture, which is as high."""
 
 _REACH, _LEAST_REACH_PX = 1.4, 6.0  # of the outer radius
-_QUALITY = {PICTURE_PX: 88, THUMBNAIL_PX: 80}
+_QUALITY = 80
 _MAGNIFIED = 2.0  # from here on pixels are shown as squares
 _PARTS = 4  # bits of a pixel that lines are drawn to
 # Told apart whatever one's colour vision, on ink and on plate; in OpenCV's order blue, green, red.
@@ -149,5 +149,6 @@ def _with_contours(picture: _Picture, cut: _Cut, scene: Scene) -> _Picture:
 
 
 def _encoded(picture: _Picture) -> bytes:
-    quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY[len(picture)]]
-    return cv2.imencode(".jpg", picture, quality)[1].tobytes()
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    sharp_colours = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    return cv2.imencode(".jpg", picture, quality + sharp_colours)[1].tobytes()
