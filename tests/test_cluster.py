@@ -8,15 +8,19 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 pytest.importorskip("distributed", reason="Dask is not installed: pip install kgcp[dask]")
 
 from click.testing import CliRunner
-from distributed import LocalCluster
+from distributed import KilledWorker, LocalCluster
+from distributed.scheduler import WorkerState
 
 from benchmarks.torture import make_flight
 from kgcp.cli import main
@@ -79,7 +83,7 @@ class Killer(Nobody):
 
 
 def test_a_cluster_on_this_machine_gives_the_same_bytes(flight: Path, expected: bytes) -> None:
-    command = ["detect", str(flight), "--scheduler", "local:2", "--out", str(flight.parent / "own")]
+    command = ["detect", str(flight), "--scheduler", "local:1", "--out", str(flight.parent / "own")]
     done = CliRunner().invoke(main, command)
     assert done.exit_code == 0, done.output
     assert (flight.parent / "own" / "detections.parquet").read_bytes() == expected
@@ -110,6 +114,28 @@ def test_a_cluster_that_loses_a_worker_gives_the_bytes_of_this_process(
     assert detect(flight, "dask", scheduler=cluster.scheduler_address, watcher=killer) == expected
     assert killer.killed is not None
     assert (flight.parent / "dask" / "run.json").exists()
+
+
+def test_what_dask_gives_up_is_tried_again_or_a_line() -> None:
+    with connected("local:1", 60.0, ()) as workers:
+        for error, kind in (
+            (
+                KilledWorker("key", cast("WorkerState", SimpleNamespace(address="tcp://one")), 3),
+                BrokenExecutor,
+            ),
+            (ModuleNotFoundError("kgcp"), KgcpError),
+            (LookupError("of the call itself"), LookupError),
+            (None, KgcpError),  # cancelled, by a client that has lost its scheduler
+        ):
+            inner: Future[object] = Future()
+            if error is None:
+                inner.cancel()
+            else:
+                inner.set_exception(error)
+            future: Future[object] = Future()
+            workers._waiting.add(future)
+            workers._hand_over(future, inner)
+            assert isinstance(future.exception(timeout=0.0), kind)
 
 
 def test_workers_must_be_as_the_run_needs_them(
