@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 from kgcp.report.numbers import BiasNumbers
 from kgcp.report.ranges import RangeRow
+from kgcp.report.reexpose import GAINS, Reexposed
 from kgcp.report.words import amount, exposure_sentence, label_of, meaning_of, value_of
 
 
@@ -40,6 +42,8 @@ class Limits:
         Size of a significant scale [%] and offset [m].
     exposure_share : float
         Of the variance, explained by exposure of which a term is significant.
+    reexposure_percent : float
+        RMS change of distances that are measured again darker and brighter [%].
     standardised_low, standardised_high : float
         Spread of the residuals, without scale and offset, over their reported deviations.
     lost_share, unusable_lost_share : float
@@ -54,6 +58,7 @@ class Limits:
     scale_percent: float = 0.02
     offset_m: float = 0.01
     exposure_share: float = 0.1
+    reexposure_percent: float = 0.1
     standardised_low: float = 0.5
     standardised_high: float = 1.5
     lost_share: float = 0.05
@@ -99,14 +104,17 @@ class Verdict:
         return (f"{self.grade.words}.", *(finding.text for finding in self.findings))
 
 
-def judge(numbers: BiasNumbers, limits: Limits = LIMITS) -> Verdict:
-    """Judge a flight by its numbers."""
+def judge(
+    numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), limits: Limits = LIMITS
+) -> Verdict:
+    """Judge a flight by its numbers, and by what measuring some frames again has changed."""
     findings = [
         _accuracy(numbers, limits),
         _bias(numbers, limits),
         *_causes(numbers, limits),
         *_deviations(numbers, limits),
         *_losses(numbers, limits),
+        *_reexposure(reexposed, limits),
         *_detection(numbers, limits),
         *_reservations(numbers),
     ]
@@ -174,6 +182,20 @@ def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
             yield Finding(Grade.LOOK, meaning_of(term), "causes")
     material = found.is_exposure_significant and found.exposure_share >= limits.exposure_share
     yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(found), "exposure")
+
+
+def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Finding]:
+    changes = [one.change_percent for one in reexposed if one.change_percent is not None]
+    if not changes:
+        return
+    rms = math.hypot(*changes) / math.sqrt(len(changes))
+    lost = len(reexposed) - len(changes)
+    text = (
+        f"Measured again with grey values × {' and × '.join(f'{gain:g}' for gain in GAINS)},"
+        f" distances change by {rms:.3f} % (RMS of {len(changes)}; {lost} lost)."
+    )
+    grade = Grade.LOOK if rms > limits.reexposure_percent else Grade.GOOD
+    yield Finding(grade, text, "reexposure")
 
 
 def _deviations(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:

@@ -129,7 +129,7 @@ def _content(
     spread, worst = evenly(numbers.data.distance_m, SPREAD), largest(deviations)
     again = evenly(numbers.data.distance_m, reexpose)
     closeups, reexposed = _look(numbers, flight, frames, settings, [*spread, *worst], again)
-    verdict = judge(numbers)
+    verdict = judge(numbers, reexposed)
     return Content(
         name=flight.name,
         numbers=numbers,

@@ -10,6 +10,7 @@ from kgcp.bias.study import BiasStudy, Comparison
 from kgcp.bias.terms import Term
 from kgcp.geometry.arrays import FloatArray
 from kgcp.report.numbers import BiasNumbers, bias_numbers
+from kgcp.report.reexpose import Reexposed
 from kgcp.report.verdict import Grade, judge
 from kgcp.report.words import amount, meaning_of
 
@@ -118,6 +119,17 @@ def test_deviations_that_are_too_small_are_found(fly: Fly) -> None:
     too_large = fly(sd_m=0.1)
     assert "may be too large" in texts(too_large)
     assert judge(too_large).grade is Grade.GOOD
+
+
+def test_distances_that_follow_the_grey_values_are_found(fly: Fly) -> None:
+    def again(*changes: float | None) -> list[Reexposed]:
+        return [Reexposed(0, 1.6, 20.0, change, 0.01, 0.3) for change in changes]
+
+    numbers = fly()
+    steady = judge(numbers, again(0.01, -0.02, None))
+    assert steady.grade is Grade.GOOD
+    assert "change by 0.016 % (RMS of 2; 1 lost)" in "\n".join(steady.sentences)
+    assert judge(numbers, again(0.5, 0.01)).grade is Grade.LOOK
 
 
 def test_outliers_and_misses_are_counted(fly: Fly) -> None:
