@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from kgcp.cli import COMMANDS, main
+from kgcp.io.flight import read_flight
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -129,6 +131,30 @@ def test_what_is_shown_runs(shown: Shown, workspace: Path) -> None:
     assert result.exit_code == 0, result.stderr
     for path in set(workspace.iterdir()) - before:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def programs() -> list[str]:
+    pages = (page.read_text(encoding="utf-8") for page in PAGES)
+    blocks = (textwrap.dedent(block).strip() for text in pages for block in code_blocks(text))
+    return [block for block in blocks if block.startswith("import ")]
+
+
+@pytest.mark.usefixtures("workspace")
+@pytest.mark.parametrize("program", programs())
+def test_python_that_is_shown_runs(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(program, "shown", "exec"), {})  # noqa: S102 - it is the project's own
+    assert "frame_0002.jpg" in capsys.readouterr().out
+
+
+def test_the_flight_toml_of_the_guide_is_one(tmp_path: Path) -> None:
+    guide = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    match = re.search(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
+    assert match
+    (tmp_path / "flight.toml").write_text(match[1], encoding="utf-8")
+    (tmp_path / "frames").mkdir()
+    flight = read_flight(tmp_path)
+    assert [target.name for target in flight.targets] == ["A"]
+    assert flight.vehicle is not None
 
 
 def test_every_command_is_shown_to_newcomers() -> None:
