@@ -114,7 +114,7 @@ def regress(data: Residuals) -> Regression | None:
     (x − mean) D / R, and δ, which is a displacement itself, δ D / R. Blur displaces curved edges
     by σ² / 2R, so that D / R² is looked for last, and kept where it is significant.
     """
-    if len(data.residual_m) < MIN_COUNT:
+    if len(data.residual_m) < MIN_COUNT or not varies(data.residual_m):
         return None
     columns, used = _columns(data)
     weight = 1.0 / np.sqrt(data.noise.white + data.noise.lasting)

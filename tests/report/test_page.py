@@ -7,7 +7,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -224,3 +224,22 @@ def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_
     assert "The frames are not where" in text or "the frames are not where" in text
     assert {path.name for path in report.files} >= {"bias_error.png", "bias_summary.json"}
     assert not (tmp_path / "bias_reexposure.png").exists()
+
+
+def test_without_times_deviations_or_poses_there_is_a_page_too(
+    compare: Compare, study: Study, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(1)
+    compared = []
+    for distance in rng.uniform(10.0, 100.0, 30):
+        one = compare(distance, rng.normal(0.0, 0.05), sds=None, iso=rng.choice([100.0, 200.0]))
+        assert one.attempt.sighting is not None
+        bare = replace(one.attempt.sighting, time_s=None, pose=None)
+        compared.append(replace(one, attempt=replace(one.attempt, time_s=None, sighting=bare)))
+    write_report(study(*compared), read_flight(SAMPLE), DetectSettings(), tmp_path, 0)
+    summary = json.loads((tmp_path / "bias_summary.json").read_text(encoding="utf-8"))
+    assert summary["standardised"] is None
+    assert summary["edges"] is None
+    assert summary["regression"]["correlation_s"] == 0.0
+    assert set(summary["regression"]["terms"]) == {"scale", "offset_m", "iso"}
+    assert not (tmp_path / "bias_standardised.png").exists()

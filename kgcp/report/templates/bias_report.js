@@ -108,6 +108,8 @@
     plot.append(spot);
     plot.classList.add("live");
     plot.tabIndex = 0;
+    plot.setAttribute("role", "group");
+    plot.setAttribute("aria-label", "Figure: the arrow keys go through its measurements");
     const order = rows.map((_, index) => index)
       .sort((a, b) => places[2 * a] - places[2 * b] || a - b);
     let current = -1;
@@ -195,7 +197,7 @@
     return csv(lines);
   };
   const tableText = (table) => csv([...table.rows].map((row) =>
-    [...row.cells].map((one) => one.textContent.trim().replace(/\s+/g, " ").replace("−", "-"))));
+    [...row.cells].map((one) => one.textContent.trim().replace(/\s+/g, " ").replaceAll("−", "-"))));
   for (const button of document.querySelectorAll("button[data-save]")) {
     const name = button.dataset.save;
     button.addEventListener("click", () => {
