@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,11 @@ from kgcp.target.layout import Target
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format")
-_MOST_BYTES = 1 << 20
+_MOST_BYTES = 1 << 18
+# tomllib takes the square of the number of a key's parts.
+_LONG_KEY = re.compile(
+    r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')[ \t]*+\.[ \t]*+){50}"""
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +168,8 @@ def _name_of(folder: Path) -> str:
 def _read_toml(path: Path) -> tuple[TomlTable, str]:
     """Return the whole file as a table, and as text."""
     text = _read_text(path)
+    if _LONG_KEY.search(text):
+        raise KgcpError(f"{path}: has a key of very many parts; delete it")
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

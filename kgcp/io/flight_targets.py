@@ -35,9 +35,7 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
     written = flight.tables("target")
     if len(written) > _MOST_TARGETS:
         raise flight.error("target", f"has {len(written)} tables", f"give at most {_MOST_TARGETS}")
-    tables = [
-        _target_table(flight, index, values) for index, values in enumerate(written, start=1)
-    ]
+    tables = [_target_table(flight, index, values) for index, values in enumerate(written, start=1)]
     plates = [table for table in tables if "replica_of" not in table]
     replicas = [table for table in tables if "replica_of" in table]
     names = [table.name("name") for table in plates]

@@ -119,5 +119,5 @@ def _entries(stream: BinaryIO, layout: _Layout) -> Iterator[_Entry]:
             tag, kind, _ = struct.unpack_from(layout.order + layout.entry, entry)
             yield _Entry(place, tag, kind, entry[size:])
             place += len(entry)
-    except (struct.error, OverflowError, OSError):
+    except (struct.error, OverflowError, ValueError, OSError):
         return  # the file is cut, or no place is where it says

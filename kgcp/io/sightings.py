@@ -112,7 +112,13 @@ def _pose(row: _Row) -> Pose | None:
     quaternion = [_number(row, name) for name in ("qw", "qx", "qy", "qz")]
     if None in translation or None in quaternion:
         return None
-    rotation = Rotation.from_quat(np.array(quaternion, float), scalar_first=True)
+    components = np.array(quaternion, float)
+    if not np.linalg.norm(components) > 0.5:  # written ones have the norm 1
+        raise KgcpError(
+            f"detections of {row['frame']!r}: the quaternion is none;"
+            " run 'kgcp detect' on this flight again"
+        )
+    rotation = Rotation.from_quat(components, scalar_first=True)
     return Pose(rotation.as_matrix(), np.array(translation, float))
 
 

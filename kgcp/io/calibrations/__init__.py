@@ -113,6 +113,8 @@ def _agreed_size(
             raise file.error("", "has no image size", "add width and height to [camera]")
         return width, height
     found_width, found_height = entry.size
+    if min(entry.size) < 1:
+        raise file.error("", f"is for {found_width} x {found_height} px", "export it again")
     size = (width or found_width, height or found_height)
     if size != entry.size and not (entry.is_relative and _same_shape(size, entry.size)):
         raise file.error(

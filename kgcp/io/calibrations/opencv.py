@@ -6,14 +6,16 @@ Pixels count from the centre of the top-left one, and the coefficients are those
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-import cv2
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
 from kgcp.geometry.camera import Camera
+from kgcp.io.anyfile import is_sound
 from kgcp.io.calibrations.entry import Entry, refuse_terms, unsupported
 from kgcp.io.foreign import ForeignFile
+from kgcp.io.plainyaml import load_yaml
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 # How OpenCV's own samples and users' scripts name the values, in small letters without "_".
 _MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "k", "m1", "mtx")
@@ -29,6 +31,9 @@ _DISTORTION_KEYS = (
 )
 _WIDTH_KEYS = ("imagewidth", "width")
 _HEIGHT_KEYS = ("imageheight", "height")
+
+_MOST_NUMBERS = 100  # in a matrix
+_PROBLEM, _REMEDY = "is no OpenCV FileStorage of a camera", "write it again with OpenCV"
 
 # Numbers of coefficients that OpenCV writes for its models; beyond 8 they must be zero.
 _COUNTS = (0, 4, 5, 8, 12, 14)
@@ -46,26 +51,47 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If OpenCV cannot read it, or it has no camera matrix.
+        If it cannot be read, or has no camera matrix.
     """
+    nodes = {str(key).lower().replace("_", ""): value for key, value in _nodes(file).items()}
     try:
-        storage = cv2.FileStorage(file.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        keys = storage.root().keys()
-        nodes = {key.lower().replace("_", ""): key for key in keys}
-        is_fisheye = "fisheyemodel" in nodes and storage.getNode(nodes["fisheyemodel"]).real()
-        matrix = _matrix(storage, nodes, _MATRIX_KEYS)
-        coefficients = _matrix(storage, nodes, _DISTORTION_KEYS)
-        width = _number(storage, nodes, _WIDTH_KEYS)
-        height = _number(storage, nodes, _HEIGHT_KEYS)
-    except (cv2.error, SystemError) as error:  # SystemError: what the bindings make of bad syntax
-        raise file.error("", "is no OpenCV FileStorage", "write it again with OpenCV") from error
+        is_fisheye = _number(nodes, ("fisheyemodel",))
+        matrix = _matrix(nodes, _MATRIX_KEYS)
+        coefficients = _matrix(nodes, _DISTORTION_KEYS)
+        width, height = _number(nodes, _WIDTH_KEYS), _number(nodes, _HEIGHT_KEYS)
+    except (TypeError, ValueError, LookupError) as error:
+        raise file.error("", _PROBLEM, _REMEDY) from error
     if is_fisheye:
         raise unsupported(file, "", "a fisheye model")
     if matrix is None:
         raise file.error("", "has no camera_matrix", "add it or write the values to [camera]")
     size = (int(width), int(height)) if width and height else None
-    flat = [] if coefficients is None else coefficients.ravel().tolist()
-    return (matrix_entry(file, "", size, matrix.tolist(), flat),)
+    flat = [] if coefficients is None else [value for row in coefficients for value in row]
+    return (matrix_entry(file, "", size, matrix, flat),)
+
+
+def _nodes(file: ForeignFile) -> Mapping[object, object]:
+    """Return what stands at the top of a FileStorage.
+
+    OpenCV's own parsers are not asked: a damaged file may end the process in them, or worse.
+    """
+    if file.root is not None:
+        return {child.tag: _element(child) for child in file.root}
+    if isinstance(file.document, dict):
+        return file.document
+    head, _, rest = file.text.partition("\n")
+    try:
+        nodes = load_yaml(rest if head.startswith("%YAML") else file.text)
+    except ValueError as error:
+        raise file.error("", f"{_PROBLEM} ({error})", _REMEDY) from error
+    if not isinstance(nodes, dict):
+        raise file.error("", _PROBLEM, _REMEDY)
+    return nodes
+
+
+def _element(element: Element) -> object:
+    cells = {child.tag: child.text or "" for child in element}
+    return {**cells, "data": cells.get("data", "").split()} if cells else element.text
 
 
 def matrix_entry(
@@ -94,18 +120,30 @@ def matrix_entry(
     return Entry(name, size, convert)
 
 
-def _matrix(
-    storage: cv2.FileStorage, nodes: Mapping[str, str], names: Sequence[str]
-) -> npt.NDArray[Any] | None:
-    key = next((nodes[name] for name in names if name in nodes), None)
-    return None if key is None else storage.getNode(key).mat()
+def _matrix(nodes: Mapping[str, object], names: Sequence[str]) -> list[list[float]] | None:
+    """Return the rows of the first matrix that has one of these names."""
+    node = next((nodes[name] for name in names if name in nodes), None)
+    if node is None:
+        return None
+    if not isinstance(node, dict) or not isinstance(node["data"], list):
+        raise TypeError("no matrix")
+    rows, columns = int(node["rows"]), int(node["cols"])
+    data = node["data"]
+    if len(data) != rows * columns or len(data) > _MOST_NUMBERS:
+        raise ValueError("rows and columns are not those of its data")
+    values = [_finite(value) for value in data]
+    return [values[row * columns : (row + 1) * columns] for row in range(rows)]
 
 
-def _number(
-    storage: cv2.FileStorage, nodes: Mapping[str, str], names: Sequence[str]
-) -> float | None:
-    key = next((nodes[name] for name in names if name in nodes), None)
-    return None if key is None else storage.getNode(key).real()
+def _number(nodes: Mapping[str, object], names: Sequence[str]) -> float | None:
+    node = next((nodes[name] for name in names if name in nodes), None)
+    return None if node is None else _finite(node)
+
+
+def _finite(node: object) -> float:
+    if not isinstance(node, int | float | str) or not is_sound(float(node)):
+        raise ValueError("no finite number")
+    return float(node)
 
 
 def _check_model(

@@ -86,6 +86,8 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
     if sensor is None:
         raise file.error(where, "does not say its sensor width", "export it from Pix4D again")
     width_mm, height_mm = file.numbers(f"{sensor[1]} {sensor[2]}", 2, where)
+    if min(width_mm, height_mm) <= 0.0:
+        raise file.error(where, "has a sensor of no size", "export it from Pix4D again")
     values = dict(re.findall(r"^[^\S\n]*([A-Z]\w*)[^\S\n]+(\S+)[^\S\n]*$", block, re.MULTILINE))
 
     def number(key: str) -> float:

@@ -9,6 +9,7 @@ one it is.
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -18,6 +19,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.foreign import ForeignFile
 from kgcp.io.poses.source import SourcePoses, photo_rotation
 
+_SHORTEST = 1e-6  # of quaternions, which should have the length 1
 _LINE = re.compile(r"\d+(\s+[-+.\deE]+){7}\s+\d+\s+(\S.*)")
 
 
@@ -66,7 +68,7 @@ def _pose(file: ForeignFile, where: str, row: str) -> tuple[str, FloatArray, Flo
         )
     *numbers, _, name = row.split(maxsplit=9)
     _, w, x, y, z, *translation = file.numbers(" ".join(numbers), 8, where)
-    if w == x == y == z == 0.0:
+    if math.hypot(w, x, y, z) < _SHORTEST:
         raise file.error(where, "has a quaternion of zeros", "export it again")
     world_from_camera = np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix()).T
     rotation = photo_rotation(file, where, world_from_camera)

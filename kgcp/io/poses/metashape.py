@@ -18,7 +18,7 @@ from pyproj.exceptions import CRSError
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.foreign import ForeignFile
-from kgcp.io.poses.source import SourcePoses, from_geocentric, photo_rotation
+from kgcp.io.poses.source import SourcePoses, from_geocentric, photo_rotation, require_rotation
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -122,7 +122,11 @@ def _similarity(file: ForeignFile, parent: Element) -> _Similarity | None:
     rotation = file.numbers(element.findtext("rotation"), 9, f"{where} rotation")
     translation = file.numbers(element.findtext("translation"), 3, f"{where} translation")
     (scale,) = file.numbers(element.findtext("scale") or "1", 1, f"{where} scale")
-    return _Similarity(scale, np.array(rotation).reshape(3, 3), np.array(translation))
+    if scale <= 0.0:
+        raise file.error(where, f"has the scale {scale:g}", "export it again")
+    matrix = np.array(rotation).reshape(3, 3)
+    require_rotation(file, where, matrix)
+    return _Similarity(scale, matrix, np.array(translation))
 
 
 def _geodetic(file: ForeignFile, chunk: Element) -> str | None:

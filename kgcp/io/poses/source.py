@@ -61,11 +61,21 @@ def photo_rotation(file: ForeignFile, where: str, frame_from_camera: FloatArray)
     KgcpError
         If the matrix is no rotation.
     """
-    departure = np.abs(frame_from_camera @ frame_from_camera.T - np.eye(3)).max()
-    if not departure < _MAX_DISTORTION or np.linalg.det(frame_from_camera) < 0.0:
-        raise file.error(where, "has a rotation matrix that is none", "export it again")
+    require_rotation(file, where, frame_from_camera)
     rotation: FloatArray = frame_from_camera @ CAMERA_FROM_PHOTO
     return rotation
+
+
+def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:
+    """Refuse a matrix (3, 3) that is no rotation.
+
+    Raises
+    ------
+    KgcpError
+    """
+    departure = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not departure < _MAX_DISTORTION or np.linalg.det(matrix) < 0.0:
+        raise file.error(where, "has a rotation matrix that is none", "export it again")
 
 
 def from_geocentric(
