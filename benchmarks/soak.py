@@ -88,8 +88,13 @@ class Speed:
 
 
 def speed_between(taken: Sequence[Sample], first: float, last: float) -> Speed:
-    """Return the speed between two numbers of looks, nearest samples."""
-    begin, end = (min(taken, key=lambda one: abs(one.done - done)) for done in (first, last))
+    """Return the speed between two numbers of looks, by the nearest samples.
+
+    Only those count in which there were looks to come: later on, workers have ended, and their CPU
+    time is not seen any more.
+    """
+    looking = [one for one in taken if one.is_looking]
+    begin, end = (min(looking, key=lambda one: abs(one.done - done)) for done in (first, last))
     done = end.done - begin.done
     return Speed(done / (end.time_s - begin.time_s), done / (end.cpu_s - begin.cpu_s))
 

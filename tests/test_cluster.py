@@ -93,7 +93,7 @@ def test_what_kills_its_process_or_hangs_costs_no_worker_and_no_other() -> None:
     deadly = "__import__('os').kill(__import__('os').getpid(), 9)"
     slow = "__import__('time').sleep(60)"
     items = ["1 + 1", deadly, "2 + 2", slow, "3 + 3", "4 + 4"]
-    with connected("local:2", 1.0, ()) as workers:
+    with connected("local:2", 0.5, ()) as workers:
         assert workers.jobs == 2
         start = lambda _: workers.executor()  # noqa: E731 - short
         results = dict(careful_map(eval, items, start=start, jobs=2, limit_s=math.inf))
