@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed soak torture sample-flight dist clean
+.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed soak torture fuzz sample-flight dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -58,6 +58,12 @@ torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames
 
 soak: $(VENV)/.runs ## memory and speed of detect over 20 000 small frames (a quarter of an hour)
 	$(BIN)/python -m benchmarks.soak $(BENCH)
+
+FUZZ_SECONDS ?= 300
+
+fuzz: $(VENV)/.runs ## look for files that break a reader, FUZZ_SECONDS for each kind (half an hour)
+	$(PIP) --editable '.[fuzz]'
+	$(BIN)/python -m fuzz --seconds $(FUZZ_SECONDS) $(FUZZ)
 
 sample-flight: $(VENV)/.runs ## make sample_flight/ again, byte for byte
 	rm -rf sample_flight

@@ -59,7 +59,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         matrix = _matrix(nodes, _MATRIX_KEYS)
         coefficients = _matrix(nodes, _DISTORTION_KEYS)
         width, height = _number(nodes, _WIDTH_KEYS), _number(nodes, _HEIGHT_KEYS)
-    except (TypeError, ValueError, LookupError) as error:
+    except (TypeError, ValueError, LookupError, OverflowError) as error:
         raise file.error("", _PROBLEM, _REMEDY) from error
     if is_fisheye:
         raise unsupported(file, "", "a fisheye model")

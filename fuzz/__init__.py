@@ -1,0 +1,1 @@
+"""Coverage-guided fuzzing of all readers: `make fuzz`. CONTRIBUTING.md says how."""

@@ -1,0 +1,189 @@
+"""What is fuzzed: each target takes the bytes of one file and hands them to its readers.
+
+A reader may return or raise `KgcpError` or `Rejection`. Whatever else it raises is a finding, and
+so are warnings that are none of kgcp's.
+
+Each input is read as a flight would have it, its content telling the format, and once more with
+keys of flight.toml that its checksum chooses.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import TypeVar
+
+from kgcp.errors import KgcpError, KgcpWarning, Rejection
+from kgcp.geometry.camera import Camera
+from kgcp.io.calibrations import FORMATS as CALIBRATION_FORMATS
+from kgcp.io.calibrations import read_calibration
+from kgcp.io.flight import read_camera_and_targets, read_flight, read_printed_targets
+from kgcp.io.frames import read_exif, read_grey
+from kgcp.io.frametimes import TimesFormat, read_times
+from kgcp.io.gpstime import TimeSystem
+from kgcp.io.journal_text import from_text
+from kgcp.io.poses import FORMATS as POSE_FORMATS
+from kgcp.io.poses import read_reference_poses
+from kgcp.io.poses.notation import PoseNotation
+from kgcp.io.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
+from kgcp.io.trajectories.notation import Wander
+from kgcp.mapframe import parse_crs
+
+CRS = "EPSG:25832"
+FRAME_WIDTH, FRAME_HEIGHT = 40, 30
+FRAMES = ("DJI_0001.JPG", "DJI_0002.JPG", "a/frame 1.jpg", "a/frame 2.jpg", "b/frame 1.jpg")
+
+OPF_PARTS = {
+    "calibrated-cameras": """{"format": "application/opf-calibrated-cameras+json",
+"version": "1.0", "sensors": [], "cameras": [{"id": 1, "sensor_id": 3,
+"orientation_deg": [1.5, -2.5, 30.0], "position": [12.5, -7.25, 101.5]}, {"id": "2",
+"sensor_id": 3, "orientation_deg": [0, 0, -150.0], "position": [32.5, -7.25, 99.0]}]}
+""",
+    "camera-list": """{"format": "application/opf-camera-list+json", "version": "1.0",
+"cameras": [{"id": 1, "uri": "../image%20files/DJI_0001.JPG#page=0"},
+{"id": 2, "uri": "DJI_0002.JPG"}]}
+""",
+    "scene-reference-frame": """{"format": "application/opf-scene-reference-frame+json",
+"version": "1.0", "crs": {"definition": "EPSG:25832", "geoid_height": 47.5},
+"base_to_canonical": {"shift": [689500.0, 5336200.0, 500.0], "scale": [1.0, 1.0, 1.0],
+"swap_xy": false}}
+""",
+}
+
+LATE_MODULES = (
+    *CALIBRATION_FORMATS.values(),
+    *POSE_FORMATS.values(),
+    "kgcp.io.poses.georeference",
+    *(f"PIL.{name}ImagePlugin" for name in ("Bmp", "Jpeg", "Jpeg2K", "Mpo")),
+    *(f"PIL.{name}ImagePlugin" for name in ("Png", "Ppm", "Tiff", "WebP")),
+)
+"""What readers import when they are called."""
+
+_CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
+_COURSE = TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0))
+_DATED = replace(_COURSE, first_day=date(2026, 6, 16), time_system=TimeSystem.GPS)
+_NOTATIONS = (
+    *(TrajectoryNotation(format=kind) for kind in TrajectoryFormat),
+    *(replace(_DATED, format=kind) for kind in (TrajectoryFormat.CSV, TrajectoryFormat.TUM)),
+    replace(_DATED, format=TrajectoryFormat.SBET, course_sd_deg=None, wander=Wander.SUBTRACT),
+    replace(_COURSE, format=TrajectoryFormat.RTKLIB),
+    replace(_COURSE, time_system=TimeSystem.UTC, crs="EPSG:4258"),
+    replace(_COURSE, time_system=TimeSystem.GPS),
+)
+
+_One = TypeVar("_One")
+
+
+def flight_toml(data: bytes, folder: Path) -> None:
+    """Read a flight, its targets alone, and its CRS."""
+    (folder / "frames").mkdir(exist_ok=True)
+    (folder / "flight.toml").write_bytes(data)
+    _allow(lambda: read_printed_targets(folder))
+    _allow(lambda: read_camera_and_targets(folder))
+    flight = read_flight(folder)
+    if flight.crs is not None:
+        parse_crs(flight.crs)
+
+
+def times(data: bytes, folder: Path) -> None:
+    """Read times of frames."""
+    path = _written(folder, data)
+    _allow(lambda: read_times(path, FRAMES))
+    read_times(path, FRAMES, _chosen(data, tuple(TimesFormat)))
+
+
+def trajectories(data: bytes, folder: Path) -> None:
+    """Read a vehicle's trajectory."""
+    path = _written(folder, data)
+    _allow(lambda: read_trajectory(path, CRS))
+    read_trajectory(path, CRS, _chosen(data, _NOTATIONS))
+
+
+def poses(data: bytes, folder: Path) -> None:
+    """Read reference poses."""
+    path = _written_among_parts(folder, data)
+    _allow(lambda: read_reference_poses(path, crs=CRS, frames=FRAMES))
+    stated = _chosen(data, (None, CRS, "EPSG:4978"))
+    notation = PoseNotation(_chosen(data, tuple(POSE_FORMATS)), stated)
+    read_reference_poses(path, notation, crs=CRS, frames=FRAMES)
+
+
+def calibrations(data: bytes, folder: Path) -> None:
+    """Read a camera's calibration."""
+    path = _written(folder, data)
+    _allow(lambda: read_calibration(path, (None, None)))
+    read_calibration(path, (1600, 1200), _chosen(data, tuple(CALIBRATION_FORMATS)))
+
+
+def frames(data: bytes, folder: Path) -> None:
+    """Read a frame's EXIF and its pixels."""
+    path = _written(folder, data)
+    read_exif(path)
+    read_grey(path, _CAMERA)
+
+
+def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
+    """Read the result of a frame that an interrupted run has left in the flight's folder."""
+    try:
+        from_text(data)
+    except ValueError as error:  # what `Journal.read` makes a `KgcpError` of
+        raise KgcpError(" ".join(str(error).split())) from error
+
+
+TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
+    target.__name__: target
+    for target in (flight_toml, times, trajectories, poses, calibrations, frames, journal)
+}
+
+
+def feed(target: str, data: bytes, folder: Path) -> None:
+    """Hand the bytes of a file to a target, with a folder to write it to.
+
+    Raises
+    ------
+    Exception
+        Whatever is a finding.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", KgcpWarning)
+        _allow(lambda: TARGETS[target](data, folder))
+
+
+def feed_in_new_folder(target: str, data: bytes) -> None:
+    """Hand the bytes of a file to a target, which leaves nothing behind."""
+    with tempfile.TemporaryDirectory() as folder:
+        feed(target, data, Path(folder))
+
+
+def _allow(read: Callable[[], object]) -> None:
+    """Call a reader, which may raise known errors."""
+    with suppress(KgcpError, Rejection):
+        read()
+
+
+def _written(folder: Path, data: bytes) -> Path:
+    path = folder / "input"
+    path.write_bytes(data)
+    return path
+
+
+def _written_among_parts(folder: Path, data: bytes) -> Path:
+    """Write a part of an OPF project in the place of its sound one, and name the project."""
+    kind = next((kind for kind in OPF_PARTS if f"opf-{kind}+json".encode() in data), None)
+    if kind is None:
+        return _written(folder, data)
+    for name, part in OPF_PARTS.items():
+        content = data if name == kind else part.encode()
+        (folder / f"{name.replace('-', '_')}.json").write_bytes(content)
+    return folder / "calibrated_cameras.json"
+
+
+def _chosen(data: bytes, choices: tuple[_One, ...]) -> _One:
+    return choices[zlib.crc32(data) % len(choices)]
