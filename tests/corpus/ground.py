@@ -86,7 +86,7 @@ class Case:
     rows : mapping of str
         Of `kgcp detect`: frame to reason, beside the sound frame's.
     command : tuple of str
-        What is run, but for the flight.
+        What is run, but for the flight, for which `{flight}` stands.
     is_huge : bool
         Whether the memory is limited meanwhile.
     absent : tuple of bytes
@@ -165,7 +165,7 @@ def sparse(path: Path, head: bytes = b"") -> None:
 
 def run(case: Case, flight: Path) -> Result:
     """Run a case's command, within its limits of time and memory."""
-    command, *options = case.command
+    command, *options = (word.format(flight=flight) for word in case.command)
     with _at_most_seconds(LIMIT_S), _at_most_bytes(_MEMORY if case.is_huge else None):
         return CliRunner().invoke(main, (command, str(flight), *options))
 

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from tests.corpus.ground import (
     REFERENCE,
+    SEEN,
     TOML,
     VEHICLE,
     Case,
@@ -24,9 +25,11 @@ from tests.corpus.ground import (
 _EXPORT = ("export-gcp", "--format", "csv")
 _ALL = ("export-gcp", "--format", "all")
 _REPORT = ("bias-report", "--reexpose", "0")
+_SHEET = ("detect", "--jobs", "0", "--no-guided", "--overlay", "{flight}/kgcp/sheet")
 _TABLE = "kgcp/detections.parquet"
 _JOURNAL = "kgcp/.detections.journal"
 _SCRIPT = "<script>alert(1)<"
+_FRAME = f"{_SCRIPT}img src=x onerror=alert(2)>.png"
 
 
 class _Trap:
@@ -93,13 +96,11 @@ def _huge(name: str) -> Callable[[Path], object]:
 
 def _names(flight: Path) -> None:
     """Let the flight, its target and its frame be called like programs."""
-    frame = f"{_SCRIPT}img src=x onerror=alert(2)>.png"
     toml = TOML.replace('"lies"', f'"{_SCRIPT}\'&"').replace('"A"', f'"{_SCRIPT}"')
     (flight / "flight.toml").write_text(toml)
-    (flight / "frames" / frame).write_bytes(encoded(".png"))
-    (flight / "frames" / "sound.png").unlink()
-    (flight / "reference.csv").write_text(REFERENCE.replace("sound.png", frame))
-    write_detections(flight / _TABLE, frame=frame, target=_SCRIPT, scale_used=_SCRIPT)
+    (flight / "frames" / _FRAME).write_bytes(encoded(".png"))
+    (flight / "reference.csv").write_text(REFERENCE.replace("sound.png", _FRAME))
+    write_detections(flight / _TABLE, frame=_FRAME, target=_SCRIPT, scale_used=_SCRIPT)
 
 
 def _separating_names(flight: Path) -> None:
@@ -177,6 +178,13 @@ CASES = (
     Case("a status of its own", _table(status="splendid"), "no target was meas", command=_EXPORT),
     # names that would be more than names
     Case("names that are scripts, in the report", _names, command=_REPORT, absent=_ESCAPED),
+    Case(
+        "names that are scripts, in the contact sheet",
+        _names,
+        rows={_FRAME: SEEN},
+        command=_SHEET,
+        absent=_ESCAPED,
+    ),
     Case("names that are scripts, in all exports", _names, command=_ALL, absent=_ESCAPED),
     Case("names that break lines, in all exports", _separating_names, command=_ALL),
 )
