@@ -16,7 +16,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import GeographicCRS
 from pyproj.enums import TransformDirection
-from pyproj.exceptions import ProjError
+from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from kgcp.errors import KgcpError
@@ -203,6 +203,20 @@ class MapFrame:
         return result
 
 
+def crs_of(text: str) -> CRS:
+    """Return the CRS that a text names, without heights where it has none.
+
+    Raises
+    ------
+    CRSError
+        If pyproj cannot read it, or it names a file of definitions (`+init=`, which PROJ has given
+        up): it would be opened, whatever it is.
+    """
+    if "init=" in text:
+        raise CRSError("'init=' is no longer in use; write EPSG:25832 for +init=epsg:25832")
+    return CRS.from_user_input(text)
+
+
 def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
     """Return a CRS with heights; ellipsoidal ones, in metres, unless it is compound.
 
@@ -212,7 +226,7 @@ def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
         Beginning with `where`, if pyproj cannot read it.
     """
     try:
-        parsed = CRS.from_user_input(crs)
+        parsed = crs_of(crs)
     except ProjError as error:
         raise KgcpError(_explain(crs, error, where)) from error
     while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed

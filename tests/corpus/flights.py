@@ -61,6 +61,11 @@ def _many_targets(count: int) -> str:
     return TOML[:start] + tables + TOML[end:]
 
 
+def _crs_of_a_pipe(flight: Path) -> None:
+    os.mkfifo(flight / "pipe")
+    _toml("EPSG:25832", f"+init={flight}/pipe:a")(flight)
+
+
 def _elsewhere(flight: Path) -> None:
     _toml('folder = "frames"', 'folder = "../elsewhere"')(flight)
     shutil.copy(flight / "frames" / "sound.png", flight.parent / "elsewhere" / "sound.png")
@@ -299,6 +304,7 @@ CASES = (
         "a flight.toml that is a pipe", _instead("flight.toml", os.mkfifo), "does not exist; name"
     ),
     Case("a flight.toml that is a folder", _instead("flight.toml", Path.mkdir), "does not exist"),
+    Case("a CRS of a pipe", _crs_of_a_pipe, "'init=' is no longer in use", command=_EXPORT),
     Case("times that are a pipe", _instead("frames.csv", os.mkfifo)),
     Case(
         "a pipe for a trajectory", _instead("vehicle.csv", os.mkfifo), "no regular", command=_EXPORT

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.foreign import ForeignFile
 from kgcp.io.poses.source import SourcePoses, from_geocentric, photo_rotation, require_rotation
+from kgcp.mapframe import crs_of
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -135,7 +135,7 @@ def _geodetic(file: ForeignFile, chunk: Element) -> str | None:
     if not text:
         return None
     try:
-        crs = CRS.from_user_input(text)
+        crs = crs_of(text)
     except CRSError as error:
         raise file.error(
             "chunk reference",

@@ -20,6 +20,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.reference import rotation_from_opk
 from kgcp.io.foreign import ForeignFile, JsonObject
 from kgcp.io.poses.source import SourcePoses
+from kgcp.mapframe import crs_of
 
 _CAMERAS = "calibrated-cameras"
 _SCENE = "scene-reference-frame"
@@ -158,7 +159,7 @@ def _parsed(said: JsonObject) -> CRS | None:
     """Return the CRS; None where it is of no place on the Earth."""
     text = said.text("definition")
     try:
-        crs = CRS.from_user_input(text)
+        crs = crs_of(text)
     except CRSError as error:
         raise said.file.error(
             said.where, f"is no CRS that pyproj reads ({text[:40]!r})", "export it again"
