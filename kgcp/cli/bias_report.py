@@ -45,10 +45,13 @@ def command(
     from kgcp.bias.study import study_bias
     from kgcp.errors import KgcpError
     from kgcp.io.flight import read_flight
+    from kgcp.io.plotting import load_matplotlib
     from kgcp.io.poses import read_flight_poses
     from kgcp.io.sightings import read_attempts, read_settings
     from kgcp.io.staging import DETECTIONS, workplace
     from kgcp.io.whereabouts import read_whereabouts
+
+    load_matplotlib()  # before the report does
     from kgcp.report.write import write_report
 
     with workplace(flight, out, (DETECTIONS,)) as place:

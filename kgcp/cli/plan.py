@@ -98,6 +98,9 @@ def command(
     camera, calibration, targets = read_camera_and_targets(flight)
     target = chosen_targets(targets, (name,) if name else ())[0]
     if plot is not None:
+        from kgcp.io.plotting import load_matplotlib
+
+        load_matplotlib()  # before the figure does
         from kgcp.io.plan_files import check_figure_name
 
         check_figure_name(plot)
