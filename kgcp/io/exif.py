@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -14,8 +15,10 @@ from PIL.ExifTags import IFD, Base
 
 from kgcp.errors import SettingError
 from kgcp.io.anyfile import is_file
-from kgcp.io.imageheader import FORMATS
+from kgcp.io.imageheader import FORMATS, is_greedy
 from kgcp.io.times import parse_time
+
+_EXIF_MARK = b"Exif\0\0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,12 @@ def _exif_tags(path: Path) -> Mapping[int, Any]:
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # the limit guards decoding; aerial cameras exceed it
     try:
+        with path.open("rb") as stream:
+            if is_greedy(stream):
+                return {}
         with Image.open(path, "r", (*FORMATS, "TIFF")) as image:
+            if is_greedy(BytesIO(image.info.get("exif", b"").removeprefix(_EXIF_MARK))):
+                return {}
             # The method of the base class: that of PNG would decode all pixels.
             exif = Image.Image.getexif(image)
             return {**exif, **exif.get_ifd(IFD.Exif)}

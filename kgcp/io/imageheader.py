@@ -13,10 +13,11 @@ from PIL import Image
 FORMATS = ("BMP", "JPEG", "JPEG2000", "PNG", "PPM", "WEBP")
 """Pillow's names of what a frame may be, beside TIFF, whatever its name ends in."""
 
-_WIDTH, _HEIGHT, _ORIENTATION = 256, 257, 274
+_WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
 _UPRIGHT = 1
 _SHORT = 3
 _MOST_TAGS = 0xFFFF  # more, libtiff does not read either
+_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # of types; others: 1
 _INTEGERS = {1: "B", _SHORT: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 
 
@@ -44,12 +45,21 @@ class _Layout:
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """A tag of the first image of a TIFF, and where in the file it stands."""
+    """A tag of a TIFF, and where in the file it stands."""
 
     place: int
     tag: int
     kind: int
+    count: int
     value: bytes
+
+    def integer(self, order: str) -> int | None:
+        """Return the value, if it is one whole number."""
+        code = _INTEGERS.get(self.kind)
+        if code is None:
+            return None
+        (value,) = struct.unpack_from(order + code, self.value.ljust(8, b"\0"))
+        return int(value)
 
 
 def image_size(stream: BinaryIO) -> tuple[int, int] | None:
@@ -93,21 +103,37 @@ def upright(stream: BinaryIO) -> bytes:
     return bytes(turned)
 
 
+def is_greedy(stream: BinaryIO) -> bool:
+    """Return whether the tags of a TIFF, or of EXIF, say that they have more than it can hold.
+
+    Many tags may share the same bytes, and who reads them all has those bytes many times.
+    """
+    stream.seek(0)
+    layout = _Layout.of(stream.read(16))
+    if layout is None:
+        return False
+    entries = list(_entries(stream, layout))
+    below = [one.integer(layout.order) for one in entries if one.tag == _EXIF]
+    for first in below[:1]:
+        entries += _entries(stream, layout, first)
+    return sum(_BYTES.get(one.kind, 1) * one.count for one in entries) > 2 * stream.seek(0, 2)
+
+
 def _tiff_size(stream: BinaryIO, layout: _Layout) -> tuple[int, int] | None:
     found: dict[int, int] = {}
     for entry in _entries(stream, layout):
-        code = _INTEGERS.get(entry.kind)
-        if entry.tag in (_WIDTH, _HEIGHT) and code is not None:
-            (value,) = struct.unpack_from(layout.order + code, entry.value.ljust(8, b"\0"))
+        value = entry.integer(layout.order)
+        if entry.tag in (_WIDTH, _HEIGHT) and value is not None:
             found.setdefault(entry.tag, value)
     return (found[_WIDTH], found[_HEIGHT]) if len(found) == 2 else None
 
 
-def _entries(stream: BinaryIO, layout: _Layout) -> Iterator[_Entry]:
-    """Yield the tags of the first image, as far as the file has them."""
+def _entries(stream: BinaryIO, layout: _Layout, first: int | None = None) -> Iterator[_Entry]:
+    """Yield the tags of a directory, by default the first image's, as far as they are there."""
     stream.seek(0)
     try:
-        (first,) = struct.unpack(layout.order + layout.first, stream.read(2 * layout.field))
+        if first is None:
+            (first,) = struct.unpack(layout.order + layout.first, stream.read(2 * layout.field))
         place = first + struct.calcsize(layout.order + layout.count)
         stream.seek(first)
         (count,) = struct.unpack(layout.order + layout.count, stream.read(place - first))
@@ -116,8 +142,8 @@ def _entries(stream: BinaryIO, layout: _Layout) -> Iterator[_Entry]:
             entry = stream.read(size + layout.field)
             if len(entry) < size + layout.field:
                 return
-            tag, kind, _ = struct.unpack_from(layout.order + layout.entry, entry)
-            yield _Entry(place, tag, kind, entry[size:])
+            tag, kind, values = struct.unpack_from(layout.order + layout.entry, entry)
+            yield _Entry(place, tag, kind, values, entry[size:])
             place += len(entry)
     except (struct.error, OverflowError, ValueError, OSError):
         return  # the file is cut, or no place is where it says

@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import struct
+import tracemalloc
 from io import BytesIO
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from kgcp.io.imageheader import image_size, upright
+from kgcp.io.exif import Exif, read_exif
+from kgcp.io.imageheader import image_size, is_greedy, upright
 
 SIZE = (43, 29)
 
@@ -52,3 +56,27 @@ def test_no_header_is_trusted(head: bytes, place: int, noise: bytes) -> None:
     size = image_size(BytesIO(data))
     assert size is None or len(size) == 2
     assert len(upright(BytesIO(data))) == len(data)
+
+
+def tags_of_the_same_bytes(count: int, size: int, start: int) -> bytes:
+    """A TIFF whose tags all have its last bytes."""
+    entries = b"".join(struct.pack("<HHII", 40_000 + n, 7, size, start) for n in range(count))
+    head = b"II*\0" + struct.pack("<IH", 8, count) + entries + bytes(4)
+    return head + bytes(max(start + size - len(head), 0))
+
+
+def test_tags_that_share_their_bytes_are_not_read(tmp_path: Path) -> None:
+    greedy = tags_of_the_same_bytes(1000, 1 << 16, 1 << 15)
+    assert is_greedy(BytesIO(greedy))
+    assert not is_greedy(BytesIO(tags_of_the_same_bytes(1, 1 << 16, 1 << 15)))
+    assert not any(is_greedy(BytesIO(saved(form))) for form in ("TIFF", "JPEG"))
+    exif = Image.Exif()
+    exif.get_ifd(34665)[37510] = b"a comment" * 100
+    assert not is_greedy(BytesIO(exif.tobytes().removeprefix(b"Exif\0\0")))
+    path = tmp_path / "frame.png"
+    path.write_bytes(saved("PNG", exif=b"Exif\0\0" + greedy))
+    tracemalloc.start()
+    assert read_exif(path) == Exif()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 5_000_000  # and not 65 MB
