@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from kgcp.cli import main
 from tests.corpus.flights import CASES as FLIGHTS
 from tests.corpus.frames import CASES as FRAMES
 from tests.corpus.ground import SEEN, Case, reasons, run, sound_flight, state
@@ -24,11 +26,12 @@ def test_the_corpus_is_large_and_its_names_differ() -> None:
 def _warm(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Import and compile what is needed before there is a limit of time."""
     flight = sound_flight(tmp_path_factory.mktemp("warm"))
-    from click.testing import CliRunner
-
-    from kgcp.cli import main
-
-    assert CliRunner().invoke(main, ("detect", str(flight), "--jobs", "0")).exit_code == 0
+    for command, *options in (
+        *(("bias-report", "--reexpose", "0"), ("export-gcp", "--format", "all")),
+        ("detect", "--jobs", "0"),
+    ):
+        result = CliRunner().invoke(main, (command, str(flight), *options))
+        assert result.exit_code == 0, result.stderr
     assert reasons(flight) == {"sound.png": SEEN}
 
 
