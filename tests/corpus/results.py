@@ -26,6 +26,7 @@ _EXPORT = ("export-gcp", "--format", "csv")
 _ALL = ("export-gcp", "--format", "all")
 _REPORT = ("bias-report", "--reexpose", "0")
 _SHEET = ("detect", "--jobs", "0", "--no-guided", "--overlay", "{flight}/kgcp/sheet")
+_DRAW = ("target", "--format", "svg", "--format", "pdf", "--format", "dxf")
 _TABLE = "kgcp/detections.parquet"
 _JOURNAL = "kgcp/.detections.journal"
 _SCRIPT = "<script>alert(1)<"
@@ -101,6 +102,11 @@ def _names(flight: Path) -> None:
     (flight / "frames" / _FRAME).write_bytes(encoded(".png"))
     (flight / "reference.csv").write_text(REFERENCE.replace("sound.png", _FRAME))
     write_detections(flight / _TABLE, frame=_FRAME, target=_SCRIPT, scale_used=_SCRIPT)
+
+
+def _called_like_a_path(flight: Path) -> None:
+    toml = TOML.replace('"A"', '"../../../elsewhere/precious.txt"')
+    (flight / "flight.toml").write_text(toml)
 
 
 def _separating_names(flight: Path) -> None:
@@ -186,5 +192,10 @@ CASES = (
         absent=_ESCAPED,
     ),
     Case("names that are scripts, in all exports", _names, command=_ALL, absent=_ESCAPED),
+    Case("names that are scripts, in drawings", _names, command=_DRAW, absent=_ESCAPED),
+    Case("a target called like a path", _called_like_a_path, command=_DRAW),
+    Case(
+        "targets that are a link", _link("kgcp/targets", "../../elsewhere"), "link", command=_DRAW
+    ),
     Case("names that break lines, in all exports", _separating_names, command=_ALL),
 )
