@@ -16,6 +16,7 @@ from kgcp.errors import KgcpError
 MOST_BYTES = 1 << 29
 """Of a file that is read as a whole: a large reconstruction has a tenth of it."""
 _LONGEST_LINE = 1 << 20  # characters
+_UNTOLD = 1 << 20  # bytes, where the system does not tell
 LARGEST = 1e15
 """What no coordinate, angle, time or parameter reaches: more of it would overflow somewhere."""
 
@@ -61,13 +62,14 @@ def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
     try:
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
-            data = stream.read(most + 1) if size <= most else b""
+            room = min(size or _UNTOLD, most)  # which `read` takes at once, however little there is
+            data = stream.read(room + 1) if size <= most else b""
     except OSError as error:
         raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
-    if max(size, len(data)) > most:
+    if size > most or len(data) > room:
         raise KgcpError(
-            f"{path}: has {size} bytes, and what {toml_key} names has at most {most};"
-            " name the right file"
+            f"{path}: has {max(size, len(data))} bytes or more, and what {toml_key} names has at"
+            f" most {most}; name the right file"
         )
     return data
 

@@ -122,8 +122,8 @@ def _encoded(path: Path, camera: Camera) -> bytes:
             if size > most:
                 raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
             return upright(stream)
-    except OSError as error:
-        raise Rejection(Reason.DECODE_FAILED, str(error.strerror)) from error
+    except (OSError, ValueError) as error:  # ValueError: of names that no file has
+        raise Rejection(Reason.DECODE_FAILED, str(error)) from error
 
 
 def _require_size(width: int, height: int, camera: Camera) -> None:

@@ -62,7 +62,7 @@ def read_settings(path: Path) -> DetectSettings:
         known = {field.name for field in fields(DetectSettings)} & values.keys()
         settings = DetectSettings(**{name: values[name] for name in known})
         return replace(settings, method=Method(settings.method))
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError, RecursionError) as error:
         raise KgcpError(
             f"{path}: its settings are not of this version of kgcp ({error});"
             " run 'kgcp detect' on this flight again"

@@ -140,7 +140,7 @@ def sound_flight(around: Path) -> Path:
     return flight
 
 
-def write_detections(path: Path, **cells: object) -> None:
+def write_detections(path: Path, settings: str = "{}", **cells: object) -> None:
     """Write a table of one measured row, in which some cells may be others."""
     words: dict[str, object] = {
         "frame": "sound.png",
@@ -153,7 +153,7 @@ def write_detections(path: Path, **cells: object) -> None:
     row: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
     row |= words | pose | found
     row |= {"instance": 0, "reason": "", "time": time_cell(1781597701.0)} | cells
-    write_table(path, DETECTION_COLUMNS, [row], {"settings": "{}"})
+    write_table(path, DETECTION_COLUMNS, [row], {"settings": settings})
 
 
 def sparse(path: Path, head: bytes = b"") -> None:

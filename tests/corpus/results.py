@@ -27,6 +27,7 @@ _ALL = ("export-gcp", "--format", "all")
 _REPORT = ("bias-report", "--reexpose", "0")
 _SHEET = ("detect", "--jobs", "0", "--no-guided", "--overlay", "{flight}/kgcp/sheet")
 _DRAW = ("target", "--format", "svg", "--format", "pdf", "--format", "dxf")
+_REMEASURE = ("bias-report", "--reexpose", "9")
 _TABLE = "kgcp/detections.parquet"
 _JOURNAL = "kgcp/.detections.journal"
 _SCRIPT = "<script>alert(1)<"
@@ -182,6 +183,10 @@ CASES = (
     Case("a measurement that is none", _table(x_px=float("nan")), "x_px is empty", command=_EXPORT),
     Case("a point far out of the frame", _table(x_px=1e300), "", command=_EXPORT),
     Case("a status of its own", _table(status="splendid"), "no target was meas", command=_EXPORT),
+    Case("settings in depth", _table(settings="[" * 100_000), "its settings", command=_REPORT),
+    Case("settings of words", _table(settings='{"min_score": "x"}'), "its set", command=_REPORT),
+    Case("a frame of another folder", _table(frame="/etc/passwd"), "; ", command=_REMEASURE),
+    Case("a frame that no file is called", _table(frame="a\0b.png"), "; ", command=_REMEASURE),
     # names that would be more than names
     Case("names that are scripts, in the report", _names, command=_REPORT, absent=_ESCAPED),
     Case(

@@ -23,7 +23,7 @@ def test_only_regular_files_are_read_and_names_of_any_length_may_be_asked_for(
     (tmp_path / "link").symlink_to("file")
     assert read_bytes(tmp_path / "link", KEY, 5) == b"12345"
     with pytest.raises(
-        KgcpError, match=r"file: has 5 bytes, and what .*trajectory.* at most 4; na"
+        KgcpError, match=r"file: has 5 bytes or more, and what .*trajectory.* at most 4; na"
     ):
         read_bytes(whole, KEY, 4)
     os.mkfifo(tmp_path / "pipe")
