@@ -58,8 +58,8 @@ def _in_place_of_results(flight: Path) -> None:
     (flight / "kgcp").write_text("a file\n")
 
 
-def _table(**cells: object) -> Callable[[Path], object]:
-    return lambda flight: write_detections(flight / _TABLE, **cells)
+def _table(settings: str = "{}", **cells: object) -> Callable[[Path], object]:
+    return lambda flight: write_detections(flight / _TABLE, settings, **cells)
 
 
 def _retyped(column: str, values: pa.Array) -> Callable[[Path], object]:
