@@ -39,7 +39,7 @@ class DetectSettings:
     Attributes
     ----------
     method : Method
-        `model`: the image model of `kgcp.target.model`, started by the paper's chain;
+        `model`: the image model of `kgcp.target.model`, started by an outline's pose;
         `paper`: the search and the closed-form chain of Cucci (2016) alone.
     min_radius_px : float
         Smallest radius of a ring's outer circle that is looked for [px]; μ_min of §2.2.

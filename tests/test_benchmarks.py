@@ -16,6 +16,7 @@ from benchmarks.bound import frame_bound
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.planning.bound import censored_information, pose_covariance
+from kgcp.report.reexpose import reexposed
 from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import TARGET_PLATE, FramePlan, plan_flight
 from kgcp.synthetic.imaging import Optics, Sensor
@@ -199,8 +200,8 @@ def test_methods_without_sigmas_leave_dashes() -> None:
 
 def test_reexposed_frames_clip_and_round() -> None:
     grey = np.array([[0, 7, 100, 160, 255]], dtype=np.uint8)
-    np.testing.assert_array_equal(reexpose.reexposed(grey, 1.6), [[0, 11, 160, 255, 255]])
-    np.testing.assert_array_equal(reexpose.reexposed(grey, 0.6), [[0, 4, 60, 96, 153]])
+    np.testing.assert_array_equal(reexposed(grey, 1.6), [[0, 11, 160, 255, 255]])
+    np.testing.assert_array_equal(reexposed(grey, 0.6), [[0, 4, 60, 96, 153]])
 
 
 @pytest.fixture(scope="module")

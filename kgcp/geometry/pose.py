@@ -73,6 +73,21 @@ class Pose:
         turn = rotation_about(axis / sine * 2.0 * math.atan2(sine, cosine))
         return Pose(turn @ self.rotation, self.translation_m)
 
+    def tilted(self, least_rad: float) -> Pose:
+        """Return the pose with its normal turned away from the centre's ray, if it is nearer.
+
+        In its own direction; where it has none, in any.
+        """
+        ray = self.translation_m / self.distance_m
+        axis = np.cross(ray, self.normal)
+        lack_rad = least_rad - math.atan2(float(np.linalg.norm(axis)), float(ray @ self.normal))
+        if lack_rad <= 0.0:
+            return self
+        if np.linalg.norm(axis) < _SQUARE_VIEW:
+            axis = np.cross(ray, np.array([1.0, 0.0, 0.0]))
+        turn = rotation_about(lack_rad / np.linalg.norm(axis) * axis)
+        return Pose(turn @ self.rotation, self.translation_m)
+
     @property
     def roll_deg(self) -> float:
         """φ of the paper's eq. 11: tilt of the diameter in the camera's yz plane; 0 for R = I.

@@ -122,7 +122,9 @@ def _encoded(path: Path, camera: Camera) -> bytes:
             if size > most:
                 raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
             return upright(stream)
-    except (OSError, ValueError) as error:  # ValueError: of names that no file has
+    except OSError as error:  # without the path: a table is the same wherever its flight lies
+        raise Rejection(Reason.DECODE_FAILED, error.strerror or str(error)) from error
+    except ValueError as error:  # names that no file has
         raise Rejection(Reason.DECODE_FAILED, str(error)) from error
 
 

@@ -171,7 +171,7 @@ def confirm(
     settings: DetectSettings,
     prior: NormalPrior | None,
 ) -> Observation:
-    """Measure what the closed-form chain has found, and make sure that it is the target.
+    """Measure what a start has found, and make sure that it is the target.
 
     Raises
     ------

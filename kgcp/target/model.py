@@ -1,6 +1,6 @@
 """The measurement: a model of the image fitted to the grey values around all circles.
 
-Started by the paper's chain, which gives a pose good to a per cent or so. Both poses of the circle
+Started by the closed-form pose of an outline, good to a per cent or so. Both poses of the circle
 are adjusted; the one that fits better is reported, the other one kept with how much worse it fits.
 """
 
@@ -29,13 +29,15 @@ from kgcp.target.pairs import Blur
 from kgcp.target.plate import circles_of
 from kgcp.target.prior import NormalPrior
 from kgcp.target.sample import choose_sample
-from kgcp.target.verify import MAX_EDGE_NOISE, check_code, check_fit, check_precision, edge_noise
+from kgcp.target.verify import check_code, check_fit, check_precision, edge_noise
 from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
-_START_BLUR, _START_SLACK_PX = Blur(0.5, 0.5, 0.0), 1.5
+_SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
+_START_SLACK_PX = 1.5
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
-_SPILT_PX = (0.7, 1.4)  # by which edges may be displaced
+_DOUBTFUL_EDGE_NOISE = 0.07  # of the contrast: more than a true pose leaves in most frames
+_SPILT_PX = (0.7, 1.4, -0.7)  # by which edges may be displaced beyond what the start says
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
 _HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose is fitted no better
 
@@ -61,7 +63,7 @@ def measure_by_model(
     start: Observation,
     prior: NormalPrior | None = None,
 ) -> Observation:
-    """Measure a target that the paper's chain has found.
+    """Measure a target that the search has found.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def measure_by_model(
     target : Target
         Its layout.
     start : Observation
-        By the paper's chain.
+        By `kgcp.target.start`.
     prior : NormalPrior, optional
         Of the plate's normal. It only helps to choose between the two poses, whose values remain
         those of the image.
@@ -83,7 +85,7 @@ def measure_by_model(
     """
     pose = _without_edge_shift(start)
     imaging = imaging_of(grey, camera, target, pose)
-    poses = fit_both_poses(imaging, pose)
+    poses = fit_both_poses(imaging, pose, _start_blur(start))
     if prior is not None:
         poses = _choose_by_prior(imaging, poses, prior)
     check_fit(poses.best)
@@ -94,9 +96,9 @@ def measure_by_model(
 
 
 def _without_edge_shift(start: Observation) -> Pose:
-    """Return the pose that the paper's chain would give if the outer edge were not displaced.
+    """Return the pose that the start would have if the outer edge were not displaced.
 
-    The chain takes the distance from the outer circle alone; its radius is short by δ.
+    Its distance is from the outer circle alone, of which the radius is short by δ.
     """
     radius_px = start.appearance.radius_px
     shrink = radius_px / (radius_px + (start.appearance.edge_shift_px or 0.0))
@@ -139,9 +141,17 @@ def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
     return sum(2 + len(ring.code_deg) for ring in rings)
 
 
-def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
+def _start_blur(start: Observation) -> Blur:
+    """Return the blur that the start has seen; that of a sharp frame at least."""
+    appearance = start.appearance
+    seen_px = min(appearance.blur_px or 0.0, _LARGEST_START_BLUR * appearance.radius_px)
+    variance = max(_SHARP_PX2, seen_px * seen_px)
+    return Blur(variance, variance, 0.0)
+
+
+def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
     """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
-    rough = _rough_fit(imaging, pose)
+    rough = _rough_fit(imaging, pose, blur)
     other = _mirrored_fit(rough, _UNLIKELY)
     near = other.parameters if other.total < rough.total else rough.parameters
     best = adjust_with_streak(imaging, near)
@@ -152,28 +162,28 @@ def fit_both_poses(imaging: Imaging, pose: Pose) -> TwoPoses:
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
 
 
-def _rough_fit(imaging: Imaging, pose: Pose) -> Fit:
-    """Come near the minimum; from smaller distances if there is none near the start pose.
+def _rough_fit(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
+    """Come near the minimum; from other distances if there is none near the start pose.
 
     Where the plate is burnt white its light spills over the edges, and the start may be far off.
     """
-    rough = _approach(imaging, pose)
+    rough = _approach(imaging, pose, blur)
     for shift_px in _SPILT_PX:
-        if edge_noise(rough) <= MAX_EDGE_NOISE:
+        if edge_noise(rough) <= _DOUBTFUL_EDGE_NOISE:
             break
         closer = imaging.outer_radius_px / (imaging.outer_radius_px + shift_px)
         with contextlib.suppress(Rejection):
-            other = _approach(imaging, Pose(pose.rotation, closer * pose.translation_m))
+            other = _approach(imaging, Pose(pose.rotation, closer * pose.translation_m), blur)
             rough = min(rough, other, key=edge_noise)
     return rough
 
 
-def _approach(imaging: Imaging, pose: Pose) -> Fit:
+def _approach(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
     light = first_levels(imaging, pose)
     few = imaging.few_pixels
-    sample = choose_sample(imaging, pose, _START_BLUR, light, most=few, slack_px=_START_SLACK_PX)
+    sample = choose_sample(imaging, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
     unknowns = unknowns_of(imaging.response, has_streak=False)
-    return approach(sample, Parameters(pose, _START_BLUR, light), unknowns)
+    return approach(sample, Parameters(pose, blur, light), unknowns)
 
 
 def _choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:

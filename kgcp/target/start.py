@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 
-from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes, pose_on_plane
@@ -12,37 +14,38 @@ from kgcp.geometry.conic import fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.settings import Method
 from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
+from kgcp.target.edges import clear_of_dots
 from kgcp.target.layout import Ring, Target
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.paper import measure_ring, points_of_code
+
+_REACH_PX, _STEP_PX = 3.0, 0.2
+_AXIS_ERROR_PX = 0.3  # of an outline
+_FAINTEST = 0.25  # grey values per pixel: less is rounding
 
 
 def start_pose(
     grey: GreyArray, camera: Camera, target: Target, match: CodeMatch, method: Method
 ) -> Observation:
-    """Start by the closed-form chain, or, where that breaks, by the outline of the search.
+    """Start by the method's own means: the paper's chain, or the outline of the search.
 
-    Where white is burnt out far, or a ring is small and faint, the chain finds no edges that belong
-    together; the image model needs a pose good to some per cent only.
+    The outline is good to some tenths of a pixel, and the image model needs no more.
 
     Raises
     ------
     Rejection
-        With the method `paper`, where the chain breaks.
+        With the method `paper`, where its chain breaks.
     """
-    try:
+    if method is Method.PAPER:
         return measure_ring(grey, camera, target, match)
-    except Rejection:
-        if method is Method.PAPER:
-            raise
-        return _pose_of_outline(grey, camera, target, match)
+    return _pose_of_outline(grey, camera, target, match)
 
 
 def _pose_of_outline(
     grey: GreyArray, camera: Camera, target: Target, match: CodeMatch
 ) -> Observation:
     """Take the better one of the two poses that an outline has."""
-    ring, full_range = match.ring, float(np.iinfo(grey.dtype).max)
+    ring = match.ring
     outline = camera.undistort(match.outer.points(CODE_ANGLES_RAD))
     towards_x = camera.undistort(match.outer.points(np.radians([match.lag_deg])))[0]
     poses = (
@@ -51,8 +54,8 @@ def _pose_of_outline(
     )
     turned = [_turned(grey, camera, pose, ring) for pose in poses]
     score, pose = max(turned, key=lambda scored: scored[0])
-    radius_px = match.outer.a * target.ring.outer_diameter_m / ring.outer_diameter_m
-    black, white = match.black / full_range, match.white / full_range
+    # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
+    pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
     return Observation(
         target=target.name,
         ring=ring.name,
@@ -61,7 +64,7 @@ def _pose_of_outline(
         pose=pose,
         centre_px=camera.project(pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, pose),
-        appearance=Appearance(radius_px, black, white, 0.0, 0.0),
+        appearance=_appearance(grey, target, match),
         alternative=None,
         uncertainty=None,
     )
@@ -71,3 +74,58 @@ def _turned(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> tuple[fl
     """Turn a plate about its normal to where its code fits best."""
     scores, lags_deg = match_code(sample_grey(grey, points_of_code(camera, pose, ring)[None]), ring)
     return float(scores[0]), pose.turned(float(lags_deg[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Profile:
+    """One of a ring's edges, from the mean grey values along its radii.
+
+    Attributes
+    ----------
+    radius_px : float
+        Where they change most.
+    slope_per_px : float
+        By how much there, in grey values.
+    """
+
+    radius_px: float
+    slope_per_px: float
+
+
+def _appearance(grey: GreyArray, target: Target, match: CodeMatch) -> Appearance:
+    """Return size, levels, blur and δ as the mean profile along radii shows them.
+
+    Where the plate is burnt white its light spills over the edges, and the outline is too small.
+    """
+    ring, full_range = match.ring, float(np.iinfo(grey.dtype).max)
+    outer, inner = (
+        _profile(grey, match, diameter_m)
+        for diameter_m in (ring.outer_diameter_m, ring.inner_diameter_m)
+    )
+    contrast = match.white - match.black
+    return Appearance(
+        radius_px=match.outer.a * target.ring.outer_diameter_m / ring.outer_diameter_m,
+        black=match.black / full_range,
+        white=match.white / full_range,
+        saturated=0.0,
+        edge_shift_px=(inner.radius_px - ring.inner_ratio * outer.radius_px)
+        / (1.0 + ring.inner_ratio),
+        blur_px=contrast / (math.sqrt(2.0 * math.pi) * max(outer.slope_per_px, _FAINTEST)),
+    )
+
+
+def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Profile:
+    ring, outline = match.ring, match.outer
+    share = edge_diameter_m / ring.outer_diameter_m
+    reach_px = min(_REACH_PX, 0.5 * (1.0 - ring.inner_ratio) * outline.mean_radius)
+    radii_px = share * outline.mean_radius + np.arange(-reach_px, reach_px, _STEP_PX)
+    angles = CODE_ANGLES_RAD[::4]
+    px_per_m = 2.0 * outline.mean_radius / ring.outer_diameter_m
+    clear = clear_of_dots(angles, ring, edge_diameter_m, match.lag_deg, px_per_m)
+    spokes = outline.points(angles[clear]) - outline.centre
+    factors = radii_px / outline.mean_radius
+    profile = sample_grey(grey, outline.centre + factors[:, None, None] * spokes).mean(axis=1)
+    is_outer = edge_diameter_m > ring.inner_diameter_m
+    slopes = np.gradient(profile, _STEP_PX) * (1.0 if is_outer else -1.0)
+    steepest = int(np.argmax(slopes))
+    return _Profile(float(radii_px[steepest]), float(slopes[steepest]))

@@ -15,8 +15,7 @@ from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3
-MAX_EDGE_NOISE = 0.15
-"""Largest residuals near edges, of the contrast."""
+_MAX_EDGE_NOISE = 0.15  # of the contrast: the largest residuals near edges
 _MAX_RELATIVE_SD = 0.01
 _POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
@@ -45,7 +44,7 @@ def check_fit(fit: Fit) -> None:
     seen = ~(censoring.at_high | censoring.at_low)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
     noise = edge_noise(fit)
-    if outlying > _MAX_OUTLIERS or noise > MAX_EDGE_NOISE:
+    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE:
         raise Rejection(
             Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
         )

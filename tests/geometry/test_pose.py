@@ -110,3 +110,19 @@ def test_points_on_the_plate_need_no_third_coordinate() -> None:
     whole = np.column_stack((flat, np.zeros(2)))
     np.testing.assert_allclose(pose.transform(flat), pose.transform(whole))
     np.testing.assert_allclose(pose.transform(whole), whole @ pose.rotation.T + AHEAD)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 4.0, 11.0])
+def test_a_pose_is_tilted_in_its_own_direction_and_no_less_than_before(tilt_deg: float) -> None:
+    translation_m = np.array([3.0, -5.0, 40.0])
+    ray = translation_m / np.linalg.norm(translation_m)
+    facing = Rotation.align_vectors(ray[None], np.array([[0.0, 0.0, 1.0]]))[0]
+    way = facing.apply([math.cos(0.7), math.sin(0.7), 0.0])
+    turn = Rotation.from_rotvec(math.radians(tilt_deg) * way)
+    pose = Pose((turn * facing).as_matrix(), translation_m)
+    tilted = pose.tilted(math.radians(8.0))
+    sine = np.cross(ray, tilted.normal)
+    assert math.degrees(math.asin(np.linalg.norm(sine))) == pytest.approx(max(8.0, tilt_deg))
+    if tilt_deg:
+        np.testing.assert_allclose(sine / np.linalg.norm(sine), way, atol=1e-9)
+    np.testing.assert_array_equal(tilted.translation_m, translation_m)

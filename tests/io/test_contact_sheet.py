@@ -37,7 +37,8 @@ def cards() -> list[Card]:
         Card(
             *(f"f_{number:02d}.jpg", "A", 0, "measured", ""),
             *(f"{10 + number} m", "centre (1.0, 2.0) px"),
-            *(10.0 + number, 0.01 * (number % 7), 20.0, 1.0, f"{number + 1:06d}-0"),
+            *(10.0 + number, 0.01 * (number % 7), 20.0, 1.0),
+            stem=f"{number + 1:06d}-0",
         )
         for number in range(MEASURED)
     ]

@@ -18,6 +18,7 @@ from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.model import fit_both_poses
 from kgcp.target.observation import Appearance, Observation
+from kgcp.target.pairs import Blur
 from kgcp.target.verify import check_code, check_fit, check_precision
 
 PlacePlate = Callable[..., Pose]
@@ -40,7 +41,7 @@ def fit_plate(
         pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
         shown = Target(replace(target.ring, code_deg=code_deg), target.replicas)
         imaging = imaging_of(draw_frame((shown, pose)), camera, target, pose)
-        return fit_both_poses(imaging, pose).best
+        return fit_both_poses(imaging, pose, Blur(0.5, 0.5, 0.0)).best
 
     return fit
 
