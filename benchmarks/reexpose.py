@@ -17,11 +17,11 @@ import pandas as pd
 from benchmarks.bands import RADIUS_BANDS_PX, join_truth, read_truth
 from benchmarks.timing import time_measurement, timing_line
 from kgcp.errors import Rejection
+from kgcp.io.cells import Row
 from kgcp.io.detections import FrameResult, detection_rows
 from kgcp.io.exif import Exif
 from kgcp.io.flight import Flight, read_flight
 from kgcp.io.frames import list_frames, read_grey
-from kgcp.io.tables import Row
 from kgcp.report.reexpose import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
 from kgcp.target.measure import measure_frame

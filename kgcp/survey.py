@@ -13,6 +13,7 @@ from kgcp.crew import Crew, hired
 from kgcp.errors import KgcpError
 from kgcp.examine import Debug, FrameNote, FrameTask
 from kgcp.expectations import expectations, with_expectations
+from kgcp.io.cells import Row
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.contact_sheet import ContactSheet
 from kgcp.io.detections import detection_rows
@@ -24,7 +25,7 @@ from kgcp.io.locking import locked
 from kgcp.io.poses import read_flight_poses
 from kgcp.io.runrecord import versions, write_run_record
 from kgcp.io.stores import StoredFolder, frames_below
-from kgcp.io.tables import Row, write_table
+from kgcp.io.tables import write_table
 from kgcp.looks import Looks, Watcher
 from kgcp.overlays import draw_overlay
 from kgcp.settings import DetectSettings

@@ -11,8 +11,9 @@ import numpy as np
 
 from kgcp.consistency.advice import advice, rms_m
 from kgcp.consistency.study import Consistency, Discrepancy
+from kgcp.io.cells import Row, time_cell
 from kgcp.io.columns import CONSISTENCY_COLUMNS
-from kgcp.io.tables import Row, time_cell, write_table
+from kgcp.io.tables import write_table
 from kgcp.io.wholefile import write_bytes
 
 _AXES = ("along", "across", "up")

@@ -9,9 +9,9 @@ import numpy as np
 
 from kgcp.errors import Status
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.cells import Row, time_cell
 from kgcp.io.columns import DETECTION_COLUMNS
 from kgcp.io.frames import Exif
-from kgcp.io.tables import Row, time_cell
 from kgcp.target.observation import (
     Appearance,
     CommonUncertainty,

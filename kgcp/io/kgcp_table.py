@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.bias.edges import edge_distances
 from kgcp.bias.study import Comparison, Exposure
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.tables import Row, time_cell
+from kgcp.io.cells import Row, time_cell
 from kgcp.kgcps import Kgcp
 from kgcp.settings import Method
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +12,12 @@ import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.io.anyfile import is_file
+from kgcp.io.cells import Row
 from kgcp.io.columns import DETECTION_COLUMNS, Column, ColumnType
 from kgcp.io.wholefile import whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Row = Mapping[str, object]
 
 _ARROW_TYPES = {
     ColumnType.TEXT: pa.string(),
@@ -30,13 +28,7 @@ _ARROW_TYPES = {
     ColumnType.NUMBERS: pa.list_(pa.float64()),
 }
 _KEYS = ("frame", "target", "instance", "status")  # no row is without
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _ROWS_PER_GROUP = 4096  # of the file's row groups: so many are in memory at once
-
-
-def time_cell(time_s: float | None) -> datetime | None:
-    """Return Unix seconds as a table cell: UTC, rounded to the microsecond."""
-    return None if time_s is None else _EPOCH + timedelta(microseconds=round(time_s * 1e6))
 
 
 def write_table(

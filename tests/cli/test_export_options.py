@@ -14,8 +14,9 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.cells import time_cell
 from kgcp.io.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
-from kgcp.io.tables import read_table, time_cell, write_table
+from kgcp.io.tables import read_table, write_table
 from kgcp.mapframe import MapFrame
 
 _TOML = """\

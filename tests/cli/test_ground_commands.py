@@ -15,8 +15,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from kgcp.io.cells import time_cell
 from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
-from kgcp.io.tables import read_table, time_cell, write_table
+from kgcp.io.tables import read_table, write_table
 
 _TOML = """\
 name = "six <frames>"

@@ -22,8 +22,9 @@ from PIL import Image
 from kgcp.cli import main
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
+from kgcp.io.cells import time_cell
 from kgcp.io.columns import DETECTION_COLUMNS
-from kgcp.io.tables import time_cell, write_table
+from kgcp.io.tables import write_table
 
 WIDTH, HEIGHT = 64, 48
 LIMIT_S = 5.0

@@ -12,8 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from kgcp.errors import KgcpError
+from kgcp.io.cells import Row, time_cell
 from kgcp.io.columns import Column, ColumnType
-from kgcp.io.tables import Row, read_detections, read_table, time_cell, write_table
+from kgcp.io.tables import read_detections, read_table, write_table
 
 COLUMNS = (
     Column("name", ColumnType.TEXT, ""),
