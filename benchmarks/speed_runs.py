@@ -28,7 +28,6 @@ _BASE_MB, _FRAMES_HELD = 250, 4  # limit of a worker's memory
 _QUALITY = 92
 _HELP_RUNS = 5
 _MB = 1e6
-_MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
 class _Clock:
@@ -110,11 +109,19 @@ def _in_own_process(path: Path, flight: Flight) -> str:
         return pool.submit(_size_line, path, flight).result()
 
 
+def _peak_memory_bytes() -> int:
+    """Return the most memory that this process had; on Linux `getrusage` counts its parent's, too."""
+    if sys.platform != "linux":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
 def _size_line(path: Path, flight: Flight) -> str:
     cost_of(path, flight)  # compiles
     cost = cost_of(path, flight)
     costs = Costs("", "", (cost,))
-    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_BYTES / _MB
+    memory_mb = _peak_memory_bytes() / _MB
     limit_mb = _BASE_MB + _FRAMES_HELD * cost.pixels / _MB
     return (
         f"{1e-6 * cost.pixels:6.1f}{1e3 * cost.decode_s:11.1f}{costs.search:9.2f}{costs.whole:8.2f}"
