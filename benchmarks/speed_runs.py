@@ -110,7 +110,7 @@ def _in_own_process(path: Path, flight: Flight) -> str:
 
 
 def _peak_memory_bytes() -> int:
-    """Return the most memory that this process had; on Linux `getrusage` counts its parent's, too."""
+    """Return this process's peak memory; on Linux, `getrusage` counts its parent's, too."""
     if sys.platform != "linux":
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     status = Path("/proc/self/status").read_text(encoding="ascii")
