@@ -33,7 +33,7 @@ _UNEVEN = 0.5  # grey values of ink, disc and plate, of the contrast
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _CLEAR_SCORE = 0.9
-_DARKEST_BLACK = -0.15  # of the contrast; sharpening makes ink darker than it is
+_DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 CODE_LIKE = 0.7
 """Score above which a ring with dots is a code, if another one."""
