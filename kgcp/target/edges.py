@@ -18,7 +18,7 @@ _OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])
 _CUBIC_FROM_SAMPLES = np.linalg.inv(np.vander(_OFFSETS_PX, 4, increasing=True))
 _SEARCH_PX = np.arange(-2.5, 2.75, 0.25)
 _MAX_SHIFT_PX = 1.5
-_FAINTEST = 0.25  # grey values per pixel: less is rounding
+FAINTEST = 0.25  # grey values per pixel: less is rounding
 _MIN_SLOPE = 0.3  # of the median slope along the contour
 _PASSES = 3
 _DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
@@ -134,7 +134,7 @@ def edge_points(
     with np.errstate(divide="ignore", invalid="ignore"):  # no cubic term: no inflection, left out
         shift = -quadratic / (3.0 * cubic)
         slope = linear + shift * quadratic
-    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > _FAINTEST)
+    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST)
     if plausible.any():
         plausible &= slope >= _MIN_SLOPE * np.median(slope[plausible])
     return np.asarray((base + shift[:, None] * normals)[plausible])

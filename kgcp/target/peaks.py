@@ -16,7 +16,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 PEAK_RADIUS_PX = 2.8
 """Radius of the rings that the filters answer to most; a quarter more or less is as good."""
 _REACH = 4  # rows and columns that the filters look around a pixel, neighbours included
-_ROW, _MOST_ROWS = 3, 5  # rows that the answers of three are kept of; rows of a disc
+_ROW = 3  # rows that the answers of three are kept of
 _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around

@@ -14,14 +14,13 @@ from kgcp.geometry.conic import fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.settings import Method
 from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
-from kgcp.target.edges import clear_of_dots
+from kgcp.target.edges import FAINTEST, clear_of_dots
 from kgcp.target.layout import Ring, Target
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.paper import measure_ring, points_of_code
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
 _AXIS_ERROR_PX = 0.3  # of an outline
-_FAINTEST = 0.25  # grey values per pixel: less is rounding
 
 
 def start_pose(
@@ -110,7 +109,7 @@ def _appearance(grey: GreyArray, target: Target, match: CodeMatch) -> Appearance
         saturated=0.0,
         edge_shift_px=(inner.radius_px - ring.inner_ratio * outer.radius_px)
         / (1.0 + ring.inner_ratio),
-        blur_px=contrast / (math.sqrt(2.0 * math.pi) * max(outer.slope_per_px, _FAINTEST)),
+        blur_px=contrast / (math.sqrt(2.0 * math.pi) * max(outer.slope_per_px, FAINTEST)),
     )
 
 
