@@ -126,7 +126,7 @@ def look_again(
         candidate = Considered(
             target.name, match.ring.name, match.outer, match.score, is_match=True
         )
-        if any(map(candidate.is_on_plate_of, rivals)):
+        if any(rival.covers(candidate.outline) for rival in rivals):
             continue
         try:
             start = start_pose(grey, camera, target, match, settings.method)

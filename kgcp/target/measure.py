@@ -104,7 +104,7 @@ def examine(
         others = (other for other in trials if other is not trial)
         rivals = [*known, *(seen for other in others for seen in other.found)]
         own = _undisputed(trial.found, rivals)
-        free = [one for one in trial.considered if not any(map(one.is_on_plate_of, rivals))]
+        free = [one for one in trial.considered if not any(rival.covers(one.outline) for rival in rivals)]
         outcomes += own or (miss_of(grey, trial.target, free, settings),)
         considered += trial.considered
     return Examination(tuple(outcomes), tuple(considered))
@@ -140,7 +140,8 @@ def _try_target(
     found: list[Observation] = []
     considered: list[Considered] = []
     for ring in target.rings:
-        matches, refused = find_code(grey, outlines, ring, settings)
+        free = tuple(one for one in outlines if not any(seen.covers(one) for seen in found))
+        matches, refused = find_code(grey, free, ring, settings)
         considered += [
             Considered(
                 *(target.name, ring.name, one.outline, one.score),
@@ -152,7 +153,7 @@ def _try_target(
         ]
         for match in matches:
             candidate = Considered(target.name, ring.name, match.outer, match.score, is_match=True)
-            if any(map(candidate.is_on_plate_of, found)):
+            if any(seen.covers(match.outer) for seen in found):
                 continue
             try:
                 start = start_pose(grey, camera, target, match, settings.method)

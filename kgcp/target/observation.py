@@ -141,6 +141,11 @@ class Observation:
     common: CommonUncertainty | None = None
     is_guided: bool = False
 
+    def covers(self, outline: Ellipse) -> bool:
+        """Tell whether a ring lies on this plate."""
+        offset = np.linalg.norm(outline.centre - self.centre_px)
+        return bool(offset < self.appearance.radius_px)
+
 
 @dataclass(frozen=True, slots=True)
 class Miss:
@@ -207,8 +212,3 @@ class Considered:
     is_match: bool
     reason: Reason | None = None
     detail: str = ""
-
-    def is_on_plate_of(self, observation: Observation) -> bool:
-        """Tell whether this ring lies on a plate that is measured."""
-        offset = np.linalg.norm(self.outline.centre - observation.centre_px)
-        return bool(offset < observation.appearance.radius_px)
