@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
@@ -64,7 +65,7 @@ class Unknowns:
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""
         deviation = parameters.nuisance_vector - self.mean
-        return float(0.5 * (self.precision * deviation * deviation).sum())
+        return float(0.5 * (self.precision * deviation) @ deviation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,10 +256,8 @@ def _damped(normal: FloatArray, damping: float) -> FloatArray:
 
 
 def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    try:
-        solution = np.linalg.solve(matrix, right)
-    except np.linalg.LinAlgError as error:
-        raise Rejection(Reason.POOR_FIT, "singular normal equations") from error
-    if not np.all(np.isfinite(solution)):
-        raise Rejection(Reason.POOR_FIT, "steps are not finite")
-    return np.asarray(solution, dtype=np.float64)
+    """Solve normal equations by Cholesky's method; LAPACK itself, for they are small and many."""
+    _, solution, failure = dposv(matrix, right)
+    if failure or not np.isfinite(solution).all():
+        raise Rejection(Reason.POOR_FIT, "singular normal equations")
+    return np.asarray(solution)

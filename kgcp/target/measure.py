@@ -104,7 +104,11 @@ def examine(
         others = (other for other in trials if other is not trial)
         rivals = [*known, *(seen for other in others for seen in other.found)]
         own = _undisputed(trial.found, rivals)
-        free = [one for one in trial.considered if not any(rival.covers(one.outline) for rival in rivals)]
+        free = [
+            one
+            for one in trial.considered
+            if not any(rival.covers(one.outline) for rival in rivals)
+        ]
         outcomes += own or (miss_of(grey, trial.target, free, settings),)
         considered += trial.considered
     return Examination(tuple(outcomes), tuple(considered))

@@ -108,27 +108,73 @@ def estimate_noise(
     count : float
         One grey value's step.
     """
-    floor = (_MIN_NOISE_COUNTS * count) ** 2
-    share = np.minimum(np.maximum(share, 0.0), 1.0)
-    dark = _trimmed_variance(residuals[usable & (share < 0.15)])
-    bright = _trimmed_variance(residuals[usable & (share > 0.85)])
-    if dark is None or bright is None:
-        dark = bright = dark or bright or _trimmed_variance(residuals[usable]) or floor
-    plateau = np.maximum(dark + (bright - dark) * share, floor)
-    edge = usable & (share > 0.2) & (share < 0.8)
-    standardised = _trimmed_variance(residuals[edge] / np.sqrt(plateau[edge]))
-    excess = max(0.0, standardised - 1.0) if standardised is not None else 0.0
-    variance = plateau * (1.0 + excess * 4.0 * share * (1.0 - share))
-    return Noise(np.sqrt(variance), np.sqrt(plateau))
+    sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
+    _estimate(residuals, share, usable, (_MIN_NOISE_COUNTS * count) ** 2, sd, plateau_sd)
+    return Noise(sd, plateau_sd)
 
 
-def _trimmed_variance(values: FloatArray) -> float | None:
-    """Return the variance of the central part, scaled to the whole; None if there are too few."""
-    if len(values) < _MIN_SAMPLES:
-        return None
-    count = max(1, int(_TRIM * len(values)))
-    squares = np.partition(values * values, count - 1)[:count]
-    return float(squares.sum()) / (count * _TRIMMED_VARIANCE)
+@compiled
+def _estimate(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    floor: float,
+    sd: FloatArray,
+    plateau_sd: FloatArray,
+) -> None:
+    ink, white = _plateau_variances(residuals, share, usable, floor)
+    edge, of_edge = np.empty(len(share)), 0
+    for i in range(len(share)):
+        within = min(max(share[i], 0.0), 1.0)
+        variance = max(ink + (white - ink) * within, floor)
+        plateau_sd[i] = math.sqrt(variance)
+        if usable[i] and 0.2 < within < 0.8:
+            edge[of_edge] = residuals[i] * residuals[i] / variance
+            of_edge += 1
+    standardised = _trimmed_variance(edge[:of_edge])
+    excess = 0.0 if math.isnan(standardised) else max(0.0, standardised - 1.0)
+    for i in range(len(share)):
+        within = min(max(share[i], 0.0), 1.0)
+        sd[i] = plateau_sd[i] * math.sqrt(1.0 + excess * 4.0 * within * (1.0 - within))
+
+
+@compiled
+def _plateau_variances(
+    residuals: FloatArray, share: FloatArray, usable: BoolArray, floor: float
+) -> tuple[float, float]:
+    """Return the variances of ink and plate; one for both, where there is too little of either."""
+    dark, bright, both = np.empty((3, len(share)))
+    of_dark = of_bright = of_both = 0
+    for i in range(len(share)):
+        if not usable[i]:
+            continue
+        both[of_both] = square = residuals[i] * residuals[i]
+        of_both += 1
+        if share[i] < 0.15:
+            dark[of_dark] = square
+            of_dark += 1
+        elif share[i] > 0.85:
+            bright[of_bright] = square
+            of_bright += 1
+    ink, white = _trimmed_variance(dark[:of_dark]), _trimmed_variance(bright[:of_bright])
+    if not math.isnan(ink + white):
+        return ink, white
+    for one in (ink, white, _trimmed_variance(both[:of_both])):
+        if not math.isnan(one):
+            return one, one
+    return floor, floor
+
+
+@compiled
+def _trimmed_variance(squares: FloatArray) -> float:
+    """Return the variance of the central part, scaled to the whole; NaN if there are too few."""
+    if len(squares) < _MIN_SAMPLES:
+        return math.nan
+    count = max(1, int(_TRIM * len(squares)))
+    total = 0.0
+    for square in np.partition(squares, count - 1)[:count]:
+        total += square
+    return total / (count * _TRIMMED_VARIANCE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,6 +39,12 @@ class Blur:
         """Tell whether there is motion."""
         return bool(self.streak_x or self.streak_y)
 
+    def scaled(self, factor: float) -> Blur:
+        """Return a blur that is so many times as wide."""
+        square = factor * factor
+        streak = (factor * self.streak_x, factor * self.streak_y)
+        return Blur(square * self.xx, square * self.yy, square * self.xy, *streak)
+
     @property
     def vector(self) -> FloatArray:
         """All five, in the order of the attributes."""
