@@ -30,6 +30,7 @@ _HIDDEN_SIGMAS = 4.0  # from there through the next edge
 _SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
 _MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
 _DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
+_SAME_PLACE = 1e-6  # of a radius
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
 
 
@@ -68,8 +69,8 @@ class SeenPlate:
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
         """Return pixels (n,) with all that a kernel around them covers."""
-        reached = cv2.dilate(pixels.reshape(self.shape).astype(np.uint8), kernel)
-        return np.asarray(reached.ravel() > 0)
+        reached = cv2.dilate(pixels.reshape(self.shape).view(np.uint8), kernel)
+        return np.asarray(reached.ravel().view(np.bool_))
 
 
 def see_plate(
@@ -94,7 +95,7 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     x, y = points_m = plate_points(pose, window.rays[:, some])
     share, off_edge_m = np.ones(len(x)), np.empty(len(x))
     _fill_plateaus(
-        points_m, circles.centres_m, circles.radii_m, circles.signs, 0.0, share, off_edge_m
+        points_m, circles.centres_m, circles.radii_m, circles.signs, 0.0, np.inf, share, off_edge_m
     )
     inside = x * x + y * y < imaging.outer_radius_m**2
     black, white = (
@@ -127,9 +128,9 @@ def reached_by_surroundings(seen: SeenPlate) -> BoolArray:
     imaging, blur = seen.imaging, seen.blur
     black, white = seen.levels()
     contrast, white = white - black, min(white, 1.0)
-    beyond = seen.rho_m / imaging.outer_radius_m - 1.0
-    outside = beyond * imaging.outer_radius_px > _CLEAR_SIGMAS * blur.largest_sd_px
-    foreign = outside & (np.abs(imaging.window.smooth - white) > _FOREIGN_CONTRAST * contrast)
+    clear = 1.0 + _CLEAR_SIGMAS * blur.largest_sd_px / imaging.outer_radius_px
+    foreign = np.abs(imaging.window.smooth - white) > _FOREIGN_CONTRAST * contrast
+    foreign &= seen.rho_m > clear * imaging.outer_radius_m
     reach = _FOREIGN_SIGMAS * blur.largest_sd_px
     half = int(np.ceil(reach))
     columns, rows = np.meshgrid(*2 * [np.arange(-half, half + 1)])
@@ -138,7 +139,8 @@ def reached_by_surroundings(seen: SeenPlate) -> BoolArray:
     distance2 = (yy * columns**2 - 2.0 * xy * columns * rows + xx * rows**2) / determinant
     kernel = (distance2 <= _FOREIGN_SIGMAS**2).astype(np.uint8)
     reached = seen.dilated(foreign, kernel)
-    return np.asarray(reached & (beyond > -2.0 * reach / imaging.outer_radius_px))
+    inmost_m = (1.0 - 2.0 * reach / imaging.outer_radius_px) * imaging.outer_radius_m
+    return np.asarray(reached & (seen.rho_m > inmost_m))
 
 
 def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
@@ -151,25 +153,27 @@ def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
     count = seen.points_m.shape[1]
     if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
         return np.zeros(count, dtype=bool)
-    share, off_edge = np.ones(count), np.empty(count)
+    share, off_edge_m = np.ones(count), np.empty(count)
     circles, per_px = imaging.circles, 1.0 / seen.metres_per_px
-    small_m = _SMALL_SIGMAS * sd_px * seen.metres_per_px
+    clear_m = (_CLEAR_SIGMAS * sd_px + slack_px) * seen.metres_per_px
     _fill_plateaus(
-        seen.points_m, circles.centres_m, circles.radii_m, circles.signs, small_m, share, off_edge
+        *(seen.points_m, circles.centres_m, circles.radii_m, circles.signs),
+        *(_SMALL_SIGMAS * sd_px * seen.metres_per_px, clear_m, share, off_edge_m),
     )
-    off_edge = off_edge * per_px - slack_px
-    beyond = (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px
     black, white = seen.levels()
-    contrast = min(white, 1.0) - black
-    off_level = np.abs(imaging.window.smooth - (black + contrast * share))
-    tested = (off_edge > _CLEAR_SIGMAS * sd_px) & (beyond < 0.0)
-    other = tested & (off_level > _HIDDEN_CONTRAST * contrast)
-    near = (off_edge > _NO_EDGE_SIGMAS * sd_px) & (beyond < _NO_EDGE_OUTSIDE_SIGMAS * sd_px)
-    other |= near & (off_level > _NO_EDGE_CONTRAST * contrast)
+    other = np.empty(count, dtype=np.bool_)
+    tested = _mark_other(
+        *(imaging.window.smooth, share, black, min(white, 1.0) - black),
+        *(
+            off_edge_m * per_px - slack_px,
+            (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px,
+        ),
+        *(sd_px, other),
+    )
     if other.any():
         other = _without_dots(seen, other)
     found = int(np.count_nonzero(other))
-    if not found or found > _MAX_HIDDEN * np.count_nonzero(tested | near):
+    if not found or found > _MAX_HIDDEN * tested:
         return np.zeros(count, dtype=bool)
     half = math.ceil(_HIDDEN_SIGMAS * sd_px + slack_px)
     size = (2 * half + 1, 2 * half + 1)
@@ -182,9 +186,7 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
     That speaks of another code, and must not be overlooked.
     """
     radii_m = seen.imaging.circles.radii_m
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(
-        other.reshape(seen.shape).astype(np.uint8)
-    )
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(other.reshape(seen.shape).view(np.uint8))
     beside = (seen.rho_m > radii_m[0]) | (seen.rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
     hides = np.bincount(labels.ravel(), weights=beside) > 0
@@ -195,21 +197,64 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
 
 
 @compiled
+def _mark_other(
+    smooth: FloatArray,
+    share: FloatArray,
+    black: float,
+    contrast: float,
+    off_edge_px: FloatArray,
+    beyond_px: FloatArray,
+    sd_px: float,
+    other: BoolArray,
+) -> int:
+    """Mark the pixels that are not what they should be; return how many are looked at."""
+    tested = 0
+    for i in range(len(smooth)):
+        is_clear = off_edge_px[i] > _CLEAR_SIGMAS * sd_px and beyond_px[i] < 0.0
+        is_near = off_edge_px[i] > _NO_EDGE_SIGMAS * sd_px
+        is_near &= beyond_px[i] < _NO_EDGE_OUTSIDE_SIGMAS * sd_px
+        tested += is_clear or is_near
+        off_level = abs(smooth[i] - (black + contrast * share[i]))
+        other[i] = (is_clear and off_level > _HIDDEN_CONTRAST * contrast) or (
+            is_near and off_level > _NO_EDGE_CONTRAST * contrast
+        )
+    return tested
+
+
+@compiled
 def _fill_plateaus(
     points_m: FloatArray,
     centres_m: FloatArray,
     radii_m: FloatArray,
     signs: FloatArray,
     small_m: float,
+    reach_m: float,
     share: FloatArray,
     off_edge_m: FloatArray,
 ) -> None:
-    """Fill in the white share without blur, and the distance to the nearest edge or small disc."""
+    """Fill in the white share without blur, and the distance to the nearest edge or small disc.
+
+    Edges farther than the reach may count as infinitely far.
+    """
+    count = len(radii_m)
+    # from a circle that is out of reach on to the next that may be in reach: dots of one ring are
+    # all as far from the target's centre
+    out_m, beyond = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
+    for c in range(count - 1, -1, -1):
+        beyond[c] = c + 1
+        is_like_next = c + 1 < count and radii_m[c] == radii_m[c + 1]
+        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_PLACE * radii_m[c]:
+            beyond[c] = beyond[c + 1]
     for i in range(points_m.shape[1]):
-        nearest = np.inf
-        for c in range(len(radii_m)):
-            dx, dy = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
-            square, radius = dx * dx + dy * dy, radii_m[c]
+        x, y = points_m[0, i], points_m[1, i]
+        rho, nearest, c = math.sqrt(x * x + y * y), np.inf, 0
+        while c < count:
+            radius = radii_m[c]
+            if abs(rho - out_m[c]) > radius + min(reach_m, nearest):
+                c = beyond[c]
+                continue
+            dx, dy = x - centres_m[0, c], y - centres_m[1, c]
+            square = dx * dx + dy * dy
             is_inside = square < radius * radius
             if is_inside:
                 share[i] += signs[c]
@@ -219,4 +264,5 @@ def _fill_plateaus(
             is_farther = square < limit * limit if is_inside else square > limit * limit
             if not is_farther or limit < 0.0:  # roots are what costs here
                 nearest = min(nearest, abs(radius - math.sqrt(square)))
+            c += 1
         off_edge_m[i] = nearest

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring
@@ -48,16 +49,23 @@ def circles_of(rings: tuple[Ring, ...]) -> Circles:
 
 def plate_points(pose: Pose, rays: FloatArray) -> FloatArray:
     """Return where the rays (6, n) of n pixels meet the plate (2, n) [m]."""
-    axes, offset = pose.rotation, pose.translation_m
-    normal = axes[:, 2]
-    x, y = rays[:2]
-    depth = (normal @ offset) / (normal[0] * x + normal[1] * y + normal[2])
-    points = np.empty((2, len(x)))
-    for j in (0, 1):
-        axis = axes[:, j]
-        np.multiply(axis[0] * x + axis[1] * y + axis[2], depth, out=points[j])
-        points[j] -= axis @ offset
+    points = np.empty((2, rays.shape[1]))
+    _meet(pose.rotation, pose.translation_m, rays, points)
     return points
+
+
+@compiled
+def _meet(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatArray) -> None:
+    height, along = 0.0, np.zeros(2)
+    for k in range(3):
+        height += axes[k, 2] * offset[k]
+        for j in range(2):
+            along[j] += axes[k, j] * offset[k]
+    for i in range(rays.shape[1]):
+        x, y = rays[0, i], rays[1, i]
+        depth = height / (axes[0, 2] * x + axes[1, 2] * y + axes[2, 2])
+        for j in range(2):
+            points[j, i] = depth * (axes[0, j] * x + axes[1, j] * y + axes[2, j]) - along[j]
 
 
 def largest_metres_per_px(pose: Pose, rays: FloatArray) -> float:

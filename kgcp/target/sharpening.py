@@ -14,6 +14,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 _REACH_SIGMAS = 2.5  # of the mask
 
 SingleArray = npt.NDArray[np.float32]
+NumberArray = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +37,8 @@ class Mask:
     """
 
     others: IndexArray
-    along_rows: IndexArray
-    along_columns: IndexArray
+    along_rows: NumberArray
+    along_columns: NumberArray
     kernel: FloatArray
 
     def detail(self, values: FloatArray) -> FloatArray:
@@ -91,30 +92,54 @@ def unsharp_mask(width: int, height: int, index: IndexArray, sigma_px: float) ->
     sigma_px : float
     """
     reach = math.ceil(_REACH_SIGMAS * sigma_px)
+    taps = 2 * reach + 1
+    along_columns = np.empty((len(index), taps), dtype=np.int32)
+    nothing = np.zeros(0, dtype=np.intp)
+    needed = _gather(index, nothing, width, height, along_columns, True)  # noqa: FBT003
+    along_rows = np.empty((len(needed), taps), dtype=np.int32)
+    sources = _gather(needed, index, width, height, along_rows, False)  # noqa: FBT003
     steps = np.arange(-reach, reach + 1)
-    row, column = np.divmod(index, width)
-    above = np.clip(row[:, None] + steps, 0, height - 1) * width + column[:, None]
-    needed, along_columns = _numbered(above, width * height, np.zeros(0, dtype=np.intp))
-    row, column = np.divmod(needed, width)
-    beside = row[:, None] * width + np.clip(column[:, None] + steps, 0, width - 1)
-    sources, along_rows = _numbered(beside, width * height, index)
     kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
     return Mask(sources[len(index) :], along_rows, along_columns, kernel / kernel.sum())
 
 
-def _numbered(pixels: IndexArray, size: int, first: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return the distinct pixels, given ones first, and the number of every pixel among them."""
-    occurs = np.zeros(size, dtype=bool)
-    occurs[pixels] = True
-    occurs[first] = False
-    distinct = np.concatenate((first, np.flatnonzero(occurs)))
-    number = np.empty(size, dtype=np.intp)
-    number[distinct] = np.arange(len(distinct))
-    return distinct, number[pixels]
+@compiled
+def _gather(
+    index: IndexArray,
+    first: IndexArray,
+    width: int,
+    height: int,
+    numbers: NumberArray,
+    is_column: bool,  # noqa: FBT001 - compiled functions have no keywords
+) -> IndexArray:
+    """Return the pixels that are needed along columns or rows, given ones first.
+
+    The number among them of each that a pixel (n,) needs goes to `numbers` (n, 2 r + 1).
+    """
+    reach = numbers.shape[1] // 2
+    number = np.full(width * height, -1, np.int32)
+    for i in range(len(index)):
+        row, column = index[i] // width, index[i] % width
+        for j in range(numbers.shape[1]):
+            if is_column:
+                pixel = min(max(row + j - reach, 0), height - 1) * width + column
+            else:
+                pixel = row * width + min(max(column + j - reach, 0), width - 1)
+            numbers[i, j] = pixel
+            number[pixel] = 0
+    for pixel in first:
+        number[pixel] = -1
+    distinct = np.concatenate((first, np.flatnonzero(number == 0)))
+    for k in range(len(distinct)):
+        number[distinct[k]] = k
+    for i in range(len(index)):
+        for j in range(numbers.shape[1]):
+            numbers[i, j] = number[numbers[i, j]]
+    return distinct
 
 
 @compiled
-def _smooth(source: FloatArray, at: IndexArray, kernel: FloatArray, out: FloatArray) -> None:
+def _smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: FloatArray) -> None:
     """Add up weighted values: out[i] = Σ kernel[j] · source[at[i, j]]."""
     for i in range(at.shape[0]):
         total = 0.0
@@ -133,7 +158,7 @@ def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
 
 @compiled
 def _smooth_layers(
-    source: SingleArray, at: IndexArray, kernel: SingleArray, out: SingleArray
+    source: SingleArray, at: NumberArray, kernel: SingleArray, out: SingleArray
 ) -> None:
     """Do as `_smooth` for every layer."""
     for i in range(at.shape[0]):
@@ -148,7 +173,7 @@ def _smooth_layers(
 def _add_detail(
     layers: SingleArray,
     between: SingleArray,
-    at: IndexArray,
+    at: NumberArray,
     kernel: SingleArray,
     rows: IndexArray,
     strength: float,
