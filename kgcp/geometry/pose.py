@@ -53,7 +53,7 @@ class Pose:
 
     def turned(self, angle_deg: float) -> Pose:
         """Return this pose with the target turned about its own z axis, from +x towards +y."""
-        turn = Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
+        turn = rotation_about(np.array([0.0, 0.0, math.radians(angle_deg)]))
         return Pose(self.rotation @ turn, self.translation_m)
 
     def moved(self, step: FloatArray) -> Pose:

@@ -15,14 +15,14 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit, adjust, approach, minimise
+from kgcp.target.adjust import Fit, adjust, approach, minimise, predict
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import PoseCovariance, pose_covariance, propagate
 from kgcp.target.foreign import first_levels
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import Parameters
-from kgcp.target.noise import find_censoring
+from kgcp.target.noise import find_censoring, misfit
 from kgcp.target.nuisance import adjust_with_streak, unknowns_of
 from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur
@@ -36,7 +36,7 @@ _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _START_SLACK_PX = 1.5
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
-_NARROWED = 1.12  # blur, of what a first approach sees: half of what usual sharpening takes away
+_HALF_SHARPENED, _NARROWED = 0.25, 1.12  # strength, and blur as a share of what seems to be
 _DOUBTFUL_EDGE_NOISE = 0.07  # of the contrast: more than a true pose leaves in most frames
 _SPILT_PX = (0.7, 1.4, -0.7)  # by which edges may be displaced beyond what the start says
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
@@ -154,15 +154,21 @@ def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
     """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
     rough = _rough_fit(imaging, pose, blur)
     other = _mirrored_fit(rough, _UNLIKELY)
-    near = other.parameters if other.total < rough.total else rough.parameters
-    if imaging.sharpening_px:
-        near = replace(near, blur=near.blur.scaled(_NARROWED))
-    best = adjust_with_streak(imaging, near)
-    other = _mirrored_fit(best)
+    near, far = (other, rough) if other.total < rough.total else (rough, other)
+    best = adjust_with_streak(imaging, _with_sharpening(imaging, near.parameters))
+    other = _fit_at(best, far.parameters.pose)
     if other.total < best.total:
         best = adjust(imaging, other.parameters, best.unknowns)
         other = _mirrored_fit(best)
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
+
+
+def _with_sharpening(imaging: Imaging, parameters: Parameters) -> Parameters:
+    """Go half the way to what usual sharpening does, if there may be any: it was left out."""
+    if not imaging.sharpening_px:
+        return parameters
+    light = replace(parameters.light, sharpening=_HALF_SHARPENED)
+    return Parameters(parameters.pose, parameters.blur.scaled(_NARROWED), light)
 
 
 def _rough_fit(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
@@ -234,6 +240,20 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
             break
         mirrored, linear = other.parameters, (other.prediction, other.jacobian)
     return other
+
+
+def _fit_at(fit: Fit, pose: Pose) -> Fit:
+    """Fit another pose to the pixels of a fit, unless it is hopeless."""
+    parameters = Parameters(pose, fit.parameters.blur, fit.parameters.light)
+    prediction = predict(fit.sample, parameters)
+    current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
+    there = replace(fit, parameters=parameters, prediction=prediction, misfit=current)
+    if there.total - fit.total > _HOPELESS:
+        return there
+    steps = _MIRRORED_STEPS[-1]
+    return minimise(
+        fit.sample, parameters, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
+    )
 
 
 def _observation(

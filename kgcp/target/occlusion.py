@@ -43,7 +43,7 @@ def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
     )
     visible = np.ones(ANGLES, dtype=bool)
     for step in (outwards, inwards):
-        visible &= step > _MIN_STEP * np.quantile(step, _TYPICAL)
+        visible &= step > _MIN_STEP * np.sort(step)[round(_TYPICAL * (ANGLES - 1))]
     core = _all_around(~visible, _SHORTEST // 2)
     if not core.any():
         return None
@@ -53,7 +53,8 @@ def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
 
 def _all_around(flags: BoolArray, reach: int) -> BoolArray:
     """Tell where flags are set, and so many samples on either side."""
-    return np.asarray(np.all([np.roll(flags, shift) for shift in range(-reach, reach + 1)], axis=0))
+    around = np.concatenate((flags[-reach:], flags, flags[:reach]))
+    return np.convolve(around, np.ones(2 * reach + 1), "valid") > 2 * reach + 0.5
 
 
 def _row(seen: FloatArray, ratio: float) -> FloatArray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
+from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
@@ -230,33 +232,67 @@ def _verdict(
 ) -> Verdict:
     templates = templates_of(ring)
     score, index, shift, lag = match
-    image = np.roll(templates.images[index], lag, axis=1)
-    seen = patch[shift : shift + len(image)]
-    black, contrast = _fit_levels(image, seen, templates.weights[:, None] * visible)
-    band = _code_rows(ring)
-    dots = _smoothed(image[band].mean(axis=0), ring)
-    rest = _smoothed((seen - black - contrast * image)[band].mean(axis=0) * visible, ring)
-    dot_contrast = float(np.ptp(dots))
+    image = templates.images[index]
+    dots, rest = np.empty(ANGLES), np.empty(ANGLES)
+    black, contrast = _compare(
+        *(image, lag, patch[shift : shift + len(image)], templates.weights),
+        *(visible, _code_rows(ring), dots, rest),
+    )
+    dot_contrast = float(np.ptp(_smoothed(dots, ring)))
     scale = max(abs(contrast) * dot_contrast, 1e-6)
     return Verdict(
         score=score,
         lag_deg=lag * 360.0 / ANGLES,
         black=black,
         white=black + contrast,
-        misfit=float(np.abs(rest).max()) / scale,
+        misfit=float(np.abs(_smoothed(rest, ring)).max()) / scale,
         dot_contrast=dot_contrast,
     )
 
 
-def _fit_levels(image: FloatArray, seen: FloatArray, weights: FloatArray) -> tuple[float, float]:
-    weights = weights / weights.sum()
-    image_mean, seen_mean = float(np.sum(image * weights)), float(np.sum(seen * weights))
-    centred = image - image_mean
-    contrast = float(np.sum(centred * seen * weights) / np.sum(centred**2 * weights))
-    return seen_mean - contrast * image_mean, contrast
+@compiled
+def _compare(
+    image: FloatArray,
+    lag: int,
+    seen: FloatArray,
+    weights: FloatArray,
+    visible: BoolArray,
+    is_code: BoolArray,
+    dots: FloatArray,
+    rest: FloatArray,
+) -> tuple[float, float]:
+    """Fit black and contrast to what is seen of a ring, by an image (rows, angles) of it.
+
+    The means over the code's rows go to `dots`, of the image, and to `rest`, of what it leaves.
+    """
+    total = mean = square = seen_mean = product = 0.0
+    rows, angles = image.shape
+    for r in range(rows):
+        for a in range(angles):
+            if visible[a]:
+                wanted, found = image[r, (a - lag) % angles], seen[r, a]
+                total += weights[r]
+                mean += weights[r] * wanted
+                seen_mean += weights[r] * found
+                square += weights[r] * wanted * wanted
+                product += weights[r] * wanted * found
+    mean, seen_mean = mean / total, seen_mean / total
+    contrast = (product / total - mean * seen_mean) / (square / total - mean * mean)
+    black = seen_mean - contrast * mean
+    share = 1.0 / is_code.sum()
+    dots[:], rest[:] = 0.0, 0.0
+    for r in range(rows):
+        if is_code[r]:
+            for a in range(angles):
+                wanted = image[r, (a - lag) % angles]
+                dots[a] += share * wanted
+                if visible[a]:
+                    rest[a] += share * (seen[r, a] - black - contrast * wanted)
+    return black, contrast
 
 
-def _code_rows(ring: Ring) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+@lru_cache(maxsize=64)
+def _code_rows(ring: Ring) -> BoolArray:
     radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
     return np.asarray(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
 

@@ -11,15 +11,16 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes, pose_on_plane
 from kgcp.geometry.conic import fit_ellipse
-from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.geometry.pose import image_heading_deg
 from kgcp.settings import Method
 from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
 from kgcp.target.edges import FAINTEST, clear_of_dots
-from kgcp.target.layout import Ring, Target
+from kgcp.target.layout import Target
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.paper import measure_ring, points_of_code
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
+_OUTLINE_STEP = 5  # of an ellipse's points enough give its undistorted image
 _AXIS_ERROR_PX = 0.3  # of an outline
 
 
@@ -45,21 +46,23 @@ def _pose_of_outline(
 ) -> Observation:
     """Take the better one of the two poses that an outline has."""
     ring = match.ring
-    outline = camera.undistort(match.outer.points(CODE_ANGLES_RAD))
+    outline = camera.undistort(match.outer.points(CODE_ANGLES_RAD[::_OUTLINE_STEP]))
     towards_x = camera.undistort(match.outer.points(np.radians([match.lag_deg])))[0]
-    poses = (
+    poses = [
         pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards_x)
         for plane in circle_planes(fit_ellipse(outline))
-    )
-    turned = [_turned(grey, camera, pose, ring) for pose in poses]
-    score, pose = max(turned, key=lambda scored: scored[0])
+    ]
+    seen = sample_grey(grey, np.stack([points_of_code(camera, pose, ring) for pose in poses]))
+    scores, lags_deg = match_code(seen, ring)
+    best = int(scores.argmax())
+    pose = poses[best].turned(float(lags_deg[best]))  # about its normal, to where its code fits
     # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
     return Observation(
         target=target.name,
         ring=ring.name,
         instance=0,
-        score=score,
+        score=float(scores[best]),
         pose=pose,
         centre_px=camera.project(pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, pose),
@@ -67,12 +70,6 @@ def _pose_of_outline(
         alternative=None,
         uncertainty=None,
     )
-
-
-def _turned(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> tuple[float, Pose]:
-    """Turn a plate about its normal to where its code fits best."""
-    scores, lags_deg = match_code(sample_grey(grey, points_of_code(camera, pose, ring)[None]), ring)
-    return float(scores[0]), pose.turned(float(lags_deg[0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,12 +114,12 @@ def best_template(patch: FloatArray, templates: Templates) -> tuple[float, int, 
         Sampled at `SAMPLED_RADII`.
     """
     rows = templates.images.shape[1]
+    window = np.arange(len(patch) - rows + 1)[:, None] + np.arange(rows)
     sums = np.stack((patch.sum(axis=1), np.einsum("ra,ra->r", patch, patch)))
-    mean, power = np.lib.stride_tricks.sliding_window_view(sums, rows, axis=1) @ templates.weights
+    mean, power = sums[:, window] @ templates.weights
     sd = np.sqrt(np.maximum(power - mean**2, 1e-9))
     spectrum = np.fft.rfft(patch, axis=1)[:, :_FREQUENCIES].T
-    shifted = np.lib.stride_tricks.sliding_window_view(spectrum, rows, axis=1).swapaxes(1, 2)
-    products = (templates.spectra @ shifted).reshape(_FREQUENCIES, -1)
+    products = (templates.spectra @ spectrum[:, window.T]).reshape(_FREQUENCIES, -1)
     correlation = (_WAVES @ np.concatenate((products.real, products.imag))).reshape(
         ANGLES, len(templates.images), -1
     )
