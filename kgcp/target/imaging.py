@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
-from kgcp.target.noise import Censoring
+from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.plate import Circles
 from kgcp.target.window import Window
 
@@ -35,6 +35,9 @@ class Imaging:
     response : Response
     sharpening_px : float
         σ of the unsharp mask to be modelled [px]; 0: none.
+    visible : (m,) array of bool, or None
+        Where the target is seen, in equal steps about its normal from its +x axis on; None:
+        everywhere, as far as the search knows.
     """
 
     window: Window
@@ -47,6 +50,7 @@ class Imaging:
     censoring: Censoring
     response: Response
     sharpening_px: float
+    visible: BoolArray | None = None
 
     @property
     def few_pixels(self) -> int | None:

@@ -184,12 +184,13 @@ def confirm(
         With the reason of the first test that is not passed.
     """
     ring = next(ring for ring in target.rings if ring.name == start.ring)
-    verify(grey, camera, start.pose, ring, settings)
+    visible = verify(grey, camera, start.pose, ring, settings)
     if ring is not target.ring:
         _check_main_ring(grey, camera, target.ring, start)
     if settings.method is Method.PAPER:
         return start
-    observation = measure_by_model(grey, camera, target, start, prior)
+    seen = visible if ring is target.ring else None
+    observation = measure_by_model(grey, camera, target, start, prior, seen)
     check_chance(observation, target, ring, settings.false_alarm)
     return observation
 

@@ -22,7 +22,7 @@ from kgcp.target.foreign import first_levels
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import Parameters
-from kgcp.target.noise import find_censoring, misfit
+from kgcp.target.noise import BoolArray, find_censoring, misfit
 from kgcp.target.nuisance import adjust_with_streak, unknowns_of
 from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur
@@ -63,6 +63,7 @@ def measure_by_model(
     target: Target,
     start: Observation,
     prior: NormalPrior | None = None,
+    visible: BoolArray | None = None,
 ) -> Observation:
     """Measure a target that the search has found.
 
@@ -78,6 +79,8 @@ def measure_by_model(
     prior : NormalPrior, optional
         Of the plate's normal. It only helps to choose between the two poses, whose values remain
         those of the image.
+    visible : (m,) array of bool, optional
+        Where the target is seen, in equal steps about its normal from its +x axis on.
 
     Raises
     ------
@@ -85,7 +88,7 @@ def measure_by_model(
         `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
     pose = _without_edge_shift(start)
-    imaging = imaging_of(grey, camera, target, pose)
+    imaging = replace(imaging_of(grey, camera, target, pose), visible=visible)
     poses = fit_both_poses(imaging, pose, _start_blur(start))
     if prior is not None:
         poses = _choose_by_prior(imaging, poses, prior)

@@ -90,6 +90,8 @@ def choose_sample(
     if light is not None:
         seen = see_plate(imaging, points, scale, blur, light)
         zone[reached_by_surroundings(seen) | hidden_pixels(seen, slack_px)] = _Zone.UNUSED
+    if imaging.visible is not None:
+        zone[~imaging.visible[_steps_about(points, len(imaging.visible))]] = _Zone.UNUSED
     near, flat = np.flatnonzero(zone == _Zone.NEAR), np.flatnonzero(zone == _Zone.FLAT)
     index = np.concatenate((near, flat[:: max(1, len(flat) // _PLATEAU_PIXELS)]))
     index.sort()
@@ -134,6 +136,12 @@ def _sample(
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
         pairs=_pairs(imaging, pose, blur, rays, points_m[:, index], metres_per_px),
     )
+
+
+def _steps_about(points_m: FloatArray, count: int) -> IndexArray:
+    """Return in which of so many steps about the plate's normal points (2, n) are."""
+    turns = np.arctan2(points_m[1], points_m[0]) / (2.0 * math.pi)
+    return np.asarray(np.rint(turns * count).astype(np.intp) % count)
 
 
 class _Zone(IntEnum):

@@ -43,7 +43,7 @@ _SEED_REACH = 2.0  # around places that are pointed out, of their radii
 _SMALLEST_WINDOW_PX = 12
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
     """How well one ring in the frame looks like a target's.
 
@@ -60,6 +60,8 @@ class Verdict:
         many or too few.
     dot_contrast : float
         Of the template's dots, of the ring's contrast: less than 1 where they are blurred.
+    visible : (angles,) array of bool, or None
+        Where the ring is seen, by angles of the sampled circles; None: everywhere.
     """
 
     score: float
@@ -68,6 +70,7 @@ class Verdict:
     white: float
     misfit: float
     dot_contrast: float
+    visible: BoolArray | None
 
     @property
     def limit(self) -> float:
@@ -196,14 +199,26 @@ def _rank(share: float) -> int:
 
 def verify(
     grey: GreyArray, camera: Camera, pose: Pose, ring: Ring, settings: DetectSettings
-) -> None:
-    """Raise `Rejection` unless a ring shows its code in the true perspective of its pose."""
+) -> BoolArray | None:
+    """Make sure that a ring shows its code in the true perspective of its pose.
+
+    Returns
+    -------
+    (angles,) array of bool, or None
+        Where it is seen, in equal steps about the plate's normal from its +x axis on; None:
+        everywhere.
+
+    Raises
+    ------
+    Rejection
+        `CODE_MISMATCH`, `OTHER_CODE` or `NO_CONTRAST`.
+    """
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     circle = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
     points = camera.project(pose.transform((radii_m[:, None, None] * circle).reshape(-1, 2)))
-    judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring).check(
-        settings.min_score
-    )
+    verdict = judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring)
+    verdict.check(settings.min_score)
+    return verdict.visible
 
 
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
@@ -217,7 +232,7 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
     Where a part of the ring is hidden, the rest of it is compared.
     """
     match = best_template(patch, templates_of(ring))
-    verdict = _verdict(patch, ring, match, np.ones(ANGLES, dtype=bool))
+    verdict = _verdict(patch, ring, match, None)
     visible = None
     if not verdict.is_clear:
         visible = visible_angles(patch[match[2] : len(patch) - 2 * SHIFTS + match[2]], ring)
@@ -228,15 +243,16 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
 
 
 def _verdict(
-    patch: FloatArray, ring: Ring, match: tuple[float, int, int, int], visible: BoolArray
+    patch: FloatArray, ring: Ring, match: tuple[float, int, int, int], visible: BoolArray | None
 ) -> Verdict:
     templates = templates_of(ring)
     score, index, shift, lag = match
     image = templates.images[index]
     dots, rest = np.empty(ANGLES), np.empty(ANGLES)
+    everywhere = np.ones(ANGLES, dtype=bool)
     black, contrast = _compare(
         *(image, lag, patch[shift : shift + len(image)], templates.weights),
-        *(visible, _code_rows(ring), dots, rest),
+        *(everywhere if visible is None else visible, _code_rows(ring), dots, rest),
     )
     dot_contrast = float(np.ptp(_smoothed(dots, ring)))
     scale = max(abs(contrast) * dot_contrast, 1e-6)
@@ -247,6 +263,7 @@ def _verdict(
         white=black + contrast,
         misfit=float(np.abs(_smoothed(rest, ring)).max()) / scale,
         dot_contrast=dot_contrast,
+        visible=visible,
     )
 
 

@@ -21,6 +21,7 @@ from kgcp.target.paper import measure_ring, points_of_code
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
 _OUTLINE_STEP = 5  # of an ellipse's points enough give its undistorted image
+_MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
 _AXIS_ERROR_PX = 0.3  # of an outline
 
 
@@ -55,7 +56,10 @@ def _pose_of_outline(
     seen = sample_grey(grey, np.stack([points_of_code(camera, pose, ring) for pose in poses]))
     scores, lags_deg = match_code(seen, ring)
     best = int(scores.argmax())
-    pose = poses[best].turned(float(lags_deg[best]))  # about its normal, to where its code fits
+    turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
+    pose = poses[best]
+    if abs(turn_deg) < _MAX_TURN_DEG:  # else something hides the code, which the search knows
+        pose = pose.turned(turn_deg)
     # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
     return Observation(

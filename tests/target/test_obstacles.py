@@ -15,9 +15,11 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
+from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import TARGET_PLATE
 from kgcp.synthetic.plate import Plate
 from kgcp.synthetic.shapes import Disc, Shape, rectangle
+from kgcp.target.measure import measure_frame
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Observation
 
@@ -172,3 +174,22 @@ def test_a_hidden_quarter_is_refused_or_owned_up_to(
     reasons = {outcome.reason for outcome in outcomes if outcome.reason is not None}
     assert reasons <= {Reason.POOR_FIT, Reason.OTHER_CODE}
     check(outcomes, sigmas=6.0, percent=1.5)
+
+
+@pytest.mark.parametrize("radiance", [0.03, 0.3, 0.85])
+@pytest.mark.parametrize("angle_deg", [20.0, 225.0, 300.0])
+def test_a_target_with_a_hidden_quarter_is_found_and_measured(
+    photograph: Photograph, angle_deg: float, radiance: float
+) -> None:
+    """The search sees what is hidden; black, grey or white, and dots with it."""
+    rng = np.random.default_rng(7)
+    pose = some_pose(rng)
+    quarter_m = 0.9 * math.sin(math.radians(21.0))
+    plate = with_layers((Disc(on_circle(0.45, angle_deg), quarter_m), radiance))
+    grey = photograph(LENS, pose, rng, plate=plate)
+    (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
+    assert isinstance(seen, Observation)
+    assert seen.uncertainty is not None
+    off_m = abs(seen.pose.distance_m - pose.distance_m)
+    assert off_m < 5.0 * seen.uncertainty.sd_distance_m
+    assert seen.uncertainty.sd_distance_m < 1e-3 * pose.distance_m
