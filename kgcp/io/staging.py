@@ -114,24 +114,11 @@ def _copied(flight: StoredFolder, folder: Path) -> Path:
     frames = _frames_folder(folder / "flight.toml")
     if frames is not None:
         (folder / frames).mkdir(parents=True, exist_ok=True)
-    passed_over = {NAME, str(frames)}
-    _copy_files(flight, folder, PurePosixPath(), passed_over)
+    for name in flight.tree([NAME] if frames is None else [NAME, str(frames)]):
+        if PurePosixPath(name).suffix.lower() not in FRAME_SUFFIXES:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes((flight / name).read())
     return folder
-
-
-def _copy_files(
-    flight: StoredFolder, folder: Path, below: PurePosixPath, passed_over: set[str]
-) -> None:
-    source = flight / str(below) if below.parts else flight
-    for name, info in source.files(is_deep=False):
-        path = below / name
-        if name.startswith(".") or str(path) in passed_over:
-            continue
-        if not info.is_file:
-            _copy_files(flight, folder, path, passed_over)
-        elif path.suffix.lower() not in FRAME_SUFFIXES:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / path).write_bytes((flight / str(path)).read())
 
 
 def _frames_folder(path: Path) -> PurePosixPath | None:

@@ -73,6 +73,24 @@ class StoredFolder:
                 raise KgcpError(f"{self}: the name {name!r} is no path below it; rename the object")
         return [each for each in named if not is_deep or each[1].type == FileType.File]
 
+    def tree(self, passed_over: Sequence[str]) -> Iterator[str]:
+        """Yield what files are below the folder: names relative to it.
+
+        Hidden ones are left out, and the folders `passed_over`, which S3 does not even list; in
+        `gs://` Arrow sees no folder that it does not list. Raises as `files`.
+        """
+        above = [f"{each}/" for each in passed_over]
+        folders = [""]
+        for folder in folders:
+            for name, info in (self / folder).files(is_deep=self.url.startswith("g")):
+                path = f"{folder}/{name}".lstrip("/")
+                if "/." in f"/{path}" or any(map(f"{path}/".startswith, above)):
+                    continue
+                if info.is_file:
+                    yield path
+                else:
+                    folders.append(path)
+
     def read(self) -> bytes:
         """Return the content of an object.
 
@@ -269,6 +287,8 @@ def _system(url: str) -> tuple[FileSystem, str]:
 
 def _content(system: FileSystem, path: str) -> bytes:
     with system.open_input_file(path) as stream:
+        if stream.closed:  # a stream of gs:// that has failed already
+            raise OSError("the store has broken off")
         content: bytes = stream.read()
     return content
 
