@@ -21,11 +21,11 @@ from kgcp.io.stores import StoredFolder, at_hand
 from kgcp.settings import DetectSettings
 from kgcp.target.common import common_uncertainty
 from kgcp.target.expected import Expectation, look_again
+from kgcp.target.judgement import CODE_LIKE
 from kgcp.target.layout import Target
 from kgcp.target.measure import Examination, examine, miss_of
 from kgcp.target.observation import Considered, Miss, Observation, Outcome, is_unreadable
 from kgcp.target.prior import NormalPrior
-from kgcp.target.search import CODE_LIKE
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,15 +78,26 @@ class Pose:
 
         In its own direction; where it has none, in any.
         """
+        axis, tilt_rad = self._tilt()
+        turn = rotation_about(max(0.0, least_rad - tilt_rad) * axis)
+        return Pose(turn @ self.rotation, self.translation_m)
+
+    def tilted_across(self, angle_rad: float) -> Pose:
+        """Return the pose with its normal turned away from the ray square to where it is turned."""
+        axis, tilt_rad = self._tilt()
+        across = np.cross(self.translation_m, axis) / self.distance_m
+        turn = rotation_about(angle_rad * across) @ rotation_about(-tilt_rad * axis)
+        return Pose(turn @ self.rotation, self.translation_m)
+
+    def _tilt(self) -> tuple[FloatArray, float]:
+        """Return about which unit axis the normal is off the ray, any if none, and how far."""
         ray = self.translation_m / self.distance_m
         axis = np.cross(ray, self.normal)
-        lack_rad = least_rad - math.atan2(float(np.linalg.norm(axis)), float(ray @ self.normal))
-        if lack_rad <= 0.0:
-            return self
-        if np.linalg.norm(axis) < _SQUARE_VIEW:
+        sine = float(np.linalg.norm(axis))
+        tilt_rad = math.atan2(sine, float(ray @ self.normal))
+        if sine < _SQUARE_VIEW:
             axis = np.cross(ray, np.array([1.0, 0.0, 0.0]))
-        turn = rotation_about(lack_rad / np.linalg.norm(axis) * axis)
-        return Pose(turn @ self.rotation, self.translation_m)
+        return axis / np.linalg.norm(axis), tilt_rad
 
     @property
     def roll_deg(self) -> float:

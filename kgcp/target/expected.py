@@ -14,11 +14,12 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings
 from kgcp.target.code import CodeMatch
+from kgcp.target.judgement import judge, polar_patch
 from kgcp.target.layout import Target
 from kgcp.target.measure import confirm
 from kgcp.target.observation import Considered, Observation
 from kgcp.target.prior import NormalPrior
-from kgcp.target.search import find_rings_at, judge, polar_patch
+from kgcp.target.search import find_rings_at
 from kgcp.target.start import start_pose
 
 _SIGMAS = 4.0

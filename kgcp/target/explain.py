@@ -9,9 +9,9 @@ import numpy as np
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
+from kgcp.target.judgement import CODE_LIKE, judge, polar_patch
 from kgcp.target.layout import Ring
 from kgcp.target.observation import Considered
-from kgcp.target.search import CODE_LIKE, judge, polar_patch
 from kgcp.target.template import SAMPLED_RADII
 
 _CUT = 0.1  # of the outline outside the frame

@@ -16,16 +16,19 @@ from kgcp.target.chance import check_chance
 from kgcp.target.circles import paper_outlines
 from kgcp.target.code import fixed_lag_score
 from kgcp.target.explain import explain
+from kgcp.target.judgement import judge_at
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
+from kgcp.target.noise import BoolArray
 from kgcp.target.observation import Considered, Miss, Observation, Outcome
 from kgcp.target.paper import points_of_code
 from kgcp.target.prior import NormalPrior
-from kgcp.target.search import find_code, find_rings, verify
+from kgcp.target.search import find_code, find_rings
 from kgcp.target.start import start_pose
 
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
 _MIN_MAIN_SCORE = 0.75
+_MOST_TURNED_DEG = 8.0  # the main ring's heading against the replica's
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,13 +187,14 @@ def confirm(
         With the reason of the first test that is not passed.
     """
     ring = next(ring for ring in target.rings if ring.name == start.ring)
-    visible = verify(grey, camera, start.pose, ring, settings)
+    verdict = judge_at(grey, camera, start.pose, ring)
+    verdict.check(settings.min_score)
+    visible = verdict.visible
     if ring is not target.ring:
-        _check_main_ring(grey, camera, target.ring, start)
+        visible = _check_main_ring(grey, camera, target.ring, start, settings)
     if settings.method is Method.PAPER:
         return start
-    seen = visible if ring is target.ring else None
-    observation = measure_by_model(grey, camera, target, start, prior, seen)
+    observation = measure_by_model(grey, camera, target, start, prior, visible)
     check_chance(observation, target, ring, settings.false_alarm)
     return observation
 
@@ -209,20 +213,28 @@ def miss_of(
     return Miss(target.name, reason, best.detail, best.score, len(outlines), best.outline)
 
 
-def _check_main_ring(grey: GreyArray, camera: Camera, main: Ring, observation: Observation) -> None:
-    """Refuse a replica that sits on a plate with another main code.
+def _check_main_ring(
+    grey: GreyArray, camera: Camera, main: Ring, start: Observation, settings: DetectSettings
+) -> BoolArray | None:
+    """Refuse a replica that sits on a plate with another main code; return where that is seen.
 
     Plates of several targets may carry the same small ring. Where enough of the main ring is in
     the frame it must show its code at the heading of the replica.
     """
-    points = points_of_code(camera, observation.pose, main)
+    points = points_of_code(camera, start.pose, main)
     height, width = grey.shape
-    visible = np.all((points >= 0.0) & (points <= (width - 1.0, height - 1.0)), axis=1)
-    if visible.mean() < _MIN_VISIBLE:
-        return
-    score = fixed_lag_score(grey, points, visible, main)
-    if score < _MIN_MAIN_SCORE:
+    within = np.all((points >= 0.0) & (points <= (width - 1.0, height - 1.0)), axis=1)
+    if within.mean() < _MIN_VISIBLE:
+        return None
+    score = fixed_lag_score(grey, points, within, main)
+    if score >= _MIN_MAIN_SCORE:
+        return None
+    verdict = judge_at(grey, camera, start.pose, main)  # a part of it may be hidden
+    turn_deg = abs((verdict.lag_deg + 180.0) % 360.0 - 180.0)
+    if verdict.visible is None or turn_deg > _MOST_TURNED_DEG:
         raise Rejection(
             Reason.CODE_MISMATCH,
-            f"the ring around the replica {observation.ring} is not {main.name}: {score:.2f}",
+            f"the ring around the replica {start.ring} is not {main.name}: {score:.2f}",
         )
+    verdict.check(settings.min_score)
+    return verdict.visible

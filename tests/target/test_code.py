@@ -19,8 +19,9 @@ from kgcp.target.code import (
     reference_signals,
     sample_grey,
 )
+from kgcp.target.judgement import judge
 from kgcp.target.layout import Ring, Target
-from kgcp.target.search import find_code, judge
+from kgcp.target.search import find_code
 from kgcp.target.template import ANGLES_RAD, SAMPLED_RADII
 
 CODE_RATIO = 0.642857143 / 0.9

@@ -17,8 +17,8 @@ from kgcp.target.adjust import Fit
 from kgcp.target.covariance import pose_covariance, propagate
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
-from kgcp.target.model import fit_both_poses
 from kgcp.target.pairs import Blur
+from kgcp.target.two_poses import fit_both_poses
 
 PlacePlate = Callable[..., Pose]
 DRAWS = 4000

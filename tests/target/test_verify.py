@@ -16,9 +16,9 @@ from kgcp.target.adjust import Fit
 from kgcp.target.covariance import propagate
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
-from kgcp.target.model import fit_both_poses
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.pairs import Blur
+from kgcp.target.two_poses import fit_both_poses
 from kgcp.target.verify import check_code, check_fit, check_precision
 
 PlacePlate = Callable[..., Pose]

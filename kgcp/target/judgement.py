@@ -1,0 +1,204 @@
+"""How well one ring in a frame looks like a target's, whole or in part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from kgcp.compiled import compiled
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.pose import Pose
+from kgcp.target.code import sample_grey
+from kgcp.target.layout import Ring
+from kgcp.target.noise import BoolArray
+from kgcp.target.occlusion import best_partial_template, visible_angles
+from kgcp.target.template import (
+    ANGLES,
+    ANGLES_RAD,
+    SAMPLED_RADII,
+    SHIFTS,
+    best_template,
+    templates_of,
+)
+
+_MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
+_CLEAR_SCORE = 0.9
+_DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
+CODE_LIKE = 0.7
+"""Score above which a ring with dots is a code, if another one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """How well one ring in the frame looks like a target's.
+
+    Attributes
+    ----------
+    score : float
+        Normalised cross-correlation of the whole ring with its best template, -1…1.
+    lag_deg : float
+        Heading of the plate's +x axis, as an angle of the sampled circles [deg].
+    black, white : float
+        Levels of ink and plate [grey values].
+    misfit : float
+        Largest difference to the template along the code, of a dot's contrast: 1 is a dot too
+        many or too few.
+    dot_contrast : float
+        Of the template's dots, of the ring's contrast: less than 1 where they are blurred.
+    visible : (angles,) array of bool, or None
+        Where the ring is seen, by angles of the sampled circles; None: everywhere.
+    """
+
+    score: float
+    lag_deg: float
+    black: float
+    white: float
+    misfit: float
+    dot_contrast: float
+    visible: BoolArray | None
+
+    @property
+    def limit(self) -> float:
+        """What `misfit` may be: less where blur leaves little of the dots."""
+        return min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * self.dot_contrast)
+
+    @property
+    def is_clear(self) -> bool:
+        """Tell whether the whole ring looks like the target's."""
+        return self.score >= _CLEAR_SCORE and self.misfit <= self.limit
+
+    def check(self, min_score: float) -> None:
+        """Raise `Rejection` unless this is the target's ring."""
+        numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
+        if self.score < min(CODE_LIKE, min_score):
+            raise Rejection(Reason.CODE_MISMATCH, numbers)
+        if self.misfit > self.limit:
+            raise Rejection(Reason.OTHER_CODE, numbers)
+        if self.score < min_score:
+            raise Rejection(Reason.CODE_MISMATCH, numbers)
+        contrast = self.white - self.black
+        if contrast <= 0.0 or self.black < _DARKEST_BLACK * contrast:
+            raise Rejection(Reason.NO_CONTRAST, f"levels {self.black:.0f} and {self.white:.0f}")
+
+
+def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict:
+    """Compare a ring with its templates as a pose puts them; angles are the plate's."""
+    radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
+    circle = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
+    points = camera.project(pose.transform((radii_m[:, None, None] * circle).reshape(-1, 2)))
+    return judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring)
+
+
+def sample_around(grey: GreyArray, outlines: tuple[Ellipse, ...], radii: FloatArray) -> FloatArray:
+    """Sample the frame (outlines, radii, angles) on ellipses of so many times the outlines."""
+    if not outlines:
+        return np.empty((0, len(radii), ANGLES))
+    circles = np.stack([outline.points(ANGLES_RAD) - outline.centre for outline in outlines])
+    centres = np.stack([outline.centre for outline in outlines])
+    points = centres[:, None, None] + radii[:, None, None] * circles[:, None]
+    return sample_grey(grey, points.reshape(-1, ANGLES, 2)).reshape(points.shape[:3])
+
+
+def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
+    """Sample a frame around an outline, for `judge`: (radii, angles)."""
+    return np.asarray(sample_around(grey, (outline,), SAMPLED_RADII)[0])
+
+
+def judge(patch: FloatArray, ring: Ring) -> Verdict:
+    """Compare a polar patch (radii, angles) of the frame with the ring's templates.
+
+    Where a part of the ring is hidden, the rest of it is compared.
+    """
+    match = best_template(patch, templates_of(ring))
+    verdict = _verdict(patch, ring, match, None)
+    visible = None
+    if not verdict.is_clear:
+        visible = visible_angles(patch[match[2] : len(patch) - 2 * SHIFTS + match[2]], ring)
+    if visible is None:
+        return verdict
+    partial = best_partial_template(patch, visible, ring)
+    return verdict if partial is None else _verdict(patch, ring, partial, visible)
+
+
+def _verdict(
+    patch: FloatArray, ring: Ring, match: tuple[float, int, int, int], visible: BoolArray | None
+) -> Verdict:
+    templates = templates_of(ring)
+    score, index, shift, lag = match
+    image = templates.images[index]
+    dots, rest = np.empty(ANGLES), np.empty(ANGLES)
+    everywhere = np.ones(ANGLES, dtype=bool)
+    black, contrast = _compare(
+        *(image, lag, patch[shift : shift + len(image)], templates.weights),
+        *(everywhere if visible is None else visible, _code_rows(ring), dots, rest),
+    )
+    dot_contrast = float(np.ptp(_smoothed(dots, ring)))
+    scale = max(abs(contrast) * dot_contrast, 1e-6)
+    return Verdict(
+        score=score,
+        lag_deg=lag * 360.0 / ANGLES,
+        black=black,
+        white=black + contrast,
+        misfit=float(np.abs(_smoothed(rest, ring)).max()) / scale,
+        dot_contrast=dot_contrast,
+        visible=visible,
+    )
+
+
+@compiled
+def _compare(
+    image: FloatArray,
+    lag: int,
+    seen: FloatArray,
+    weights: FloatArray,
+    visible: BoolArray,
+    is_code: BoolArray,
+    dots: FloatArray,
+    rest: FloatArray,
+) -> tuple[float, float]:
+    """Fit black and contrast to what is seen of a ring, by an image (rows, angles) of it.
+
+    The means over the code's rows go to `dots`, of the image, and to `rest`, of what it leaves.
+    """
+    total = mean = square = seen_mean = product = 0.0
+    rows, angles = image.shape
+    for r in range(rows):
+        for a in range(angles):
+            if visible[a]:
+                wanted, found = image[r, (a - lag) % angles], seen[r, a]
+                total += weights[r]
+                mean += weights[r] * wanted
+                seen_mean += weights[r] * found
+                square += weights[r] * wanted * wanted
+                product += weights[r] * wanted * found
+    mean, seen_mean = mean / total, seen_mean / total
+    contrast = (product / total - mean * seen_mean) / (square / total - mean * mean)
+    black = seen_mean - contrast * mean
+    share = 1.0 / is_code.sum()
+    dots[:], rest[:] = 0.0, 0.0
+    for r in range(rows):
+        if is_code[r]:
+            for a in range(angles):
+                wanted = image[r, (a - lag) % angles]
+                dots[a] += share * wanted
+                if visible[a]:
+                    rest[a] += share * (seen[r, a] - black - contrast * wanted)
+    return black, contrast
+
+
+@lru_cache(maxsize=64)
+def _code_rows(ring: Ring) -> BoolArray:
+    radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
+    return np.asarray(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
+
+
+def _smoothed(signal: FloatArray, ring: Ring) -> FloatArray:
+    """Average a periodic signal over the width of a dot."""
+    half = max(1, round(ring.dot_half_angle_deg * ANGLES / 360.0))
+    padded = np.concatenate((signal[-half:], signal, signal[:half]))
+    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
