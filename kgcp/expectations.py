@@ -11,6 +11,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.guide import Track, expect, reference_states, state_of
+from kgcp.io.anyfile import is_file
 from kgcp.io.detections import FrameResult
 from kgcp.io.flight import Flight
 from kgcp.io.poses import read_flight_poses
@@ -95,7 +96,7 @@ def _reference_states(flight: Flight, target: Target, sightings: Sightings) -> F
     files = [flight.reference_file]
     if target.position_m is None:
         files.append(flight.trajectory_file)
-    if flight.crs is None or not all(path is not None and path.is_file() for path in files):
+    if flight.crs is None or not all(path is not None and is_file(path) for path in files):
         return None
     poses = read_flight_poses(flight, sightings.frames)
     return (

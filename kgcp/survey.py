@@ -13,6 +13,7 @@ from kgcp.crew import Crew, hired
 from kgcp.errors import KgcpError
 from kgcp.examine import Debug, FrameNote, FrameTask
 from kgcp.expectations import expectations, with_expectations
+from kgcp.io.anyfile import is_file
 from kgcp.io.cells import Row
 from kgcp.io.columns import DETECTION_COLUMNS, SCHEMA_VERSION
 from kgcp.io.contact_sheet import ContactSheet
@@ -197,7 +198,7 @@ def _take_notes(
         path = flight.reference_file
         priors = normal_priors(
             frames,
-            read_flight_poses(flight, frames) if path is not None and path.is_file() else None,
+            read_flight_poses(flight, frames) if path is not None and is_file(path) else None,
             level_sd_deg=flight.vehicle.level_sd_deg,
             plumb_sd_deg=flight.plumb_sd_deg,
         )

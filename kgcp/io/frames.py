@@ -19,7 +19,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.anyfile import is_file, is_folder, read_lines
 from kgcp.io.exif import Exif, read_exif
-from kgcp.io.imageheader import image_size, upright
+from kgcp.io.imageheader import image_size, is_cut_png, upright
 from kgcp.io.times import parse_time
 
 __all__ = ["Exif", "list_frames", "read_exif", "read_frame_times", "read_grey"]
@@ -121,11 +121,14 @@ def _encoded(path: Path, camera: Camera) -> bytes:
             most = _MOST_BYTES_PER_PIXEL * camera.width * camera.height + _MOST_METADATA_BYTES
             if size > most:
                 raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
-            return upright(stream)
+            data = upright(stream)
     except OSError as error:  # without the path: a table is the same wherever its flight lies
         raise Rejection(Reason.DECODE_FAILED, error.strerror or str(error)) from error
     except ValueError as error:  # names that no file has
         raise Rejection(Reason.DECODE_FAILED, str(error)) from error
+    if is_cut_png(data):
+        raise Rejection(Reason.DECODE_FAILED, f"a chunk ends beyond the {size} bytes of the file")
+    return data
 
 
 def _require_size(width: int, height: int, camera: Camera) -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 FORMATS = ("BMP", "JPEG", "JPEG2000", "PNG", "PPM", "WEBP")
 """Pillow's names of what a frame may be, beside TIFF, whatever its name ends in."""
 
+_PNG_START = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
 _UPRIGHT = 1
 _SHORT = 3
@@ -117,6 +118,20 @@ def is_greedy(stream: BinaryIO) -> bool:
     for first in below[:1]:
         entries += _entries(stream, layout, first)
     return sum(_BYTES.get(one.kind, 1) * one.count for one in entries) > 2 * stream.seek(0, 2)
+
+
+def is_cut_png(data: bytes) -> bool:
+    """Return whether this is a PNG of which a chunk goes beyond the end, or that has none.
+
+    Some decoders make room for what a chunk says to be long, before they see that it is not there.
+    """
+    place, kind = len(_PNG_START), b""
+    if data[:place] != _PNG_START:
+        return False
+    while kind != b"IEND" and place + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, place)
+        place += length + 12
+    return kind != b"IEND" or place > len(data)
 
 
 def _tiff_size(stream: BinaryIO, layout: _Layout) -> tuple[int, int] | None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +147,29 @@ class TestReadGrey:
         path.write_bytes(encoded(image, suffix)[:-1000])
         assert rejection(path).reason is Reason.DECODE_FAILED
         assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.skipif(sys.platform != "linux", reason="counts memory as Linux does")
+    def test_a_png_takes_no_more_memory_than_it_has_bytes(self) -> None:
+        """The chunk of an animated PNG says that it is 2 GB long, and some decoders believe it."""
+        path = Path(__file__).parents[2] / "fuzz/found/frames/long_chunk.png"
+        script = """
+import resource, sys
+from pathlib import Path
+from kgcp.errors import Rejection
+from kgcp.geometry.camera import Camera
+from kgcp.io.frames import read_grey
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    read_grey(Path(sys.argv[1]), Camera(40, 30, 50.0, 50.0, 20.0, 15.0))
+except Rejection as rejection:
+    print(rejection.reason, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+        ran = subprocess.run(
+            [sys.executable, "-c", script, path], check=True, capture_output=True, text=True
+        )
+        reason, kilobytes = ran.stdout.split()
+        assert reason == Reason.DECODE_FAILED
+        assert int(kilobytes) < 100_000
 
     @pytest.mark.parametrize("content", [b"", b"\xff", b"no image at all\n" * 50])
     def test_what_is_no_image_is_rejected(self, tmp_path: Path, content: bytes) -> None:

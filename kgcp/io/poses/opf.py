@@ -18,6 +18,7 @@ from pyproj.exceptions import CRSError
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.reference import rotation_from_opk
+from kgcp.io.anyfile import is_file
 from kgcp.io.foreign import ForeignFile, JsonObject
 from kgcp.io.poses.source import SourcePoses
 from kgcp.mapframe import crs_of
@@ -76,7 +77,7 @@ def _part(file: ForeignFile, kind: str) -> tuple[ForeignFile, str, object]:
     path = file.path.parent / f"{kind.replace('-', '_')}.json"
     if _kind(file) == _PROJECT:
         path = _resource(file, kind)
-    if not path.is_file():
+    if not is_file(path):
         raise file.error(
             "", f"needs {path}, which does not exist", f"name the project, an .opf, in {_KEY}"
         )
