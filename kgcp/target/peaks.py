@@ -1,29 +1,32 @@
 """Where box filters answer to a ring: a first glance at every pixel, which must be cheap.
 
-The filters go through an image row by row: every loop is over one row of small integers, of which
-the processor takes some tens at once, and all that is between two loops stays in its cache.
+The filters go through an image row by row, in strips: every loop is over one row of small integers,
+of which the processor takes some tens at once, and all that is between two loops stays in its
+cache.
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.compiled import compiled, inlined
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
 PEAK_RADIUS_PX = 2.8
 """Radius of the rings that the filters answer to most; a quarter more or less is as good."""
 _REACH = 4  # rows and columns that the filters look around a pixel, neighbours included
-_ROW = 3  # rows that the answers of three are kept of
+_STRIP = 512 - 2 * _REACH  # columns
+_VECTOR = 32  # columns that the processor may take at once
+_ROWS = 8  # rows of grey values that are kept, of which the filters look at seven
+_KEPT = 3  # rows of their answers that are kept
 _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around
 
 _MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
 
-_Row = npt.NDArray[np.generic]
+_Rows = npt.NDArray[np.generic]
 
 
 def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
@@ -44,142 +47,181 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
     middles : (n,) array
         Grey values between those of core and ring.
     """
-    padded = cv2.copyMakeBorder(
-        image, _REACH, _REACH, _REACH, _REACH, borderType=cv2.BORDER_REPLICATE
-    )
     most = ((image.shape[0] + 1) // 2) * ((image.shape[1] + 1) // 2)  # maxima have no neighbours
-    points, middles, shares = np.empty((most, 2)), np.empty(most), np.empty(most)
-    count = _scan(padded, points, middles, shares)
-    kept = np.arange(count)
+    found = np.empty((most, 4))
+    found = found[: _scan(image, found)]
     limit = max(int(_MAX_PEAK_SHARE * image.size), _MAX_PEAKS)
-    if count > limit:
-        kept = np.flatnonzero(shares[:count] >= np.partition(shares[:count], -limit)[-limit])
-    return points[kept], middles[kept]
+    if len(found) > limit:
+        shares = found[:, 3]
+        found = np.compress(shares >= np.partition(shares, -limit)[-limit], found, axis=0)
+    return found[:, :2], found[:, 2]
 
 
 @compiled
-def _scan(padded: GreyArray, points: FloatArray, middles: FloatArray, shares: FloatArray) -> int:
-    """Fill in where the peaks are, grey values between core and ring, shares; return how many.
-
-    Row r of the image is number r + 4 of `padded`. Of what is kept of three rows, each at its
-    number modulo 3, entry 0 is in column `reach` of `padded`.
-    """
-    height, columns = padded.shape[0] - 2 * _REACH, padded.shape[1]
-    sums = np.empty(columns, np.uint16)
-    core = np.zeros((_ROW, columns - 2), np.uint16)  # reach 1
-    disc = np.zeros((_ROW, columns - 4), np.uint16)  # reach 2
-    wide = np.empty(columns - 4, np.uint16)
-    score = np.zeros((_ROW, columns - 6), np.int16)  # reach 3
-    highest = np.zeros((_ROW, columns - 8), np.int16)  # reach 4
-    extent = np.empty(columns - 4, np.uint8)
-    lowest = np.empty(columns, np.uint8)
-    words = np.zeros((columns - 5) // 4, np.uint64)
-    answer = words.view(np.int16)[: columns - 8]
+def _scan(image: GreyArray, found: FloatArray) -> int:
+    """Fill in columns and rows of peaks, grey values between core and ring, shares; count them."""
     count = 0
-    for row in range(2, height + 6):
-        _add_three(padded[row - 1], padded[row], padded[row + 1], sums)
-        _three_columns(sums, core[row % _ROW])
-        _add_five(padded[row - 2 : row + 3], sums)
-        _five_columns(sums, disc[row % _ROW])
-        if row < _REACH:
-            continue
-        last = (row - 1) % _ROW
-        _add_three(disc[0], disc[1], disc[2], wide)
-        _score(core[last, 2:], disc[last, 1:], wide, score[last])
-        _highest_of_three(score[last], highest[last])
-        if row < _REACH + 2:
-            continue
-        middle = row - 2
-        before, at, after = (middle - 1) % _ROW, middle % _ROW, (middle + 1) % _ROW
-        _extents(padded[middle - 2 : middle + 3], sums.view(np.uint8), lowest, extent)
-        _mark(score[at], highest[before], highest[at], highest[after], extent[2:], answer)
-        for word in range(len(words)):
-            if words[word] == 0:
-                continue
-            for x in range(4 * word, min(4 * word + 4, len(answer))):
-                if answer[x] > 0:
-                    up, level, down = score[before, x + 1], score[at], score[after, x + 1]
-                    points[count, 0] = x + _beside(level[x], level[x + 1], level[x + 2])
-                    points[count, 1] = middle - _REACH + _beside(up, level[x + 1], down)
-                    middles[count] = core[at, x + 3] / 18.0 + disc[at, x + 2] / 50.0
-                    shares[count] = answer[x] / max(float(extent[x + 2]), 1.0)
-                    count += 1
+    for first in range(0, image.shape[1], _STRIP):
+        count = _scan_strip(image, first, found, count)
     return count
 
 
 @compiled
-def _add_three(one: _Row, two: _Row, three: _Row, out: _Row) -> None:
-    for x in range(len(out)):
-        out[x] = one[x] + two[x] + three[x]
+def _scan_strip(image: GreyArray, first: int, found: FloatArray, count: int) -> int:
+    """Scan some columns; return how many peaks there are now.
+
+    Entry 0 of what is kept of a row is left of the first column: by 4 columns in `grey` and `sums`,
+    by 3 in `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`. Rows are kept at their
+    numbers modulo 8 (`grey`) or 3.
+    """
+    columns = min(image.shape[1] - first, _STRIP)
+    width = -(-(columns + 2 * _REACH) // _VECTOR) * _VECTOR
+    longer = width + 2 * _REACH
+    grey, sums = np.zeros((_ROWS, longer), np.uint8), np.zeros((2, longer), np.uint16)
+    core, disc = np.zeros((_KEPT, longer), np.uint16), np.zeros((_KEPT, longer), np.uint16)
+    wide, extent = np.zeros((1, longer), np.uint16), np.zeros((_KEPT, longer), np.uint8)
+    score, highest = np.zeros((_KEPT, longer), np.int16), np.zeros((_KEPT, width), np.int16)
+    words, places = np.zeros(width // 8, np.uint64), np.empty(width + 8, np.int64)
+    is_peak = words.view(np.uint8)
+    for row in range(-_REACH, 2):
+        _take(image, row, first - _REACH, grey)
+    for row in range(-2, image.shape[0] + 2):
+        _take(image, row + 2, first - _REACH, grey)
+        _sum_columns(grey, row, sums, width)
+        _sum_rows(sums, (row + _KEPT) % _KEPT, core, disc, width)
+        if row < 0:
+            continue
+        last = (row - 1 + _KEPT) % _KEPT
+        _score(core, disc, last, wide, score, width)
+        _highest_of_three(score, last, highest, width)
+        if row < 2:
+            continue
+        _extents(grey, row - 2, extent, width)
+        _mark(score, highest, row - 2, extent, is_peak)
+        peaks = _list(words, is_peak, columns, places)
+        if peaks > 0:
+            more = found[count : count + peaks]
+            _describe(places, first, row - 2, score, core, disc, extent, more)
+            count += peaks
+    return count
 
 
-@compiled
-def _add_five(rows: GreyArray, out: _Row) -> None:
-    a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
-    for x in range(len(out)):
-        out[x] = a[x] + b[x] + c[x] + d[x] + e[x]
+@inlined
+def _take(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
+    """Keep a row from some column on; beyond its border the image repeats its last pixels."""
+    height, width = image.shape
+    line, out = image[min(max(row, 0), height - 1)], grey[row % _ROWS]
+    left, right = max(-first, 0), min(len(out), width - first)
+    seen, copy = line[first + left : first + right], out[left:right]
+    for x in range(len(copy)):
+        copy[x] = seen[x]
+    out[:left] = line[0]
+    out[right:] = line[width - 1]
 
 
-@compiled
-def _three_columns(row: _Row, out: _Row) -> None:
-    a, b, c = row, row[1:], row[2:]
-    for x in range(len(out)):
-        out[x] = a[x] + b[x] + c[x]
+@inlined
+def _sum_columns(grey: _Rows, row: int, sums: _Rows, width: int) -> None:
+    """Add up three rows and five."""
+    a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
+    d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
+    for x in range(width):
+        sums[0, x] = grey[b, x] + grey[c, x] + grey[d, x]
+    for x in range(width):
+        sums[1, x] = sums[0, x] + grey[a, x] + grey[e, x]
 
 
-@compiled
-def _five_columns(row: _Row, out: _Row) -> None:
-    a, b, c, d, e = row, row[1:], row[2:], row[3:], row[4:]
-    for x in range(len(out)):
-        out[x] = a[x] + b[x] + c[x] + d[x] + e[x]
+@inlined
+def _sum_rows(sums: _Rows, slot: int, core: _Rows, disc: _Rows, width: int) -> None:
+    """Add up three columns of the sums of three rows, five of those of five."""
+    for x in range(width):
+        core[slot, x] = sums[0, x] + sums[0, x + 1] + sums[0, x + 2]
+    for x in range(width):
+        three = sums[1, x] + sums[1, x + 1] + sums[1, x + 2]
+        disc[slot, x] = three + sums[1, x + 3] + sums[1, x + 4]
 
 
-@compiled
-def _score(core: _Row, disc: _Row, wide: _Row, out: _Row) -> None:
+@inlined
+def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width: int) -> None:
     """Combine sums over 9, 25 and 225 pixels, so that nothing exceeds 16 bits."""
-    a, b, c = wide, wide[1:], wide[2:]
-    for x in range(len(out)):
-        surround = np.int16(np.uint16(a[x] + b[x] + c[x]) >> 2)
-        inner = np.int16(np.uint16(25 * core[x]) >> 2)
-        ring = np.int16(np.uint16(9 * disc[x]) >> 2)
-        out[x] = inner - ring + surround - ring
+    for x in range(width):
+        wide[0, x] = disc[0, x] + disc[1, x] + disc[2, x]
+    for x in range(width):
+        surround = np.int16(np.uint16(wide[0, x] + wide[0, x + 1] + wide[0, x + 2]) >> 2)
+        inner = np.int16(np.uint16(25 * core[slot, x + 2]) >> 2)
+        ring = np.int16(np.uint16(9 * disc[slot, x + 1]) >> 2)
+        score[slot, x] = inner - ring + surround - ring
+
+
+@inlined
+def _highest_of_three(score: _Rows, slot: int, out: _Rows, width: int) -> None:
+    for x in range(width):
+        out[slot, x] = max(score[slot, x], score[slot, x + 1], score[slot, x + 2])
+
+
+@inlined
+def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
+    """Return the range of grey values in 5 x 5 pixels; rows 1 and 2 are for its use."""
+    a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
+    d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
+    high, low = 1, 2
+    for x in range(width):
+        out[high, x] = max(grey[a, x], grey[b, x], grey[c, x], grey[d, x], grey[e, x])
+    for x in range(width):
+        out[low, x] = min(grey[a, x], grey[b, x], grey[c, x], grey[d, x], grey[e, x])
+    for x in range(width):
+        out[0, x] = max(
+            out[high, x], out[high, x + 1], out[high, x + 2], out[high, x + 3], out[high, x + 4]
+        ) - min(out[low, x], out[low, x + 1], out[low, x + 2], out[low, x + 3], out[low, x + 4])
+
+
+@inlined
+def _mark(score: _Rows, highest: _Rows, row: int, extent: _Rows, is_peak: _Rows) -> None:
+    """Tell where peaks are. Of equal neighbours the first is one."""
+    before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
+    for x in range(len(is_peak)):
+        value = score[at, x + 1]
+        is_peak[x] = (
+            (value > highest[before, x])
+            & (value > score[at, x])
+            & (value >= highest[at, x])
+            & (value >= highest[after, x])
+            & (value >= _MIN_SCORE)
+            & (value >= np.int16(_MIN_SHARE * extent[0, x + 2]))
+        )
+
+
+@inlined
+def _list(words: _Rows, is_peak: _Rows, columns: int, places: IndexArray) -> int:
+    """Fill in where the peaks of a row are, of which eight are one word; return how many."""
+    count = 0
+    for word in range(-(-columns // 8)):
+        if words[word]:
+            for x in range(8 * word, 8 * word + 8):
+                places[count] = x
+                count += is_peak[x] & (x < columns)
+    return count
 
 
 @compiled
-def _highest_of_three(row: _Row, out: _Row) -> None:
-    a, b, c = row, row[1:], row[2:]
-    for x in range(len(out)):
-        out[x] = max(a[x], b[x], c[x])
-
-
-@compiled
-def _extents(rows: GreyArray, high: GreyArray, low: GreyArray, out: GreyArray) -> None:
-    """Return the range of grey values in 5 x 5 pixels; `high` and `low` are for its use."""
-    a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
-    for x in range(len(low)):
-        high[x] = max(a[x], b[x], c[x], d[x], e[x])
-    for x in range(len(low)):
-        low[x] = min(a[x], b[x], c[x], d[x], e[x])
-    a, b, c, d, e = high, high[1:], high[2:], high[3:], high[4:]
-    for x in range(len(out)):
-        out[x] = max(a[x], b[x], c[x], d[x], e[x])
-    a, b, c, d, e = low, low[1:], low[2:], low[3:], low[4:]
-    for x in range(len(out)):
-        out[x] -= min(a[x], b[x], c[x], d[x], e[x])
-
-
-@compiled
-def _mark(score: _Row, before: _Row, at: _Row, after: _Row, extent: _Row, out: _Row) -> None:
-    """Return the scores of peaks, 0 elsewhere. Of equal neighbours the first is a peak."""
-    left, here = score, score[1:]
-    for x in range(len(out)):
-        value = here[x]
-        is_peak = (value > before[x]) & (value > left[x]) & (value >= at[x]) & (value >= after[x])
-        out[x] = value if is_peak else 0
-    for x in range(len(out)):
-        value = out[x]
-        is_clear = (value >= _MIN_SCORE) & (value >= np.int16(_MIN_SHARE * extent[x]))
-        out[x] = value if is_clear else 0
+def _describe(
+    places: IndexArray,
+    first: int,
+    row: int,
+    score: _Rows,
+    core: _Rows,
+    disc: _Rows,
+    extent: _Rows,
+    found: FloatArray,
+) -> None:
+    """Fill in column and row of a row's peaks, grey values between core and ring, and shares."""
+    before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
+    for i in range(len(found)):
+        x = places[i]
+        up, top, down = score[before, x + 1], score[at, x + 1], score[after, x + 1]
+        found[i, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
+        found[i, 1] = row + _beside(up, top, down)
+        found[i, 2] = core[at, x + 3] / 18.0 + disc[at, x + 2] / 50.0
+        found[i, 3] = top / max(float(extent[0, x + 2]), 1.0)
 
 
 @compiled
