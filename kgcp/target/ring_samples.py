@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
@@ -13,22 +15,41 @@ _RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # circles that are looked at, of t
 _RING, _NEAR, _FAR, _CORE = range(4)  # the last is outside of a replica
 _ROUGH = np.array((0.85, 1.1))  # radii that are tried
 _FINE = np.array((0.9, 1.0, 1.1))
-_FEW, _MANY, _ALL = 8, 16, 24  # directions
+_TRIALS = np.outer(_ROUGH, _FINE).ravel()
+_REACH = float(_TRIALS.max() * _RATIOS.max())
+_DIRECTIONS = _FEW, _MANY, _ALL = 8, 16, 24  # that are looked in first, then, and at last
 _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # hidden quarters and dots leave half of the ring
 _MIN_CONTRAST = 5  # grey values
 _SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
 
+_Shifts = npt.NDArray[np.uintp]  # (radii, circles, few and many and all directions)
 
-@compiled
+
+def _sorting_network(count: int) -> IndexArray:
+    """Return the pairs (n, 2) that, put in order one by one, sort so many values.
+
+    Merge exchange (Batcher 1968; Knuth, The Art of Computer Programming 3, algorithm 5.2.2 M).
+    """
+    pairs = []
+    largest = 1 << ((count - 1).bit_length() - 1)
+    span = largest
+    while span > 0:
+        step, apart, residue = largest, span, 0
+        while True:
+            pairs += [(i, i + apart) for i in range(count - apart) if i & span == residue]
+            if step == span:
+                break
+            step, apart, residue = step // 2, step - span, span
+        span //= 2
+    return np.array(pairs)
+
+
+_NETWORK = _sorting_network(_ALL)
+
+
 def look_around(
-    image: GreyArray,
-    centres: FloatArray,
-    middles: FloatArray,
-    radius: float,
-    clear: float,
-    stretches: FloatArray,
-    clearness: FloatArray,
-) -> None:
+    image: GreyArray, centres: FloatArray, middles: FloatArray, radius: float, clear: float
+) -> tuple[FloatArray, FloatArray]:
     """Tell how clear rings are whose ring, core and surround are each of one grey value.
 
     Cheap tests come first: dark and then bright in some of eight directions, then in some of 16.
@@ -36,6 +57,7 @@ def look_around(
     Parameters
     ----------
     image : (height, width) array of uint8
+        Contiguous.
     centres : (n, 2) array
         Of the rings [px].
     middles : (n,) array
@@ -44,87 +66,145 @@ def look_around(
         Of the outer circles [px].
     clear : float
         By how much ring, core and surround may be spread each, of the contrast.
-    stretches, clearness : (n,) array
-        Filled in: by how much the radius is larger; contrast in grey values less spread, 0 where
-        there is no ring.
+
+    Returns
+    -------
+    stretches : (n,) array
+        By how much the radius is larger.
+    clearness : (n,) array
+        Contrast in grey values less spread; 0 where there is no ring.
     """
-    trials = (_ROUGH.reshape(-1, 1) * _FINE).ravel()
-    few, many = _offsets(radius * _ROUGH, _FEW), _offsets(radius * trials, _MANY)
-    every = _offsets(radius * trials, _ALL)
+    reach = math.ceil(radius * _REACH)
+    shifts = _shifts(radius, image.shape[1]), _shifts(radius, 2 * reach + 1)
+    stretches, clearness = np.empty(len(centres)), np.empty(len(centres))
+    _look(image, centres, middles, reach, *shifts, clear, stretches, clearness)
+    return stretches, clearness
+
+
+@lru_cache(maxsize=128)
+def _shifts(radius: float, width: int) -> _Shifts:
+    """Return how many pixels further samples on circles are, in images of a width.
+
+    Those that are nearer have wrapped about, as their sums with a pixel's place do.
+    """
+    angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in _DIRECTIONS])
+    lengths = radius * _TRIALS[:, None, None] * _RATIOS[:, None]
+    x, y = np.floor(lengths * np.cos(angles) + 0.5), np.floor(lengths * np.sin(angles) + 0.5)
+    return np.asarray(y * width + x, np.intp).view(np.uintp)
+
+
+@compiled
+def _look(
+    image: GreyArray,
+    centres: FloatArray,
+    middles: FloatArray,
+    reach: int,
+    shifts: _Shifts,
+    patch_shifts: _Shifts,
+    clear: float,
+    stretches: FloatArray,
+    clearness: FloatArray,
+) -> None:
+    """Fill in what `look_around` returns. Near the border a copy of what is around is looked at."""
+    height, width = image.shape
+    side = 2 * reach + 1
+    pixels, patch = image.reshape(-1), np.empty((side, side), np.uint8)
     values = np.empty((3, _ALL), np.int64)
     for i in range(len(centres)):
         x, y = math.floor(centres[i, 0] + 0.5), math.floor(centres[i, 1] + 0.5)
-        clearness[i] = 0.0
-        most, rough = 0, 0
-        for k in range(len(_ROUGH)):
-            count = _count(image, x, y, few[k], middles[i])
-            if count > most:
-                most, rough = count, k
-        if most < _ENOUGH_OF_FEW:
-            continue
-        for k in range(len(_FINE) * rough, len(_FINE) * (rough + 1)):
-            if _count(image, x, y, many[k], middles[i]) >= _ENOUGH_OF_MANY:
-                found = _clearness(image, x, y, every[k], clear, values)
-                if found > clearness[i]:
-                    clearness[i], stretches[i] = found, trials[k]
+        if reach <= x < width - reach and reach <= y < height - reach:
+            place = y * width + x
+            found = _clearest(pixels, place, shifts, middles[i], clear, values)
+        else:
+            _copy_around(image, x - reach, y - reach, patch)
+            place = reach * side + reach
+            found = _clearest(patch.reshape(-1), place, patch_shifts, middles[i], clear, values)
+        clearness[i], stretches[i] = found[0], _TRIALS[found[1]]
 
 
 @compiled
-def _offsets(radii: FloatArray, count: int) -> IndexArray:
-    """Return pixels (radii, circles, directions, 2) on circles about a pixel."""
-    offsets = np.empty((len(radii), len(_RATIOS), count, 2), np.int64)
-    for i in range(len(radii)):
-        for j in range(len(_RATIOS)):
-            for k in range(count):
-                angle, length = 2.0 * math.pi / count * (k + 0.5), radii[i] * _RATIOS[j]
-                offsets[i, j, k, 0] = math.floor(length * math.cos(angle) + 0.5)
-                offsets[i, j, k, 1] = math.floor(length * math.sin(angle) + 0.5)
-    return offsets
+def _copy_around(image: GreyArray, left: int, top: int, patch: GreyArray) -> None:
+    """Copy some rows and columns; beyond its border the image repeats its last pixels."""
+    height, width = image.shape
+    side = len(patch)
+    first, last = min(max(-left, 0), side), min(max(width - left, 0), side)
+    for i in range(side):
+        row = image[min(max(top + i, 0), height - 1)]
+        patch[i, :first] = row[0]
+        patch[i, last:] = row[width - 1]
+        for j in range(first, last):
+            patch[i, j] = row[left + j]
 
 
 @compiled
-def _value(image: GreyArray, x: int, y: int, offset: IndexArray) -> int:
-    """Return a pixel's value; beyond its border the image repeats its last pixels."""
-    column = min(max(x + offset[0], 0), image.shape[1] - 1)
-    row = min(max(y + offset[1], 0), image.shape[0] - 1)
-    return int(image[row, column])
+def _clearest(
+    pixels: GreyArray, place: int, shifts: _Shifts, middle: float, clear: float, values: IndexArray
+) -> tuple[float, int]:
+    """Return how clear the clearest ring about a pixel is, and the number of its radius."""
+    at = np.uintp(place)
+    dark, bright = math.ceil(middle), math.floor(middle)
+    most, best, clearest = _ENOUGH_OF_FEW - 1, 0, 0.0
+    first = -1
+    for k in range(0, len(_TRIALS), len(_FINE)):
+        count = _count(pixels, at, shifts, k + 1, 0, _FEW, dark, bright)
+        if count > most:
+            most, first = count, k
+    if first < 0:
+        return clearest, best
+    for k in range(first, first + len(_FINE)):
+        count = _count(pixels, at, shifts, k, _FEW, _MANY, dark, bright)
+        if count >= _ENOUGH_OF_MANY:
+            clearness = _clearness(pixels, at, shifts, k, clear, values)
+            if clearness > clearest:
+                clearest, best = clearness, k
+    return clearest, best
 
 
 @compiled
-def _count(image: GreyArray, x: int, y: int, offsets: IndexArray, middle: float) -> int:
+def _count(
+    pixels: GreyArray,
+    at: np.uintp,
+    shifts: _Shifts,
+    trial: int,
+    first: int,
+    directions: int,
+    dark: int,
+    bright: int,
+) -> int:
     """Count the directions in which a dark ring is followed by a brighter surround."""
     count = 0
-    for k in range(offsets.shape[1]):
-        is_dark = _value(image, x, y, offsets[_RING, k]) < middle
-        is_near = _value(image, x, y, offsets[_NEAR, k]) > middle
-        is_far = _value(image, x, y, offsets[_FAR, k]) > middle
+    for k in range(first, first + directions):
+        is_dark = pixels[at + shifts[trial, _RING, k]] < dark
+        is_near = pixels[at + shifts[trial, _NEAR, k]] > bright
+        is_far = pixels[at + shifts[trial, _FAR, k]] > bright
         count += is_dark & (is_near | is_far)
     return count
 
 
 @compiled
 def _clearness(
-    image: GreyArray,
-    x: int,
-    y: int,
-    offsets: IndexArray,
+    pixels: GreyArray,
+    at: np.uintp,
+    shifts: _Shifts,
+    trial: int,
     clear: float,
     values: IndexArray,
 ) -> float:
     """Return the contrast, less the ring's spread; 0 if anything is spread too much."""
     ring, core, plate = values[0], values[1], values[2]
-    for k in range(offsets.shape[1]):
-        ring[k] = _value(image, x, y, offsets[_RING, k])
-        core[k] = _value(image, x, y, offsets[_CORE, k])
+    first = _FEW + _MANY
+    for k in range(_ALL):
+        ring[k] = pixels[at + shifts[trial, _RING, first + k]]
+        core[k] = pixels[at + shifts[trial, _CORE, first + k]]
     _sort(ring)
     _sort(core)
     contrast, spread = core[11] - ring[4], ring[8] - ring[1]
     limit = clear * contrast
     if contrast < _MIN_CONTRAST or spread > limit or core[17] - core[7] > limit:
         return 0.0
-    for k in range(offsets.shape[1]):
-        near = _value(image, x, y, offsets[_NEAR, k])
-        plate[k] = max(near, _value(image, x, y, offsets[_FAR, k]))
+    for k in range(_ALL):
+        near = pixels[at + shifts[trial, _NEAR, first + k]]
+        plate[k] = max(near, pixels[at + shifts[trial, _FAR, first + k]])
     _sort(plate)
     difference = abs(core[11] - plate[14])
     contrast = min(core[11], plate[14]) - ring[4]
@@ -138,10 +218,8 @@ def _clearness(
 
 @compiled
 def _sort(values: IndexArray) -> None:
-    """Sort a few values in place, by insertion."""
-    for i in range(1, len(values)):
-        value, k = values[i], i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
+    """Sort as many values as there are directions, in place."""
+    for k in range(len(_NETWORK)):
+        i, j = _NETWORK[k, 0], _NETWORK[k, 1]
+        one, other = values[i], values[j]
+        values[i], values[j] = min(one, other), max(one, other)

@@ -83,7 +83,7 @@ def eight_bit(grey: GreyArray) -> GreyArray:
     A 16-bit frame often holds 10 or 12 bits: its range is stretched to its brightest pixels.
     """
     if grey.dtype == np.uint8:
-        return grey
+        return np.ascontiguousarray(grey)
     white = max(float(np.quantile(grey[::4, ::4], _BRIGHTEST_QUANTILE)), 1.0)
     return cv2.convertScaleAbs(grey, alpha=255.0 / white)
 
@@ -124,11 +124,9 @@ def _seeds_of(level: Level, finer: Level) -> Seeds:
     points, middles = find_peaks(level.image)
     centres = level.to_frame(points)
     radius = PEAK_RADIUS_PX * level.factor
-    stretches, clearness = np.empty(len(points)), np.empty(len(points))
-    look_around(
-        *(finer.image, finer.from_frame(centres), middles, radius / finer.factor),
-        _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR,
-        *(stretches, clearness),
+    clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
+    stretches, clearness = look_around(
+        finer.image, finer.from_frame(centres), middles, radius / finer.factor, clear
     )
     good = clearness > 0.0
     return Seeds(centres[good], radius * stretches[good], clearness[good])
