@@ -7,21 +7,25 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.compiled import compiled, inlined
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
 RAYS = 40
 RAYS_RAD = 2.0 * np.pi / RAYS * np.arange(RAYS)
 _RADII = np.arange(0.5, 1.71, 0.04)  # of the seed's radius
 _STEP = 2  # samples either side that a slope is taken over
 _EVERY = 2  # ray that is looked at first
+_FEW = RAYS // _EVERY
 _MIDDLES = _RADII[_STEP:-_STEP]
 _SPACING = _RADII[1] - _RADII[0]
 # ρ(θ) of an ellipse that is not far from a circle, nor its centre from the seed's.
-_HARMONICS = np.stack(
-    [np.ones(RAYS), *(f(k * RAYS_RAD) for k in (1, 2) for f in (np.cos, np.sin))], axis=1
-)
-_TERMS = _HARMONICS.shape[1]
+_HARMONICS = np.stack([np.ones(RAYS), *(f(k * RAYS_RAD) for k in (1, 2) for f in (np.cos, np.sin))])
+_TERMS = len(_HARMONICS)
+_PAIRS = _TERMS * (_TERMS + 1) // 2
+_PRODUCTS = np.stack([_HARMONICS[i] * _HARMONICS[j] for i in range(_TERMS) for j in range(i + 1)])
+_SUMMANDS = np.ascontiguousarray(np.concatenate((_PRODUCTS, _HARMONICS)).T)  # normal equations'
+_FEW_HARMONICS = np.ascontiguousarray(_HARMONICS[:, ::_EVERY])
+_FEW_SUMMANDS = np.ascontiguousarray(_SUMMANDS[::_EVERY])
 _WIDTHS_AT_FIRST = np.array((0.25, 0.12, 0.07))  # of residuals' weighting, of the seed's radius
 _WIDTHS = np.array((0.07, 0.05))
 _REACH = 0.17  # of an edge from a curve, of the seed's radius
@@ -45,6 +49,7 @@ def follow(
     Parameters
     ----------
     image : (height, width) array of uint8
+        Contiguous.
     centres : (n, 2) array
         Of the rings, roughly [px].
     radii : (n,) array
@@ -54,20 +59,20 @@ def follow(
     inlying : (n, rays) array of bool
         Filled in: which edges are on the curve; none at all if they are too few for a ring.
     """
-    values = np.empty(len(_RADII))
-    strength, scratch, curve = np.empty(RAYS), np.empty(RAYS), np.empty(_TERMS)
+    few, strength, rest = np.empty(_FEW), np.empty(RAYS), np.empty(RAYS)
+    curve, values = np.empty(_TERMS), np.empty(len(_RADII))
+    places, parts = np.empty(len(_RADII), np.intp), np.empty((2, len(_RADII)))
     for i in range(len(radii)):
         x, y, radius = centres[i, 0], centres[i, 1], radii[i]
         edge, is_inlying = edges[i], inlying[i]
         is_inlying[:] = False
-        _glance(image, x, y, radius, values, edge, strength)
-        _fit_curve(edge, strength, _EVERY, _WIDTHS_AT_FIRST, scratch, curve)
-        near = _mark_near(edge, curve, 2.0 * _INLIER, _EVERY, is_inlying)
-        if near > _MIN_INLIERS_AT_FIRST * (RAYS // _EVERY):
-            _follow_curve(image, x, y, radius, curve, values, edge, strength)
-            _fit_curve(edge, strength, 1, _WIDTHS, scratch, curve)
-            _mark_near(edge, curve, _INLIER, 1, is_inlying)
-            is_inlying &= strength > 0.0
+        _glance(image, x, y, radius, places, values, few, strength)
+        _fit_curve(few, strength, _FEW_HARMONICS, _FEW_SUMMANDS, _WIDTHS_AT_FIRST, rest, curve)
+        if np.sum(np.abs(rest[:_FEW]) < 2.0 * _INLIER) <= _MIN_INLIERS_AT_FIRST * _FEW:
+            continue
+        _follow_curve(image, x, y, radius, curve, places, parts, values, edge, strength)
+        _fit_curve(edge, strength, _HARMONICS, _SUMMANDS, _WIDTHS, rest, curve)
+        is_inlying[:] = (np.abs(rest) < _INLIER) & (strength > 0.0)
         if is_inlying.sum() < _MIN_INLIERS * RAYS:
             is_inlying[:] = False
 
@@ -78,18 +83,22 @@ def _glance(
     x: float,
     y: float,
     radius: float,
+    places: IndexArray,
     values: FloatArray,
     edge: FloatArray,
     strength: FloatArray,
 ) -> None:
     """Find the steepest rise outwards on some of the rays, in the pixels as they are."""
-    last_x, last_y = image.shape[1] - 1, image.shape[0] - 1
-    for k in range(0, RAYS, _EVERY):
-        dx, dy = radius * _HARMONICS[k, 1], radius * _HARMONICS[k, 2]
+    pixels, width = image.reshape(-1), image.shape[1]
+    last_x, last_y = width - 1, image.shape[0] - 1
+    for k in range(_FEW):
+        dx, dy = radius * _FEW_HARMONICS[1, k], radius * _FEW_HARMONICS[2, k]
         for j in range(len(_RADII)):
             column = min(max(int(x + _RADII[j] * dx + 0.5), 0), last_x)
             row = min(max(int(y + _RADII[j] * dy + 0.5), 0), last_y)
-            values[j] = image[row, column]
+            places[j] = row * width + column
+        for j in range(len(_RADII)):
+            values[j] = pixels[np.uintp(places[j])]
         best, steepest = 0, -1.0
         for j in range(len(_MIDDLES)):
             slope = values[j + 2 * _STEP] - values[j]
@@ -105,115 +114,162 @@ def _follow_curve(
     y: float,
     radius: float,
     curve: FloatArray,
+    places: IndexArray,
+    parts: FloatArray,
     values: FloatArray,
     edge: FloatArray,
     strength: FloatArray,
 ) -> None:
     """Find the steepest rise outwards within reach of a curve on all rays, interpolated."""
+    pixels = image.reshape(-1)
     for k in range(RAYS):
-        rho = _at(curve, k)
+        rho = 0.0
+        for i in range(_TERMS):
+            rho += curve[i] * _HARMONICS[i, k]
         first = max(math.ceil((rho - _REACH - _MIDDLES[0]) / _SPACING), 1)
         last = min(math.floor((rho + _REACH - _MIDDLES[0]) / _SPACING), len(_MIDDLES) - 2)
         edge[k], strength[k] = rho, 0.0
         if first > last:
             continue
-        dx, dy = radius * _HARMONICS[k, 1], radius * _HARMONICS[k, 2]
-        for j in range(first - 1, last + 2 + 2 * _STEP):
-            values[j] = _bilinear(image, x + _RADII[j] * dx, y + _RADII[j] * dy)
-        best = first
-        for j in range(first, last + 1):
+        radii = _RADII[first - 1 : last + 2 + 2 * _STEP]
+        dx, dy = radius * _HARMONICS[1, k], radius * _HARMONICS[2, k]
+        _place(image.shape, x, y, dx, dy, radii, places, parts)
+        _interpolate(pixels, image.shape[1], places, parts, values[: len(radii)])
+        best = 1
+        for j in range(1, last - first + 2):
             if values[j + 2 * _STEP] - values[j] > values[best + 2 * _STEP] - values[best]:
                 best = j
         left = values[best - 1 + 2 * _STEP] - values[best - 1]
         top = values[best + 2 * _STEP] - values[best]
         right = values[best + 1 + 2 * _STEP] - values[best + 1]
         bend = min(left - 2.0 * top + right, -1e-3)
-        edge[k] = _MIDDLES[best] + _SPACING * min(max(0.5 * (left - right) / bend, -0.5), 0.5)
+        beside = min(max(0.5 * (left - right) / bend, -0.5), 0.5)
+        edge[k] = _MIDDLES[first - 1 + best] + _SPACING * beside
         strength[k] = max(top, 0.0)
 
 
 @compiled
-def _bilinear(image: GreyArray, x: float, y: float) -> float:
-    """Return a grey value between pixels; beyond its border the image repeats its last pixels."""
-    last_x, last_y = image.shape[1] - 1, image.shape[0] - 1
-    column, row = min(max(x, 0.0), float(last_x)), min(max(y, 0.0), float(last_y))
-    left, top = int(column), int(row)
-    right, bottom = min(left + 1, last_x), min(top + 1, last_y)
-    one, two = float(image[top, left]), float(image[top, right])
-    three, four = float(image[bottom, left]), float(image[bottom, right])
-    upper = one + (column - left) * (two - one)
-    return upper + (row - top) * (three + (column - left) * (four - three) - upper)
+def _place(
+    shape: tuple[int, int],
+    x: float,
+    y: float,
+    dx: float,
+    dy: float,
+    radii: FloatArray,
+    places: IndexArray,
+    parts: FloatArray,
+) -> None:
+    """Fill in the pixels above and left of samples, and how far these are beyond them.
+
+    Beyond its border the image repeats its last pixels.
+    """
+    height, width = shape
+    last_x, last_y = width - 1, height - 1
+    for j in range(len(radii)):
+        column = _within(x + radii[j] * dx, float(last_x))
+        row = _within(y + radii[j] * dy, float(last_y))
+        left, top = min(int(column), last_x - 1), min(int(row), last_y - 1)
+        places[j] = top * width + left
+        parts[0, j], parts[1, j] = column - left, row - top
+
+
+@compiled
+def _interpolate(
+    pixels: GreyArray, width: int, places: IndexArray, parts: FloatArray, values: FloatArray
+) -> None:
+    """Fill in grey values between pixels."""
+    for j in range(len(values)):
+        at = np.uintp(places[j])
+        below = at + np.uintp(width)
+        one, two = float(pixels[at]), float(pixels[at + np.uintp(1)])
+        three, four = float(pixels[below]), float(pixels[below + np.uintp(1)])
+        upper = one + parts[0, j] * (two - one)
+        values[j] = upper + parts[1, j] * (three + parts[0, j] * (four - three) - upper)
+
+
+@inlined
+def _within(value: float, most: float) -> float:
+    """Return a value in 0…`most`; `min` and `max` heed NaN, which keeps loops from vectors."""
+    if value < 0.0:
+        return 0.0
+    if value > most:
+        return most
+    return value
 
 
 @compiled
 def _fit_curve(
     edge: FloatArray,
     strength: FloatArray,
-    every: int,
+    harmonics: FloatArray,
+    summands: FloatArray,
     widths: FloatArray,
-    scratch: FloatArray,
+    rest: FloatArray,
     curve: FloatArray,
 ) -> None:
-    """Fit the harmonics of a curve, robustly: strong edges near it count most."""
-    typical = _median(strength[::every], scratch) + 1e-6
-    curve[0] = _median(edge[::every], scratch)
+    """Fit the harmonics of a curve to edges on rays, robustly: strong edges near it count most.
+
+    `rest` is filled in: how far the edges are from the curve.
+    """
+    rays = len(edge)
+    weight, sums = np.empty(rays), np.empty(summands.shape[1])
+    typical = _median(strength[:rays], rest) + 1e-6
+    curve[0] = _median(edge, rest)
     curve[1:] = 0.0
-    normal, right = np.empty((_TERMS, _TERMS)), np.empty(_TERMS)
+    _subtract(edge, harmonics, curve, rest)
     for width in widths:
-        normal[:] = 0.0
-        right[:] = 0.0
-        for k in range(0, RAYS, every):
-            residual = (edge[k] - _at(curve, k)) / width
-            weight = min(strength[k] / typical, 1.0) / (1.0 + residual * residual) ** 2
-            for i in range(_TERMS):
-                weighted = weight * _HARMONICS[k, i]
-                right[i] += weighted * edge[k]
-                for j in range(i + 1):
-                    normal[i, j] += weighted * _HARMONICS[k, j]
-        for i in range(_TERMS):
-            normal[i, i] += _RIDGE
-        _solve(normal, right, curve)
+        for k in range(rays):
+            far = rest[k] / width
+            near = 1.0 / (1.0 + far * far)
+            weight[k] = _within(strength[k] / typical, 1.0) * near * near
+        _add_up(weight, edge, summands, sums)
+        _solve(sums, curve)
+        _subtract(edge, harmonics, curve, rest)
 
 
 @compiled
-def _solve(lower: FloatArray, right: FloatArray, out: FloatArray) -> None:
-    """Solve positive definite equations, of which the lower triangle is given, by Cholesky."""
+def _subtract(edge: FloatArray, harmonics: FloatArray, curve: FloatArray, rest: FloatArray) -> None:
+    """Return how far edges are from a curve."""
+    a, b, c, d, e = curve[0], curve[1], curve[2], curve[3], curve[4]
+    for k in range(len(edge)):
+        there = a + b * harmonics[1, k] + c * harmonics[2, k]
+        rest[k] = edge[k] - there - d * harmonics[3, k] - e * harmonics[4, k]
+
+
+@compiled
+def _add_up(weight: FloatArray, edge: FloatArray, summands: FloatArray, sums: FloatArray) -> None:
+    """Fill in the normal equations: the lower triangle row by row, then the right-hand side."""
+    sums[:] = 0.0
+    for k in range(len(edge)):
+        weighted = weight[k] * edge[k]
+        for i in range(_PAIRS):
+            sums[i] += weight[k] * summands[k, i]
+        for i in range(_PAIRS, _PAIRS + _TERMS):
+            sums[i] += weighted * summands[k, i]
+
+
+@compiled
+def _solve(sums: FloatArray, out: FloatArray) -> None:
+    """Solve positive definite equations by Cholesky's decomposition."""
+    lower = np.empty((_TERMS, _TERMS))  # of its diagonal, the reciprocals
+    place = 0
     for i in range(_TERMS):
         for j in range(i + 1):
-            value = lower[i, j]
+            value = sums[place] + (_RIDGE if i == j else 0.0)
             for k in range(j):
                 value -= lower[i, k] * lower[j, k]
-            lower[i, j] = math.sqrt(value) if i == j else value / lower[j, j]
+            lower[i, j] = 1.0 / math.sqrt(value) if i == j else value * lower[j, j]
+            place += 1
     for i in range(_TERMS):
-        value = right[i]
+        value = sums[_PAIRS + i]
         for k in range(i):
             value -= lower[i, k] * out[k]
-        out[i] = value / lower[i, i]
+        out[i] = value * lower[i, i]
     for i in range(_TERMS - 1, -1, -1):
         value = out[i]
         for k in range(i + 1, _TERMS):
             value -= lower[k, i] * out[k]
-        out[i] = value / lower[i, i]
-
-
-@compiled
-def _at(curve: FloatArray, ray: int) -> float:
-    value = 0.0
-    for i in range(_TERMS):
-        value += curve[i] * _HARMONICS[ray, i]
-    return value
-
-
-@compiled
-def _mark_near(
-    edge: FloatArray, curve: FloatArray, reach: float, every: int, near: BoolArray
-) -> int:
-    """Tell which edges are within reach of a curve; return how many."""
-    count = 0
-    for k in range(0, RAYS, every):
-        near[k] = abs(edge[k] - _at(curve, k)) < reach
-        count += near[k]
-    return count
+        out[i] = value * lower[i, i]
 
 
 @compiled
