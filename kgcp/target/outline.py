@@ -76,7 +76,7 @@ def _follow(pyramid: tuple[Level, ...], seeds: Seeds) -> _Outlines:
     inlying = np.empty((len(seeds), RAYS), dtype=np.bool_)
     wanted = np.floor(np.log2(np.maximum(seeds.radii_px / _FINEST_RADIUS_PX, 1.0))).astype(np.intp)
     wanted = np.minimum(wanted, len(pyramid) - 1)
-    for index in np.unique(wanted):
+    for index in set(wanted.tolist()):
         level, members = pyramid[index], np.flatnonzero(wanted == index)
         centres = level.from_frame(seeds.centres_px[members])
         found = np.empty((len(members), RAYS)), np.empty((len(members), RAYS), dtype=np.bool_)

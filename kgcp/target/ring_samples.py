@@ -48,7 +48,12 @@ _NETWORK = _sorting_network(_ALL)
 
 
 def look_around(
-    image: GreyArray, centres: FloatArray, middles: FloatArray, radius: float, clear: float
+    image: GreyArray,
+    points: FloatArray,
+    middles: FloatArray,
+    coarser: float,
+    radius: float,
+    clear: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Tell how clear rings are whose ring, core and surround are each of one grey value.
 
@@ -58,12 +63,13 @@ def look_around(
     ----------
     image : (height, width) array of uint8
         Contiguous.
-    centres : (n, 2) array
-        Of the rings [px].
+    points : (n, 2) array
+        Centres of the rings in another image, whose pixels are `coarser` times as wide [px].
     middles : (n,) array
         Grey values between those of core and ring.
+    coarser : float
     radius : float
-        Of the outer circles [px].
+        Of the outer circles, in that other image [px].
     clear : float
         By how much ring, core and surround may be spread each, of the contrast.
 
@@ -74,10 +80,11 @@ def look_around(
     clearness : (n,) array
         Contrast in grey values less spread; 0 where there is no ring.
     """
-    reach = math.ceil(radius * _REACH)
-    shifts = _shifts(radius, image.shape[1]), _shifts(radius, 2 * reach + 1)
-    stretches, clearness = np.empty(len(centres)), np.empty(len(centres))
-    _look(image, centres, middles, reach, *shifts, clear, stretches, clearness)
+    reach = math.ceil(coarser * radius * _REACH)
+    inside, near_border = image.shape[1], 2 * reach + 1
+    shifts = _shifts(coarser * radius, inside), _shifts(coarser * radius, near_border)
+    stretches, clearness = np.empty(len(points)), np.empty(len(points))
+    _look(image, points, middles, coarser, reach, *shifts, clear, stretches, clearness)
     return stretches, clearness
 
 
@@ -96,8 +103,9 @@ def _shifts(radius: float, width: int) -> _Shifts:
 @compiled
 def _look(
     image: GreyArray,
-    centres: FloatArray,
+    points: FloatArray,
     middles: FloatArray,
+    coarser: float,
     reach: int,
     shifts: _Shifts,
     patch_shifts: _Shifts,
@@ -110,8 +118,9 @@ def _look(
     side = 2 * reach + 1
     pixels, patch = image.reshape(-1), np.empty((side, side), np.uint8)
     values = np.empty((3, _ALL), np.int64)
-    for i in range(len(centres)):
-        x, y = math.floor(centres[i, 0] + 0.5), math.floor(centres[i, 1] + 0.5)
+    for i in range(len(points)):
+        x = math.floor(coarser * (points[i, 0] + 0.5))  # the pixel that holds the point
+        y = math.floor(coarser * (points[i, 1] + 0.5))
         if reach <= x < width - reach and reach <= y < height - reach:
             place = y * width + x
             found = _clearest(pixels, place, shifts, middles[i], clear, values)

@@ -13,7 +13,9 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.target.distinct import distinct
 from kgcp.target.peaks import PEAK_RADIUS_PX, find_peaks
@@ -25,6 +27,8 @@ _SMALLEST_RATIO = 0.93  # of rings looked for in a level, to that radius
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
 _LARGE_PX = 22.0  # radius from which there are few seeds
 _NEAR, _ALIKE = 0.3, 0.25  # of one ring: distance of centres, of its radius; ratio of radii
+
+_Sums = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,21 +119,44 @@ def find_seeds(pyramid: tuple[Level, ...], min_radius_px: float) -> Seeds:
 def _third(half: Level) -> Level:
     """Return a level whose pixels are half as wide again."""
     height, width = (size // 3 for size in half.image.shape)
-    image = half.image[: 3 * height, : 3 * width]
-    return Level(cv2.resize(image, (2 * width, 2 * height)), 1.5 * half.factor)
+    image = np.empty((2 * height, 2 * width), np.uint8)
+    _fill_from_three(half.image, image)
+    return Level(image, 1.5 * half.factor)
+
+
+@compiled
+def _fill_from_three(image: GreyArray, out: GreyArray) -> None:
+    """Make two rows and columns of three, interpolating linearly between pixels' centres."""
+    height, width = out.shape[0] // 2, out.shape[1] // 2
+    upper, lower = np.empty(3 * width, np.uint16), np.empty(3 * width, np.uint16)
+    for i in range(height):
+        for x in range(len(upper)):
+            upper[x] = 3 * image[3 * i, x] + image[3 * i + 1, x]
+        for x in range(len(lower)):
+            lower[x] = image[3 * i + 1, x] + 3 * image[3 * i + 2, x]
+        _fill_row(upper, out[2 * i])
+        _fill_row(lower, out[2 * i + 1])
+
+
+@compiled
+def _fill_row(row: _Sums, out: GreyArray) -> None:
+    """Make two columns of three, of sums that are four times the grey values."""
+    for j in range(len(out) // 2):
+        left, middle, right = row[3 * j], row[3 * j + 1], row[3 * j + 2]
+        out[2 * j] = np.uint16(3 * left + middle + 8) >> 4
+        out[2 * j + 1] = np.uint16(middle + 3 * right + 8) >> 4
 
 
 def _seeds_of(level: Level, finer: Level) -> Seeds:
     """Find peaks in a level, and look around them in a finer one."""
     points, middles = find_peaks(level.image)
-    centres = level.to_frame(points)
     radius = PEAK_RADIUS_PX * level.factor
-    clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
     stretches, clearness = look_around(
-        finer.image, finer.from_frame(centres), middles, radius / finer.factor, clear
+        *(finer.image, points, middles, level.factor / finer.factor, PEAK_RADIUS_PX),
+        _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR,
     )
-    good = clearness > 0.0
-    return Seeds(centres[good], radius * stretches[good], clearness[good])
+    good = np.flatnonzero(clearness)
+    return Seeds(level.to_frame(points[good]), radius * stretches[good], clearness[good])
 
 
 def _joined(parts: list[Seeds]) -> Seeds:
