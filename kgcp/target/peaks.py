@@ -47,9 +47,11 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
     middles : (n,) array
         Grey values between those of core and ring.
     """
-    most = ((image.shape[0] + 1) // 2) * ((image.shape[1] + 1) // 2)  # maxima have no neighbours
-    found = np.empty((most, 4))
-    found = found[: _scan(image, found)]
+    rows, columns = image.shape[0], min(image.shape[1], _STRIP)
+    most = ((rows + 1) // 2) * ((columns + 1) // 2)  # maxima have no neighbours
+    strip = np.empty((most, 4))
+    places = range(0, image.shape[1], _STRIP)
+    found = np.concatenate([strip[: _scan(image, first, strip)].copy() for first in places])
     limit = max(int(_MAX_PEAK_SHARE * image.size), _MAX_PEAKS)
     if len(found) > limit:
         shares = found[:, 3]
@@ -58,22 +60,14 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
 
 
 @compiled
-def _scan(image: GreyArray, found: FloatArray) -> int:
-    """Fill in columns and rows of peaks, grey values between core and ring, shares; count them."""
-    count = 0
-    for first in range(0, image.shape[1], _STRIP):
-        count = _scan_strip(image, first, found, count)
-    return count
+def _scan(image: GreyArray, first: int, found: FloatArray) -> int:
+    """Fill in columns and rows of peaks, grey values between core and ring, shares; count them.
 
-
-@compiled
-def _scan_strip(image: GreyArray, first: int, found: FloatArray, count: int) -> int:
-    """Scan some columns; return how many peaks there are now.
-
-    Entry 0 of what is kept of a row is left of the first column: by 4 columns in `grey` and `sums`,
-    by 3 in `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`. Rows are kept at their
-    numbers modulo 8 (`grey`) or 3.
+    It is a strip from the first column on that is scanned. Entry 0 of what is kept of a row is left
+    of that column: by 4 columns in `grey` and `sums`, by 3 in `core`, by 2 in `disc`, `wide` and
+    `extent`, by 1 in `score`. Rows are kept at their numbers modulo 8 (`grey`) or 3.
     """
+    count = 0
     columns = min(image.shape[1] - first, _STRIP)
     width = -(-(columns + 2 * _REACH) // _VECTOR) * _VECTOR
     longer = width + 2 * _REACH
@@ -220,12 +214,11 @@ def _describe(
         up, top, down = score[before, x + 1], score[at, x + 1], score[after, x + 1]
         found[i, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
         found[i, 1] = row + _beside(up, top, down)
-        found[i, 2] = core[at, x + 3] / 18.0 + disc[at, x + 2] / 50.0
-        found[i, 3] = top / max(float(extent[0, x + 2]), 1.0)
+        found[i, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
+        found[i, 3] = top / max(extent[0, x + 2], 1)
 
 
 @compiled
 def _beside(before: int, top: int, after: int) -> float:
-    """Return how far beside a maximum the parabola through the scores has its own, ±0.5."""
-    bend = min(before - 2.0 * top + after, -1.0)
-    return min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+    """Return how far beside a maximum the parabola through the scores has its own: up to ±0.5."""
+    return 0.5 * (before - after) / min(before - 2 * top + after, -1)

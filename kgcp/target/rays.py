@@ -135,12 +135,11 @@ def _follow_curve(
         dx, dy = radius * _HARMONICS[1, k], radius * _HARMONICS[2, k]
         _place(image.shape, x, y, dx, dy, radii, places, parts)
         _interpolate(pixels, image.shape[1], places, parts, values[: len(radii)])
-        best = 1
-        for j in range(1, last - first + 2):
-            if values[j + 2 * _STEP] - values[j] > values[best + 2 * _STEP] - values[best]:
-                best = j
+        best, top = 1, values[1 + 2 * _STEP] - values[1]
+        for j in range(2, last - first + 2):
+            slope = values[j + 2 * _STEP] - values[j]
+            best, top = (j, slope) if slope > top else (best, top)
         left = values[best - 1 + 2 * _STEP] - values[best - 1]
-        top = values[best + 2 * _STEP] - values[best]
         right = values[best + 1 + 2 * _STEP] - values[best + 1]
         bend = min(left - 2.0 * top + right, -1e-3)
         beside = min(max(0.5 * (left - right) / bend, -0.5), 0.5)
