@@ -76,12 +76,10 @@ def _follow(pyramid: tuple[Level, ...], seeds: Seeds) -> _Outlines:
     inlying = np.empty((len(seeds), RAYS), dtype=np.bool_)
     wanted = np.floor(np.log2(np.maximum(seeds.radii_px / _FINEST_RADIUS_PX, 1.0))).astype(np.intp)
     wanted = np.minimum(wanted, len(pyramid) - 1)
+    centres, radii = np.ascontiguousarray(seeds.centres_px), np.ascontiguousarray(seeds.radii_px)
     for index in set(wanted.tolist()):
-        level, members = pyramid[index], np.flatnonzero(wanted == index)
-        centres = level.from_frame(seeds.centres_px[members])
-        found = np.empty((len(members), RAYS)), np.empty((len(members), RAYS), dtype=np.bool_)
-        follow(level.image, centres, seeds.radii_px[members] / level.factor, *found)
-        edges[members], inlying[members] = found
+        level, which = pyramid[index], np.flatnonzero(wanted == index)
+        follow(level.image, float(level.factor), which, centres, radii, edges, inlying)
     share = inlying.mean(axis=1)
     good = np.flatnonzero(share)
     return _fit_ellipses(

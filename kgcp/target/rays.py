@@ -39,6 +39,8 @@ BoolArray = npt.NDArray[np.bool_]
 @compiled
 def follow(
     image: GreyArray,
+    factor: float,
+    which: IndexArray,
     centres: FloatArray,
     radii: FloatArray,
     edges: FloatArray,
@@ -49,11 +51,15 @@ def follow(
     Parameters
     ----------
     image : (height, width) array of uint8
-        Contiguous.
+        A frame, reduced; contiguous.
+    factor : float
+        How many pixels of the frame a pixel of the image is wide.
+    which : (m,) array of int
+        Rings that are looked at.
     centres : (n, 2) array
-        Of the rings, roughly [px].
+        Of the rings in the frame, roughly [px].
     radii : (n,) array
-        Of the rings, roughly [px].
+        Of the rings in the frame, roughly [px].
     edges : (n, rays) array
         Filled in: how far the edge is from the centre, of the radius.
     inlying : (n, rays) array of bool
@@ -62,8 +68,9 @@ def follow(
     few, strength, rest = np.empty(_FEW), np.empty(RAYS), np.empty(RAYS)
     curve, values = np.empty(_TERMS), np.empty(len(_RADII))
     places, parts = np.empty(len(_RADII), np.intp), np.empty((2, len(_RADII)))
-    for i in range(len(radii)):
-        x, y, radius = centres[i, 0], centres[i, 1], radii[i]
+    for i in which:
+        x, y = (centres[i, 0] + 0.5) / factor - 0.5, (centres[i, 1] + 0.5) / factor - 0.5
+        radius = radii[i] / factor
         edge, is_inlying = edges[i], inlying[i]
         is_inlying[:] = False
         _glance(image, x, y, radius, places, values, few, strength)

@@ -49,10 +49,6 @@ class Level:
         """Return coordinates in the frame of coordinates in the level [px]."""
         return np.asarray(self.factor * (pixels + 0.5) - 0.5)
 
-    def from_frame(self, pixels: FloatArray) -> FloatArray:
-        """Return coordinates in the level of coordinates in the frame [px]."""
-        return np.asarray((pixels + 0.5) / self.factor - 0.5)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
