@@ -7,7 +7,7 @@ Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y dow
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -92,6 +92,18 @@ class Camera:
             if not math.isfinite(getattr(self, key)):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
         require_range("readout_s", self.readout_s, 0.0, 10.0, unit="s")
+
+    def binned(self, count: int) -> Camera:
+        """Return the camera whose pixels are squares of `count` by `count` of this one's."""
+        return replace(
+            self,
+            width=self.width // count,
+            height=self.height // count,
+            fx=self.fx / count,
+            fy=self.fy / count,
+            cx=(self.cx - 0.5 * (count - 1)) / count,
+            cy=(self.cy - 0.5 * (count - 1)) / count,
+        )
 
     @property
     def mean_focal_px(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.special import ndtri
 
@@ -11,6 +13,7 @@ from kgcp.target.imager import share_at
 from kgcp.target.layout import Target
 from kgcp.target.light import plateau_levels
 from kgcp.target.observation import Appearance
+from kgcp.target.pairs import variance_in_pixels
 from kgcp.target.window import contour_px, semi_major_axis_px
 
 
@@ -19,15 +22,19 @@ def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
     imaging = fit.sample.imaging
     black, white = plateau_levels(fit.parameters.light, imaging.response)
     inside = np.hypot(*fit.prediction.points_m) < imaging.outer_radius_m
-    clipped = fit.sample.censoring.at_high | fit.sample.censoring.at_low
+    binning, clipped = imaging.window.binning, fit.sample.clipped
+    blur_px, shift_px = fit.parameters.blur.mean_sd_px, _edge_shift_px(fit)
+    if binning > 1:
+        blur_px = math.sqrt(variance_in_pixels(blur_px * blur_px, binning))
+        shift_px *= binning
     contour = contour_px(camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m)
     return Appearance(
         radius_px=semi_major_axis_px(contour),
         black=float(np.clip(black, 0.0, 1.0)),
         white=float(np.clip(white, 0.0, 1.0)),
         saturated=float(np.mean(clipped[inside])),
-        edge_shift_px=_edge_shift_px(fit),
-        blur_px=fit.parameters.blur.mean_sd_px,
+        edge_shift_px=shift_px,
+        blur_px=blur_px,
     )
 
 

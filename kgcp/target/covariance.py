@@ -19,7 +19,7 @@ from scipy.special import ndtri
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import Fit, noise_of
 from kgcp.target.imager import share_at
@@ -29,6 +29,7 @@ from kgcp.target.observation import Uncertainty
 _ARC_PX = 6.0
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
+_TONED_EDGE_FLOOR_PX = 0.005  # of the frame, where a tone curve displaces edges within bins
 _COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
@@ -77,7 +78,10 @@ def _common_displacement_px(fit: Fit) -> float:
     print, compression, tails of what is not modelled) averages out along a circle only in part. And
     of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
     """
-    floor_px = math.hypot(_EDGE_FLOOR_PX, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
+    imaging = fit.sample.imaging
+    is_plain = imaging.window.binning == 1 or imaging.response is Response.LINEAR
+    floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / imaging.window.binning
+    floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction)
     share = fit.prediction.share
     edge = (share > 0.3) & (share < 0.7)

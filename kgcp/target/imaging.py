@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.plate import Circles
 from kgcp.target.window import Window
 
+_CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
 _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 
 
@@ -56,3 +59,15 @@ class Imaging:
     def few_pixels(self) -> int | None:
         """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
         return None if self.sharpening_px else _FEW_PIXELS
+
+
+def apparent_response(response: Response, window: Window) -> Response:
+    """Return how the grey values of a window follow light.
+
+    In means of grey values, tone curves, sharpening and clipping leave of an edge within a bin how
+    far they displace it; the parameters of an unknown response take that.
+    """
+    if window.clipped is None:
+        return response
+    is_clipped = float(np.mean(window.clipped)) > _CLIPPED
+    return Response.LINEAR if response is Response.LINEAR and not is_clipped else Response.UNKNOWN

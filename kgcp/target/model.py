@@ -6,6 +6,7 @@ are adjusted; the one that fits better is reported, the other one kept with how 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +17,11 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import pose_covariance, propagate
-from kgcp.target.imaging import Imaging
+from kgcp.target.imaging import Imaging, apparent_response
 from kgcp.target.layout import Target
 from kgcp.target.noise import BoolArray, find_censoring
 from kgcp.target.observation import Alternative, Observation
-from kgcp.target.pairs import Blur
+from kgcp.target.pairs import Blur, variance_in_bins
 from kgcp.target.plate import circles_of
 from kgcp.target.prior import NormalPrior
 from kgcp.target.two_poses import TwoPoses, advantage, choose_by_prior, fit_both_poses
@@ -29,6 +30,7 @@ from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
+_LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 
 
@@ -64,7 +66,7 @@ def measure_by_model(
     """
     pose = _without_edge_shift(start)
     imaging = replace(imaging_of(grey, camera, target, pose), visible=visible)
-    poses = fit_both_poses(imaging, pose, _start_blur(start))
+    poses = fit_both_poses(imaging, pose, _start_blur(start, imaging.window.binning))
     if prior is not None:
         poses = choose_by_prior(imaging, poses, prior)
     check_fit(poses.best)
@@ -88,23 +90,27 @@ def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> I
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
-        contour = contour_px(camera, pose, radius_m)
+        size_px = semi_major_axis_px(contour_px(camera, pose, radius_m))
+        binning = max(1, math.ceil(size_px / _LARGEST_RADIUS_PX))
+        seen = camera if binning == 1 else camera.binned(binning)
+        contour = contour_px(seen, pose, radius_m)
         try:
-            window = cut_window(grey, camera, contour, _MARGIN_PX)
+            window = cut_window(grey, seen, contour, _MARGIN_PX, binning)
         except Rejection as rejection:
             cut = rejection
             continue
+        is_plain = binning > 1 or camera.response is Response.LINEAR
         return Imaging(
             window=window,
             circles=circles_of(target.rings),
             measured_count=_measured_count(camera, target, pose),
             outer_radius_m=radius_m,
             outer_radius_px=semi_major_axis_px(contour),
-            centre_px=camera.project(pose.translation_m[None])[0],
-            focal_px=camera.mean_focal_px,
+            centre_px=seen.project(pose.translation_m[None])[0],
+            focal_px=seen.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
-            response=camera.response,
-            sharpening_px=0.0 if camera.response is Response.LINEAR else _SHARPENING_PX,
+            response=apparent_response(camera.response, window),
+            sharpening_px=0.0 if is_plain else _SHARPENING_PX,
         )
     raise cut
 
@@ -120,11 +126,11 @@ def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
     return sum(2 + len(ring.code_deg) for ring in rings)
 
 
-def _start_blur(start: Observation) -> Blur:
-    """Return the blur that the start has seen; that of a sharp frame at least."""
+def _start_blur(start: Observation, binning: int) -> Blur:
+    """Return the blur that the start has seen, in bins; that of a sharp frame at least."""
     appearance = start.appearance
     seen_px = min(appearance.blur_px or 0.0, _LARGEST_START_BLUR * appearance.radius_px)
-    variance = max(_SHARP_PX2, seen_px * seen_px)
+    variance = variance_in_bins(max(_SHARP_PX2, seen_px * seen_px), binning)
     return Blur(variance, variance, 0.0)
 
 

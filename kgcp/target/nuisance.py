@@ -33,25 +33,30 @@ _OF_RESPONSE = {
     Response.SRGB: [Param.SHARPENING],
     Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
 }
+_OF_BINS = [Param.TONE_1]  # how far edges are displaced; their shape is that of the bins
 
 
 def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
     """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
     streak = _streak_of(start.blur)
     if streak is None:
-        best = adjust(imaging, start, unknowns_of(imaging.response, has_streak=False, moves=moves))
+        best = adjust(imaging, start, unknowns_of(imaging, has_streak=False, moves=moves))
         streak, start = _streak_of(best.parameters.blur), best.parameters
         if streak is None:
             return best
-    unknowns = unknowns_of(imaging.response, has_streak=True, moves=moves)
+    unknowns = unknowns_of(imaging, has_streak=True, moves=moves)
     streaked = Parameters(start.pose, streak, start.light)
     near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
     return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
-def unknowns_of(response: Response, *, has_streak: bool, moves: bool = True) -> Unknowns:
+def unknowns_of(imaging: Imaging, *, has_streak: bool, moves: bool = True) -> Unknowns:
     """Return which parameters are free, with weak priors on what one frame hardly tells."""
-    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_RESPONSE[response]]
+    response = imaging.response
+    of_response = _OF_RESPONSE[response]
+    if imaging.window.binning > 1 and of_response:
+        of_response = _OF_BINS
+    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *of_response]
     mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
     for param, sd in _PRIOR_SD.items():
         precision[param] = sd**-2 if param in free else 0.0

@@ -80,6 +80,16 @@ class Blur:
         return float(np.sqrt(0.5 * (xx + yy)))
 
 
+def variance_in_bins(variance_px2: float, count: int) -> float:
+    """Return a blur's variance in bins of `count` by `count` pixels, their integration included."""
+    return (variance_px2 + (count * count - 1) / 12.0) / (count * count)
+
+
+def variance_in_pixels(variance: float, count: int) -> float:
+    """Return what `variance_in_bins` took [px²]; that of a pixel at least."""
+    return max(1.0 / 12.0, count * count * variance - (count * count - 1) / 12.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePairs:
     """Which of n pixels feel the edge of which of c circles.

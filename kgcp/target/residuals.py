@@ -15,7 +15,7 @@ from kgcp.target.layout import Target
 from kgcp.target.light import Parameters, plateau_levels
 from kgcp.target.model import imaging_of
 from kgcp.target.nuisance import adjust_with_streak
-from kgcp.target.pairs import Blur
+from kgcp.target.pairs import Blur, variance_in_bins
 from kgcp.target.plate import circles_of
 from kgcp.target.sample import whole_plate
 from kgcp.target.verify import edge_noise
@@ -69,7 +69,8 @@ def residuals_of(
         As `kgcp.target.model.measure_by_model`.
     """
     imaging = imaging_of(grey, camera, target, pose)
-    variance = (blur_px or _USUAL_BLUR_PX) ** 2
+    binning = imaging.window.binning
+    variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
     start = Parameters(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
     fit = adjust_with_streak(imaging, start, moves=False)
     light = fit.parameters.light
@@ -83,7 +84,8 @@ def residuals_of(
         min(white, limits.high) - black
     )
     shape = (window.height, window.width)
-    return Residuals(window.x0, window.y0, share.reshape(shape), edge_noise(fit))
+    of_pixels = np.kron(share.reshape(shape), np.ones((binning, binning)))
+    return Residuals(binning * window.x0, binning * window.y0, of_pixels, edge_noise(fit))
 
 
 def contours_px(camera: Camera, target: Target, pose: Pose) -> FloatArray:

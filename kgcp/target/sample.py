@@ -17,7 +17,7 @@ from kgcp.target.foreign import hidden_pixels, reached_by_surroundings, see_plat
 from kgcp.target.imager import Imager
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import PARAM_COUNT, Light
-from kgcp.target.noise import Censoring
+from kgcp.target.noise import BoolArray, Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges
 from kgcp.target.plate import largest_metres_per_px, plate_points
 from kgcp.target.sharpening import unsharp_mask
@@ -57,6 +57,14 @@ class Sample:
     imager: Imager
     censoring: Censoring
     pairs: EdgePairs
+
+    @property
+    def clipped(self) -> FloatArray | BoolArray:
+        """Share of clipped pixels (n,) in each."""
+        bins = self.imaging.window.clipped
+        if bins is None:
+            return self.censoring.at_high | self.censoring.at_low
+        return bins[self.index]
 
 
 def choose_sample(

@@ -111,7 +111,7 @@ def _approach(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
     plain = replace(imaging, sharpening_px=0.0)
     few = plain.few_pixels
     sample = choose_sample(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
-    unknowns = unknowns_of(imaging.response, has_streak=False)
+    unknowns = unknowns_of(imaging, has_streak=False)
     return approach(sample, Parameters(pose, blur, light), unknowns)
 
 

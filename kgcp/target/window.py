@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.geometry.raster import rays_of_window
+from kgcp.target.noise import find_censoring
 
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
 _UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
@@ -20,6 +22,8 @@ _UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """A rectangle of pixels, flattened row by row.
+
+    Of a large target, bins take the place of pixels: means over squares of the frame's.
 
     Attributes
     ----------
@@ -34,6 +38,10 @@ class Window:
     rays : (6, n) array
         Normalised image coordinates x, y of the pixel centres, free of distortion, and their
         derivatives xx, xy, yx, yy with respect to the raw pixel coordinates.
+    binning : int
+        So many by so many pixels of the frame are one of the window.
+    clipped : (n,) array or None
+        Share of clipped pixels in every bin; None without bins.
     """
 
     x0: int
@@ -44,6 +52,8 @@ class Window:
     smooth: FloatArray
     levels_per_count: float
     rays: FloatArray
+    binning: int = 1
+    clipped: FloatArray | None = None
 
     def pixels(self, chosen: IndexArray) -> FloatArray:
         """Return raw pixel coordinates (m, 2) of the chosen pixels."""
@@ -64,8 +74,13 @@ def semi_major_axis_px(contour: FloatArray) -> float:
     return float(0.5 * np.hypot(*(contour[:half] - contour[half:]).T).max())
 
 
-def cut_window(grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: float) -> Window:
+def cut_window(
+    grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: float, binning: int = 1
+) -> Window:
     """Cut out the image of a circle, by `contour_px`, with a margin around it.
+
+    Camera, contour and margin are those of the window's pixels: with `binning`, of
+    `Camera.binned`.
 
     Raises
     ------
@@ -73,7 +88,7 @@ def cut_window(grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: 
         `CUT` if less than a quarter of the circle's box is within the frame.
     """
     low, high = contour.min(axis=0) - margin_px, contour.max(axis=0) + margin_px
-    height, width = grey.shape
+    height, width = (size // binning for size in grey.shape)
     x0, y0 = (max(0, int(np.floor(value))) for value in low)
     x1, y1 = (
         min(size, int(np.ceil(value)) + 1)
@@ -85,14 +100,33 @@ def cut_window(grey: GreyArray, camera: Camera, contour: FloatArray, margin_px: 
     rays = rays_of_window(
         camera, np.arange(x0, x1, dtype=np.float64), np.arange(y0, y1, dtype=np.float64)
     )
-    part = grey[y0:y1, x0:x1].astype(np.float32) / scale
+    part = grey[binning * y0 : binning * y1, binning * x0 : binning * x1]
+    means = part if binning == 1 else _binned(part, binning)
+    smooth = cv2.medianBlur(means.astype(np.float32) / scale, 3)
+    levels = means.ravel().astype(np.float64) / scale
     return Window(
         x0=x0,
         y0=y0,
         width=x1 - x0,
         height=y1 - y0,
-        levels=grey[y0:y1, x0:x1].ravel().astype(np.float64) / scale,
-        smooth=cv2.medianBlur(part, 3).ravel().astype(np.float64),
+        levels=levels,
+        smooth=smooth.ravel().astype(np.float64),
         levels_per_count=1.0 / scale,
         rays=rays,
+        binning=binning,
+        clipped=None if binning == 1 else _clipped(part, binning, levels, 1.0 / scale),
     )
+
+
+def _clipped(part: GreyArray, binning: int, levels: FloatArray, count: float) -> FloatArray:
+    """Return the share (n,) of clipped pixels in every bin."""
+    limits = find_censoring(levels, count)
+    clipped = (part >= limits.high / count) | (part <= limits.low / count)
+    return _binned(clipped, binning).ravel()
+
+
+def _binned(values: np.ndarray[tuple[int, int], Any], count: int) -> FloatArray:
+    """Return the means over squares of `count` by `count`."""
+    height, width = (size // count for size in values.shape)
+    columns = values.reshape(height, count, width * count).sum(axis=1, dtype=np.float64)
+    return np.asarray(columns.reshape(height, width, count).sum(axis=2) / (count * count))
