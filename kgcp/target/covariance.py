@@ -29,7 +29,7 @@ from kgcp.target.observation import Uncertainty
 _ARC_PX = 6.0
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
-_TONED_EDGE_FLOOR_PX = 0.005  # of the frame, where a tone curve displaces edges within bins
+_TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
 _COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
