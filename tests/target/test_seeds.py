@@ -13,6 +13,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.target.distinct import distinct
 from kgcp.target.outline import find_outlines
 from kgcp.target.peaks import find_peaks
+from kgcp.target.ring_samples import look_around
 from kgcp.target.seeds import build_pyramid, find_seeds
 
 SUPER = 8  # drawn so many times as large
@@ -63,6 +64,19 @@ def test_the_smallest_images_can_be_searched(shape: tuple[int, int]) -> None:
     points, middles = find_peaks(np.zeros(shape, dtype=np.uint8))
     assert points.shape == (0, 2)
     assert middles.shape == (0,)
+
+
+@pytest.mark.parametrize("coarser", [2.0, 3.0])
+def test_beyond_its_border_the_image_repeats_its_last_pixels(coarser: float) -> None:
+    frame = ring_frame((141.3, 103.8), (2.8 * coarser, 2.8 * coarser))
+    cut = np.ascontiguousarray(frame[97:, 134:])  # the ring, without its surround on two sides
+    padded = cv2.copyMakeBorder(cut, 36, 36, 36, 36, borderType=cv2.BORDER_REPLICATE)
+    x, y = np.meshgrid(np.arange(0.0, cut.shape[1], coarser), np.arange(0.0, 40.0, coarser))
+    points, middles = np.stack((x.ravel(), y.ravel()), axis=1) / coarser, np.full(x.size, 115.0)
+    seen = look_around(cut, points, middles, coarser, 2.8, 0.8)
+    there = look_around(padded, points + 36.0 / coarser, middles, coarser, 2.8, 0.8)
+    assert np.count_nonzero(seen[1]) > 0
+    assert np.array_equal(seen, there)
 
 
 @pytest.mark.parametrize("radius", [6.0, 7.1, 9.3, 12.0, 16.0, 23.0, 31.0, 44.0, 60.0, 88.0])
