@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 
-from benchmarks.speed_sources import Source
-from kgcp.io.flight import Flight
+from kgcp.geometry.camera import Camera
 from kgcp.io.frames import read_grey
 from kgcp.settings import DetectSettings
+from kgcp.target.layout import Target
 from kgcp.target.measure import measure_frame
 from kgcp.target.observation import Observation
 from kgcp.target.search import find_rings
+
+if TYPE_CHECKING:  # what workers import decides about their memory
+    from benchmarks.speed_sources import Source
 
 Result = TypeVar("Result")
 
@@ -84,29 +89,49 @@ def cv2_alone() -> None:
     cv2.setNumThreads(0)
 
 
-def cost_of(path: Path, flight: Flight) -> FrameCost:
+def peak_memory_bytes() -> int:
+    """Return this process's peak memory; on Linux, `getrusage` counts its parent's, too."""
+    if sys.platform != "linux":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+def cost_and_memory(
+    path: Path, camera: Camera, targets: tuple[Target, ...]
+) -> tuple[FrameCost, int]:
+    """Time one frame; return its costs, and the peak memory of the process [bytes]."""
+    cost_of(path, camera, targets)  # compiles
+    return cost_of(path, camera, targets), peak_memory_bytes()
+
+
+def cost_of(path: Path, camera: Camera, targets: tuple[Target, ...]) -> FrameCost:
     """Time what becomes of one frame."""
     settings = DetectSettings()
-    decode_s, grey = _timed(lambda: read_grey(path, flight.camera))
+    decode_s, grey = _timed(lambda: read_grey(path, camera))
     search_s, _ = _timed(lambda: find_rings(grey, settings))
-    measure_s, seen = _timed(lambda: measure_frame(grey, flight.camera, flight.targets, settings))
+    measure_s, seen = _timed(lambda: measure_frame(grey, camera, targets, settings))
     found = sum(isinstance(one, Observation) for one in seen)
     return FrameCost(grey.size, decode_s, search_s, measure_s, found)
 
 
 def _timed(function: Callable[[], Result]) -> tuple[float, Result]:
     best_s = float("inf")
-    for _ in range(_REPEATS):
+    for left in reversed(range(_REPEATS)):
         begin_s = time.process_time()
         result = function()
         best_s = min(best_s, time.process_time() - begin_s)
+        if left:
+            del result  # workers do not have two frames at a time
     return best_s, result
 
 
 def cost_of_all(source: Source) -> Iterable[Costs]:
     """Time the frames of a source; those with a measured target and those without stand apart."""
-    cost_of(source.flight.frames_folder / source.frames[0], source.flight)  # compiles
-    costs = [cost_of(source.flight.frames_folder / name, source.flight) for name in source.frames]
+    flight = source.flight
+    paths = [flight.frames_folder / name for name in source.frames]
+    cost_of(paths[0], flight.camera, flight.targets)  # compiles
+    costs = [cost_of(path, flight.camera, flight.targets) for path in paths]
     for targets, chosen in (("with", _found(costs)), ("without", _missed(costs))):
         if chosen:
             yield Costs(source.name, targets, tuple(chosen))

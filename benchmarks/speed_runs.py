@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
 import shutil
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.speed_costs import Costs, cost_of, cv2_alone
+from benchmarks.speed_costs import Costs, FrameCost, cost_and_memory, cv2_alone
 from benchmarks.speed_sources import Source, flight_over
 from kgcp.io.flight import Flight
 from kgcp.settings import DetectSettings
@@ -106,22 +105,14 @@ def size_lines(picture: tuple[Path, Source], work: Path) -> Iterator[str]:
 def _in_own_process(path: Path, flight: Flight) -> str:
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=spawn, initializer=cv2_alone) as pool:
-        return pool.submit(_size_line, path, flight).result()
+        return _size_line(
+            *pool.submit(cost_and_memory, path, flight.camera, flight.targets).result()
+        )
 
 
-def _peak_memory_bytes() -> int:
-    """Return this process's peak memory; on Linux, `getrusage` counts its parent's, too."""
-    if sys.platform != "linux":
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
-
-
-def _size_line(path: Path, flight: Flight) -> str:
-    cost_of(path, flight)  # compiles
-    cost = cost_of(path, flight)
+def _size_line(cost: FrameCost, memory_bytes: int) -> str:
     costs = Costs("", "", (cost,))
-    memory_mb = _peak_memory_bytes() / _MB
+    memory_mb = memory_bytes / _MB
     limit_mb = _BASE_MB + _FRAMES_HELD * cost.pixels / _MB
     return (
         f"{1e-6 * cost.pixels:6.1f}{1e3 * cost.decode_s:11.1f}{costs.search:9.2f}{costs.whole:8.2f}"

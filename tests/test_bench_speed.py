@@ -41,7 +41,7 @@ def test_photographs_are_put_together_by_size_and_timed(source: Source, tmp_path
     found = photographs_of(tmp_path, source)
     assert [one.frames for one in found] == [("a.png", "b.png"), ("c.png",)]
     assert (found[0].flight.camera.width, found[0].flight.camera.height) == (160, 90)
-    cost = cost_of(tmp_path / "a.png", found[0].flight)
+    cost = cost_of(tmp_path / "a.png", found[0].flight.camera, found[0].flight.targets)
     assert (cost.pixels, cost.found) == (160 * 90, 0)
     assert min(cost.decode_s, cost.search_s, cost.measure_s) >= 0.0
 
