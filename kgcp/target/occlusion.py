@@ -5,11 +5,14 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray
 from kgcp.target.layout import Ring
 from kgcp.target.noise import BoolArray
-from kgcp.target.template import ANGLES, SAMPLED_RADII, SHIFTS, Templates, templates_of
+from kgcp.target.template import ANGLES, SAMPLED_RADII, SHIFTS, templates_of
+
+ComplexArray = npt.NDArray[np.complex128]
 
 _TYPICAL = 0.65  # quantile of steps of light that is not hidden, however much else is
 _MIN_STEP = 0.35  # of the typical one
@@ -89,30 +92,33 @@ def best_partial_template(
 
 
 @lru_cache(maxsize=16)
-def _spectra(ring: Ring) -> tuple[IndexArray, IndexArray, Templates]:
-    """Return spectra (t, rows, frequencies) of the templates and of their squares, weighted."""
+def _spectra(ring: Ring) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return spectra of the weighted templates: by (frequency, t, row); sums (t, frequency).
+
+    The sums over the rows are those of the templates and of their squares.
+    """
     templates = templates_of(ring)
     weighted = templates.images * templates.weights[:, None]
     plain = np.conj(np.fft.rfft(weighted, axis=2))
-    return plain, np.conj(np.fft.rfft(weighted * templates.images, axis=2)), templates
+    squares = np.conj(np.fft.rfft(np.sum(weighted * templates.images, axis=1), axis=1))
+    return plain.transpose(2, 0, 1).copy(), plain.sum(axis=1), squares
 
 
 def _correlation(patch: FloatArray, visible: BoolArray, ring: Ring) -> FloatArray:
     """Return the normalised cross-correlation of what is visible: (lag, template, shift)."""
-    plain, squares, templates = _spectra(ring)
-    rows, weights = templates.images.shape[1], templates.weights
-    masked = patch * visible
+    by_row, plain, squares = _spectra(ring)
+    weights = templates_of(ring).weights
     mask = np.fft.rfft(visible.astype(np.float64))
     total = float(weights.sum() * visible.sum())
-    sum_t = np.fft.irfft(plain.sum(axis=1) * mask, ANGLES).T / total  # lag, template
-    sum_tt = np.fft.irfft(squares.sum(axis=1) * mask, ANGLES).T / total
+    sum_t = np.fft.irfft(plain * mask, ANGLES).T / total  # lag, template
+    sum_tt = np.fft.irfft(squares * mask, ANGLES).T / total
     spread_t = np.sqrt(np.maximum(sum_tt - sum_t**2, 1e-12))
-    scores = []
-    for shift in range(len(patch) - rows + 1):
-        part = masked[shift : shift + rows]
-        mean = float(weights @ part.sum(axis=1)) / total
-        power = float(weights @ (part * part).sum(axis=1)) / total
-        cross = np.einsum("trf,rf->tf", plain, np.fft.rfft(part, axis=1))
-        covariance = np.fft.irfft(cross, ANGLES).T / total - mean * sum_t
-        scores.append(covariance / (spread_t * np.sqrt(max(power - mean**2, 1e-12))))
-    return np.stack(scores, axis=2)
+    masked = patch * visible
+    window = np.arange(len(patch) - len(weights) + 1)[:, None] + np.arange(len(weights))
+    sums = np.stack((masked.sum(axis=1), np.einsum("ra,ra->r", masked, masked)))
+    mean, power = sums[:, window] @ weights / total  # of every shift
+    spread = np.sqrt(np.maximum(power - mean**2, 1e-12))
+    spectrum = np.fft.rfft(masked, axis=1).T
+    cross = np.fft.irfft(by_row @ spectrum[:, window.T], ANGLES, axis=0)
+    covariance = cross / total - sum_t[:, :, None] * mean
+    return np.asarray(covariance / (spread_t[:, :, None] * spread))
