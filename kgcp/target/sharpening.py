@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,8 @@ import numpy.typing as npt
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
-_REACH_SIGMAS = 2.5  # of the mask
+_LAYERS = 16  # room for all rows that are sharpened: a full vector of the processor
+_TAPS = 7  # of the mask: 2.5 σ to either side, if σ is 1.2 px
 
 SingleArray = npt.NDArray[np.float32]
 NumberArray = npt.NDArray[np.int32]
@@ -28,11 +28,11 @@ class Mask:
     ----------
     others : (q,) array of int
         Pixels in reach that are not modelled, in the flattened window.
-    along_rows : (m, 2 r + 1) array of int
+    along_rows : (m, 7) array of int
         What the first pass adds up: modelled pixels by number, then the others.
-    along_columns : (n, 2 r + 1) array of int
+    along_columns : (n, 7) array of int
         What the second pass adds up for each modelled pixel.
-    kernel : (2 r + 1,) array
+    kernel : (7,) array
         Weights of either pass, which add up to 1.
     """
 
@@ -71,13 +71,15 @@ class Mask:
         strength : float
         """
         count = len(self.along_columns)
-        layers = np.zeros((count + others.shape[1], len(rows)), dtype=np.float32)
-        between = np.empty((len(self.along_rows), len(rows)), dtype=np.float32)
+        layers = np.zeros((count + others.shape[1], _LAYERS), dtype=np.float32)
+        between = np.empty((len(self.along_rows), _LAYERS), dtype=np.float32)
         kernel = self.kernel.astype(np.float32)
         _stack(jacobian, rows, layers)
         layers[count:, :2] = others.T
         _smooth_layers(layers, self.along_rows, kernel, between)
-        _add_detail(layers, between, self.along_columns, kernel, rows, strength, jacobian)
+        smooth = np.empty((count, _LAYERS), dtype=np.float32)
+        _smooth_layers(between, self.along_columns, kernel, smooth)
+        _add_detail(layers, smooth, rows, strength, jacobian)
 
 
 def unsharp_mask(width: int, height: int, index: IndexArray, sigma_px: float) -> Mask:
@@ -91,14 +93,12 @@ def unsharp_mask(width: int, height: int, index: IndexArray, sigma_px: float) ->
         The modelled pixels in the flattened window.
     sigma_px : float
     """
-    reach = math.ceil(_REACH_SIGMAS * sigma_px)
-    taps = 2 * reach + 1
-    along_columns = np.empty((len(index), taps), dtype=np.int32)
+    along_columns = np.empty((len(index), _TAPS), dtype=np.int32)
     nothing = np.zeros(0, dtype=np.intp)
     needed = _gather(index, nothing, width, height, along_columns, True)  # noqa: FBT003
-    along_rows = np.empty((len(needed), taps), dtype=np.int32)
+    along_rows = np.empty((len(needed), _TAPS), dtype=np.int32)
     sources = _gather(needed, index, width, height, along_rows, False)  # noqa: FBT003
-    steps = np.arange(-reach, reach + 1)
+    steps = np.arange(_TAPS) - _TAPS // 2
     kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
     return Mask(sources[len(index) :], along_rows, along_columns, kernel / kernel.sum())
 
@@ -114,7 +114,7 @@ def _gather(
 ) -> IndexArray:
     """Return the pixels that are needed along columns or rows, given ones first.
 
-    The number among them of each that a pixel (n,) needs goes to `numbers` (n, 2 r + 1).
+    The number among them of each that a pixel (n,) needs goes to `numbers` (n, 7).
     """
     reach = numbers.shape[1] // 2
     number = np.full(width * height, -1, np.int32)
@@ -160,33 +160,29 @@ def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
 def _smooth_layers(
     source: SingleArray, at: NumberArray, kernel: SingleArray, out: SingleArray
 ) -> None:
-    """Do as `_smooth` for every layer."""
+    """Do as `_smooth` for every layer; all taps at once make full use of vector units."""
+    far, farther, farthest, middle = kernel[2], kernel[1], kernel[0], kernel[3]
     for i in range(at.shape[0]):
-        out[i] = 0.0
-        for j in range(at.shape[1]):
-            row, weight = at[i, j], kernel[j]
-            for k in range(source.shape[1]):
-                out[i, k] += weight * source[row, k]
+        a, b, c, d, e, f, g = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5], at[i, 6]
+        for k in range(source.shape[1]):
+            out[i, k] = (
+                middle * source[d, k]
+                + far * (source[c, k] + source[e, k])
+                + farther * (source[b, k] + source[f, k])
+                + farthest * (source[a, k] + source[g, k])
+            )
 
 
 @compiled
 def _add_detail(
     layers: SingleArray,
-    between: SingleArray,
-    at: NumberArray,
-    kernel: SingleArray,
+    smooth: SingleArray,
     rows: IndexArray,
     strength: float,
     jacobian: FloatArray,
 ) -> None:
-    """Smooth along columns, and add what that takes away."""
-    detail = np.empty(len(rows), dtype=np.float32)
-    for i in range(at.shape[0]):
-        for k in range(len(rows)):
-            detail[k] = layers[i, k]
-        for j in range(at.shape[1]):
-            row, weight = at[i, j], kernel[j]
-            for k in range(len(rows)):
-                detail[k] -= weight * between[row, k]
-        for k in range(len(rows)):
-            jacobian[rows[k], i] += strength * detail[k]
+    """Add what smoothing takes away."""
+    for k in range(len(rows)):
+        row = jacobian[rows[k]]
+        for i in range(len(row)):
+            row[i] += strength * (layers[i, k] - smooth[i, k])
