@@ -196,15 +196,16 @@ def minimise(
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
     At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
-    anew only while steps are large: near the minimum it hardly changes, and costs most.
+    anew only while steps are large, and the normal matrix with it: near the minimum they hardly
+    change, and cost most.
     """
     damping = _DAMPING
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     scaled = jacobian[unknowns.free] / sd
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
+    normal = _normal_matrix(scaled, current, unknowns)
     for number in range(steps):
-        normal = _normal_matrix(scaled, current, unknowns)
         gradient = _gradient(scaled, parameters, current, unknowns)
         while True:
             step = np.zeros(PARAM_COUNT)
@@ -225,9 +226,10 @@ def minimise(
         if not is_better:
             break
         gain, total = total - trial_total, trial_total
+        parameters, prediction, current = candidate, attempt, trial
         if attempt_jacobian is not jacobian:
             jacobian, scaled = attempt_jacobian, attempt_jacobian[unknowns.free] / sd
-        parameters, prediction, current = candidate, attempt, trial
+            normal = _normal_matrix(scaled, current, unknowns)
         damping = max(0.1 * damping, 1e-9)
         if gain < enough:
             break
