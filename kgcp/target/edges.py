@@ -93,7 +93,8 @@ def clear_of_dots(
     on_edge = 0.5 * edge_diameter_m * np.exp(1j * angles_rad)
     dots = 0.5 * ring.code_diameter_m * np.exp(1j * np.radians(np.add(ring.code_deg, lag_deg)))
     gap_m = np.abs(on_edge[:, None] - dots).min(axis=1) - 0.5 * ring.dot_diameter_m
-    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.quantile(gap_m, 1.0 - _MIN_CLEAR)))
+    fewest = math.ceil((1.0 - _MIN_CLEAR) * (len(gap_m) - 1))
+    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.partition(gap_m, fewest)[fewest]))
     return np.asarray(gap_m >= reach_m)
 
 
