@@ -162,13 +162,11 @@ def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
     )
     black, white = seen.levels()
     other = np.empty(count, dtype=np.bool_)
+    off_edge_px = off_edge_m * per_px - slack_px
+    beyond_px = (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px
+    contrast = min(white, 1.0) - black
     tested = _mark_other(
-        *(imaging.window.smooth, share, black, min(white, 1.0) - black),
-        *(
-            off_edge_m * per_px - slack_px,
-            (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px,
-        ),
-        *(sd_px, other),
+        imaging.window.smooth, share, black, contrast, off_edge_px, beyond_px, sd_px, other
     )
     if other.any():
         other = _without_dots(seen, other)

@@ -40,7 +40,7 @@ class Verdict:
     Attributes
     ----------
     score : float
-        Normalised cross-correlation of the whole ring with its best template, -1…1.
+        Normalised cross-correlation with the best template, of what is seen of the ring, -1…1.
     lag_deg : float
         Heading of the plate's +x axis, as an angle of the sampled circles [deg].
     black, white : float

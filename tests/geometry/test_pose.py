@@ -126,3 +126,12 @@ def test_a_pose_is_tilted_in_its_own_direction_and_no_less_than_before(tilt_deg:
     if tilt_deg:
         np.testing.assert_allclose(sine / np.linalg.norm(sine), way, atol=1e-9)
     np.testing.assert_array_equal(tilted.translation_m, translation_m)
+
+
+def test_a_tilt_across_another_is_square_to_it() -> None:
+    pose = tilted(np.array([4.0, -3.0, 50.0]), np.array([2.0, -1.0, 20.0]))
+    across = pose.tilted_across(math.radians(9.0))
+    ray = pose.translation_m / pose.distance_m
+    before, after = (each.normal - (ray @ each.normal) * ray for each in (pose, across))
+    assert math.degrees(math.acos(ray @ across.normal)) == pytest.approx(9.0)
+    assert before @ after == pytest.approx(0.0, abs=1e-12)

@@ -19,9 +19,11 @@ from kgcp.settings import DetectSettings
 from kgcp.synthetic.flight import TARGET_PLATE
 from kgcp.synthetic.plate import Plate
 from kgcp.synthetic.shapes import Disc, Shape, rectangle
-from kgcp.target.measure import measure_frame
+from kgcp.target.measure import confirm, measure_frame
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Observation
+from kgcp.target.search import find_code, find_rings
+from kgcp.target.start import start_pose
 
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., Observation]
@@ -193,3 +195,19 @@ def test_a_target_with_a_hidden_quarter_is_found_and_measured(
     off_m = abs(seen.pose.distance_m - pose.distance_m)
     assert off_m < 5.0 * seen.uncertainty.sd_distance_m
     assert seen.uncertainty.sd_distance_m < 1e-3 * pose.distance_m
+
+
+def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Photograph) -> None:
+    rng = np.random.default_rng(8)
+    far, target = some_pose(rng), TARGET_PLATE.target
+    pose = Pose(far.rotation, RADIUS_PX / 60.0 * far.translation_m)
+    plate = with_layers((Disc(on_circle(0.45, 130.0), 0.9 * math.sin(math.radians(21.0))), 0.85))
+    grey = photograph(LENS, pose, rng, plate=plate)
+    settings, replica = DetectSettings(), target.rings[1]
+    matches, _ = find_code(grey, find_rings(grey, settings), replica, settings)
+    start = start_pose(grey, LENS, target, matches[0], settings.method)
+    seen = confirm(grey, LENS, target, start, settings, None)
+    assert seen.uncertainty is not None
+    off_m = abs(seen.pose.distance_m - pose.distance_m)
+    assert off_m < 5.0 * seen.uncertainty.sd_distance_m
+    assert seen.uncertainty.sd_distance_m < 5e-4 * pose.distance_m
