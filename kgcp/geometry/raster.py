@@ -24,8 +24,12 @@ def _interpolator(axis: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     """Return Chebyshev nodes on the range of an axis, and the weights of values there."""
     nodes, basis = _nodes_and_basis(order)
     middle, half = 0.5 * (axis[0] + axis[-1]), max(0.5 * (axis[-1] - axis[0]), 0.5)
-    vander = chebyshev.chebvander((axis - middle) / half, order - 1)
-    return middle + half * nodes, vander @ basis
+    scaled = (axis - middle) / half
+    polynomials = np.empty((order, len(axis)))
+    polynomials[0], polynomials[1] = 1.0, scaled
+    for k in range(2, order):
+        polynomials[k] = 2.0 * scaled * polynomials[k - 1] - polynomials[k - 2]
+    return middle + half * nodes, polynomials.T @ basis
 
 
 def normalised_grid(
@@ -71,16 +75,18 @@ def rays_of_window(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatA
     """
     x_nodes, columns = _interpolator(x_px, WINDOW_ORDER)
     y_nodes, rows = _interpolator(y_px, WINDOW_ORDER)
-    at_nodes = camera.undistort(np.stack(np.meshgrid(x_nodes, y_nodes), axis=-1))
-    inverse = _inverse_2x2(camera.distort_jacobian(at_nodes))
-    fields = np.concatenate((at_nodes, inverse.reshape(*at_nodes.shape[:2], 4)), axis=-1)
-    flat: FloatArray = (rows @ np.moveaxis(fields, -1, 0) @ columns.T).reshape(6, -1)
+    nodes = np.empty((WINDOW_ORDER, WINDOW_ORDER, 2))
+    nodes[..., 0], nodes[..., 1] = x_nodes, y_nodes[:, None]
+    at_nodes = camera.undistort(nodes)
+    fields = np.empty((6, WINDOW_ORDER, WINDOW_ORDER))
+    fields[0], fields[1] = at_nodes[..., 0], at_nodes[..., 1]
+    _fill_inverse(camera.distort_jacobian(at_nodes), fields[2:])
+    flat: FloatArray = (rows @ fields @ columns.T).reshape(6, -1)
     return flat
 
 
-def _inverse_2x2(matrix: FloatArray) -> FloatArray:
-    a, b = matrix[..., 0, 0], matrix[..., 0, 1]
-    c, d = matrix[..., 1, 0], matrix[..., 1, 1]
-    adjugate = np.stack((np.stack((d, -b), axis=-1), np.stack((-c, a), axis=-1)), axis=-2)
-    inverse: FloatArray = adjugate / (a * d - b * c)[..., None, None]
-    return inverse
+def _fill_inverse(matrix: FloatArray, inverse: FloatArray) -> None:
+    """Fill in the four elements (4, …) of the inverses of matrices (…, 2, 2)."""
+    a, b, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1]
+    inverse[0], inverse[1], inverse[2], inverse[3] = d, -b, -c, a
+    inverse /= a * d - b * c

@@ -94,10 +94,9 @@ class Fit:
     unknowns: Unknowns
 
     @property
-    def normal(self) -> FloatArray:
-        """Normal matrix (p, p), priors included."""
-        scaled = self.jacobian[self.unknowns.free] / self.sd
-        return _normal_matrix(scaled, self.misfit, self.unknowns)
+    def scaled_jacobian(self) -> FloatArray:
+        """Jacobian of the free parameters (p, n), in units of the noise."""
+        return self.jacobian[self.unknowns.free] / self.sd
 
     @property
     def total(self) -> float:
@@ -204,7 +203,7 @@ def minimise(
     scaled = jacobian[unknowns.free] / sd
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
-    normal = _normal_matrix(scaled, current, unknowns)
+    normal = normal_matrix(scaled, current, unknowns)
     for number in range(steps):
         gradient = _gradient(scaled, parameters, current, unknowns)
         while True:
@@ -229,14 +228,14 @@ def minimise(
         parameters, prediction, current = candidate, attempt, trial
         if attempt_jacobian is not jacobian:
             jacobian, scaled = attempt_jacobian, attempt_jacobian[unknowns.free] / sd
-            normal = _normal_matrix(scaled, current, unknowns)
+            normal = normal_matrix(scaled, current, unknowns)
         damping = max(0.1 * damping, 1e-9)
         if gain < enough:
             break
     return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)
 
 
-def _normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
+def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
     """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
     normal = (scaled * current.weight) @ scaled.T
     normal.flat[:: len(normal) + 1] += unknowns.precision[unknowns.free]

@@ -21,10 +21,12 @@ from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.target.adjust import Fit, noise_of
+from kgcp.target.adjust import Fit, noise_of, normal_matrix
 from kgcp.target.imager import share_at
 from kgcp.target.light import plateau_levels
+from kgcp.target.noise import median_at_edges
 from kgcp.target.observation import Uncertainty
+from kgcp.target.plate import find_skips
 
 _ARC_PX = 6.0
 # Of a circle's edge as a whole: no print and no pixel is known better, …
@@ -56,19 +58,17 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
     small common displacement of each circle's edge would do.
     """
-    inverse = np.linalg.inv(fit.normal)
-    scaled = fit.jacobian[fit.unknowns.free] / fit.sd
+    scaled = fit.scaled_jacobian
+    inverse = np.linalg.inv(normal_matrix(scaled, fit.misfit, fit.unknowns))
     circle, arc = _nearest_edges(fit)
-    count = int(arc.max()) + 1
-    sums = np.zeros((len(scaled), count))
-    _add_by_arc(scaled, fit.misfit.score, arc, sums)
-    used = int(np.count_nonzero(np.bincount(arc, minlength=count)))
+    sums, counts = _sum_by_arc(scaled, fit.misfit.score, arc)
+    used = int(np.count_nonzero(counts))
     correction = used / max(used - len(scaled), 0.25 * used)
-    robust = (correction * inverse @ (sums @ sums.T) @ inverse)[:6, :6]
-    plain = inverse[:6, :6]
-    inflation = max(1.0, float(np.trace(np.linalg.solve(plain, robust))) / 6.0)
-    shifts = (inverse @ _edge_pull(fit, scaled, circle))[:6] * _common_displacement_px(fit)
-    return PoseCovariance(_at_least(robust, plain) + shifts @ shifts.T, inflation)
+    half = inverse[:6] @ sums
+    robust, plain = correction * (half @ half.T), inverse[:6, :6]
+    at_least, inflation = _at_least(robust, plain)
+    shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
+    return PoseCovariance(at_least + shifts @ shifts.T, inflation)
 
 
 def _common_displacement_px(fit: Fit) -> float:
@@ -83,14 +83,11 @@ def _common_displacement_px(fit: Fit) -> float:
     floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / imaging.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction)
-    share = fit.prediction.share
-    edge = (share > 0.3) & (share < 0.7)
-    if not edge.any():
-        return floor_px
-    black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
-    slope_per_px = (white - black) / (np.sqrt(2.0 * np.pi) * fit.parameters.blur.mean_sd_px)
-    excess = np.sqrt(np.median(noise.sd[edge] ** 2 - noise.plateau_sd[edge] ** 2))
-    return max(floor_px, float(_COMMON_SHARE * excess / slope_per_px))
+    excess = noise.sd**2 - noise.plateau_sd**2
+    at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
+    black, white = plateau_levels(fit.parameters.light, imaging.response)
+    slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
+    return max(floor_px, _COMMON_SHARE * math.sqrt(at_edges) / slope_per_px)
 
 
 def _clipped_reach_px(fit: Fit) -> float:
@@ -108,28 +105,26 @@ def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
     Coming nearer by the share 1/r grows a circle of r pixels by one pixel.
     """
     imaging = fit.sample.imaging
-    translation_m = fit.parameters.pose.translation_m
-    by_approach = -(translation_m @ fit.jacobian[:3]) * fit.misfit.weight / fit.sd
-    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
-    pulls = [
-        scaled[:, circle == index] @ by_approach[circle == index] / (radius * px_per_m)
-        for index, radius in enumerate(imaging.circles.radii_m[:2])
-    ]
-    return np.stack(pulls, axis=1)
+    per_pixel = -fit.misfit.weight / (fit.sd * imaging.outer_radius_px / imaging.outer_radius_m)
+    by_approach = per_pixel * (fit.parameters.pose.translation_m @ fit.jacobian[:3])
+    pulls = np.zeros((2, len(by_approach)))
+    for index, radius_m in enumerate(imaging.circles.radii_m[:2]):
+        np.divide(by_approach, radius_m, out=pulls[index], where=circle == index)
+    return np.asarray(scaled @ pulls.T)
 
 
-def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> FloatArray:
-    """Return the robust covariance, nowhere below the plain one.
+def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> tuple[FloatArray, float]:
+    """Return the robust covariance, nowhere below the plain one, and their mean ratio, at least 1.
 
     Few arcs can by chance agree too well in some direction; the noise of the pixels is there all
     the same.
     """
     root = np.linalg.cholesky(plain)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, robust).T)
+    to_white = np.linalg.inv(root)
+    whitened = to_white @ robust @ to_white.T
     values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
-    raised = (vectors * np.maximum(values, 1.0)) @ vectors.T
-    covariance: FloatArray = root @ raised @ root.T
-    return covariance
+    raised = root @ (vectors * np.sqrt(np.maximum(values, 1.0)))
+    return raised @ raised.T, max(1.0, float(values.mean()))
 
 
 def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
@@ -139,9 +134,8 @@ def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
     px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
     counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
     firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
-    circle, arc = (np.zeros(points.shape[1], dtype=np.intp) for _ in range(2))
-    _number_arcs(points, circles.centres_m, circles.radii_m, firsts, counts, circle, arc)
-    return circle, arc
+    skips = find_skips(circles.centres_m, circles.radii_m)
+    return _number_arcs(points, circles.centres_m, circles.radii_m, *skips, firsts, counts)
 
 
 @compiled
@@ -149,32 +143,45 @@ def _number_arcs(
     points_m: FloatArray,
     centres_m: FloatArray,
     radii_m: FloatArray,
+    out_m: FloatArray,
+    beyond: IndexArray,
     firsts: FloatArray,
     counts: FloatArray,
-    circle: IndexArray,
-    arc: IndexArray,
-) -> None:
+) -> tuple[IndexArray, IndexArray]:
+    """Return the circle of every pixel's nearest edge, and the number of the arc there."""
+    circle, arc = np.zeros((2, points_m.shape[1]), np.intp)
     for i in range(points_m.shape[1]):
-        nearest = np.inf
-        for c in range(len(radii_m)):
-            x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
-            square, far = x * x + y * y, radii_m[c] + nearest
-            if square < far * far:
-                off_edge = abs(math.sqrt(square) - radii_m[c])
-                if off_edge < nearest:
-                    nearest, circle[i] = off_edge, c
+        x, y, c = points_m[0, i], points_m[1, i], 0
+        rho, nearest = math.sqrt(x * x + y * y), np.inf
+        while c < len(radii_m):
+            if abs(rho - out_m[c]) > radii_m[c] + nearest:
+                c = beyond[c]
+                continue
+            dx, dy = x - centres_m[0, c], y - centres_m[1, c]
+            off_edge = abs((rho if out_m[c] == 0.0 else math.sqrt(dx * dx + dy * dy)) - radii_m[c])
+            if off_edge < nearest:
+                nearest, circle[i] = off_edge, c
+            c += 1
         c = circle[i]
-        x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
-        turn = math.atan2(y, x) / (2.0 * math.pi)
+        turn = math.atan2(y - centres_m[1, c], x - centres_m[0, c]) / (2.0 * math.pi)
         turn -= math.floor(turn)
         arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
+    return circle, arc
 
 
 @compiled
-def _add_by_arc(scaled: FloatArray, score: FloatArray, arc: IndexArray, sums: FloatArray) -> None:
+def _sum_by_arc(
+    scaled: FloatArray, score: FloatArray, arc: IndexArray
+) -> tuple[FloatArray, IndexArray]:
+    """Return the scores' sums (p, arcs), and how many pixels (arcs,) each of them has."""
+    count = arc.max() + 1
+    sums, pixels = np.zeros((scaled.shape[0], count)), np.zeros(count, np.intp)
     for k in range(scaled.shape[0]):
         for i in range(scaled.shape[1]):
             sums[k, arc[i]] += scaled[k, i] * score[i]
+    for i in range(len(arc)):
+        pixels[arc[i]] += 1
+    return sums, pixels
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:

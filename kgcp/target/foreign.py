@@ -12,14 +12,15 @@ from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.pose import Pose
+from kgcp.target.bare_plate import BarePlate, look_at_plate
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import Light, light_of_levels, plateau_levels
 from kgcp.target.noise import BoolArray
-from kgcp.target.pairs import Blur
-from kgcp.target.plate import plate_points
+from kgcp.target.pairs import REACH_SIGMAS, Blur
+from kgcp.target.plate import largest_metres_per_px
 
 _BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
-_ENOUGH_PIXELS = 4000  # for a median
+_ENOUGH_PIXELS = 2000  # for a median
 _CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
@@ -30,7 +31,7 @@ _HIDDEN_SIGMAS = 4.0  # from there through the next edge
 _SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
 _MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
 _DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
-_SAME_PLACE = 1e-6  # of a radius
+_SCALE_PIXELS = 100  # enough to see how the plate's scale varies
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
 
 
@@ -41,44 +42,35 @@ class SeenPlate:
     Attributes
     ----------
     imaging : Imaging
-    points_m : (2, n) array
-        Where the pixels' rays meet the plate.
     metres_per_px : float
         Largest length on the plate that a pixel spans.
     blur : Blur
-    light : Light
-    rho_m : (n,) array
-        Distance of the points from the target's centre.
+    bare : BarePlate
+        Under every pixel, with small discs and edges in reach by `see_plate`.
     """
 
     imaging: Imaging
-    points_m: FloatArray
     metres_per_px: float
     blur: Blur
-    light: Light
-    rho_m: FloatArray
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the window."""
-        return self.imaging.window.height, self.imaging.window.width
-
-    def levels(self) -> tuple[float, float]:
-        """Return the grey values of ink and plate."""
-        return plateau_levels(self.light, self.imaging.response)
+    bare: BarePlate
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
         """Return pixels (n,) with all that a kernel around them covers."""
-        reached = cv2.dilate(pixels.reshape(self.shape).view(np.uint8), kernel)
+        shape = self.imaging.window.height, self.imaging.window.width
+        reached = cv2.dilate(pixels.reshape(shape).view(np.uint8), kernel)
         return np.asarray(reached.ravel().view(np.bool_))
 
 
-def see_plate(
-    imaging: Imaging, points_m: FloatArray, metres_per_px: float, blur: Blur, light: Light
-) -> SeenPlate:
-    """Prepare a window for what is asked of it."""
-    x, y = points_m
-    return SeenPlate(imaging, points_m, metres_per_px, blur, light, np.sqrt(x * x + y * y))
+def see_plate(imaging: Imaging, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
+    """Prepare a window for what is asked of it; the pose may be off by so many pixels."""
+    rays, sd_px = imaging.window.rays, blur.largest_sd_px
+    step = max(1, rays.shape[1] // _SCALE_PIXELS)
+    scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
+    reach_px = max(REACH_SIGMAS * sd_px, _CLEAR_SIGMAS * sd_px + slack_px)
+    bare = look_at_plate(
+        imaging, pose, rays, small_m=_SMALL_SIGMAS * sd_px * scale, reach_m=reach_px * scale
+    )
+    return SeenPlate(imaging, scale, blur, bare)
 
 
 def first_levels(imaging: Imaging, pose: Pose) -> Light:
@@ -89,18 +81,16 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     Rejection
         `NO_CONTRAST` if ink is not darker than the plate.
     """
-    window, circles = imaging.window, imaging.circles
+    window = imaging.window
     some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
     levels = window.levels[some]
-    x, y = points_m = plate_points(pose, window.rays[:, some])
-    share, off_edge_m = np.ones(len(x)), np.empty(len(x))
-    _fill_plateaus(
-        points_m, circles.centres_m, circles.radii_m, circles.signs, 0.0, np.inf, share, off_edge_m
-    )
-    inside = x * x + y * y < imaging.outer_radius_m**2
+    outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
+    rays = np.ascontiguousarray(window.rays[:, some])
+    bare = look_at_plate(imaging, pose, rays, reach_m=outer_m - inner_m)
+    inside, is_ink = bare.rho_m < imaging.outer_radius_m, bare.share < 0.5
     black, white = (
-        _median_of_clearest(levels[chosen], off_edge_m[chosen])
-        for chosen in (inside & (share < 0.5), inside & (share > 0.5))
+        _median_of_clearest(levels[chosen], bare.off_edge_m[chosen])
+        for chosen in (inside & is_ink, inside & ~is_ink)
     )
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
@@ -123,56 +113,73 @@ def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
     return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
 
 
-def reached_by_surroundings(seen: SeenPlate) -> BoolArray:
+def reached_by_surroundings(seen: SeenPlate, light: Light) -> BoolArray:
     """Tell which pixels (n,) of the window blur may mix with something that is not plate."""
-    imaging, blur = seen.imaging, seen.blur
-    black, white = seen.levels()
-    contrast, white = white - black, min(white, 1.0)
+    imaging, blur, rho_m = seen.imaging, seen.blur, seen.bare.rho_m
+    black, white = plateau_levels(light, imaging.response)
     clear = 1.0 + _CLEAR_SIGMAS * blur.largest_sd_px / imaging.outer_radius_px
-    foreign = np.abs(imaging.window.smooth - white) > _FOREIGN_CONTRAST * contrast
-    foreign &= seen.rho_m > clear * imaging.outer_radius_m
-    reach = _FOREIGN_SIGMAS * blur.largest_sd_px
-    half = int(np.ceil(reach))
-    columns, rows = np.meshgrid(*2 * [np.arange(-half, half + 1)])
-    xx, yy, xy = blur.total_covariance
-    determinant = xx * yy - xy * xy
-    distance2 = (yy * columns**2 - 2.0 * xy * columns * rows + xx * rows**2) / determinant
-    kernel = (distance2 <= _FOREIGN_SIGMAS**2).astype(np.uint8)
-    reached = seen.dilated(foreign, kernel)
-    inmost_m = (1.0 - 2.0 * reach / imaging.outer_radius_px) * imaging.outer_radius_m
-    return np.asarray(reached & (seen.rho_m > inmost_m))
+    off_level = _FOREIGN_CONTRAST * (white - black)
+    foreign = np.empty(len(rho_m), dtype=np.bool_)
+    smooth, level = imaging.window.smooth, min(white, 1.0)
+    if not _mark_foreign(smooth, rho_m, level, off_level, clear * imaging.outer_radius_m, foreign):
+        return foreign
+    reach_px = _FOREIGN_SIGMAS * blur.largest_sd_px
+    half = math.ceil(reach_px)
+    kernel = np.empty((2 * half + 1, 2 * half + 1), dtype=np.uint8)
+    _fill_ellipse(*blur.total_covariance, _FOREIGN_SIGMAS, kernel)
+    inmost_m = (1.0 - 2.0 * reach_px / imaging.outer_radius_px) * imaging.outer_radius_m
+    return np.asarray(seen.dilated(foreign, kernel) & (rho_m > inmost_m))
 
 
-def hidden_pixels(seen: SeenPlate, slack_px: float) -> BoolArray:
+@compiled
+def _mark_foreign(
+    smooth: FloatArray,
+    rho_m: FloatArray,
+    level: float,
+    off_level: float,
+    beyond_m: float,
+    foreign: BoolArray,
+) -> int:
+    """Mark the pixels farther out that are off the plate's level; return how many there are."""
+    count = 0
+    for i in range(len(smooth)):
+        foreign[i] = rho_m[i] > beyond_m and abs(smooth[i] - level) > off_level
+        count += foreign[i]
+    return count
+
+
+@compiled
+def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyArray) -> None:
+    """Fill in 1 within so many sigmas of a blur about the middle, 0 elsewhere."""
+    half, limit = kernel.shape[0] // 2, sigmas * sigmas * (xx * yy - xy * xy)
+    for row in range(-half, half + 1):
+        for column in range(-half, half + 1):
+            distance2 = yy * column * column - 2.0 * xy * column * row + xx * row * row
+            kernel[row + half, column + half] = 1 if distance2 <= limit else 0
+
+
+def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     """Tell which pixels (n,) of the window show something else than ink and plate.
 
     By levels that are neither where it is flat, and by edges that are not there: grey values
     just beside one that are like those beyond it. The pose may be off by `slack_px`.
     """
-    imaging, sd_px = seen.imaging, seen.blur.largest_sd_px
-    count = seen.points_m.shape[1]
+    imaging, sd_px, bare = seen.imaging, seen.blur.largest_sd_px, seen.bare
+    other = np.zeros(len(bare.rho_m), dtype=np.bool_)
     if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
-        return np.zeros(count, dtype=bool)
-    share, off_edge_m = np.ones(count), np.empty(count)
-    circles, per_px = imaging.circles, 1.0 / seen.metres_per_px
-    clear_m = (_CLEAR_SIGMAS * sd_px + slack_px) * seen.metres_per_px
-    _fill_plateaus(
-        *(seen.points_m, circles.centres_m, circles.radii_m, circles.signs),
-        *(_SMALL_SIGMAS * sd_px * seen.metres_per_px, clear_m, share, off_edge_m),
+        return other
+    black, white = plateau_levels(light, imaging.response)
+    contrast, scale = min(white, 1.0) - black, seen.metres_per_px
+    found, tested = _mark_other(
+        *(imaging.window.smooth, bare.share, bare.off_edge_m, bare.rho_m, black, contrast),
+        *(imaging.outer_radius_m, slack_px * scale, sd_px * scale),
+        other,
     )
-    black, white = seen.levels()
-    other = np.empty(count, dtype=np.bool_)
-    off_edge_px = off_edge_m * per_px - slack_px
-    beyond_px = (seen.rho_m - imaging.outer_radius_m) * per_px - slack_px
-    contrast = min(white, 1.0) - black
-    tested = _mark_other(
-        imaging.window.smooth, share, black, contrast, off_edge_px, beyond_px, sd_px, other
-    )
-    if other.any():
+    if found:
         other = _without_dots(seen, other)
-    found = int(np.count_nonzero(other))
+        found = int(np.count_nonzero(other))
     if not found or found > _MAX_HIDDEN * tested:
-        return np.zeros(count, dtype=bool)
+        return np.zeros_like(other)
     half = math.ceil(_HIDDEN_SIGMAS * sd_px + slack_px)
     size = (2 * half + 1, 2 * half + 1)
     return seen.dilated(other, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size).astype(np.uint8))
@@ -183,9 +190,10 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
 
     That speaks of another code, and must not be overlooked.
     """
-    radii_m = seen.imaging.circles.radii_m
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(other.reshape(seen.shape).view(np.uint8))
-    beside = (seen.rho_m > radii_m[0]) | (seen.rho_m < radii_m[1])
+    radii_m, rho_m, window = seen.imaging.circles.radii_m, seen.bare.rho_m, seen.imaging.window
+    mask = other.reshape(window.height, window.width).view(np.uint8)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
+    beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
     hides = np.bincount(labels.ravel(), weights=beside) > 0
     hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2
@@ -198,69 +206,25 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
 def _mark_other(
     smooth: FloatArray,
     share: FloatArray,
+    off_edge_m: FloatArray,
+    rho_m: FloatArray,
     black: float,
     contrast: float,
-    off_edge_px: FloatArray,
-    beyond_px: FloatArray,
-    sd_px: float,
+    outer_radius_m: float,
+    slack_m: float,
+    sd_m: float,
     other: BoolArray,
-) -> int:
-    """Mark the pixels that are not what they should be; return how many are looked at."""
-    tested = 0
+) -> tuple[int, int]:
+    """Mark the pixels that are not what they should be; return their number, and of all tested."""
+    found = tested = 0
     for i in range(len(smooth)):
-        is_clear = off_edge_px[i] > _CLEAR_SIGMAS * sd_px and beyond_px[i] < 0.0
-        is_near = off_edge_px[i] > _NO_EDGE_SIGMAS * sd_px
-        is_near &= beyond_px[i] < _NO_EDGE_OUTSIDE_SIGMAS * sd_px
+        off_m, beyond_m = off_edge_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m
+        is_clear = off_m > _CLEAR_SIGMAS * sd_m and beyond_m < 0.0
+        is_near = off_m > _NO_EDGE_SIGMAS * sd_m and beyond_m < _NO_EDGE_OUTSIDE_SIGMAS * sd_m
         tested += is_clear or is_near
         off_level = abs(smooth[i] - (black + contrast * share[i]))
         other[i] = (is_clear and off_level > _HIDDEN_CONTRAST * contrast) or (
             is_near and off_level > _NO_EDGE_CONTRAST * contrast
         )
-    return tested
-
-
-@compiled
-def _fill_plateaus(
-    points_m: FloatArray,
-    centres_m: FloatArray,
-    radii_m: FloatArray,
-    signs: FloatArray,
-    small_m: float,
-    reach_m: float,
-    share: FloatArray,
-    off_edge_m: FloatArray,
-) -> None:
-    """Fill in the white share without blur, and the distance to the nearest edge or small disc.
-
-    Edges farther than the reach may count as infinitely far.
-    """
-    count = len(radii_m)
-    # from a circle that is out of reach on to the next that may be in reach: dots of one ring are
-    # all as far from the target's centre
-    out_m, beyond = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
-    for c in range(count - 1, -1, -1):
-        beyond[c] = c + 1
-        is_like_next = c + 1 < count and radii_m[c] == radii_m[c + 1]
-        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_PLACE * radii_m[c]:
-            beyond[c] = beyond[c + 1]
-    for i in range(points_m.shape[1]):
-        x, y = points_m[0, i], points_m[1, i]
-        rho, nearest, c = math.sqrt(x * x + y * y), np.inf, 0
-        while c < count:
-            radius = radii_m[c]
-            if abs(rho - out_m[c]) > radius + min(reach_m, nearest):
-                c = beyond[c]
-                continue
-            dx, dy = x - centres_m[0, c], y - centres_m[1, c]
-            square = dx * dx + dy * dy
-            is_inside = square < radius * radius
-            if is_inside:
-                share[i] += signs[c]
-            if is_inside and radius < small_m:
-                nearest = 0.0
-            limit = radius - nearest if is_inside else radius + nearest
-            is_farther = square < limit * limit if is_inside else square > limit * limit
-            if not is_farther or limit < 0.0:  # roots are what costs here
-                nearest = min(nearest, abs(radius - math.sqrt(square)))
-            c += 1
-        off_edge_m[i] = nearest
+        found += other[i]
+    return found, tested

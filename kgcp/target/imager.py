@@ -10,13 +10,14 @@ from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.target.coverage import WhiteShare
-from kgcp.target.light import PARAM_COUNT, Light, Param, encoded, srgb_slope
+from kgcp.target.light import PARAM_COUNT, Light, Param, decoded, encoded, srgb_slope
 from kgcp.target.sharpening import Mask
 
 # The gradient of the light is left out: over a whole ring, it is flat over the mask.
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
+_SHARE_STEPS = 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,18 +88,27 @@ class Imager:
         mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
 
 
-def tone_curve(share: FloatArray, light: Light) -> FloatArray:
-    """Return the grey values (n,) before any encoding at white shares (n,), in even light."""
-    value = np.empty(len(share))
-    _expose(share, np.zeros((2, len(share))), light.values, value)
-    return value
-
-
 def share_at(level: float, light: Light, response: Response) -> float:
     """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
-    share = np.linspace(0.0, 1.0, 401)
-    grey = np.maximum.accumulate(encoded(tone_curve(share, light), response))
-    return float(np.interp(level, grey, share))
+    return _share_at(float(decoded(np.array(level), response)), light.values)
+
+
+@compiled
+def _share_at(level: float, light: tuple[float, ...]) -> float:
+    """Return where between ink and plate a level is first passed for good, by steps of 1/400."""
+    black, white, _, _, tone_1, tone_2, tone_3, _ = light
+    highest = black
+    if level < highest:
+        return 0.0
+    for k in range(1, _SHARE_STEPS + 1):
+        t = k / _SHARE_STEPS
+        lean = 2.0 * t - 1.0
+        tone = t + t * (1.0 - t) * (tone_1 + lean * (tone_2 + lean * tone_3))
+        there = black + (white - black) * tone
+        if there > level:
+            return (k - 1 + (level - highest) / (there - highest)) / _SHARE_STEPS
+        highest = max(highest, there)
+    return 1.0
 
 
 @compiled

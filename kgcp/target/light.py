@@ -111,13 +111,20 @@ def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
 
     They are the light's own levels, but for a camera with a known encoding.
     """
-    black, white = encoded(np.array([light.black, light.white]), response)
-    return float(black), float(white)
+    if response is not Response.SRGB:
+        return light.black, light.white
+    black, white = srgb_encoded(np.array([light.black, light.white])).tolist()
+    return black, white
 
 
 def encoded(level: FloatArray, response: Response) -> FloatArray:
     """Return grey values from the light of a camera with a known response."""
     return srgb_encoded(level) if response is Response.SRGB else level
+
+
+def decoded(level: FloatArray, response: Response) -> FloatArray:
+    """Return the light that gives grey values, of a camera with a known response."""
+    return srgb_decoded(level) if response is Response.SRGB else level
 
 
 def light_of_levels(black: float, white: float, response: Response) -> Light:

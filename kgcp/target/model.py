@@ -88,12 +88,16 @@ def _without_edge_shift(start: Observation) -> Pose:
 
 def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
+    count = _measured_count(camera, target, pose)
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
-        size_px = semi_major_axis_px(contour_px(camera, pose, radius_m))
+        contour, seen = contour_px(camera, pose, radius_m), camera
+        size_px = semi_major_axis_px(contour)
         binning = max(1, math.ceil(size_px / _LARGEST_RADIUS_PX))
-        seen = camera if binning == 1 else camera.binned(binning)
-        contour = contour_px(seen, pose, radius_m)
+        if binning > 1:
+            seen = camera.binned(binning)
+            contour = contour_px(seen, pose, radius_m)
+            size_px = semi_major_axis_px(contour)
         try:
             window = cut_window(grey, seen, contour, _MARGIN_PX, binning)
         except Rejection as rejection:
@@ -103,9 +107,9 @@ def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> I
         return Imaging(
             window=window,
             circles=circles_of(target.rings),
-            measured_count=_measured_count(camera, target, pose),
+            measured_count=count,
             outer_radius_m=radius_m,
-            outer_radius_px=semi_major_axis_px(contour),
+            outer_radius_px=size_px,
             centre_px=seen.project(pose.translation_m[None])[0],
             focal_px=seen.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),

@@ -25,6 +25,7 @@ _MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
 _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
+_PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -62,14 +63,13 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
     count : float
         One grey value's step.
     """
-    high = 1.0 - 0.5 * count
+    high, low = 1.0 - 0.5 * count, 0.5 * count
     top = float(levels.max())
     # a sensor of fewer bits than its files saturates below the end of the range
-    if top < high and np.mean(levels == top) > 0.05 > np.mean(
-        (levels < top) & (levels > 0.98 * top)
-    ):
-        high = top - 0.5 * count
-    low = 0.5 * count
+    if top < high:
+        at_top = float(np.mean(levels == top))
+        if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
+            high = top - 0.5 * count
     return Censoring(high, low, levels >= high, levels <= low)
 
 
@@ -163,6 +163,19 @@ def _plateau_variances(
         if not math.isnan(one):
             return one, one
     return floor, floor
+
+
+@compiled
+def median_at_edges(
+    values: FloatArray, share: FloatArray, ink: float, plate: float, otherwise: float
+) -> float:
+    """Return the median of values (n,) where the white share (n,) is between two limits."""
+    there, count = np.empty(len(values)), 0
+    for i in range(len(values)):
+        if ink < share[i] < plate:
+            there[count] = values[i]
+            count += 1
+    return float(np.median(there[:count])) if count else otherwise
 
 
 @compiled

@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.target.plate import Circles
+from kgcp.target.plate import Circles, find_skips
 from kgcp.target.quadrature import quadrature_for
 
 REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
@@ -125,35 +125,49 @@ def pair_edges(
     blur : Blur
     """
     sd_m = blur.largest_sd_px * metres_per_px
-    reach_m = REACH_SIGMAS * sd_m + _SLACK_PX * metres_per_px
     sharpest_m = blur.smallest_sd_px * metres_per_px
-    rules = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
-    columns = (circles.centres_m.T, circles.radii_m, circles.signs, rules.astype(np.float64))
-    table: FloatArray = np.column_stack(columns)
-    count = points_m.shape[1]
-    starts, background = np.zeros(count + 1, dtype=np.intp), np.ones(count)
-    members = np.empty(count * len(table), dtype=np.intp)
-    _pair(points_m, table, reach_m, starts, members, background)
-    return EdgePairs(table, starts, members[: starts[-1]], background)
+    table = np.empty((len(circles.radii_m), 5))
+    table[:, 0], table[:, 1] = circles.centres_m
+    table[:, 2], table[:, 3] = circles.radii_m, circles.signs
+    table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
+    skips = find_skips(circles.centres_m, circles.radii_m)
+    return EdgePairs(table, *_pair(points_m, table, *skips, reach_px(blur) * metres_per_px))
+
+
+def reach_px(blur: Blur) -> float:
+    """Return how far from an edge pixels feel it, wherever a circle may move [px]."""
+    return REACH_SIGMAS * blur.largest_sd_px + _SLACK_PX
 
 
 @compiled
 def _pair(
     points_m: FloatArray,
     circles: FloatArray,
+    out_m: FloatArray,
+    beyond: IndexArray,
     reach_m: float,
-    starts: IndexArray,
-    members: IndexArray,
-    background: FloatArray,
-) -> None:
-    found = 0
-    for i in range(points_m.shape[1]):
-        for c in range(circles.shape[0]):
-            dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
-            square, within = dx * dx + dy * dy, circles[c, 2] - reach_m
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Return starts, members and background."""
+    count, found = points_m.shape[1], 0
+    starts, background = np.zeros(count + 1, np.intp), np.ones(count)
+    members = np.empty(2 * count + len(circles), np.intp)
+    for i in range(count):
+        if found + len(circles) > len(members):
+            members = np.concatenate((members, np.empty_like(members)))
+        x, y, c = points_m[0, i], points_m[1, i], 0
+        rho = math.sqrt(x * x + y * y)
+        while c < len(circles):
+            radius = circles[c, 2]
+            if abs(rho - out_m[c]) > radius + reach_m:
+                c = beyond[c]
+                continue
+            dx, dy = x - circles[c, 0], y - circles[c, 1]
+            square, within = dx * dx + dy * dy, radius - reach_m
             if within > 0.0 and square < within * within:
                 background[i] += circles[c, 3]
-            elif square <= (circles[c, 2] + reach_m) ** 2:
+            elif square <= (radius + reach_m) ** 2:
                 members[found] = c
                 found += 1
+            c += 1
         starts[i + 1] = found
+    return starts, members[:found], background

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring
+
+_SAME_PLACE = 1e-6  # of a radius
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +37,7 @@ class Circles:
         return Circles(self.centres_m[:, which], self.radii_m[which], self.signs[which])
 
 
+@cache
 def circles_of(rings: tuple[Ring, ...]) -> Circles:
     """Return all circles of concentric rings: edges and dots."""
     centres: list[FloatArray] = []
@@ -70,13 +75,40 @@ def _meet(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatA
 
 def largest_metres_per_px(pose: Pose, rays: FloatArray) -> float:
     """Return the largest length on the plate that a pixel with these rays (6, n) spans [m]."""
-    axes, normal = pose.rotation, pose.normal
-    x, y = rays[:2]
-    facing = normal[0] * x + normal[1] * y + normal[2]
-    depth = (normal @ pose.translation_m) / facing
-    squares = np.zeros((2, len(x)))
-    for j in (0, 1):
-        share = (axes[0, j] * x + axes[1, j] * y + axes[2, j]) / facing
-        slide_x, slide_y = axes[0, j] - share * normal[0], axes[1, j] - share * normal[1]
-        squares += (depth * (slide_x * rays[2:4] + slide_y * rays[4:6])) ** 2
-    return float(np.sqrt(squares.max()))
+    return math.sqrt(_largest_square(pose.rotation, pose.translation_m, rays))
+
+
+@compiled
+def _largest_square(axes: FloatArray, offset: FloatArray, rays: FloatArray) -> float:
+    """Return the largest square of the length on the plate along x or y of a raw pixel [m²]."""
+    height, largest = 0.0, 0.0
+    for k in range(3):
+        height += axes[k, 2] * offset[k]
+    for i in range(rays.shape[1]):
+        x, y = rays[0, i], rays[1, i]
+        facing = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2]
+        depth = height / facing
+        along_x = along_y = 0.0
+        for j in range(2):
+            share = (axes[0, j] * x + axes[1, j] * y + axes[2, j]) / facing
+            slide_x, slide_y = axes[0, j] - share * axes[0, 2], axes[1, j] - share * axes[1, 2]
+            along_x += (depth * (slide_x * rays[2, i] + slide_y * rays[4, i])) ** 2
+            along_y += (depth * (slide_x * rays[3, i] + slide_y * rays[5, i])) ** 2
+        largest = max(largest, along_x, along_y)
+    return largest
+
+
+@compiled
+def find_skips(centres_m: FloatArray, radii_m: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Return how far circles (c,) are out, and the next that may be in reach where one is not.
+
+    Dots of one ring are all as far from the target's centre.
+    """
+    count = len(radii_m)
+    out_m, beyond = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
+    for c in range(count - 1, -1, -1):
+        beyond[c] = c + 1
+        is_like_next = c + 1 < count and radii_m[c] == radii_m[c + 1]
+        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_PLACE * radii_m[c]:
+            beyond[c] = beyond[c + 1]
+    return out_m, beyond

@@ -12,10 +12,12 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.target.adjust import Fit
 from kgcp.target.layout import Ring
 from kgcp.target.light import plateau_levels
+from kgcp.target.noise import median_at_edges
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3
 _MAX_EDGE_NOISE = 0.15  # of the contrast: the largest residuals near edges
+_NO_SENSE = 2.0
 _MAX_RELATIVE_SD = 0.01
 _POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
@@ -26,10 +28,9 @@ _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
 
 def edge_noise(fit: Fit) -> float:
     """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
-    share = fit.prediction.share
-    edge = (share > 0.2) & (share < 0.8)
     black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
-    return float(np.median(fit.sd[edge])) / (white - black) if edge.any() and white > black else 2.0
+    residual = median_at_edges(fit.sd, fit.prediction.share, 0.2, 0.8, math.nan)
+    return residual / (white - black) if residual > 0.0 and white > black else _NO_SENSE
 
 
 def check_fit(fit: Fit) -> None:
@@ -83,9 +84,8 @@ def check_code(fit: Fit, ring: Ring) -> None:
     off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
     at_dot = np.abs(off_dot_deg).argmin(axis=0)
     between = np.abs(off_dot_deg).min(axis=1) > 2.0 * ring.dot_half_angle_deg
-    with np.errstate(invalid="ignore"):  # NaN where the frame ends: says nothing
-        extra = float(np.nanmax(np.append(excess[between], 0.0)))
-        missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
+    extra = float(excess[between].max(initial=0.0))
+    missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
     moved = _largest_displacement(excess, off_dot_deg, ring)
     if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
         light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
@@ -97,17 +97,16 @@ def _largest_displacement(excess: FloatArray, off_dot_deg: FloatArray, ring: Rin
     reach_deg = 2.0 * ring.dot_half_angle_deg
     left = (off_dot_deg < 0.0) & (off_dot_deg >= -reach_deg)
     right = (off_dot_deg > 0.0) & (off_dot_deg <= reach_deg)
-    known = np.nan_to_num(excess)[:, None]
-    most_left, most_right = (np.max(known * side, axis=0) for side in (left, right))
-    lack_left, lack_right = (np.max(-known * side, axis=0) for side in (left, right))
-    moved = np.maximum(np.minimum(most_left, lack_right), np.minimum(most_right, lack_left))
-    return float(moved.max())
+    sides = np.stack((left, right))
+    known = excess[:, None] * sides
+    most, lack = known.max(axis=1), -known.min(axis=1)
+    return float(np.minimum(most, lack[::-1]).max())
 
 
 def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
     """Return what the fit lacks of light all around the code circle, 1: a whole dot.
 
-    NaN where too few pixels are seen.
+    0, which says nothing, where too few pixels are seen.
     """
     sample, clip = fit.sample, fit.sample.censoring.high
     black, white = plateau_levels(fit.parameters.light, sample.imaging.response)
@@ -115,34 +114,35 @@ def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
     lack = lack / max(min(white, clip) - black, sample.imaging.window.levels_per_count)
     code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m
     counts, sums = np.zeros(_POSITIONS), np.zeros(_POSITIONS)
-    angles = np.arange(_POSITIONS) * (2.0 * np.pi / _POSITIONS)
-    centres_m = code_m * np.stack((np.cos(angles), np.sin(angles)))
-    _gather_around(fit.prediction.points_m, lack, centres_m, dot_m, counts, sums)
+    _gather_around(fit.prediction.points_m, lack, code_m, dot_m, counts, sums)
     px_per_m = sample.imaging.outer_radius_px / sample.imaging.outer_radius_m
     ratio = dot_m * px_per_m / fit.parameters.blur.mean_sd_px
     visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
-    mean = np.full(_POSITIONS, np.nan)
-    enough = counts >= _MIN_PIXELS
-    mean[enough] = sums[enough] / counts[enough] / visible
-    return mean
+    return np.where(counts >= _MIN_PIXELS, sums / np.maximum(counts, 1.0) / visible, 0.0)
 
 
 @compiled
 def _gather_around(
     points_m: FloatArray,
     lack: FloatArray,
-    centres_m: FloatArray,
+    code_m: float,
     dot_m: float,
     counts: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Count the pixels within discs, and add up what they lack."""
-    code_m = math.sqrt(centres_m[0, 0] ** 2 + centres_m[1, 0] ** 2)
+    """Count the pixels within discs on the code circle, and add up what they lack."""
+    step = 2.0 * math.pi / len(counts)
+    reach = math.ceil(math.asin(min(1.0, dot_m / code_m)) / step)
+    angles = np.arange(len(counts)) * step
+    centres_x, centres_y = code_m * np.cos(angles), code_m * np.sin(angles)
     for i in range(points_m.shape[1]):
-        if abs(math.sqrt(points_m[0, i] ** 2 + points_m[1, i] ** 2) - code_m) > dot_m:
+        x, y = points_m[0, i], points_m[1, i]
+        if abs(math.sqrt(x * x + y * y) - code_m) > dot_m:
             continue
-        for k in range(len(counts)):
-            dx, dy = points_m[0, i] - centres_m[0, k], points_m[1, i] - centres_m[1, k]
+        nearest = round(math.atan2(y, x) / step)
+        for beside in range(-reach, reach + 1):
+            k = (nearest + beside) % len(counts)
+            dx, dy = x - centres_x[k], y - centres_y[k]
             if dx * dx + dy * dy < dot_m * dot_m:
                 counts[k] += 1.0
                 sums[k] += lack[i]

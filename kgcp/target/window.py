@@ -56,11 +56,12 @@ class Window:
     clipped: FloatArray | None = None
 
     def pixels(self, chosen: IndexArray) -> FloatArray:
-        """Return raw pixel coordinates (m, 2) of the chosen pixels."""
-        index = np.arange(self.width * self.height)[chosen]
-        return np.column_stack(
-            (self.x0 + index % self.width, self.y0 + index // self.width)
-        ).astype(np.float64)
+        """Return raw pixel coordinates (2, m) of the chosen pixels, by their index."""
+        rows, columns = np.divmod(chosen, self.width)
+        pixels = np.empty((2, len(chosen)))
+        np.add(columns, self.x0, out=pixels[0])
+        np.add(rows, self.y0, out=pixels[1])
+        return pixels
 
 
 def contour_px(camera: Camera, pose: Pose, radius_m: float) -> FloatArray:
@@ -102,15 +103,15 @@ def cut_window(
     )
     part = grey[binning * y0 : binning * y1, binning * x0 : binning * x1]
     means = part if binning == 1 else _binned(part, binning)
-    smooth = cv2.medianBlur(means.astype(np.float32) / scale, 3)
-    levels = means.ravel().astype(np.float64) / scale
+    smooth = cv2.medianBlur(means.astype(np.float32), 3)
+    levels: FloatArray = means.ravel() / scale
     return Window(
         x0=x0,
         y0=y0,
         width=x1 - x0,
         height=y1 - y0,
         levels=levels,
-        smooth=smooth.ravel().astype(np.float64),
+        smooth=np.divide(smooth.ravel(), scale, dtype=np.float64),
         levels_per_count=1.0 / scale,
         rays=rays,
         binning=binning,

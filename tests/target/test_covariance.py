@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit
+from kgcp.target.adjust import Fit, normal_matrix
 from kgcp.target.covariance import pose_covariance, propagate
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
@@ -79,7 +79,7 @@ def fit(
 
 def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: Fit) -> None:
     covariance = pose_covariance(fit)
-    plain = np.linalg.inv(fit.normal)[:6, :6]
+    plain = np.linalg.inv(normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns))[:6, :6]
     assert eigh(covariance.pose_cov, plain, eigvals_only=True).min() > 1.0 - 1e-6
     np.testing.assert_allclose(covariance.pose_cov, covariance.pose_cov.T, rtol=1e-6)
     assert 1.0 <= covariance.inflation < 3.0

@@ -42,7 +42,7 @@ def photograph(
 
 def opacity_of(sample: Sample, image: PlateImage) -> FloatArray:
     window = sample.imaging.window
-    x, y = window.pixels(sample.index).astype(int).T
+    x, y = window.pixels(sample.index).astype(int)
     return np.asarray(image.opacity[y - image.window.row, x - image.window.column])
 
 

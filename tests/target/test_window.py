@@ -45,8 +45,8 @@ def test_pixels_and_rays_belong_together(camera: Camera, place_plate: PlacePlate
     window = cut_plate(numbered_frame(camera), camera, pose)
     chosen = np.array([0, 1, window.width, 7 * window.width + 3])
     pixels = window.pixels(chosen)
-    np.testing.assert_array_equal(pixels[3], [window.x0 + 3, window.y0 + 7])
-    np.testing.assert_allclose(camera.distort(window.rays[:2, chosen].T), pixels, atol=1e-8)
+    np.testing.assert_array_equal(pixels[:, 3], [window.x0 + 3, window.y0 + 7])
+    np.testing.assert_allclose(camera.distort(window.rays[:2, chosen].T), pixels.T, atol=1e-8)
 
 
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
