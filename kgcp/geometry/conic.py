@@ -51,8 +51,10 @@ class Ellipse:
     def stretch(self) -> FloatArray:
         """Symmetric matrix (2, 2) that makes this ellipse, up to its centre, of the unit circle."""
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        axes = np.array([[c, -s], [s, c]])
-        return np.asarray((axes * (self.a, self.b)) @ axes.T)
+        xy = (self.a - self.b) * c * s
+        return np.array(
+            [[self.a * c * c + self.b * s * s, xy], [xy, self.a * s * s + self.b * c * c]]
+        )
 
     @property
     def conic(self) -> FloatArray:

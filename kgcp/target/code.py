@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.target.layout import Ring
+from kgcp.target.polar import sample_grey
 
 _SAMPLES = 360
 CODE_ANGLES_RAD = np.linspace(0.0, 2.0 * math.pi, _SAMPLES, endpoint=False)
@@ -43,15 +43,6 @@ class CodeMatch:
     lag_deg: float
     black: float
     white: float
-
-
-def sample_grey(grey: GreyArray, points: FloatArray) -> FloatArray:
-    """Sample a frame bilinearly at points (m, n, 2) [px]; beyond its border it repeats itself."""
-    maps = points.astype(np.float32)
-    values = cv2.remap(
-        grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return values.astype(np.float64)
 
 
 @lru_cache(maxsize=64)

@@ -13,13 +13,14 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.target.code import sample_grey
 from kgcp.target.layout import Ring
 from kgcp.target.noise import BoolArray
 from kgcp.target.occlusion import best_partial_template, visible_angles
+from kgcp.target.polar import sample_ellipses, sample_grey
 from kgcp.target.template import (
     ANGLES,
     ANGLES_RAD,
+    CIRCLE,
     SAMPLED_RADII,
     SHIFTS,
     best_template,
@@ -29,6 +30,7 @@ from kgcp.target.template import (
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _CLEAR_SCORE = 0.9
 _DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
+_EVERYWHERE = np.ones(ANGLES, dtype=bool)
 CODE_LIKE = 0.7
 """Score above which a ring with dots is a code, if another one."""
 
@@ -94,19 +96,9 @@ def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict
     return judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring)
 
 
-def sample_around(grey: GreyArray, outlines: tuple[Ellipse, ...], radii: FloatArray) -> FloatArray:
-    """Sample the frame (outlines, radii, angles) on ellipses of so many times the outlines."""
-    if not outlines:
-        return np.empty((0, len(radii), ANGLES))
-    circles = np.stack([outline.points(ANGLES_RAD) - outline.centre for outline in outlines])
-    centres = np.stack([outline.centre for outline in outlines])
-    points = centres[:, None, None] + radii[:, None, None] * circles[:, None]
-    return sample_grey(grey, points.reshape(-1, ANGLES, 2)).reshape(points.shape[:3])
-
-
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
     """Sample a frame around an outline, for `judge`: (radii, angles)."""
-    return np.asarray(sample_around(grey, (outline,), SAMPLED_RADII)[0])
+    return np.asarray(sample_ellipses(grey, (outline,), SAMPLED_RADII, CIRCLE)[0])
 
 
 def judge(patch: FloatArray, ring: Ring) -> Verdict:
@@ -131,20 +123,16 @@ def _verdict(
     templates = templates_of(ring)
     score, index, shift, lag = match
     image = templates.images[index]
-    dots, rest = np.empty(ANGLES), np.empty(ANGLES)
-    everywhere = np.ones(ANGLES, dtype=bool)
-    black, contrast = _compare(
+    black, contrast, dot_contrast, misfit = _compare(
         *(image, lag, patch[shift : shift + len(image)], templates.weights),
-        *(everywhere if visible is None else visible, _code_rows(ring), dots, rest),
+        *(_EVERYWHERE if visible is None else visible, *_code_rows(ring), _half_dot(ring)),
     )
-    dot_contrast = float(np.ptp(_smoothed(dots, ring)))
-    scale = max(abs(contrast) * dot_contrast, 1e-6)
     return Verdict(
         score=score,
         lag_deg=lag * 360.0 / ANGLES,
         black=black,
         white=black + contrast,
-        misfit=float(np.abs(_smoothed(rest, ring)).max()) / scale,
+        misfit=misfit / max(abs(contrast) * dot_contrast, 1e-6),
         dot_contrast=dot_contrast,
         visible=visible,
     )
@@ -157,13 +145,14 @@ def _compare(
     seen: FloatArray,
     weights: FloatArray,
     visible: BoolArray,
-    is_code: BoolArray,
-    dots: FloatArray,
-    rest: FloatArray,
-) -> tuple[float, float]:
+    first: int,
+    last: int,
+    half: int,
+) -> tuple[float, float, float, float]:
     """Fit black and contrast to what is seen of a ring, by an image (rows, angles) of it.
 
-    The means over the code's rows go to `dots`, of the image, and to `rest`, of what it leaves.
+    Of the means over the code's rows, `first` to `last`, smoothed over `half` a dot either side,
+    the range in the image and the largest difference between both are returned, too.
     """
     total = mean = square = seen_mean = product = 0.0
     rows, angles = image.shape
@@ -179,26 +168,32 @@ def _compare(
     mean, seen_mean = mean / total, seen_mean / total
     contrast = (product / total - mean * seen_mean) / (square / total - mean * mean)
     black = seen_mean - contrast * mean
-    share = 1.0 / is_code.sum()
-    dots[:], rest[:] = 0.0, 0.0
-    for r in range(rows):
-        if is_code[r]:
-            for a in range(angles):
-                wanted = image[r, (a - lag) % angles]
-                dots[a] += share * wanted
-                if visible[a]:
-                    rest[a] += share * (seen[r, a] - black - contrast * wanted)
-    return black, contrast
+    dots, rest = np.zeros(angles), np.zeros(angles)
+    for r in range(first, last + 1):
+        for a in range(angles):
+            wanted = image[r, (a - lag) % angles]
+            dots[a] += wanted
+            if visible[a]:
+                rest[a] += seen[r, a] - black - contrast * wanted
+    share = 1.0 / ((last + 1 - first) * (2 * half + 1))
+    least, most, misfit = np.inf, -np.inf, 0.0
+    for a in range(angles):
+        dot = off = 0.0
+        for step in range(a - half, a + half + 1):
+            dot += share * dots[step % angles]
+            off += share * rest[step % angles]
+        least, most, misfit = min(least, dot), max(most, dot), max(misfit, abs(off))
+    return black, contrast, most - least, misfit
 
 
 @lru_cache(maxsize=64)
-def _code_rows(ring: Ring) -> BoolArray:
+def _code_rows(ring: Ring) -> tuple[int, int]:
+    """Return the first and last row that the dots reach to."""
     radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
-    return np.asarray(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
+    rows = np.flatnonzero(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
+    return int(rows[0]), int(rows[-1])
 
 
-def _smoothed(signal: FloatArray, ring: Ring) -> FloatArray:
-    """Average a periodic signal over the width of a dot."""
-    half = max(1, round(ring.dot_half_angle_deg * ANGLES / 360.0))
-    padded = np.concatenate((signal[-half:], signal, signal[:half]))
-    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
+def _half_dot(ring: Ring) -> int:
+    """Return about half the width of a dot, in samples."""
+    return max(1, round(ring.dot_half_angle_deg * ANGLES / 360.0))

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.layout import Ring
 from kgcp.target.noise import BoolArray
-from kgcp.target.template import ANGLES, SAMPLED_RADII, SHIFTS, templates_of
-
-ComplexArray = npt.NDArray[np.complex128]
+from kgcp.target.template import (
+    ANGLES,
+    SAMPLED_RADII,
+    SHIFTS,
+    SingleArray,
+    Templates,
+    cross_correlation,
+    levels_by_shift,
+    templates_of,
+)
 
 _TYPICAL = 0.65  # quantile of steps of light that is not hidden, however much else is
+_TYPICAL_RANK = round(_TYPICAL * (ANGLES - 1))
 _MIN_STEP = 0.35  # of the typical one
 _SHORTEST = 13  # samples; a dot that is too large takes less
 _BORDER = 2  # samples beside a hidden part that blur may mix with it
@@ -22,6 +31,7 @@ _MOST_HIDDEN = 0.4
 _DOTS_SEEN = 0.5  # of the code; that there are no others where the ring is seen counts as much
 _OTHER_LAG = 6  # samples; a match farther off is another heading
 _MARGIN = 0.04  # of the score, to other headings
+_TURNED = np.add.outer(np.arange(ANGLES), np.arange(ANGLES)) % ANGLES  # by lag and angle
 
 
 def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
@@ -38,31 +48,45 @@ def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
     (angles,) array of bool, or None
         None if nothing is hidden, or too much.
     """
+    plate, outside, disc, inside = _edge_rows(ring)
+    visible = np.empty(ANGLES, dtype=bool)
+    hidden = _see(seen[plate] - seen[outside], seen[disc] - seen[inside], visible)
+    return visible if 0 < hidden <= _MOST_HIDDEN * ANGLES else None
+
+
+@lru_cache(maxsize=64)
+def _edge_rows(ring: Ring) -> tuple[int, ...]:
+    """Return the rows on either side of the outer edge, and of the inner one, bright ones first."""
     code = ring.code_diameter_m / ring.outer_diameter_m
     dot = ring.dot_diameter_m / ring.outer_diameter_m
-    outwards = _row(seen, 1.1) - _row(seen, 0.5 * (1.0 + code + dot))
-    inwards = _row(seen, 0.85 * ring.inner_ratio) - _row(
-        seen, 0.5 * (ring.inner_ratio + code - dot)
-    )
-    visible = np.ones(ANGLES, dtype=bool)
-    for step in (outwards, inwards):
-        visible &= step > _MIN_STEP * np.sort(step)[round(_TYPICAL * (ANGLES - 1))]
-    core = _all_around(~visible, _SHORTEST // 2)
-    if not core.any():
-        return None
-    visible = _all_around(~core, _SHORTEST // 2 + _BORDER)
-    return visible if visible.mean() >= 1.0 - _MOST_HIDDEN else None
-
-
-def _all_around(flags: BoolArray, reach: int) -> BoolArray:
-    """Tell where flags are set, and so many samples on either side."""
-    around = np.concatenate((flags[-reach:], flags, flags[:reach]))
-    return np.convolve(around, np.ones(2 * reach + 1), "valid") > 2 * reach + 0.5
-
-
-def _row(seen: FloatArray, ratio: float) -> FloatArray:
+    outside, inside = 0.5 * (1.0 + code + dot), 0.5 * (ring.inner_ratio + code - dot)
     radii = SAMPLED_RADII[SHIFTS:-SHIFTS]
-    return np.asarray(seen[int(np.abs(radii - ratio).argmin())])
+    return tuple(
+        int(np.abs(radii - ratio).argmin())
+        for ratio in (1.1, outside, 0.85 * ring.inner_ratio, inside)
+    )
+
+
+@compiled
+def _see(outwards: FloatArray, inwards: FloatArray, visible: BoolArray) -> int:
+    """Fill in where the light rises at both edges, but for single samples; count the others."""
+    least = _MIN_STEP * np.sort(outwards)[_TYPICAL_RANK]
+    least_inwards = _MIN_STEP * np.sort(inwards)[_TYPICAL_RANK]
+    for a in range(ANGLES):
+        visible[a] = outwards[a] > least and inwards[a] > least_inwards
+    core = np.zeros(ANGLES, np.bool_)
+    length = 0
+    for step in range(ANGLES + _SHORTEST - 1):  # of runs: also of those over the array's end
+        length = 0 if visible[step % ANGLES] else length + 1
+        if length >= _SHORTEST:
+            core[(step - _SHORTEST // 2) % ANGLES] = True
+    reach = _SHORTEST // 2 + _BORDER
+    visible[:] = True
+    for a in range(ANGLES):
+        if core[a]:
+            for step in range(-reach, reach + 1):
+                visible[(a + step) % ANGLES] = False
+    return int(ANGLES - visible.sum())
 
 
 def best_partial_template(
@@ -79,46 +103,40 @@ def best_partial_template(
     visible : (angles,) array of bool
     ring : Ring
     """
-    score = _correlation(patch, visible, ring)
-    lag, template, shift = np.unravel_index(int(score.argmax()), score.shape)
-    best = float(score[lag, template, shift])
-    by_lag = np.roll(score.max(axis=(1, 2)), -lag)
-    others = by_lag[_OTHER_LAG : ANGLES - _OTHER_LAG + 1]
+    score = _correlation(patch, visible, templates_of(ring))
+    place, lag = divmod(int(score.argmax()), ANGLES)
+    template, shift = divmod(place, 2 * SHIFTS + 1)
+    best = float(score[place, lag])
+    others = score.max(axis=0)[_TURNED[lag, _OTHER_LAG : ANGLES - _OTHER_LAG + 1]]
     at_dots = (np.rint(np.array(ring.code_deg) * ANGLES / 360.0).astype(int) + lag) % ANGLES
     seen = int(np.count_nonzero(visible[at_dots]))
     if seen < _DOTS_SEEN * len(at_dots) or others.max() > best - _MARGIN:
         return None
-    return best, int(template), int(shift), int(lag)
+    return best, template, shift, lag
 
 
-@lru_cache(maxsize=16)
-def _spectra(ring: Ring) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return spectra of the weighted templates: by (frequency, t, row); sums (t, frequency).
-
-    The sums over the rows are those of the templates and of their squares.
-    """
-    templates = templates_of(ring)
-    weighted = templates.images * templates.weights[:, None]
-    plain = np.conj(np.fft.rfft(weighted, axis=2))
-    squares = np.conj(np.fft.rfft(np.sum(weighted * templates.images, axis=1), axis=1))
-    return plain.transpose(2, 0, 1).copy(), plain.sum(axis=1), squares
-
-
-def _correlation(patch: FloatArray, visible: BoolArray, ring: Ring) -> FloatArray:
-    """Return the normalised cross-correlation of what is visible: (lag, template, shift)."""
-    by_row, plain, squares = _spectra(ring)
-    weights = templates_of(ring).weights
-    mask = np.fft.rfft(visible.astype(np.float64))
-    total = float(weights.sum() * visible.sum())
-    sum_t = np.fft.irfft(plain * mask, ANGLES).T / total  # lag, template
-    sum_tt = np.fft.irfft(squares * mask, ANGLES).T / total
-    spread_t = np.sqrt(np.maximum(sum_tt - sum_t**2, 1e-12))
+def _correlation(patch: FloatArray, visible: BoolArray, templates: Templates) -> SingleArray:
+    """Return the normalised cross-correlation of what is visible: (templates · shifts, lags)."""
+    share = float(visible.mean())
     masked = patch * visible
-    window = np.arange(len(patch) - len(weights) + 1)[:, None] + np.arange(len(weights))
-    sums = np.stack((masked.sum(axis=1), np.einsum("ra,ra->r", masked, masked)))
-    mean, power = sums[:, window] @ weights / total  # of every shift
-    spread = np.sqrt(np.maximum(power - mean**2, 1e-12))
-    spectrum = np.fft.rfft(masked, axis=1).T
-    cross = np.fft.irfft(by_row @ spectrum[:, window.T], ANGLES, axis=0)
-    covariance = cross / total - sum_t[:, :, None] * mean
-    return np.asarray(covariance / (spread_t[:, :, None] * spread))
+    levels = levels_by_shift(masked, share, templates.weights)
+    product = cross_correlation(masked, templates, np.full(levels.shape[1], 1.0 / share))
+    moments = visible[_TURNED] @ templates.moments / share
+    _normalise(product, moments, levels)
+    return product
+
+
+@compiled
+def _normalise(product: SingleArray, moments: FloatArray, levels: FloatArray) -> None:
+    """Make correlations of mean products, moments (lags, 2 templates) and levels (2, shifts)."""
+    lags, templates, shifts = moments.shape[0], moments.shape[1] // 2, levels.shape[1]
+    for t in range(templates):
+        for a in range(lags):
+            mean = moments[a, t]
+            moments[a, templates + t] = 1.0 / math.sqrt(
+                max(moments[a, templates + t] - mean * mean, 1e-12)
+            )
+        for s in range(shifts):
+            for a in range(lags):
+                value = product[t * shifts + s, a] - moments[a, t] * levels[0, s]
+                product[t * shifts + s, a] = value * moments[a, templates + t] / levels[1, s]

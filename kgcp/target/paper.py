@@ -21,10 +21,11 @@ from kgcp.geometry.circle import (
 )
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
+from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code
 from kgcp.target.edges import EdgeFit, Patch, fit_edge, patch_around
 from kgcp.target.layout import Ring, Target
 from kgcp.target.observation import Alternative, Appearance, Observation
+from kgcp.target.polar import sample_grey
 
 _MAX_EDGE_SHIFT_PX = 1.2
 _MAX_EDGE_SHIFT_SHARE = 0.02  # of the outer radius

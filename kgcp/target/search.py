@@ -11,13 +11,12 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings
 from kgcp.target.code import CodeMatch
-from kgcp.target.judgement import judge, polar_patch, sample_around
+from kgcp.target.judgement import judge, polar_patch
 from kgcp.target.layout import Ring
 from kgcp.target.outline import find_outlines
+from kgcp.target.polar import sample_ellipses
 from kgcp.target.seeds import Seeds, build_pyramid, find_seeds
-from kgcp.target.template import (
-    ANGLES,
-)
+from kgcp.target.template import ANGLES, CIRCLE
 
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
@@ -104,7 +103,7 @@ def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> tuple
     """Return the outlines with a dark ring between bright disc and plate, brighter in places."""
     code = ring.code_diameter_m / ring.outer_diameter_m
     radii = np.array((_DISC_SHARE * ring.inner_ratio, code, _PLATE))
-    values = np.sort(sample_around(grey, outlines, radii), axis=2)
+    values = np.sort(sample_ellipses(grey, outlines, radii, CIRCLE), axis=2)
     disc, code_circle, plate = values.transpose(1, 0, 2)
     black, white = code_circle[:, _rank(0.25)], plate[:, _rank(0.5)]
     contrast = np.minimum(disc[:, _rank(0.5)], white) - black

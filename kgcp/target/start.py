@@ -13,11 +13,12 @@ from kgcp.geometry.circle import circle_planes, pose_on_plane
 from kgcp.geometry.conic import fit_ellipse
 from kgcp.geometry.pose import image_heading_deg
 from kgcp.settings import Method
-from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code, sample_grey
+from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code
 from kgcp.target.edges import FAINTEST, clear_of_dots
 from kgcp.target.layout import Target
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.paper import measure_ring, points_of_code
+from kgcp.target.polar import sample_grey
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
 _OUTLINE_STEP = 5  # of an ellipse's points enough give its undistorted image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,19 +10,23 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.layout import Ring
+
+SingleArray = npt.NDArray[np.float32]
 
 ANGLES = 120
 _FREQUENCIES = 24  # a dot is wider than a wave of the highest
 ANGLES_RAD: FloatArray = np.linspace(0.0, 2.0 * np.pi, ANGLES, endpoint=False)
-# From real and imaginary parts of the frequencies to samples: `irfft` of 24 of 61 frequencies.
-_PHASES = ANGLES_RAD[:, None] * np.arange(_FREQUENCIES)
-_WAVES: FloatArray = (
-    np.hstack((np.cos(_PHASES), -np.sin(_PHASES)))
-    * np.tile(np.where(np.arange(_FREQUENCIES) == 0, 1.0, 2.0), 2)
-    / ANGLES
-)
+# Between samples and the frequencies' real and imaginary parts: 24 of 61 of `rfft`, and back.
+_PHASES = np.arange(_FREQUENCIES)[:, None] * ANGLES_RAD
+_SAMPLES: FloatArray = np.vstack((np.cos(_PHASES), -np.sin(_PHASES)))
+_SAMPLES *= np.tile(np.where(np.arange(_FREQUENCIES) == 0, 1.0, 2.0), 2)[:, None] / ANGLES
+_TO_SAMPLES: SingleArray = _SAMPLES.astype(np.float32)
+_TO_FREQUENCIES: FloatArray = np.vstack((np.cos(_PHASES), -np.sin(_PHASES))).T.copy()
+_TO_FREQUENCIES_SINGLE: SingleArray = _TO_FREQUENCIES.astype(np.float32)
+CIRCLE: FloatArray = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
 _ROWS = 20
 _LOG_STEP = 0.06
 _OUTERMOST = 1.15  # of the outer radius: the plate's margin is hardly wider
@@ -54,14 +59,17 @@ class Templates:
     Attributes
     ----------
     images : (t, rows, angles) array
-    spectra : (frequencies, t, rows) array of complex
-        Of the standardised images along the angle, weighted, conjugated.
+    spectra : (t, rows, 2 frequencies) array of float32
+        Of the standardised images along the angle, weighted: real parts, then imaginary ones.
+    moments : (angles, 2 t) array
+        Weighted sums over the rows, of the standardised images and then of their squares.
     weights : (rows,) array
         Of each row's samples, by its area; they sum to 1 over all samples.
     """
 
     images: FloatArray
-    spectra: np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
+    spectra: SingleArray
+    moments: FloatArray
     weights: FloatArray
 
 
@@ -69,8 +77,7 @@ class Templates:
 def templates_of(ring: Ring) -> Templates:
     """Draw the ring's templates for all `LOOKS`."""
     drawing = _draw(ring)
-    circle = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
-    points = _PX * (_REACH + _TEMPLATE_RADII[:, None, None] * circle).astype(np.float32)
+    points = _PX * (_REACH + _TEMPLATE_RADII[:, None, None] * CIRCLE).astype(np.float32)
     images = []
     for blur, clip in LOOKS:
         blurred = cv2.GaussianBlur(drawing, (0, 0), _PX * blur)
@@ -80,9 +87,9 @@ def templates_of(ring: Ring) -> Templates:
     weights = _TEMPLATE_RADII**2 / (ANGLES * np.sum(_TEMPLATE_RADII**2))
     centred = stack - np.einsum("tra,r->t", stack, weights)[:, None, None]
     centred /= np.sqrt(np.einsum("tra,tra,r->t", centred, centred, weights))[:, None, None]
-    spectra = np.conj(np.fft.rfft(centred * weights[:, None], axis=2)[..., :_FREQUENCIES])
-    spectra = spectra.transpose(2, 0, 1).copy()
-    return Templates(stack, spectra, weights)
+    spectra = ((centred * weights[:, None]) @ _TO_FREQUENCIES).astype(np.float32)
+    moments = np.concatenate([np.einsum("tra,r->at", centred**k, weights) for k in (1, 2)], axis=1)
+    return Templates(stack, spectra, moments, weights)
 
 
 def _draw(ring: Ring) -> npt.NDArray[np.float32]:
@@ -113,17 +120,82 @@ def best_template(patch: FloatArray, templates: Templates) -> tuple[float, int, 
     patch : (rows + 2 shifts, angles) array
         Sampled at `SAMPLED_RADII`.
     """
-    rows = templates.images.shape[1]
-    window = np.arange(len(patch) - rows + 1)[:, None] + np.arange(rows)
-    sums = np.stack((patch.sum(axis=1), np.einsum("ra,ra->r", patch, patch)))
-    mean, power = sums[:, window] @ templates.weights
-    sd = np.sqrt(np.maximum(power - mean**2, 1e-9))
-    spectrum = np.fft.rfft(patch, axis=1)[:, :_FREQUENCIES].T
-    products = (templates.spectra @ spectrum[:, window.T]).reshape(_FREQUENCIES, -1)
-    correlation = (_WAVES @ np.concatenate((products.real, products.imag))).reshape(
-        ANGLES, len(templates.images), -1
-    )
-    correlation /= sd
-    top = int(correlation.argmax())
-    lag, template, shift = np.unravel_index(top, correlation.shape)
-    return float(correlation.ravel()[top]), int(template), int(shift), int(lag)
+    spread = levels_by_shift(patch, 1.0, templates.weights)[1]
+    products = cross_correlation(patch, templates, 1.0 / spread)
+    place, lag = divmod(int(products.argmax()), ANGLES)
+    template, shift = divmod(place, len(spread))
+    return float(products[place, lag]), template, shift, lag
+
+
+def cross_correlation(patch: FloatArray, templates: Templates, factors: FloatArray) -> SingleArray:
+    """Correlate a polar patch with the standardised templates, at all shifts and lags.
+
+    Parameters
+    ----------
+    patch : (rows + 2 shifts, angles) array
+    templates : Templates
+    factors : (shifts,) array
+        For the values of each shift.
+
+    Returns
+    -------
+    (templates · shifts, lags) array of float32
+    """
+    products = np.zeros((len(LOOKS) * len(factors), 2 * _FREQUENCIES), dtype=np.float32)
+    spectrum = patch.astype(np.float32) @ _TO_FREQUENCIES_SINGLE
+    _multiply(spectrum, templates.spectra, factors, products)
+    return np.asarray(products @ _TO_SAMPLES)
+
+
+def levels_by_shift(patch: FloatArray, share: float, weights: FloatArray) -> FloatArray:
+    """Return mean and standard deviation (2, shifts) of what a template is compared with.
+
+    Parameters
+    ----------
+    patch : (rows + 2 shifts, angles) array
+        0 where it is not compared.
+    share : float
+        Of the angles, that are compared.
+    weights : (rows,) array
+        Of a template.
+    """
+    levels = np.empty((2, len(patch) - len(weights) + 1))
+    _weigh(patch, share, weights, levels)
+    return levels
+
+
+@compiled
+def _weigh(patch: FloatArray, share: float, weights: FloatArray, levels: FloatArray) -> None:
+    """Fill in mean and standard deviation of what a template is compared with."""
+    rows, angles = patch.shape
+    sums = np.zeros((2, rows))
+    for r in range(rows):
+        for a in range(angles):
+            sums[0, r] += patch[r, a]
+            sums[1, r] += patch[r, a] * patch[r, a]
+    for s in range(levels.shape[1]):
+        mean = power = 0.0
+        for r in range(len(weights)):
+            mean += weights[r] * sums[0, s + r] / share
+            power += weights[r] * sums[1, s + r] / share
+        levels[0, s], levels[1, s] = mean, math.sqrt(max(power - mean * mean, 1e-9))
+
+
+@compiled
+def _multiply(
+    patch: SingleArray, spectra: SingleArray, factors: FloatArray, products: SingleArray
+) -> None:
+    """Add up the spectra (templates · shifts, parts) of the correlations along the angle."""
+    for t in range(spectra.shape[0]):
+        for r in range(spectra.shape[1]):
+            for s in range(len(factors)):
+                product = products[t * len(factors) + s]
+                for f in range(_FREQUENCIES):
+                    real, imaginary = patch[s + r, f], patch[s + r, _FREQUENCIES + f]
+                    a, b = spectra[t, r, f], spectra[t, r, _FREQUENCIES + f]
+                    product[f] += a * real + b * imaginary
+                    product[_FREQUENCIES + f] += a * imaginary - b * real
+    for t in range(spectra.shape[0]):
+        for s in range(len(factors)):
+            for f in range(2 * _FREQUENCIES):
+                products[t * len(factors) + s, f] *= factors[s]

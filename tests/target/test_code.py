@@ -17,10 +17,10 @@ from kgcp.target.code import (
     fixed_lag_score,
     match_code,
     reference_signals,
-    sample_grey,
 )
 from kgcp.target.judgement import judge
 from kgcp.target.layout import Ring, Target
+from kgcp.target.polar import sample_grey
 from kgcp.target.search import find_code
 from kgcp.target.template import ANGLES_RAD, SAMPLED_RADII
 
