@@ -18,7 +18,7 @@ from kgcp.io.wholefile import write_bytes
 from kgcp.target.expected import Expectation
 from kgcp.target.measure import Examination
 from kgcp.target.observation import Considered, Observation, Outcome
-from kgcp.target.seeds import eight_bit
+from kgcp.target.pyramid import eight_bit
 
 _WIDTH_PX = 1600
 _JPEG_QUALITY = 90

@@ -22,7 +22,7 @@ def fit_ellipses(
     directions: FloatArray,
     most: float,
     ellipses: FloatArray,
-    possible: BoolArray,
+    shares: FloatArray,
 ) -> None:
     """Fit an ellipse to the edges of each ring (Fitzgibbon 1999; Halíř & Flusser 1998).
 
@@ -38,12 +38,15 @@ def fit_ellipses(
         Ratio of axes.
     ellipses : (n, 5) array
         Filled in: centre, semi-major and semi-minor axis, direction of the major one [rad].
-    possible : (n,) array of bool
-        Filled in: where there is an ellipse, and not too long a one.
+    shares : (n,) array
+        Filled in: of the edges that count; 0 where there is no ellipse, or too long a one.
     """
     powers = np.empty(5)
     moments = np.empty((5, 5))
     for i in range(len(edges)):
+        shares[i] = inlying[i].mean()
+        if shares[i] == 0.0:
+            continue
         moments[:] = 0.0
         for k in range(len(directions)):
             if inlying[i, k]:
@@ -56,7 +59,8 @@ def fit_ellipses(
                     for q in range(5 - p):
                         moments[p, q] += power * powers[q]
                     power *= x
-        possible[i] = _fit(moments, ellipses[i]) and ellipses[i, 2] <= most * ellipses[i, 3]
+        if not (_fit(moments, ellipses[i]) and ellipses[i, 2] <= most * ellipses[i, 3]):
+            shares[i] = 0.0
 
 
 @compiled

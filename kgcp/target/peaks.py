@@ -29,8 +29,9 @@ _MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
 _Rows = npt.NDArray[np.generic]
 
 
-def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
-    """Return where the filters answer clearly.
+@compiled
+def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, IndexArray]:
+    """Return where the filters answer clearly, image by image.
 
     The score is core - disc + surround - disc, of the means of 3 x 3, 5 x 5 and, less at its
     corners, 7 x 7 pixels. It must be a maximum, of some grey values, and at least a fifth of the
@@ -38,25 +39,54 @@ def find_peaks(image: GreyArray) -> tuple[FloatArray, FloatArray]:
 
     Parameters
     ----------
-    image : (height, width) array of uint8
+    reduced : (n,) array of uint8
+        Images one behind the other.
+    levels : (m, 4) array of int
+        Of each of them: begin and end in `reduced`, height, width.
 
     Returns
     -------
-    points : (n, 2) array
-        In the image [px], interpolated.
-    middles : (n,) array
-        Grey values between those of core and ring.
+    peaks : (n, 4) array
+        Column and row in the image [px], interpolated; the grey value between those of core and
+        ring; the score's share of the range of grey values.
+    ends : (m,) array of int
+        Where the peaks of each image end.
     """
-    rows, columns = image.shape[0], min(image.shape[1], _STRIP)
-    most = ((rows + 1) // 2) * ((columns + 1) // 2)  # maxima have no neighbours
-    strip = np.empty((most, 4))
-    places = range(0, image.shape[1], _STRIP)
-    found = np.concatenate([strip[: _scan(image, first, strip)].copy() for first in places])
-    limit = max(int(_MAX_PEAK_SHARE * image.size), _MAX_PEAKS)
-    if len(found) > limit:
-        shares = found[:, 3]
-        found = np.compress(shares >= np.partition(shares, -limit)[-limit], found, axis=0)
-    return found[:, :2], found[:, 2]
+    most, kept = 0, 0
+    for i in range(len(levels)):
+        # Maxima have no neighbours.
+        at_most = ((levels[i, 2] + 1) // 2) * ((levels[i, 3] + 1) // 2)
+        most, kept = max(most, at_most), kept + min(at_most, _limit(levels[i]))
+    found, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
+    count = 0
+    for i in range(len(levels)):
+        at, end = levels[i], count
+        image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+        for first in range(0, image.shape[1], _STRIP):
+            end += _scan(image, first, found[end:])
+        count += _keep_best(found[count:end], _limit(at))
+        ends[i] = count
+    return found[:count], ends
+
+
+@compiled
+def _limit(level: IndexArray) -> int:
+    """Return how many peaks of an image are kept."""
+    return max(int(_MAX_PEAK_SHARE * (level[1] - level[0])), _MAX_PEAKS)
+
+
+@compiled
+def _keep_best(found: FloatArray, limit: int) -> int:
+    """Move the peaks with the largest shares, so many, to the begin; return their number."""
+    if len(found) <= limit:
+        return len(found)
+    least = np.partition(found[:, 3].copy(), len(found) - limit)[len(found) - limit]
+    count = 0
+    for i in range(len(found)):
+        if found[i, 3] >= least:
+            found[count] = found[i]
+            count += 1
+    return count
 
 
 @compiled

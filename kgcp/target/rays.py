@@ -31,6 +31,7 @@ _WIDTHS = np.array((0.07, 0.05))
 _REACH = 0.17  # of an edge from a curve, of the seed's radius
 _INLIER = 0.07
 _MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6
+_FINEST_RADIUS_PX = 12.0  # of rings in the image that they are followed in, or twice that
 _RIDGE = 1e-3  # keeps the curve through few edges near the mean circle
 
 BoolArray = npt.NDArray[np.bool_]
@@ -38,9 +39,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 @compiled
 def follow(
-    image: GreyArray,
-    factor: float,
-    which: IndexArray,
+    frame: GreyArray,
+    reduced: GreyArray,
+    levels: IndexArray,
     centres: FloatArray,
     radii: FloatArray,
     edges: FloatArray,
@@ -50,38 +51,46 @@ def follow(
 
     Parameters
     ----------
-    image : (height, width) array of uint8
-        A frame, reduced; contiguous.
-    factor : float
-        How many pixels of the frame a pixel of the image is wide.
-    which : (m,) array of int
-        Rings that are looked at.
-    centres : (n, 2) array
-        Of the rings in the frame, roughly [px].
-    radii : (n,) array
+    frame, reduced, levels
+        Of a pyramid.
+    centres, radii : (n, 2) and (n,) array
         Of the rings in the frame, roughly [px].
     edges : (n, rays) array
         Filled in: how far the edge is from the centre, of the radius.
     inlying : (n, rays) array of bool
         Filled in: which edges are on the curve; none at all if they are too few for a ring.
     """
+    for i in range(len(radii)):
+        octave, factor = 0, 1.0
+        while 2 * octave < len(levels) and radii[i] >= 2.0 * factor * _FINEST_RADIUS_PX:
+            octave, factor = octave + 1, 2.0 * factor
+        x, y = (centres[i, 0] + 0.5) / factor - 0.5, (centres[i, 1] + 0.5) / factor - 0.5
+        radius, edge, is_inlying = radii[i] / factor, edges[i], inlying[i]
+        if octave == 0:
+            _follow_one(frame, x, y, radius, edge, is_inlying)
+        else:
+            at = levels[2 * octave - 2]
+            image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+            _follow_one(image, x, y, radius, edge, is_inlying)
+
+
+@compiled
+def _follow_one(
+    image: GreyArray, x: float, y: float, radius: float, edge: FloatArray, is_inlying: BoolArray
+) -> None:
+    """Fill in the edge of one ring about a pixel, and which parts of it are on the curve."""
     few, strength, rest = np.empty(_FEW), np.empty(RAYS), np.empty(RAYS)
     curve, values = np.empty(_TERMS), np.empty(len(_RADII))
     places, parts = np.empty(len(_RADII), np.intp), np.empty((2, len(_RADII)))
-    for i in which:
-        x, y = (centres[i, 0] + 0.5) / factor - 0.5, (centres[i, 1] + 0.5) / factor - 0.5
-        radius = radii[i] / factor
-        edge, is_inlying = edges[i], inlying[i]
-        is_inlying[:] = False
-        _glance(image, x, y, radius, places, values, few, strength)
-        _fit_curve(few, strength, _FEW_HARMONICS, _FEW_SUMMANDS, _WIDTHS_AT_FIRST, rest, curve)
-        if np.sum(np.abs(rest[:_FEW]) < 2.0 * _INLIER) <= _MIN_INLIERS_AT_FIRST * _FEW:
-            continue
-        _follow_curve(image, x, y, radius, curve, places, parts, values, edge, strength)
-        _fit_curve(edge, strength, _HARMONICS, _SUMMANDS, _WIDTHS, rest, curve)
-        is_inlying[:] = (np.abs(rest) < _INLIER) & (strength > 0.0)
-        if is_inlying.sum() < _MIN_INLIERS * RAYS:
-            is_inlying[:] = False
+    is_inlying[:] = False
+    _glance(image, x, y, radius, places, values, few, strength)
+    _fit_curve(few, strength, _FEW_HARMONICS, _FEW_SUMMANDS, _WIDTHS_AT_FIRST, rest, curve)
+    if np.sum(np.abs(rest[:_FEW]) < 2.0 * _INLIER) <= _MIN_INLIERS_AT_FIRST * _FEW:
+        return
+    _follow_curve(image, x, y, radius, curve, places, parts, values, edge, strength)
+    _fit_curve(edge, strength, _HARMONICS, _SUMMANDS, _WIDTHS, rest, curve)
+    is_inlying[:] = (np.abs(rest) < _INLIER) & (strength > 0.0)
+    is_inlying &= is_inlying.sum() >= _MIN_INLIERS * RAYS
 
 
 @compiled

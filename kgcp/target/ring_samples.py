@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.target.peaks import PEAK_RADIUS_PX
+from kgcp.target.pyramid import Pyramid
 
 _RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # circles that are looked at, of the ring's radius
 _RING, _NEAR, _FAR, _CORE = range(4)  # the last is outside of a replica
 _ROUGH = np.array((0.85, 1.1))  # radii that are tried
 _FINE = np.array((0.9, 1.0, 1.1))
 _TRIALS = np.outer(_ROUGH, _FINE).ravel()
-_REACH = float(_TRIALS.max() * _RATIOS.max())
+_COARSER = np.array((2.0, 3.0))  # images than those that are looked at
+_REACHES = np.ceil(PEAK_RADIUS_PX * _COARSER * _TRIALS.max() * _RATIOS.max()).astype(np.intp)
 _DIRECTIONS = _FEW, _MANY, _ALL = 8, 16, 24  # that are looked in first, then, and at last
 _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # hidden quarters and dots leave half of the ring
 _MIN_CONTRAST = 5  # grey values
+_CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
+_LARGE_PX = 22.0  # radius from which there are few seeds
 _SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
 
 _Shifts = npt.NDArray[np.uintp]  # (radii, circles, few and many and all directions)
@@ -44,91 +48,120 @@ def _sorting_network(count: int) -> IndexArray:
     return np.array(pairs)
 
 
-_NETWORK = _sorting_network(_ALL)
+def _offsets() -> IndexArray:
+    """Return columns and rows (ratios, 2, radii, circles, directions) of samples on circles."""
+    angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in _DIRECTIONS])
+    radii = PEAK_RADIUS_PX * np.multiply.outer(np.outer(_COARSER, _TRIALS), _RATIOS)
+    places = radii[:, None, :, :, None] * np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
+    return np.asarray(np.floor(places + 0.5), np.intp)
 
 
-def look_around(
-    image: GreyArray,
-    points: FloatArray,
-    middles: FloatArray,
-    coarser: float,
-    radius: float,
-    clear: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Tell how clear rings are whose ring, core and surround are each of one grey value.
+_NETWORK, _OFFSETS = _sorting_network(_ALL), _offsets()
 
-    Cheap tests come first: dark and then bright in some of eight directions, then in some of 16.
+
+def look_around(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatArray:
+    """Tell which peaks are rings': of a ring, a core and a surround of one grey value each.
+
+    Each is looked at in a finer image. Cheap tests come first: dark and then bright in some of
+    eight directions, then in some of 16.
 
     Parameters
     ----------
-    image : (height, width) array of uint8
-        Contiguous.
-    points : (n, 2) array
-        Centres of the rings in another image, whose pixels are `coarser` times as wide [px].
-    middles : (n,) array
-        Grey values between those of core and ring.
-    coarser : float
-    radius : float
-        Of the outer circles, in that other image [px].
-    clear : float
-        By how much ring, core and surround may be spread each, of the contrast.
+    pyramid : Pyramid
+    peaks, ends
+        As `find_peaks` returns them, of the pyramid's last levels.
 
     Returns
     -------
-    stretches : (n,) array
-        By how much the radius is larger.
-    clearness : (n,) array
-        Contrast in grey values less spread; 0 where there is no ring.
+    rings : (n, 4) array
+        Centre and outer radius in the frame [px]; contrast in grey values, less the spread.
     """
-    reach = math.ceil(coarser * radius * _REACH)
-    inside, near_border = image.shape[1], 2 * reach + 1
-    shifts = _shifts(coarser * radius, inside), _shifts(coarser * radius, near_border)
-    stretches, clearness = np.empty(len(points)), np.empty(len(points))
-    _look(image, points, middles, coarser, reach, *shifts, clear, stretches, clearness)
-    return stretches, clearness
+    rings = np.empty((len(peaks), 4))
+    images = pyramid.frame, pyramid.reduced, pyramid.levels
+    count = _look_at_all(*images, peaks, ends, _OFFSETS, _REACHES, PEAK_RADIUS_PX, rings)
+    return rings[:count]
 
 
-@lru_cache(maxsize=128)
-def _shifts(radius: float, width: int) -> _Shifts:
-    """Return how many pixels further samples on circles are, in images of a width.
+@compiled
+def _look_at_all(
+    frame: GreyArray,
+    reduced: GreyArray,
+    levels: IndexArray,
+    peaks: FloatArray,
+    ends: IndexArray,
+    offsets: IndexArray,
+    reaches: IndexArray,
+    peak_radius: float,
+    rings: FloatArray,
+) -> int:
+    """Fill in what `look_around` returns, and count it.
 
-    Those that are nearer have wrapped about, as their sums with a pixel's place do.
+    Where pixels are 2, 3, 4, 6, 8, 12, … of the frame's wide, images of 1, 1, 2, 2, 4, 4, … serve.
     """
-    angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in _DIRECTIONS])
-    lengths = radius * _TRIALS[:, None, None] * _RATIOS[:, None]
-    x, y = np.floor(lengths * np.cos(angles) + 0.5), np.floor(lengths * np.sin(angles) + 0.5)
-    return np.asarray(y * width + x, np.intp).view(np.uintp)
+    count, begin = 0, 0
+    for k in range(len(ends)):
+        octave, third = divmod(len(levels) - len(ends) + k, 2)
+        some, found = peaks[begin : ends[k]], rings[count:]
+        samples = offsets[third], reaches[third], 2.0**octave, 2.0 + third, peak_radius
+        if octave == 0:
+            count += _look(frame, some, *samples, found)
+        else:
+            at = levels[2 * octave - 2]
+            image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+            count += _look(image, some, *samples, found)
+        begin = ends[k]
+    return count
 
 
 @compiled
 def _look(
     image: GreyArray,
-    points: FloatArray,
-    middles: FloatArray,
-    coarser: float,
+    peaks: FloatArray,
+    offsets: IndexArray,
     reach: int,
-    shifts: _Shifts,
-    patch_shifts: _Shifts,
-    clear: float,
-    stretches: FloatArray,
-    clearness: FloatArray,
-) -> None:
-    """Fill in what `look_around` returns. Near the border a copy of what is around is looked at."""
+    factor: float,
+    coarser: float,
+    peak_radius: float,
+    rings: FloatArray,
+) -> int:
+    """Look at the peaks of one level; near the border, at a copy of what is around.
+
+    A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
+    """
     height, width = image.shape
+    radius = factor * coarser * peak_radius
+    clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
     side = 2 * reach + 1
     pixels, patch = image.reshape(-1), np.empty((side, side), np.uint8)
+    shifts, patch_shifts = _shifts(offsets, width), _shifts(offsets, side)
     values = np.empty((3, _ALL), np.int64)
-    for i in range(len(points)):
-        x = math.floor(coarser * (points[i, 0] + 0.5))  # the pixel that holds the point
-        y = math.floor(coarser * (points[i, 1] + 0.5))
+    count = 0
+    for i in range(len(peaks)):
+        x = math.floor(coarser * (peaks[i, 0] + 0.5))  # the pixel that holds the point
+        y = math.floor(coarser * (peaks[i, 1] + 0.5))
         if reach <= x < width - reach and reach <= y < height - reach:
             place = y * width + x
-            found = _clearest(pixels, place, shifts, middles[i], clear, values)
+            found = _clearest(pixels, place, shifts, peaks[i, 2], clear, values)
         else:
             _copy_around(image, x - reach, y - reach, patch)
             place = reach * side + reach
-            found = _clearest(patch.reshape(-1), place, patch_shifts, middles[i], clear, values)
-        clearness[i], stretches[i] = found[0], _TRIALS[found[1]]
+            found = _clearest(patch.reshape(-1), place, patch_shifts, peaks[i, 2], clear, values)
+        if found[0] > 0.0:
+            rings[count, 0] = factor * coarser * (peaks[i, 0] + 0.5) - 0.5
+            rings[count, 1] = factor * coarser * (peaks[i, 1] + 0.5) - 0.5
+            rings[count, 2], rings[count, 3] = radius * _TRIALS[found[1]], found[0]
+            count += 1
+    return count
+
+
+@compiled
+def _shifts(offsets: IndexArray, width: int) -> _Shifts:
+    """Return how many pixels further samples on circles are, in images of a width.
+
+    Those that are nearer have wrapped about, as their sums with a pixel's place do.
+    """
+    shifts: _Shifts = (offsets[1] * width + offsets[0]).view(np.uintp)
+    return shifts
 
 
 @compiled

@@ -15,7 +15,8 @@ from kgcp.target.judgement import judge, polar_patch
 from kgcp.target.layout import Ring
 from kgcp.target.outline import find_outlines
 from kgcp.target.polar import sample_ellipses
-from kgcp.target.seeds import Seeds, build_pyramid, find_seeds
+from kgcp.target.pyramid import build_pyramid
+from kgcp.target.seeds import Seeds, find_seeds
 from kgcp.target.template import ANGLES, CIRCLE
 
 _MIN_CONTRAST = 0.02  # of the grey values' range

@@ -11,9 +11,10 @@ DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 
 
 def fitted(edges: np.ndarray, inlying: np.ndarray, most: float = 2.0) -> tuple[np.ndarray, bool]:
-    ellipses, possible = np.zeros((1, 5)), np.zeros(1, dtype=np.bool_)
-    fit_ellipses(edges[None], inlying[None], DIRECTIONS, most, ellipses, possible)
-    return ellipses[0], bool(possible[0])
+    ellipses, shares = np.zeros((1, 5)), np.zeros(1)
+    fit_ellipses(edges[None], inlying[None], DIRECTIONS, most, ellipses, shares)
+    assert float(shares[0]) in (0.0, pytest.approx(inlying.mean()))
+    return ellipses[0], bool(shares[0])
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
@@ -43,3 +44,8 @@ def test_too_long_an_ellipse_is_none() -> None:
     found, possible = fitted(edges, np.ones(RAYS, dtype=np.bool_))
     assert not possible
     np.testing.assert_allclose(found[2] / found[3], 2.5, rtol=1e-6)
+
+
+def test_where_no_edge_counts_there_is_none() -> None:
+    _, possible = fitted(np.ones(RAYS), np.zeros(RAYS, dtype=np.bool_))
+    assert not possible

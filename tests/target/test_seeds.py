@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.target.distinct import distinct
 from kgcp.target.outline import find_outlines
 from kgcp.target.peaks import find_peaks
+from kgcp.target.pyramid import build_pyramid, factor_of
 from kgcp.target.ring_samples import look_around
-from kgcp.target.seeds import build_pyramid, find_seeds
+from kgcp.target.seeds import find_seeds
 
 SUPER = 8  # drawn so many times as large
 BLACK, WHITE = 40.0, 190.0
@@ -35,6 +36,15 @@ def ring_frame(
     return np.asarray(np.clip(seen, 0, 255), dtype=np.uint8)
 
 
+def peaks_of(image: GreyArray) -> FloatArray:
+    """Return the peaks of the second of two images, which lie one behind the other."""
+    before = np.full(40, 99, dtype=np.uint8)
+    levels = np.array([(0, 40, 8, 5), (40, 40 + image.size, *image.shape)])
+    peaks, ends = find_peaks(np.concatenate((before, image.ravel())), levels)
+    assert ends.tolist() == [0, len(peaks)]
+    return peaks
+
+
 @pytest.mark.parametrize("shape", [(97, 131), (29, 503), (27, 505), (23, 1040)])
 def test_peaks_are_where_their_definition_says(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
@@ -46,8 +56,7 @@ def test_peaks_are_where_their_definition_says(shape: tuple[int, int]) -> None:
     extent = ndimage.maximum_filter(grey, 5) - ndimage.minimum_filter(grey, 5)
     is_peak = (score >= ndimage.maximum_filter(score, 3)) & (score > 5.1) & (score > 0.21 * extent)
     rows, columns = np.nonzero(is_peak[3:-3, 3:-3])
-    points, middles = find_peaks(image)
-    found = {(round(x), round(y)): m for (x, y), m in zip(points, middles, strict=True)}
+    found = {(round(x), round(y)): middle for x, y, middle, _ in peaks_of(image)}
     expected = {(x + 3, y + 3) for x, y in zip(columns.tolist(), rows.tolist(), strict=True)}
     assert len(expected) > 20
     assert len(expected - found.keys()) <= 0.03 * len(expected)  # half a pixel rounds either way
@@ -56,27 +65,59 @@ def test_peaks_are_where_their_definition_says(shape: tuple[int, int]) -> None:
 
 
 def test_an_even_image_has_no_peaks() -> None:
-    assert len(find_peaks(np.full((50, 70), 99, dtype=np.uint8))[0]) == 0
+    assert len(peaks_of(np.full((50, 70), 99, dtype=np.uint8))) == 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 40), (40, 2)])
 def test_the_smallest_images_can_be_searched(shape: tuple[int, int]) -> None:
-    points, middles = find_peaks(np.zeros(shape, dtype=np.uint8))
-    assert points.shape == (0, 2)
-    assert middles.shape == (0,)
+    assert peaks_of(np.zeros(shape, dtype=np.uint8)).shape == (0, 4)
 
 
-@pytest.mark.parametrize("coarser", [2.0, 3.0])
-def test_beyond_its_border_the_image_repeats_its_last_pixels(coarser: float) -> None:
+def test_of_too_many_peaks_the_clearest_are_kept() -> None:
+    rng = np.random.default_rng(2)
+    image = np.clip(rng.normal(120.0, 40.0, (400, 500)), 0, 255).astype(np.uint8)
+    kept, upper = peaks_of(image), peaks_of(image[:150])
+    assert 1000 <= len(kept) < 1010  # some are alike
+    clear = upper[(upper[:, 3] > kept[:, 3].min() + 1e-9) & (upper[:, 1] < 140.0)]
+    assert 100 < len(clear) < len(upper) - 100
+    assert {tuple(peak) for peak in clear} <= {tuple(peak) for peak in kept}
+
+
+@pytest.mark.parametrize("third", [0, 1])
+def test_beyond_its_border_the_image_repeats_its_last_pixels(third: int) -> None:
+    coarser = 2.0 + third
     frame = ring_frame((141.3, 103.8), (2.8 * coarser, 2.8 * coarser))
     cut = np.ascontiguousarray(frame[97:, 134:])  # the ring, without its surround on two sides
     padded = cv2.copyMakeBorder(cut, 36, 36, 36, 36, borderType=cv2.BORDER_REPLICATE)
     x, y = np.meshgrid(np.arange(0.0, cut.shape[1], coarser), np.arange(0.0, 40.0, coarser))
-    points, middles = np.stack((x.ravel(), y.ravel()), axis=1) / coarser, np.full(x.size, 115.0)
-    seen = look_around(cut, points, middles, coarser, 2.8, 0.8)
-    there = look_around(padded, points + 36.0 / coarser, middles, coarser, 2.8, 0.8)
-    assert np.count_nonzero(seen[1]) > 0
-    assert np.array_equal(seen, there)
+    peaks = np.column_stack((x.ravel() / coarser, y.ravel() / coarser, np.full((x.size, 2), 115.0)))
+    moved = np.array([36.0, 36.0, 0.0, 0.0])
+    seen, expected = (
+        look_around(pyramid, places, np.repeat((0, x.size), (third, len(pyramid.levels) - third)))
+        for pyramid, places in (
+            (build_pyramid(cut), peaks),
+            (build_pyramid(padded), peaks + moved / coarser),
+        )
+    )
+    assert len(seen) > 0
+    assert np.array_equal(seen, expected - moved)
+
+
+@pytest.mark.parametrize(
+    ("shape", "sizes"),
+    [((11, 90), []), ((97, 131), [(48, 65), (32, 42), (24, 32), (16, 20), (12, 16)])],
+)
+def test_reduced_images_show_what_the_frame_shows(
+    shape: tuple[int, int], sizes: list[tuple[int, int]]
+) -> None:
+    x, y = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+    frame = np.rint(20.0 + 0.9 * x + 1.1 * y).astype(np.uint8)
+    pyramid = build_pyramid(frame)
+    assert [tuple(size) for size in pyramid.levels[:, 2:]][:5] == sizes
+    for i, (begin, end, height, width) in enumerate(pyramid.levels):
+        image = pyramid.reduced[begin:end].reshape(height, width)
+        column, row = (factor_of(i) * (np.arange(n) + 0.5) - 0.5 for n in (width, height))
+        assert np.abs(image - (20.0 + 0.9 * column + 1.1 * row[:, None])).max() < 1.5
 
 
 @pytest.mark.parametrize("radius", [6.0, 7.1, 9.3, 12.0, 16.0, 23.0, 31.0, 44.0, 60.0, 88.0])
