@@ -14,7 +14,14 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.lens import Lens, distort_points, distort_slopes, undistort_points
+from kgcp.geometry.lens import (
+    Lens,
+    Scale,
+    distort_circles,
+    distort_points,
+    distort_slopes,
+    undistort_points,
+)
 from kgcp.settings import require_range
 
 
@@ -114,13 +121,30 @@ class Camera:
         """Project points (n, 3) in the camera frame [m] to raw pixels (n, 2)."""
         return self.distort(points_camera[..., :2] / points_camera[..., 2:3])
 
+    def project_circles(
+        self, axes: FloatArray, centre_m: FloatArray, radii_m: FloatArray, circle: FloatArray
+    ) -> FloatArray:
+        """Project circles about one centre, in one plane, to raw pixels (m, k, 2).
+
+        Parameters
+        ----------
+        axes : (3, 2) or (3, 3) array
+            Two perpendicular unit vectors of the plane, in the camera frame, as columns.
+        centre_m : (3,) array
+            In the camera frame [m].
+        radii_m : (m,) array
+        circle : (k, 2) array
+            Points of the unit circle, along these axes.
+        """
+        pixels = np.empty((len(radii_m), len(circle), 2))
+        distort_circles(self._lens, self._scale, axes, centre_m, radii_m, circle, pixels)
+        return pixels
+
     def distort(self, normalised: FloatArray) -> FloatArray:
         """Map normalised coordinates (n, 2) to raw pixels (n, 2)."""
         pixels = np.empty(normalised.shape)
         points = np.asarray(normalised, dtype=np.float64).reshape(-1, 2)
-        distort_points(self._lens, points, pixels.reshape(-1, 2))
-        pixels *= (self.fx, self.fy)
-        pixels += (self.cx, self.cy)
+        distort_points(self._lens, self._scale, points, pixels.reshape(-1, 2))
         return pixels
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
@@ -129,21 +153,22 @@ class Camera:
         Newton's method with the analytic Jacobian, to 1e-13; points that the distortion model
         cannot reach (beyond its fold) come back as NaN.
         """
-        plane = (np.asarray(pixels) - (self.cx, self.cy)) / (self.fx, self.fy)
-        if not any(self._lens):
-            return plane
-        normalised = np.empty(plane.shape)
-        undistort_points(self._lens, plane.reshape(-1, 2), normalised.reshape(-1, 2))
+        normalised = np.empty(np.shape(pixels))
+        places = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        undistort_points(self._lens, self._scale, places, normalised.reshape(-1, 2))
         return normalised
 
     def distort_jacobian(self, normalised: FloatArray) -> FloatArray:
         """Return the derivatives (n, 2, 2) of `distort`: rows x, y [px], columns the input."""
         slopes = np.empty((*normalised.shape, 2))
         points = np.asarray(normalised, dtype=np.float64).reshape(-1, 2)
-        distort_slopes(self._lens, points, slopes.reshape(-1, 2, 2))
-        slopes *= np.array([[self.fx], [self.fy]])
+        distort_slopes(self._lens, self._scale, points, slopes.reshape(-1, 2, 2))
         return slopes
 
     @property
     def _lens(self) -> Lens:
         return (self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6)
+
+    @property
+    def _scale(self) -> Scale:
+        return (float(self.fx), float(self.fy), float(self.cx), float(self.cy))

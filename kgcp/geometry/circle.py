@@ -226,24 +226,23 @@ def circle_planes(conic: FloatArray) -> tuple[CirclePlane, CirclePlane]:
     Rejection
         IMPOSSIBLE_GEOMETRY if the conic is no cone over an ellipse in front of the camera.
     """
-    form = oriented(conic)
-    values, axes = np.linalg.eigh(form)
-    low, middle, high = (float(value) for value in values)
+    values, axes = np.linalg.eigh(oriented(conic))
+    low, middle, high = values.tolist()
     if not low < 0.0 < middle:
         raise Rejection(Reason.IMPOSSIBLE_GEOMETRY, "the outer conic is not an ellipse's cone")
     along = math.sqrt((middle - low) / (high - low)) * axes[:, 0]
     across = math.sqrt((high - middle) / (high - low)) * axes[:, 2]
     height = middle / math.sqrt(-high * low)
-    first, second = (
-        _circle_plane(form, normal if normal[2] > 0.0 else -normal, height)
-        for normal in (along + across, along - across)
+    return (
+        _circle_plane(along + across, along / low + across / high, height),
+        _circle_plane(along - across, along / low - across / high, height),
     )
-    return first, second
 
 
-def _circle_plane(form: FloatArray, normal: FloatArray, height: float) -> CirclePlane:
-    ray = np.linalg.solve(form, normal)
-    return CirclePlane(normal=normal, centre=ray * (height / (normal @ ray)))
+def _circle_plane(normal: FloatArray, ray: FloatArray, height: float) -> CirclePlane:
+    """Place the circle: `ray` is Q'⁻¹ n, of either sign as n is."""
+    sign = 1.0 if normal[2] > 0.0 else -1.0
+    return CirclePlane(sign * normal, ray * (sign * height / float(normal @ ray)))
 
 
 def diameter_tilts_rad(centre: FloatArray, conic: FloatArray) -> tuple[float, float]:
@@ -273,11 +272,15 @@ def pose_on_plane(plane: CirclePlane, radius_m: float, towards_x: FloatArray) ->
     towards_x : (2,) array
         Normalised image point on the target's positive x axis.
     """
-    ray = np.append(towards_x, 1.0)
-    on_plate = ray * (plane.normal @ plane.centre) / (plane.normal @ ray) - plane.centre
-    x_axis = on_plate / np.linalg.norm(on_plate)
-    rotation = np.column_stack((x_axis, np.cross(plane.normal, x_axis), plane.normal))
-    return Pose(rotation=rotation, translation_m=radius_m * plane.centre)
+    (a, b, c), (x, y, z), (u, v) = (
+        array.tolist() for array in (plane.normal, plane.centre, towards_x)
+    )
+    depth = (a * x + b * y + c * z) / (a * u + b * v + c)
+    x, y, z = depth * u - x, depth * v - y, depth - z
+    length = math.sqrt(x * x + y * y + z * z)
+    x, y, z = x / length, y / length, z / length
+    rotation = [[x, b * z - c * y, a], [y, c * x - a * z, b], [z, a * y - b * x, c]]
+    return Pose(rotation=np.array(rotation), translation_m=radius_m * plane.centre)
 
 
 def conic_of_circle(pose: Pose, radius_m: float) -> FloatArray:

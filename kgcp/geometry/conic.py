@@ -59,10 +59,16 @@ class Ellipse:
     @property
     def conic(self) -> FloatArray:
         """Matrix (3, 3) of this ellipse."""
-        to_unit_circle = np.eye(3)
-        to_unit_circle[:2, :2] = np.linalg.inv(self.stretch)
-        to_unit_circle[:2, 2] = -to_unit_circle[:2, :2] @ self.centre
-        return to_unit_circle.T @ np.diag([1.0, 1.0, -1.0]) @ to_unit_circle
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = 1.0 / (self.a * self.a), 1.0 / (self.b * self.b)
+        xx, xy, yy = (
+            c * c * along + s * s * across,
+            c * s * (along - across),
+            s * s * along + c * c * across,
+        )
+        x, y = -xx * self.x - xy * self.y, -xy * self.x - yy * self.y
+        rest = -1.0 - x * self.x - y * self.y
+        return np.array([[xx, xy, x], [xy, yy, y], [x, y, rest]])
 
     def points(self, angles_rad: FloatArray, factor: float = 1.0) -> FloatArray:
         """Return points (…, 2) at angles (…) on the ellipse times `factor` about its centre.
@@ -86,9 +92,9 @@ class Ellipse:
 def oriented(conic: FloatArray) -> FloatArray:
     """Return the conic (3, 3) symmetric, of unit norm, and negative inside if it is an ellipse."""
     symmetric = 0.5 * (conic + conic.T)
-    sign = 1.0 if np.trace(symmetric[:2, :2]) > 0.0 else -1.0
-    result: FloatArray = symmetric * (sign / np.linalg.norm(symmetric))
-    return result
+    norm = math.sqrt(np.vdot(symmetric, symmetric))
+    sign = 1.0 if symmetric[0, 0] + symmetric[1, 1] > 0.0 else -1.0
+    return np.asarray(symmetric * (sign / norm))
 
 
 def transform_conic(conic: FloatArray, homography: FloatArray) -> FloatArray:

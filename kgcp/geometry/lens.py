@@ -13,6 +13,9 @@ _NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
 Lens = tuple[float, float, float, float, float, float, float, float]
 """k1, k2, p1, p2, k3, k4, k5, k6."""
 
+Scale = tuple[float, float, float, float]
+"""fx, fy, cx, cy [px]."""
+
 
 @compiled
 def _radial(lens: Lens, r2: float) -> tuple[float, float]:
@@ -51,25 +54,57 @@ def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
 
 
 @compiled
-def distort_points(lens: Lens, points: FloatArray, distorted: FloatArray) -> None:
-    """Distort normalised points (n, 2)."""
+def distort_points(lens: Lens, scale: Scale, points: FloatArray, pixels: FloatArray) -> None:
+    """Map normalised points (n, 2) to pixels."""
+    fx, fy, cx, cy = scale
     for i in range(points.shape[0]):
-        distorted[i, 0], distorted[i, 1] = _distorted(lens, points[i, 0], points[i, 1])
+        x, y = _distorted(lens, points[i, 0], points[i, 1])
+        pixels[i, 0], pixels[i, 1] = fx * x + cx, fy * y + cy
 
 
 @compiled
-def distort_slopes(lens: Lens, points: FloatArray, slopes: FloatArray) -> None:
+def distort_circles(
+    lens: Lens,
+    scale: Scale,
+    axes: FloatArray,
+    centre: FloatArray,
+    radii: FloatArray,
+    circle: FloatArray,
+    pixels: FloatArray,
+) -> None:
+    """Map circles of some radii (m,) in space to pixels (m, k, 2), by points of the unit circle.
+
+    Their common centre is given in the camera frame, their plane by the first two columns of a
+    rotation.
+    """
+    fx, fy, cx, cy = scale
+    for m in range(len(radii)):
+        for k in range(len(circle)):
+            u, v = radii[m] * circle[k, 0], radii[m] * circle[k, 1]
+            inverse = 1.0 / (centre[2] + axes[2, 0] * u + axes[2, 1] * v)
+            x = (centre[0] + axes[0, 0] * u + axes[0, 1] * v) * inverse
+            y = (centre[1] + axes[1, 0] * u + axes[1, 1] * v) * inverse
+            x, y = _distorted(lens, x, y)
+            pixels[m, k, 0], pixels[m, k, 1] = fx * x + cx, fy * y + cy
+
+
+@compiled
+def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatArray) -> None:
     """Fill in the derivatives (n, 2, 2) of `distort_points`: rows of results, columns of points."""
+    fx, fy, _, _ = scale
     for i in range(points.shape[0]):
         xx, xy, yy = _slopes(lens, points[i, 0], points[i, 1])
-        slopes[i, 0, 0], slopes[i, 0, 1], slopes[i, 1, 0], slopes[i, 1, 1] = xx, xy, xy, yy
+        slopes[i, 0, 0], slopes[i, 0, 1] = fx * xx, fx * xy
+        slopes[i, 1, 0], slopes[i, 1, 1] = fy * xy, fy * yy
 
 
 @compiled
-def undistort_points(lens: Lens, distorted: FloatArray, points: FloatArray) -> None:
+def undistort_points(lens: Lens, scale: Scale, pixels: FloatArray, points: FloatArray) -> None:
     """Invert `distort_points` by Newton's method, to 1e-13; NaN where it does not converge."""
-    for i in range(points.shape[0]):
-        x, y = wanted_x, wanted_y = distorted[i, 0], distorted[i, 1]
+    fx, fy, cx, cy = scale
+    for i in range(pixels.shape[0]):
+        x = wanted_x = (pixels[i, 0] - cx) / fx
+        y = wanted_y = (pixels[i, 1] - cy) / fy
         is_found = False
         for _ in range(_MAX_NEWTON_STEPS):
             there_x, there_y = _distorted(lens, x, y)

@@ -91,13 +91,16 @@ class Pose:
 
     def _tilt(self) -> tuple[FloatArray, float]:
         """Return about which unit axis the normal is off the ray, any if none, and how far."""
-        ray = self.translation_m / self.distance_m
-        axis = np.cross(ray, self.normal)
-        sine = float(np.linalg.norm(axis))
-        tilt_rad = math.atan2(sine, float(ray @ self.normal))
+        (a, b, c), (x, y, z) = self.normal.tolist(), self.translation_m.tolist()
+        distance = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / distance, y / distance, z / distance
+        axis = y * c - z * b, z * a - x * c, x * b - y * a
+        sine = math.hypot(*axis)
+        tilt_rad = math.atan2(sine, a * x + b * y + c * z)
         if sine < _SQUARE_VIEW:
-            axis = np.cross(ray, np.array([1.0, 0.0, 0.0]))
-        return axis / np.linalg.norm(axis), tilt_rad
+            axis = 0.0, z, -y
+            sine = math.hypot(*axis)
+        return np.array(axis) / sine, tilt_rad
 
     @property
     def roll_deg(self) -> float:

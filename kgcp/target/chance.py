@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray
 from kgcp.target.code import reference_signals
 from kgcp.target.layout import Ring, Target
 from kgcp.target.observation import Observation
@@ -34,15 +37,21 @@ def code_chance(score: float, ring: Ring, blur_rad: float) -> float:
     blur_rad : float
         σ of the edges as an angle along the code circle [rad].
     """
-    power = np.abs(np.fft.rfft(reference_signals(ring)))[:, 1:] ** 2
-    power /= power.sum(axis=1, keepdims=True)
-    frequency = np.arange(1, power.shape[1] + 1)
-    noise = np.exp(-((frequency * blur_rad) ** 2))
+    power = _power(ring)
+    square = np.arange(1, power.shape[1] + 1) ** 2
+    noise = np.exp(-blur_rad * blur_rad * square)
     shared = power @ noise
     dimensions = 2.0 * noise.sum() / shared
-    lengths = np.sqrt(power @ (frequency**2 * noise) / shared)
+    lengths = np.sqrt(power @ (square * noise) / shared)
     unlike = max(0.0, 1.0 - score * score)
     return min(1.0, float(np.sum(lengths * unlike ** (0.5 * dimensions - 1.0))))
+
+
+@lru_cache(maxsize=64)
+def _power(ring: Ring) -> FloatArray:
+    """Return the code's share of power by blur and frequency, from the lowest on."""
+    power = np.abs(np.fft.rfft(reference_signals(ring)))[:, 1:] ** 2
+    return np.asarray(power / power.sum(axis=1, keepdims=True))
 
 
 def check_chance(observation: Observation, target: Target, ring: Ring, false_alarm: float) -> None:

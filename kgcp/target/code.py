@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.target.layout import Ring
@@ -15,6 +17,7 @@ from kgcp.target.polar import sample_grey
 
 _SAMPLES = 360
 CODE_ANGLES_RAD = np.linspace(0.0, 2.0 * math.pi, _SAMPLES, endpoint=False)
+CODE_CIRCLE = np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=-1)
 _BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # edge spreads that the code is tried with
 _HEADING_SLACK = 6  # degrees that a replica's heading may be off
 
@@ -71,18 +74,34 @@ def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]
     scores, lags_deg : (m,) arrays
         The lag is refined between samples by a parabola.
     """
-    wanted = np.conj(np.fft.rfft(_standardised(reference_signals(ring))))
-    spectrum = np.fft.rfft(_standardised(signals))[:, None] * wanted
-    by_blur = np.fft.irfft(spectrum, _SAMPLES)
-    best = by_blur.max(axis=2).argmax(axis=1)
-    correlation = by_blur[np.arange(len(best)), best]
-    peak = correlation.argmax(axis=1)
-    before, top, after = (
-        correlation[np.arange(len(peak)), (peak + shift) % _SAMPLES] for shift in (-1, 0, 1)
-    )
-    bend = np.minimum(before - 2.0 * top + after, -1e-12)
-    shift = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
-    return top, (peak + shift) * (360.0 / _SAMPLES) % 360.0
+    by_blur = np.fft.irfft(np.fft.rfft(signals)[:, None] * _wanted_spectra(ring), _SAMPLES)
+    scores, lags_deg = np.empty(len(signals)), np.empty(len(signals))
+    _find_peaks(signals, by_blur, scores, lags_deg)
+    return scores, lags_deg
+
+
+@lru_cache(maxsize=64)
+def _wanted_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
+    return np.conj(np.fft.rfft(_standardised(reference_signals(ring))))
+
+
+@compiled
+def _find_peaks(
+    signals: FloatArray, by_blur: FloatArray, scores: FloatArray, lags_deg: FloatArray
+) -> None:
+    """Fill in the largest value by blur and lag of each signal, and its lag between samples."""
+    for i in range(len(signals)):
+        correlation, peak = by_blur[i, 0], 0
+        for candidate in by_blur[i]:
+            best = candidate.argmax()
+            if candidate[best] > correlation[peak]:
+                correlation, peak = candidate, best
+        before, after = correlation[peak - 1], correlation[(peak + 1) % _SAMPLES]
+        bend = min(before - 2.0 * correlation[peak] + after, -1e-12)
+        shift = min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+        lags_deg[i] = (peak + shift) * (360.0 / _SAMPLES) % 360.0
+        norm = np.sqrt(np.sum((signals[i] - signals[i].mean()) ** 2))
+        scores[i] = correlation[peak] / norm if norm > 0.0 else 0.0
 
 
 def fixed_lag_score(

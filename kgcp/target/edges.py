@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
@@ -90,12 +91,30 @@ def clear_of_dots(
 
     On a small ring with many dots none may be: then the places farthest from dots are taken.
     """
-    on_edge = 0.5 * edge_diameter_m * np.exp(1j * angles_rad)
-    dots = 0.5 * ring.code_diameter_m * np.exp(1j * np.radians(np.add(ring.code_deg, lag_deg)))
-    gap_m = np.abs(on_edge[:, None] - dots).min(axis=1) - 0.5 * ring.dot_diameter_m
+    dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
+    gap_m = np.empty(len(angles_rad))
+    _measure_gaps(angles_rad, 0.5 * edge_diameter_m, dots_rad, 0.5 * ring.code_diameter_m, gap_m)
+    gap_m -= 0.5 * ring.dot_diameter_m
     fewest = math.ceil((1.0 - _MIN_CLEAR) * (len(gap_m) - 1))
     reach_m = min(_DOT_REACH_PX / px_per_m, float(np.partition(gap_m, fewest)[fewest]))
     return np.asarray(gap_m >= reach_m)
+
+
+@compiled
+def _measure_gaps(
+    angles_rad: FloatArray,
+    radius: float,
+    others_rad: FloatArray,
+    other_radius: float,
+    gaps: FloatArray,
+) -> None:
+    """Fill in how far points of one circle are from the nearest of some points of another."""
+    for i in range(len(angles_rad)):
+        nearest = -1.0
+        for other_rad in others_rad:
+            nearest = max(nearest, math.cos(angles_rad[i] - other_rad))
+        square = radius**2 + other_radius**2 - 2.0 * radius * other_radius * nearest
+        gaps[i] = math.sqrt(max(square, 0.0))
 
 
 def steepest_ellipse(

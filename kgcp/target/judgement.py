@@ -19,7 +19,6 @@ from kgcp.target.occlusion import best_partial_template, visible_angles
 from kgcp.target.polar import sample_ellipses, sample_grey
 from kgcp.target.template import (
     ANGLES,
-    ANGLES_RAD,
     CIRCLE,
     SAMPLED_RADII,
     SHIFTS,
@@ -91,9 +90,8 @@ class Verdict:
 def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict:
     """Compare a ring with its templates as a pose puts them; angles are the plate's."""
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
-    circle = np.stack((np.cos(ANGLES_RAD), np.sin(ANGLES_RAD)), axis=-1)
-    points = camera.project(pose.transform((radii_m[:, None, None] * circle).reshape(-1, 2)))
-    return judge(sample_grey(grey, points.reshape(len(radii_m), ANGLES, 2)), ring)
+    points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
+    return judge(sample_grey(grey, points), ring)
 
 
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
@@ -156,10 +154,12 @@ def _compare(
     """
     total = mean = square = seen_mean = product = 0.0
     rows, angles = image.shape
+    turned = np.empty(image.shape)
+    turned[:, lag:], turned[:, :lag] = image[:, : angles - lag], image[:, angles - lag :]
     for r in range(rows):
         for a in range(angles):
             if visible[a]:
-                wanted, found = image[r, (a - lag) % angles], seen[r, a]
+                wanted, found = turned[r, a], seen[r, a]
                 total += weights[r]
                 mean += weights[r] * wanted
                 seen_mean += weights[r] * found
@@ -171,17 +171,16 @@ def _compare(
     dots, rest = np.zeros(angles), np.zeros(angles)
     for r in range(first, last + 1):
         for a in range(angles):
-            wanted = image[r, (a - lag) % angles]
-            dots[a] += wanted
+            dots[a] += turned[r, a]
             if visible[a]:
-                rest[a] += seen[r, a] - black - contrast * wanted
+                rest[a] += seen[r, a] - black - contrast * turned[r, a]
     share = 1.0 / ((last + 1 - first) * (2 * half + 1))
     least, most, misfit = np.inf, -np.inf, 0.0
     for a in range(angles):
         dot = off = 0.0
-        for step in range(a - half, a + half + 1):
-            dot += share * dots[step % angles]
-            off += share * rest[step % angles]
+        for step in range(-half, half + 1):
+            dot += share * dots[(a + step) % angles]
+            off += share * rest[(a + step) % angles]
         least, most, misfit = min(least, dot), max(most, dot), max(misfit, abs(off))
     return black, contrast, most - least, misfit
 

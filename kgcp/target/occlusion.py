@@ -31,7 +31,6 @@ _MOST_HIDDEN = 0.4
 _DOTS_SEEN = 0.5  # of the code; that there are no others where the ring is seen counts as much
 _OTHER_LAG = 6  # samples; a match farther off is another heading
 _MARGIN = 0.04  # of the score, to other headings
-_TURNED = np.add.outer(np.arange(ANGLES), np.arange(ANGLES)) % ANGLES  # by lag and angle
 
 
 def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
@@ -107,10 +106,13 @@ def best_partial_template(
     place, lag = divmod(int(score.argmax()), ANGLES)
     template, shift = divmod(place, 2 * SHIFTS + 1)
     best = float(score[place, lag])
-    others = score.max(axis=0)[_TURNED[lag, _OTHER_LAG : ANGLES - _OTHER_LAG + 1]]
-    at_dots = (np.rint(np.array(ring.code_deg) * ANGLES / 360.0).astype(int) + lag) % ANGLES
-    seen = int(np.count_nonzero(visible[at_dots]))
-    if seen < _DOTS_SEEN * len(at_dots) or others.max() > best - _MARGIN:
+    others = score.max(axis=0).take(
+        np.arange(lag + _OTHER_LAG, lag + ANGLES - _OTHER_LAG + 1), mode="wrap"
+    )
+    at_dots = visible.take(
+        [round(deg * ANGLES / 360.0) + lag for deg in ring.code_deg], mode="wrap"
+    )
+    if at_dots.sum() < _DOTS_SEEN * len(at_dots) or others.max() > best - _MARGIN:
         return None
     return best, template, shift, lag
 
@@ -120,23 +122,37 @@ def _correlation(patch: FloatArray, visible: BoolArray, templates: Templates) ->
     share = float(visible.mean())
     masked = patch * visible
     levels = levels_by_shift(masked, share, templates.weights)
-    product = cross_correlation(masked, templates, np.full(levels.shape[1], 1.0 / share))
-    moments = visible[_TURNED] @ templates.moments / share
-    _normalise(product, moments, levels)
+    product = cross_correlation(masked, templates, 1.0 / (share * levels[1]))
+    _normalise(product, templates.moments, visible, levels[0] / levels[1])
     return product
 
 
 @compiled
-def _normalise(product: SingleArray, moments: FloatArray, levels: FloatArray) -> None:
-    """Make correlations of mean products, moments (lags, 2 templates) and levels (2, shifts)."""
-    lags, templates, shifts = moments.shape[0], moments.shape[1] // 2, levels.shape[1]
+def _normalise(
+    product: SingleArray, moments: SingleArray, visible: BoolArray, level: FloatArray
+) -> None:
+    """Make correlations of mean products (templates · shifts, lags), where parts are not seen.
+
+    `level` is the mean of what is seen, by shift, in units of its standard deviation.
+    """
+    templates, shifts = len(moments) // 2, len(level)
+    sums = np.zeros((2 * templates, ANGLES), np.float32)
+    sums[templates:] = 1.0  # all around, images have the mean 0 and the power 1
+    for k in range(2 * templates):
+        total = sums[k]
+        for a in range(ANGLES):
+            if not visible[a]:
+                hidden = moments[k, ANGLES - a : 2 * ANGLES - a]
+                for lag in range(ANGLES):
+                    total[lag] -= hidden[lag]
+    share = np.float32(visible.sum() / ANGLES)
     for t in range(templates):
-        for a in range(lags):
-            mean = moments[a, t]
-            moments[a, templates + t] = 1.0 / math.sqrt(
-                max(moments[a, templates + t] - mean * mean, 1e-12)
-            )
+        for lag in range(ANGLES):
+            mean, power = sums[t, lag] / share, sums[templates + t, lag] / share
+            sums[t, lag] = mean
+            sums[templates + t, lag] = 1.0 / math.sqrt(max(power - mean * mean, 1e-12))
+        means, factors = sums[t], sums[templates + t]
         for s in range(shifts):
-            for a in range(lags):
-                value = product[t * shifts + s, a] - moments[a, t] * levels[0, s]
-                product[t * shifts + s, a] = value * moments[a, templates + t] / levels[1, s]
+            row, there = product[t * shifts + s], np.float32(level[s])
+            for lag in range(ANGLES):
+                row[lag] = (row[lag] - there * means[lag]) * factors[lag]

@@ -21,7 +21,7 @@ from kgcp.geometry.circle import (
 )
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code
+from kgcp.target.code import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
 from kgcp.target.edges import EdgeFit, Patch, fit_edge, patch_around
 from kgcp.target.layout import Ring, Target
 from kgcp.target.observation import Alternative, Appearance, Observation
@@ -192,9 +192,9 @@ def _posed(
 
 def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
     """Return raw pixels (360, 2) of a ring's code circle where a pose puts it, one per degree."""
-    radius_m = 0.5 * ring.code_diameter_m
-    circle_m = radius_m * np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=-1)
-    return camera.project(pose.transform(circle_m))
+    radius_m = np.array([0.5 * ring.code_diameter_m])
+    circles = camera.project_circles(pose.rotation, pose.translation_m, radius_m, CODE_CIRCLE)
+    return circles.reshape(-1, 2)
 
 
 def edge_shift_px(pose: Pose, ring: Ring, edges: RingEdges) -> float:

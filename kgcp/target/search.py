@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
+from kgcp.compiled import compiled, inlined
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
@@ -105,15 +107,30 @@ def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> tuple
     code = ring.code_diameter_m / ring.outer_diameter_m
     radii = np.array((_DISC_SHARE * ring.inner_ratio, code, _PLATE))
     values = np.sort(sample_ellipses(grey, outlines, radii, CIRCLE), axis=2)
-    disc, code_circle, plate = values.transpose(1, 0, 2)
-    black, white = code_circle[:, _rank(0.25)], plate[:, _rank(0.5)]
-    contrast = np.minimum(disc[:, _rank(0.5)], white) - black
-    good = contrast > _MIN_CONTRAST * float(np.iinfo(grey.dtype).max)
-    good &= code_circle[:, _rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
-    for circle, low, high in ((code_circle, 0.05, 0.35), (disc, 0.3, 0.7), (plate, 0.4, 0.8)):
-        good &= circle[:, _rank(high)] - circle[:, _rank(low)] < _UNEVEN * contrast
-    return tuple(outlines[i] for i in np.flatnonzero(good))
+    dotted = np.empty(len(outlines), dtype=bool)
+    _tell(values, _MIN_CONTRAST * float(np.iinfo(grey.dtype).max), dotted)
+    return tuple(outlines[i] for i in np.flatnonzero(dotted))
 
 
+@compiled
+def _tell(values: FloatArray, least: float, dotted: npt.NDArray[np.bool_]) -> None:
+    """Tell of which outlines disc, code circle and plate (n, 3, angles), sorted, are a ring's."""
+    for i in range(len(values)):
+        disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
+        black = code[_rank(0.25)]
+        contrast = min(disc[_rank(0.5)], plate[_rank(0.5)]) - black
+        uneven = max(
+            code[_rank(0.35)] - code[_rank(0.05)],
+            disc[_rank(0.7)] - disc[_rank(0.3)],
+            plate[_rank(0.8)] - plate[_rank(0.4)],
+        )
+        dotted[i] = (
+            contrast > least
+            and code[_rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
+            and uneven < _UNEVEN * contrast
+        )
+
+
+@inlined
 def _rank(share: float) -> int:
     return round(share * (ANGLES - 1))

@@ -7,21 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry.arrays import GreyArray
+from kgcp.compiled import compiled
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes, pose_on_plane
-from kgcp.geometry.conic import fit_ellipse
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import image_heading_deg
 from kgcp.settings import Method
-from kgcp.target.code import CODE_ANGLES_RAD, CodeMatch, match_code
+from kgcp.target.code import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
 from kgcp.target.edges import FAINTEST, clear_of_dots
+from kgcp.target.ellipses import fit_ellipses
 from kgcp.target.layout import Target
 from kgcp.target.observation import Appearance, Observation
 from kgcp.target.paper import measure_ring, points_of_code
-from kgcp.target.polar import sample_grey
+from kgcp.target.polar import sample_ellipses, sample_grey
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
-_OUTLINE_STEP = 5  # of an ellipse's points enough give its undistorted image
+_OUTLINE = CODE_CIRCLE[::5]  # of an ellipse's points enough give its undistorted image
+_EVERYWHERE = np.ones((1, len(_OUTLINE)), dtype=bool)
+_EDGE_RAD, _EDGE = CODE_ANGLES_RAD[::4], CODE_CIRCLE[::4]
 _MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
 _AXIS_ERROR_PX = 0.3  # of an outline
 
@@ -48,11 +53,10 @@ def _pose_of_outline(
 ) -> Observation:
     """Take the better one of the two poses that an outline has."""
     ring = match.ring
-    outline = camera.undistort(match.outer.points(CODE_ANGLES_RAD[::_OUTLINE_STEP]))
-    towards_x = camera.undistort(match.outer.points(np.radians([match.lag_deg])))[0]
+    towards_x = camera.undistort(match.outer.points(np.radians(match.lag_deg)))
     poses = [
         pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards_x)
-        for plane in circle_planes(fit_ellipse(outline))
+        for plane in circle_planes(_undistorted(camera, match.outer).conic)
     ]
     seen = sample_grey(grey, np.stack([points_of_code(camera, pose, ring) for pose in poses]))
     scores, lags_deg = match_code(seen, ring)
@@ -75,6 +79,23 @@ def _pose_of_outline(
         alternative=None,
         uncertainty=None,
     )
+
+
+def _undistorted(camera: Camera, outline: Ellipse) -> Ellipse:
+    """Return an ellipse in normalised coordinates: nearly one still."""
+    points = camera.undistort(outline.centre + _OUTLINE @ outline.stretch)
+    x, y = points.mean(axis=0).tolist()
+    spokes = points - (x, y)
+    lengths = np.hypot(spokes[:, 0], spokes[:, 1])
+    unit = float(lengths.mean())
+    found, possible = np.empty((1, 5)), np.empty(1, dtype=bool)
+    fit_ellipses(
+        (lengths / unit)[None], _EVERYWHERE, spokes / lengths[:, None], math.inf, found, possible
+    )
+    if not possible[0]:
+        raise Rejection(Reason.POOR_ELLIPSE, "the outline is beyond the lens model's reach")
+    right, down, a, b, angle_rad = found[0].tolist()
+    return Ellipse(x + unit * right, y + unit * down, unit * a, unit * b, angle_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,13 +141,27 @@ def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Prof
     share = edge_diameter_m / ring.outer_diameter_m
     reach_px = min(_REACH_PX, 0.5 * (1.0 - ring.inner_ratio) * outline.mean_radius)
     radii_px = share * outline.mean_radius + np.arange(-reach_px, reach_px, _STEP_PX)
-    angles = CODE_ANGLES_RAD[::4]
     px_per_m = 2.0 * outline.mean_radius / ring.outer_diameter_m
-    clear = clear_of_dots(angles, ring, edge_diameter_m, match.lag_deg, px_per_m)
-    spokes = outline.points(angles[clear]) - outline.centre
+    clear = clear_of_dots(_EDGE_RAD, ring, edge_diameter_m, match.lag_deg, px_per_m)
     factors = radii_px / outline.mean_radius
-    profile = sample_grey(grey, outline.centre + factors[:, None, None] * spokes).mean(axis=1)
-    is_outer = edge_diameter_m > ring.inner_diameter_m
-    slopes = np.gradient(profile, _STEP_PX) * (1.0 if is_outer else -1.0)
-    steepest = int(np.argmax(slopes))
-    return _Profile(float(radii_px[steepest]), float(slopes[steepest]))
+    seen = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
+    sign = 1.0 if edge_diameter_m > ring.inner_diameter_m else -1.0
+    steepest, rise = _steepest(seen, sign)
+    return _Profile(float(radii_px[steepest]), rise / _STEP_PX)
+
+
+@compiled
+def _steepest(seen: FloatArray, sign: float) -> tuple[int, float]:
+    """Return where the means of some rows rise most, or fall with −1, and by how much per row."""
+    rows, angles = seen.shape
+    means = np.zeros(rows)
+    for r in range(rows):
+        for a in range(angles):
+            means[r] += sign * seen[r, a] / angles
+    best, most = 0, means[1] - means[0]
+    for r in range(1, rows):
+        after = means[min(r + 1, rows - 1)]
+        rise = (after - means[r - 1]) / (min(r + 1, rows - 1) + 1 - r)
+        if rise > most:
+            best, most = r, rise
+    return best, most

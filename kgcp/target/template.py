@@ -61,15 +61,16 @@ class Templates:
     images : (t, rows, angles) array
     spectra : (t, rows, 2 frequencies) array of float32
         Of the standardised images along the angle, weighted: real parts, then imaginary ones.
-    moments : (angles, 2 t) array
-        Weighted sums over the rows, of the standardised images and then of their squares.
+    moments : (2 t, 2 angles) array of float32
+        Weighted sums over the rows, of the standardised images and then of their squares, against
+        the sense of the angle, twice around.
     weights : (rows,) array
         Of each row's samples, by its area; they sum to 1 over all samples.
     """
 
     images: FloatArray
     spectra: SingleArray
-    moments: FloatArray
+    moments: SingleArray
     weights: FloatArray
 
 
@@ -88,8 +89,9 @@ def templates_of(ring: Ring) -> Templates:
     centred = stack - np.einsum("tra,r->t", stack, weights)[:, None, None]
     centred /= np.sqrt(np.einsum("tra,tra,r->t", centred, centred, weights))[:, None, None]
     spectra = ((centred * weights[:, None]) @ _TO_FREQUENCIES).astype(np.float32)
-    moments = np.concatenate([np.einsum("tra,r->at", centred**k, weights) for k in (1, 2)], axis=1)
-    return Templates(stack, spectra, moments, weights)
+    moments = np.concatenate([np.einsum("tra,r->ta", centred**k, weights) for k in (1, 2)])
+    backwards = np.tile(np.roll(moments[:, ::-1], 1, axis=1), 2).astype(np.float32)
+    return Templates(stack, spectra, backwards, weights)
 
 
 def _draw(ring: Ring) -> npt.NDArray[np.float32]:
@@ -167,12 +169,12 @@ def levels_by_shift(patch: FloatArray, share: float, weights: FloatArray) -> Flo
 @compiled
 def _weigh(patch: FloatArray, share: float, weights: FloatArray, levels: FloatArray) -> None:
     """Fill in mean and standard deviation of what a template is compared with."""
-    rows, angles = patch.shape
-    sums = np.zeros((2, rows))
-    for r in range(rows):
-        for a in range(angles):
-            sums[0, r] += patch[r, a]
-            sums[1, r] += patch[r, a] * patch[r, a]
+    sums = np.zeros((2, len(patch)))
+    for r in range(len(patch)):
+        for a in range(0, ANGLES, 2):  # two sums each, which do not wait for each other
+            one, two = patch[r, a], patch[r, a + 1]
+            sums[0, r] += one + two
+            sums[1, r] += one * one + two * two
     for s in range(levels.shape[1]):
         mean = power = 0.0
         for r in range(len(weights)):

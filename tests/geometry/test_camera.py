@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
@@ -41,6 +42,18 @@ def test_projection_is_opencv_s(lens: str) -> None:
     np.testing.assert_allclose(
         camera.project(points), opencv_pixels(camera, points), rtol=0.0, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_circles_are_projected_point_by_point(lens: str) -> None:
+    axes = Rotation.from_euler("xyz", (0.4, -0.3, 1.1)).as_matrix()
+    centre, radii, angles = np.array([0.8, -0.5, 7.0]), np.array([0.1, 0.45]), np.arange(7.0)
+    circle = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    points = (radii[:, None, None] * circle).reshape(-1, 2) @ axes[:, :2].T + centre
+    pixels = LENSES[lens].project_circles(axes, centre, radii, circle)
+    assert pixels.shape == (2, 7, 2)
+    expected = opencv_pixels(LENSES[lens], points)
+    np.testing.assert_allclose(pixels.reshape(-1, 2), expected, rtol=0.0, atol=1e-9)
 
 
 @given(lens=st.sampled_from(sorted(LENSES)), x=st.floats(-0.5, 1599.5), y=st.floats(-0.5, 1099.5))
