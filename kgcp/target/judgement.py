@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring
 from kgcp.target.noise import BoolArray
-from kgcp.target.occlusion import best_partial_template, visible_angles
+from kgcp.target.occlusion import best_partial_template, may_show_code, visible_angles
 from kgcp.target.polar import sample_ellipses, sample_grey
 from kgcp.target.template import (
     ANGLES,
@@ -23,6 +22,7 @@ from kgcp.target.template import (
     SAMPLED_RADII,
     SHIFTS,
     best_template,
+    code_rows,
     templates_of,
 )
 
@@ -105,11 +105,11 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
     Where a part of the ring is hidden, the rest of it is compared.
     """
     match = best_template(patch, templates_of(ring))
-    verdict = _verdict(patch, ring, match, None)
-    visible = None
-    if not verdict.is_clear:
-        visible = visible_angles(patch[match[2] : len(patch) - 2 * SHIFTS + match[2]], ring)
-    if visible is None:
+    verdict, shift = _verdict(patch, ring, match, None), match[2]
+    if verdict.is_clear:
+        return verdict
+    visible = visible_angles(patch[shift : len(patch) - 2 * SHIFTS + shift], ring)
+    if visible is None or not may_show_code(patch, visible, ring, shift):
         return verdict
     partial = best_partial_template(patch, visible, ring)
     return verdict if partial is None else _verdict(patch, ring, partial, visible)
@@ -123,7 +123,7 @@ def _verdict(
     image = templates.images[index]
     black, contrast, dot_contrast, misfit = _compare(
         *(image, lag, patch[shift : shift + len(image)], templates.weights),
-        *(_EVERYWHERE if visible is None else visible, *_code_rows(ring), _half_dot(ring)),
+        *(_EVERYWHERE if visible is None else visible, *code_rows(ring), _half_dot(ring)),
     )
     return Verdict(
         score=score,
@@ -183,14 +183,6 @@ def _compare(
             off += share * rest[(a + step) % angles]
         least, most, misfit = min(least, dot), max(most, dot), max(misfit, abs(off))
     return black, contrast, most - least, misfit
-
-
-@lru_cache(maxsize=64)
-def _code_rows(ring: Ring) -> tuple[int, int]:
-    """Return the first and last row that the dots reach to."""
-    radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
-    rows = np.flatnonzero(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
-    return int(rows[0]), int(rows[-1])
 
 
 def _half_dot(ring: Ring) -> int:

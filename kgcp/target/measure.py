@@ -10,7 +10,6 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings, Method
 from kgcp.target.chance import check_chance
 from kgcp.target.circles import paper_outlines
@@ -23,7 +22,7 @@ from kgcp.target.noise import BoolArray
 from kgcp.target.observation import Considered, Miss, Observation, Outcome
 from kgcp.target.paper import points_of_code
 from kgcp.target.prior import NormalPrior
-from kgcp.target.search import find_code, find_rings
+from kgcp.target.search import Candidate, find_code, find_dotted, find_rings
 from kgcp.target.start import start_pose
 
 _MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
@@ -94,10 +93,11 @@ def examine(
         Other targets that are in this frame.
     """
     search = paper_outlines if settings.method is Method.PAPER else find_rings
-    outlines = search(grey, settings)
+    rings = (ring for target in targets for ring in target.rings)
+    candidates = find_dotted(grey, search(grey, settings), rings)
     trials = [
         _try_target(
-            grey, camera, outlines, target, settings, prior if target.position_m is None else None
+            grey, camera, candidates, target, settings, prior if target.position_m is None else None
         )
         for target in targets
     ]
@@ -138,7 +138,7 @@ def _share_a_plate(one: Observation, other: Observation) -> bool:
 def _try_target(
     grey: GreyArray,
     camera: Camera,
-    outlines: tuple[Ellipse, ...],
+    candidates: dict[Ring, tuple[Candidate, ...]],
     target: Target,
     settings: DetectSettings,
     prior: NormalPrior | None,
@@ -147,8 +147,10 @@ def _try_target(
     found: list[Observation] = []
     considered: list[Considered] = []
     for ring in target.rings:
-        free = tuple(one for one in outlines if not any(seen.covers(one) for seen in found))
-        matches, refused = find_code(grey, free, ring, settings)
+        free = (
+            one for one in candidates[ring] if not any(seen.covers(one.outline) for seen in found)
+        )
+        matches, refused = find_code(free, ring, settings)
         considered += [
             Considered(
                 *(target.name, ring.name, one.outline, one.score),

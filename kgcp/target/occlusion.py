@@ -13,13 +13,16 @@ from kgcp.target.layout import Ring
 from kgcp.target.noise import BoolArray
 from kgcp.target.template import (
     ANGLES,
+    LOOKS,
     SAMPLED_RADII,
     SHIFTS,
     SingleArray,
     Templates,
+    code_rows,
     cross_correlation,
     levels_by_shift,
     templates_of,
+    twice_backwards,
 )
 
 _TYPICAL = 0.65  # quantile of steps of light that is not hidden, however much else is
@@ -31,6 +34,8 @@ _MOST_HIDDEN = 0.4
 _DOTS_SEEN = 0.5  # of the code; that there are no others where the ring is seen counts as much
 _OTHER_LAG = 6  # samples; a match farther off is another heading
 _MARGIN = 0.04  # of the score, to other headings
+_LIKE_CODE = 0.6  # correlation along the code circle; of hidden targets, it is above 0.75
+_LOOK_OF_CODE = LOOKS.index((0.07, 1.0))
 
 
 def visible_angles(seen: FloatArray, ring: Ring) -> BoolArray | None:
@@ -86,6 +91,54 @@ def _see(outwards: FloatArray, inwards: FloatArray, visible: BoolArray) -> int:
             for step in range(-reach, reach + 1):
                 visible[(a + step) % ANGLES] = False
     return int(ANGLES - visible.sum())
+
+
+def may_show_code(patch: FloatArray, visible: BoolArray, ring: Ring, shift: int) -> bool:
+    """Tell whether what is seen along the code circle resembles the code at any heading.
+
+    Most rings of something else do not, and need no comparison with all templates.
+
+    Parameters
+    ----------
+    patch : (rows + 2 shifts, angles) array
+        Sampled at `SAMPLED_RADII`.
+    visible : (angles,) array of bool
+    ring : Ring
+    shift : int
+        Of the template that fits the whole ring best.
+    """
+    first, last = code_rows(ring)
+    seen = patch[shift + first : shift + last + 1].sum(axis=0)
+    return _best_of_all_turns(seen, visible, _code_seen(ring)) > _LIKE_CODE
+
+
+@lru_cache(maxsize=64)
+def _code_seen(ring: Ring) -> FloatArray:
+    """Return what a blurred ring shows along its code circle, backwards and twice around."""
+    first, last = code_rows(ring)
+    seen = templates_of(ring).images[_LOOK_OF_CODE, first : last + 1].sum(axis=0)
+    return twice_backwards(seen)
+
+
+@compiled
+def _best_of_all_turns(seen: FloatArray, visible: BoolArray, backwards: FloatArray) -> float:
+    """Return the largest normalised cross-correlation of what is visible, over all turns."""
+    sums = np.zeros((3, ANGLES))
+    count = mean = power = 0.0
+    for a in range(ANGLES):
+        if visible[a]:
+            value, turned = seen[a], backwards[ANGLES - a : 2 * ANGLES - a]
+            count, mean, power = count + 1.0, mean + value, power + value * value
+            for lag in range(ANGLES):
+                sums[0, lag] += turned[lag]
+                sums[1, lag] += turned[lag] * turned[lag]
+                sums[2, lag] += turned[lag] * value
+    best = 0.0
+    for lag in range(ANGLES):
+        covariance = sums[2, lag] - mean * sums[0, lag] / count
+        variance = sums[1, lag] - sums[0, lag] * sums[0, lag] / count
+        best = max(best, covariance / math.sqrt(max(variance, 1e-9)))
+    return best / math.sqrt(max(power - mean * mean / count, 1e-9))
 
 
 def best_partial_template(

@@ -47,7 +47,7 @@ def sample_ellipses(
     points = np.empty((*shape, 2), dtype=np.float32)
     for one, around in zip(outlines, points, strict=True):
         _place(one.x, one.y, one.a, one.b, one.angle_rad, factors, circle, around)
-    return sample_grey(grey, points.reshape(-1, *points.shape[2:])).reshape(shape)
+    return sample_grey(grey, points.reshape(len(outlines), -1, 2)).reshape(shape)
 
 
 @compiled

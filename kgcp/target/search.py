@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,13 +14,13 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.settings import DetectSettings
 from kgcp.target.code import CodeMatch
-from kgcp.target.judgement import judge, polar_patch
+from kgcp.target.judgement import judge
 from kgcp.target.layout import Ring
 from kgcp.target.outline import find_outlines
 from kgcp.target.polar import sample_ellipses
 from kgcp.target.pyramid import build_pyramid
 from kgcp.target.seeds import Seeds, find_seeds
-from kgcp.target.template import ANGLES, CIRCLE
+from kgcp.target.template import ANGLES, CIRCLE, SAMPLED_RADII
 
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
@@ -28,6 +29,23 @@ _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of t
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _SEED_REACH = 2.0  # around places that are pointed out, of their radii
 _SMALLEST_WINDOW_PX = 12
+_DIGITS = 6  # of proportions that are the same
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A dark ring with brighter places, between a bright disc and a bright plate.
+
+    Attributes
+    ----------
+    outline : Ellipse
+        Of its outer circle [px].
+    patch : (radii, angles) array
+        Grey values around it, for `kgcp.target.judgement.judge`.
+    """
+
+    outline: Ellipse
+    patch: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,22 +93,41 @@ def find_rings_at(
     )
 
 
+def find_dotted(
+    grey: GreyArray, outlines: tuple[Ellipse, ...], rings: Iterable[Ring]
+) -> dict[Ring, tuple[Candidate, ...]]:
+    """Return for each ring the outlines that look like it but for their code.
+
+    They have a dark ring between bright disc and plate, brighter in places. Rings of the same
+    proportions, such as replicas, share their candidates.
+    """
+    found: dict[tuple[float, float], tuple[Candidate, ...]] = {}
+    by_ring: dict[Ring, tuple[Candidate, ...]] = {}
+    for ring in rings:
+        ratios = ring.inner_ratio, ring.code_diameter_m / ring.outer_diameter_m
+        shape = round(ratios[0], _DIGITS), round(ratios[1], _DIGITS)
+        if shape not in found:
+            found[shape] = _dotted(grey, outlines, *ratios)
+        by_ring[ring] = found[shape]
+    return by_ring
+
+
 def find_code(
-    grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring, settings: DetectSettings
+    candidates: Iterable[Candidate], ring: Ring, settings: DetectSettings
 ) -> tuple[tuple[CodeMatch, ...], tuple[Refusal, ...]]:
-    """Look for a ring's code in all outlines.
+    """Look for a ring's code in all candidates.
 
     Returns
     -------
     matches : tuple of CodeMatch
         Best first.
     refused : tuple of Refusal
-        The others that have dots.
+        The others.
     """
     matches: list[CodeMatch] = []
     refused: list[Refusal] = []
-    for outline in _dotted(grey, outlines, ring):
-        verdict = judge(polar_patch(grey, outline), ring)
+    for candidate in candidates:
+        outline, verdict = candidate.outline, judge(candidate.patch, ring)
         try:
             verdict.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:
@@ -102,14 +139,16 @@ def find_code(
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
 
 
-def _dotted(grey: GreyArray, outlines: tuple[Ellipse, ...], ring: Ring) -> tuple[Ellipse, ...]:
-    """Return the outlines with a dark ring between bright disc and plate, brighter in places."""
-    code = ring.code_diameter_m / ring.outer_diameter_m
-    radii = np.array((_DISC_SHARE * ring.inner_ratio, code, _PLATE))
+def _dotted(
+    grey: GreyArray, outlines: tuple[Ellipse, ...], inner: float, code: float
+) -> tuple[Candidate, ...]:
+    """Return the candidates for rings with such circles, of their outer radius."""
+    radii = np.array((_DISC_SHARE * inner, code, _PLATE))
     values = np.sort(sample_ellipses(grey, outlines, radii, CIRCLE), axis=2)
     dotted = np.empty(len(outlines), dtype=bool)
     _tell(values, _MIN_CONTRAST * float(np.iinfo(grey.dtype).max), dotted)
-    return tuple(outlines[i] for i in np.flatnonzero(dotted))
+    kept = tuple(outlines[i] for i in np.flatnonzero(dotted))
+    return tuple(map(Candidate, kept, sample_ellipses(grey, kept, SAMPLED_RADII, CIRCLE)))
 
 
 @compiled

@@ -62,8 +62,8 @@ class Templates:
     spectra : (t, rows, 2 frequencies) array of float32
         Of the standardised images along the angle, weighted: real parts, then imaginary ones.
     moments : (2 t, 2 angles) array of float32
-        Weighted sums over the rows, of the standardised images and then of their squares, against
-        the sense of the angle, twice around.
+        Weighted sums over the rows, of the standardised images and then of their squares, by
+        `twice_backwards`.
     weights : (rows,) array
         Of each row's samples, by its area; they sum to 1 over all samples.
     """
@@ -90,8 +90,15 @@ def templates_of(ring: Ring) -> Templates:
     centred /= np.sqrt(np.einsum("tra,tra,r->t", centred, centred, weights))[:, None, None]
     spectra = ((centred * weights[:, None]) @ _TO_FREQUENCIES).astype(np.float32)
     moments = np.concatenate([np.einsum("tra,r->ta", centred**k, weights) for k in (1, 2)])
-    backwards = np.tile(np.roll(moments[:, ::-1], 1, axis=1), 2).astype(np.float32)
-    return Templates(stack, spectra, backwards, weights)
+    return Templates(stack, spectra, twice_backwards(moments).astype(np.float32), weights)
+
+
+def twice_backwards(signals: FloatArray) -> FloatArray:
+    """Return signals (…, angles) as (…, 2 angles), such that turns by all lags are slices.
+
+    At the angle a, the signal turned by the lags 0, 1, … is what begins at angles − a.
+    """
+    return np.tile(np.roll(signals[..., ::-1], 1, axis=-1), 2)
 
 
 def _draw(ring: Ring) -> npt.NDArray[np.float32]:
@@ -112,6 +119,14 @@ def _disc(
     scale = _PX * 2**_SUB_PIXEL_BITS
     x, y = (round((_REACH + c) * scale) for c in centre)
     cv2.circle(drawing, (x, y), round(radius * scale), value, -1, cv2.LINE_8, _SUB_PIXEL_BITS)
+
+
+@lru_cache(maxsize=64)
+def code_rows(ring: Ring) -> tuple[int, int]:
+    """Return the first and last row that the dots reach to."""
+    radii = SAMPLED_RADII[SHIFTS:-SHIFTS] * ring.outer_diameter_m
+    rows = np.flatnonzero(np.abs(radii - ring.code_diameter_m) < ring.dot_diameter_m)
+    return int(rows[0]), int(rows[-1])
 
 
 def best_template(patch: FloatArray, templates: Templates) -> tuple[float, int, int, int]:

@@ -21,7 +21,7 @@ from kgcp.target.code import (
 from kgcp.target.judgement import judge
 from kgcp.target.layout import Ring, Target
 from kgcp.target.polar import sample_grey
-from kgcp.target.search import find_code
+from kgcp.target.search import find_code, find_dotted
 from kgcp.target.template import ANGLES_RAD, SAMPLED_RADII
 
 CODE_RATIO = 0.642857143 / 0.9
@@ -94,7 +94,8 @@ def test_a_similar_code_of_the_same_geometry_is_another_target(
     for plate, expected in ((target, 1), (other, 0)):
         pose = place_plate((250.0, 170.0), radius_px, turn_deg=100.0)
         frame = draw_frame((plate, pose))
-        matches, refused = find_code(frame, (outer,), ring, DetectSettings())
+        candidates = find_dotted(frame, (outer,), [ring])
+        matches, refused = find_code(candidates[ring], ring, DetectSettings())
         assert len(matches) == expected
         assert [refusal.rejection.reason for refusal in refused] == [Reason.OTHER_CODE][expected:]
 
@@ -109,7 +110,7 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
         frame[np.hypot(columns - x, rows - y) < 5.7] = 200
     signal = sample_grey(frame, outer.points(CODE_ANGLES_RAD, CODE_RATIO)[None])
     assert match_code(signal, target.ring)[0][0] > 0.95
-    assert find_code(frame, (outer,), target.ring, DetectSettings()) == ((), ())
+    assert find_dotted(frame, (outer,), target.rings) == {target.ring: (), target.replicas[0]: ()}
     patch = np.stack([outer.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
     verdict = judge(sample_grey(frame, patch), target.ring)
     with pytest.raises(Rejection):

@@ -22,7 +22,7 @@ from kgcp.synthetic.shapes import Disc, Shape, rectangle
 from kgcp.target.measure import confirm, measure_frame
 from kgcp.target.model import measure_by_model
 from kgcp.target.observation import Observation
-from kgcp.target.search import find_code, find_rings
+from kgcp.target.search import find_code, find_dotted, find_rings
 from kgcp.target.start import start_pose
 
 Photograph = Callable[..., GreyArray]
@@ -204,7 +204,8 @@ def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Ph
     plate = with_layers((Disc(on_circle(0.45, 130.0), 0.9 * math.sin(math.radians(21.0))), 0.85))
     grey = photograph(LENS, pose, rng, plate=plate)
     settings, replica = DetectSettings(), target.rings[1]
-    matches, _ = find_code(grey, find_rings(grey, settings), replica, settings)
+    candidates = find_dotted(grey, find_rings(grey, settings), [replica])
+    matches, _ = find_code(candidates[replica], replica, settings)
     start = start_pose(grey, LENS, target, matches[0], settings.method)
     seen = confirm(grey, LENS, target, start, settings, None)
     assert seen.uncertainty is not None

@@ -13,7 +13,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.settings import DetectSettings, Method
 from kgcp.target.layout import Target
 from kgcp.target.observation import Observation
-from kgcp.target.search import find_code, find_rings
+from kgcp.target.search import find_code, find_dotted, find_rings
 from kgcp.target.start import start_pose
 
 DrawFrame = Callable[..., GreyArray]
@@ -31,7 +31,8 @@ def started(
         single = Target(target.ring)
         grey = draw_frame((single, pose), **light)
         settings = DetectSettings()
-        matches, _ = find_code(grey, find_rings(grey, settings), single.ring, settings)
+        candidates = find_dotted(grey, find_rings(grey, settings), single.rings)
+        matches, _ = find_code(candidates[single.ring], single.ring, settings)
         return start_pose(grey, camera, single, matches[0], Method.MODEL), pose
 
     return start

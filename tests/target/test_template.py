@@ -5,8 +5,8 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.layout import Target
-from kgcp.target.occlusion import best_partial_template, visible_angles
-from kgcp.target.template import ANGLES, SHIFTS, best_template, templates_of
+from kgcp.target.occlusion import best_partial_template, may_show_code, visible_angles
+from kgcp.target.template import ANGLES, ANGLES_RAD, SHIFTS, best_template, templates_of
 
 _HIGHEST = 12  # frequency of the light in these tests
 
@@ -78,6 +78,16 @@ def test_what_is_seen_of_a_ring_fits_as_well(target: Target, first: int) -> None
     assert match[1:] == (3, SHIFTS, 17)
     expected = correlation(turned, patch[SHIFTS:-SHIFTS], templates.weights, visible)
     assert expected == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("turn", [0, 11, 50, 87])
+def test_along_the_code_circle_a_code_is_told_from_stripes(target: Target, turn: int) -> None:
+    ring, rows = target.ring, len(templates_of(target.ring).weights)
+    patch, visible = np.zeros((rows + 2 * SHIFTS, ANGLES)), np.arange(ANGLES) < 85
+    patch[2 : 2 + rows] = np.roll(templates_of(ring).images[5], turn, axis=1)
+    assert may_show_code(patch, visible, ring, 2)
+    patch[:] = 90.0 + 40.0 * np.cos(5.0 * (ANGLES_RAD - turn))
+    assert not may_show_code(patch, visible, ring, 2)
 
 
 @pytest.mark.parametrize("hidden", [0, 6, 60])
