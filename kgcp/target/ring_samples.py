@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.compiled import compiled
+from kgcp.compiled import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.target.peaks import PEAK_RADIUS_PX
 from kgcp.target.pyramid import Pyramid
@@ -18,45 +18,26 @@ _ROUGH = np.array((0.85, 1.1))  # radii that are tried
 _FINE = np.array((0.9, 1.0, 1.1))
 _TRIALS = np.outer(_ROUGH, _FINE).ravel()
 _COARSER = np.array((2.0, 3.0))  # images than those that are looked at
-_REACHES = np.ceil(PEAK_RADIUS_PX * _COARSER * _TRIALS.max() * _RATIOS.max()).astype(np.intp)
-_DIRECTIONS = _FEW, _MANY, _ALL = 8, 16, 24  # that are looked in first, then, and at last
+_FEW, _MANY, _ALL = 8, 16, 24  # directions that are looked in first, then, and at last
 _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # hidden quarters and dots leave half of the ring
 _MIN_CONTRAST = 5  # grey values
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
 _LARGE_PX = 22.0  # radius from which there are few seeds
 _SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
 
-_Shifts = npt.NDArray[np.uintp]  # (radii, circles, few and many and all directions)
+_Shifts = npt.NDArray[np.uintp]  # (radii, circles, directions)
 
 
-def _sorting_network(count: int) -> IndexArray:
-    """Return the pairs (n, 2) that, put in order one by one, sort so many values.
-
-    Merge exchange (Batcher 1968; Knuth, The Art of Computer Programming 3, algorithm 5.2.2 M).
-    """
-    pairs = []
-    largest = 1 << ((count - 1).bit_length() - 1)
-    span = largest
-    while span > 0:
-        step, apart, residue = largest, span, 0
-        while True:
-            pairs += [(i, i + apart) for i in range(count - apart) if i & span == residue]
-            if step == span:
-                break
-            step, apart, residue = step // 2, step - span, span
-        span //= 2
-    return np.array(pairs)
+def _offsets(trials: FloatArray, circles: int, *counts: int) -> IndexArray:
+    """Return x and y of samples on circles: (ratios of pixels, 2, radii, circles, directions)."""
+    angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in counts])
+    ways = np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
+    radii = PEAK_RADIUS_PX * np.multiply.outer(np.outer(_COARSER, trials), _RATIOS[:circles])
+    return np.asarray(np.floor(radii[:, None, :, :, None] * ways + 0.5), np.intp)
 
 
-def _offsets() -> IndexArray:
-    """Return columns and rows (ratios, 2, radii, circles, directions) of samples on circles."""
-    angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in _DIRECTIONS])
-    radii = PEAK_RADIUS_PX * np.multiply.outer(np.outer(_COARSER, _TRIALS), _RATIOS)
-    places = radii[:, None, :, :, None] * np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
-    return np.asarray(np.floor(places + 0.5), np.intp)
-
-
-_NETWORK, _OFFSETS = _sorting_network(_ALL), _offsets()
+_FIRST = _offsets(_TRIALS[1 :: len(_FINE)], 3, _FEW)
+_REST = _offsets(_TRIALS, 4, _MANY, _ALL)
 
 
 def look_around(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatArray:
@@ -78,7 +59,7 @@ def look_around(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatA
     """
     rings = np.empty((len(peaks), 4))
     images = pyramid.frame, pyramid.reduced, pyramid.levels
-    count = _look_at_all(*images, peaks, ends, _OFFSETS, _REACHES, PEAK_RADIUS_PX, rings)
+    count = _look_at_all(*images, peaks, ends, _FIRST, _REST, PEAK_RADIUS_PX, rings)
     return rings[:count]
 
 
@@ -89,8 +70,8 @@ def _look_at_all(
     levels: IndexArray,
     peaks: FloatArray,
     ends: IndexArray,
-    offsets: IndexArray,
-    reaches: IndexArray,
+    first: IndexArray,
+    rest: IndexArray,
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
@@ -102,7 +83,7 @@ def _look_at_all(
     for k in range(len(ends)):
         octave, third = divmod(len(levels) - len(ends) + k, 2)
         some, found = peaks[begin : ends[k]], rings[count:]
-        samples = offsets[third], reaches[third], 2.0**octave, 2.0 + third, peak_radius
+        samples = first[third], rest[third], 2.0**octave, 2.0 + third, peak_radius
         if octave == 0:
             count += _look(frame, some, *samples, found)
         else:
@@ -117,35 +98,43 @@ def _look_at_all(
 def _look(
     image: GreyArray,
     peaks: FloatArray,
-    offsets: IndexArray,
-    reach: int,
+    first: IndexArray,
+    rest: IndexArray,
     factor: float,
     coarser: float,
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
-    """Look at the peaks of one level; near the border, at a copy of what is around.
+    """Look at the peaks of one level.
 
     A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
     """
     height, width = image.shape
+    pixels, reach = image.reshape(-1), rest.max()
     radius = factor * coarser * peak_radius
     clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
-    side = 2 * reach + 1
-    pixels, patch = image.reshape(-1), np.empty((side, side), np.uint8)
-    shifts, patch_shifts = _shifts(offsets, width), _shifts(offsets, side)
-    values = np.empty((3, _ALL), np.int64)
+    first_shifts, rest_shifts = _shifts(first, width), _shifts(rest, width)
+    first_places, rest_places = np.empty_like(first_shifts), np.empty_like(rest_shifts)
+    values = np.empty((3, _ALL), np.uint8)
     count = 0
     for i in range(len(peaks)):
         x = math.floor(coarser * (peaks[i, 0] + 0.5))  # the pixel that holds the point
         y = math.floor(coarser * (peaks[i, 1] + 0.5))
+        dark, bright = math.ceil(peaks[i, 2]), math.floor(peaks[i, 2])
         if reach <= x < width - reach and reach <= y < height - reach:
-            place = y * width + x
-            found = _clearest(pixels, place, shifts, peaks[i, 2], clear, values)
+            at = np.uintp(y * width + x)
+            rough = _roughly(pixels, at, first_shifts, dark, bright)
+            if rough < 0:
+                continue
+            found = _clearest(pixels, at, rest_shifts, rough, dark, bright, clear, values)
         else:
-            _copy_around(image, x - reach, y - reach, patch)
-            place = reach * side + reach
-            found = _clearest(patch.reshape(-1), place, patch_shifts, peaks[i, 2], clear, values)
+            at = np.uintp(0)
+            _keep_inside(first, x, y, width, height, first_places)
+            rough = _roughly(pixels, at, first_places, dark, bright)
+            if rough < 0:
+                continue
+            _keep_inside(rest, x, y, width, height, rest_places)
+            found = _clearest(pixels, at, rest_places, rough, dark, bright, clear, values)
         if found[0] > 0.0:
             rings[count, 0] = factor * coarser * (peaks[i, 0] + 0.5) - 0.5
             rings[count, 1] = factor * coarser * (peaks[i, 1] + 0.5) - 0.5
@@ -165,57 +154,61 @@ def _shifts(offsets: IndexArray, width: int) -> _Shifts:
 
 
 @compiled
-def _copy_around(image: GreyArray, left: int, top: int, patch: GreyArray) -> None:
-    """Copy some rows and columns; beyond its border the image repeats its last pixels."""
-    height, width = image.shape
-    side = len(patch)
-    first, last = min(max(-left, 0), side), min(max(width - left, 0), side)
-    for i in range(side):
-        row = image[min(max(top + i, 0), height - 1)]
-        patch[i, :first] = row[0]
-        patch[i, last:] = row[width - 1]
-        for j in range(first, last):
-            patch[i, j] = row[left + j]
+def _keep_inside(
+    offsets: IndexArray, x: int, y: int, width: int, height: int, places: _Shifts
+) -> None:
+    """Fill in where samples are; those beyond the image's border move to its last pixels."""
+    columns, rows, out = offsets[0].reshape(-1), offsets[1].reshape(-1), places.reshape(-1)
+    for k in range(len(out)):
+        column = min(max(x + columns[k], 0), width - 1)
+        out[k] = min(max(y + rows[k], 0), height - 1) * width + column
+
+
+@inlined
+def _roughly(pixels: GreyArray, at: np.uintp, shifts: _Shifts, dark: int, bright: int) -> int:
+    """Return the number of the rough radius at which there may be a ring, or -1."""
+    most, best = _ENOUGH_OF_FEW - 1, -1
+    for trial in range(len(_ROUGH)):
+        count = _count(pixels, at, shifts, trial, _FEW, dark, bright)
+        if count > most:
+            most, best = count, trial
+    return best
 
 
 @compiled
 def _clearest(
-    pixels: GreyArray, place: int, shifts: _Shifts, middle: float, clear: float, values: IndexArray
+    pixels: GreyArray,
+    at: np.uintp,
+    shifts: _Shifts,
+    rough: int,
+    dark: int,
+    bright: int,
+    clear: float,
+    values: GreyArray,
 ) -> tuple[float, int]:
-    """Return how clear the clearest ring about a pixel is, and the number of its radius."""
-    at = np.uintp(place)
-    dark, bright = math.ceil(middle), math.floor(middle)
-    most, best, clearest = _ENOUGH_OF_FEW - 1, 0, 0.0
-    first = -1
-    for k in range(0, len(_TRIALS), len(_FINE)):
-        count = _count(pixels, at, shifts, k + 1, 0, _FEW, dark, bright)
-        if count > most:
-            most, first = count, k
-    if first < 0:
-        return clearest, best
-    for k in range(first, first + len(_FINE)):
-        count = _count(pixels, at, shifts, k, _FEW, _MANY, dark, bright)
-        if count >= _ENOUGH_OF_MANY:
+    """Return how clear the clearest ring of about a radius is, and the number of its radius."""
+    best, clearest = 0, 0.0
+    for k in range(rough * len(_FINE), (rough + 1) * len(_FINE)):
+        if _count(pixels, at, shifts, k, _MANY, dark, bright) >= _ENOUGH_OF_MANY:
             clearness = _clearness(pixels, at, shifts, k, clear, values)
             if clearness > clearest:
                 clearest, best = clearness, k
     return clearest, best
 
 
-@compiled
+@inlined
 def _count(
     pixels: GreyArray,
     at: np.uintp,
     shifts: _Shifts,
     trial: int,
-    first: int,
     directions: int,
     dark: int,
     bright: int,
 ) -> int:
     """Count the directions in which a dark ring is followed by a brighter surround."""
     count = 0
-    for k in range(first, first + directions):
+    for k in range(directions):
         is_dark = pixels[at + shifts[trial, _RING, k]] < dark
         is_near = pixels[at + shifts[trial, _NEAR, k]] > bright
         is_far = pixels[at + shifts[trial, _FAR, k]] > bright
@@ -230,38 +223,41 @@ def _clearness(
     shifts: _Shifts,
     trial: int,
     clear: float,
-    values: IndexArray,
+    values: GreyArray,
 ) -> float:
     """Return the contrast, less the ring's spread; 0 if anything is spread too much."""
-    ring, core, plate = values[0], values[1], values[2]
-    first = _FEW + _MANY
     for k in range(_ALL):
-        ring[k] = pixels[at + shifts[trial, _RING, first + k]]
-        core[k] = pixels[at + shifts[trial, _CORE, first + k]]
-    _sort(ring)
-    _sort(core)
-    contrast, spread = core[11] - ring[4], ring[8] - ring[1]
+        values[0, k] = pixels[at + shifts[trial, _RING, _MANY + k]]
+        values[1, k] = pixels[at + shifts[trial, _CORE, _MANY + k]]
+    darkest, ring, ring_bright = _ranked(values[0], 1, 4, 8)
+    core_dark, core, core_bright = _ranked(values[1], 7, 11, 17)
+    contrast, spread = core - ring, ring_bright - darkest
     limit = clear * contrast
-    if contrast < _MIN_CONTRAST or spread > limit or core[17] - core[7] > limit:
+    if contrast < _MIN_CONTRAST or spread > limit or core_bright - core_dark > limit:
         return 0.0
     for k in range(_ALL):
-        near = pixels[at + shifts[trial, _NEAR, first + k]]
-        plate[k] = max(near, pixels[at + shifts[trial, _FAR, first + k]])
-    _sort(plate)
-    difference = abs(core[11] - plate[14])
-    contrast = min(core[11], plate[14]) - ring[4]
+        near = pixels[at + shifts[trial, _NEAR, _MANY + k]]
+        values[2, k] = max(near, pixels[at + shifts[trial, _FAR, _MANY + k]])
+    plate_dark, plate, plate_bright = _ranked(values[2], 11, 14, 19)
+    difference = abs(core - plate)
+    contrast = min(core, plate) - ring
     limit = clear * contrast
-    if contrast < _MIN_CONTRAST or spread > limit or core[17] - core[7] > limit:
+    if contrast < _MIN_CONTRAST or spread > limit or core_bright - core_dark > limit:
         return 0.0
-    if plate[19] - plate[11] > limit or difference > _SAME_WHITE * contrast:
+    if plate_bright - plate_dark > limit or difference > _SAME_WHITE * contrast:
         return 0.0
     return float(max(contrast - 0.5 * spread, 1.0))
 
 
 @compiled
-def _sort(values: IndexArray) -> None:
-    """Sort as many values as there are directions, in place."""
-    for k in range(len(_NETWORK)):
-        i, j = _NETWORK[k, 0], _NETWORK[k, 1]
-        one, other = values[i], values[j]
-        values[i], values[j] = min(one, other), max(one, other)
+def _ranked(values: GreyArray, low: int, middle: int, high: int) -> tuple[int, int, int]:
+    """Return three values of ascending ranks: the largest that so many or less are smaller than."""
+    one, two, three = np.uint8(0), np.uint8(0), np.uint8(0)
+    for i in range(_ALL):
+        value, smaller = values[i], np.uint8(0)
+        for k in range(_ALL):
+            smaller += np.uint8(values[k] < value)
+        one = max(one, value if smaller <= low else np.uint8(0))
+        two = max(two, value if smaller <= middle else np.uint8(0))
+        three = max(three, value if smaller <= high else np.uint8(0))
+    return np.int64(one), np.int64(two), np.int64(three)
