@@ -226,19 +226,20 @@ def _fit_curve(
 
     `rest` is filled in: how far the edges are from the curve.
     """
-    rays = len(edge)
-    weight, sums = np.empty(rays), np.empty(summands.shape[1])
-    typical = _median(strength[:rays], rest) + 1e-6
-    curve[0] = _median(edge, rest)
+    strong, weight, sums = np.empty_like(edge), np.empty_like(edge), np.empty(_PAIRS + _TERMS)
+    lower, typical = np.empty((_TERMS, _TERMS)), _median(strength[: len(edge)]) + 1e-6
+    for k in range(len(edge)):
+        strong[k] = _within(strength[k] / typical, 1.0)
+    curve[0] = _median(edge)
     curve[1:] = 0.0
     _subtract(edge, harmonics, curve, rest)
     for width in widths:
-        for k in range(rays):
+        for k in range(len(edge)):
             far = rest[k] / width
             near = 1.0 / (1.0 + far * far)
-            weight[k] = _within(strength[k] / typical, 1.0) * near * near
+            weight[k] = strong[k] * near * near
         _add_up(weight, edge, summands, sums)
-        _solve(sums, curve)
+        _solve(sums, lower, curve)
         _subtract(edge, harmonics, curve, rest)
 
 
@@ -264,9 +265,8 @@ def _add_up(weight: FloatArray, edge: FloatArray, summands: FloatArray, sums: Fl
 
 
 @compiled
-def _solve(sums: FloatArray, out: FloatArray) -> None:
-    """Solve positive definite equations by Cholesky's decomposition."""
-    lower = np.empty((_TERMS, _TERMS))  # of its diagonal, the reciprocals
+def _solve(sums: FloatArray, lower: FloatArray, out: FloatArray) -> None:
+    """Solve positive definite equations by Cholesky's decomposition, with reciprocal diagonal."""
     place = 0
     for i in range(_TERMS):
         for j in range(i + 1):
@@ -288,13 +288,13 @@ def _solve(sums: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def _median(values: FloatArray, scratch: FloatArray) -> float:
-    """Return the median of an even number of values, sorting a few of them by insertion."""
+def _median(values: FloatArray) -> float:
+    """Return the median of an even number of values, counting how many are less than each."""
+    below, above = -np.inf, -np.inf
     for i in range(len(values)):
-        value, k = values[i], i
-        while k > 0 and scratch[k - 1] > value:
-            scratch[k] = scratch[k - 1]
-            k -= 1
-        scratch[k] = value
-    half = len(values) // 2
-    return float(0.5 * (scratch[half - 1] + scratch[half]))
+        less = 0
+        for k in range(len(values)):
+            less += values[k] < values[i]
+        below = max(below, values[i]) if 2 * less < len(values) else below
+        above = max(above, values[i]) if 2 * less <= len(values) else above
+    return 0.5 * (below + above)

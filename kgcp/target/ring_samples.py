@@ -250,7 +250,9 @@ def _clearness(
 
 
 @compiled
-def _ranked(values: GreyArray, low: int, middle: int, high: int) -> tuple[int, int, int]:
+def _ranked(
+    values: GreyArray, low: int, middle: int, high: int
+) -> tuple[np.int64, np.int64, np.int64]:
     """Return three values of ascending ranks: the largest that so many or less are smaller than."""
     one, two, three = np.uint8(0), np.uint8(0), np.uint8(0)
     for i in range(_ALL):
