@@ -76,7 +76,8 @@ class Ellipse:
         The angles are those of the unit circle before it is stretched along the axes, without a
         rotation: for a nearly frontal circle they are directions on the plate plus its heading.
         """
-        unit = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1)
+        unit = np.empty((*np.shape(angles_rad), 2))
+        unit[..., 0], unit[..., 1] = np.cos(angles_rad), np.sin(angles_rad)
         return factor * unit @ self.stretch + self.centre
 
     def angles_rad(self, points: FloatArray) -> FloatArray:

@@ -119,10 +119,33 @@ def fixed_lag_score(
     visible : (360,) array
         Which of them count.
     """
-    signal = sample_grey(grey, points[None])[0][visible]
-    lags = np.arange(-_HEADING_SLACK, _HEADING_SLACK + 1)
-    references = np.stack([np.roll(reference_signals(ring), lag, axis=1) for lag in lags])
-    return float(np.max(_standardised(references[..., visible]) @ _standardised(signal)))
+    return _best_near(sample_grey(grey, points[None])[0], visible, reference_signals(ring))
+
+
+@compiled
+def _best_near(
+    signal: FloatArray,
+    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    references: FloatArray,
+) -> float:
+    """Return the best correlation with references (m, 360), turned by little, where visible."""
+    best = -1.0
+    for reference in references:
+        for lag in range(-_HEADING_SLACK, _HEADING_SLACK + 1):
+            count = wanted = found = wanted_power = found_power = product = 0.0
+            for a in range(_SAMPLES):
+                if visible[a]:
+                    one, other = reference[(a - lag) % _SAMPLES], signal[a]
+                    count, wanted, found = count + 1.0, wanted + one, found + other
+                    wanted_power, found_power = (
+                        wanted_power + one * one,
+                        found_power + other * other,
+                    )
+                    product += one * other
+            variances = (wanted_power - wanted**2 / count) * (found_power - found**2 / count)
+            covariance = product - wanted * found / count
+            best = max(best, covariance / math.sqrt(max(variances, 1e-12)))
+    return best
 
 
 def _standardised(signals: FloatArray) -> FloatArray:

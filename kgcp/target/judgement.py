@@ -75,16 +75,19 @@ class Verdict:
 
     def check(self, min_score: float) -> None:
         """Raise `Rejection` unless this is the target's ring."""
-        numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
-        if self.score < min(CODE_LIKE, min_score):
-            raise Rejection(Reason.CODE_MISMATCH, numbers)
-        if self.misfit > self.limit:
-            raise Rejection(Reason.OTHER_CODE, numbers)
-        if self.score < min_score:
-            raise Rejection(Reason.CODE_MISMATCH, numbers)
         contrast = self.white - self.black
-        if contrast <= 0.0 or self.black < _DARKEST_BLACK * contrast:
+        if self.score < min(CODE_LIKE, min_score):
+            reason = Reason.CODE_MISMATCH
+        elif self.misfit > self.limit:
+            reason = Reason.OTHER_CODE
+        elif self.score < min_score:
+            reason = Reason.CODE_MISMATCH
+        elif contrast <= 0.0 or self.black < _DARKEST_BLACK * contrast:
             raise Rejection(Reason.NO_CONTRAST, f"levels {self.black:.0f} and {self.white:.0f}")
+        else:
+            return
+        numbers = f"score {self.score:.2f}, a dot off by {self.misfit:.2f} of {self.limit:.2f}"
+        raise Rejection(reason, numbers)
 
 
 def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict:

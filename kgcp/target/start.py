@@ -24,8 +24,8 @@ from kgcp.target.paper import measure_ring, points_of_code
 from kgcp.target.polar import sample_ellipses, sample_grey
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
-_OUTLINE = CODE_CIRCLE[::5]  # of an ellipse's points enough give its undistorted image
-_EVERYWHERE = np.ones((1, len(_OUTLINE)), dtype=bool)
+_OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # of an ellipse enough points give its undistorted image
+_EVERYWHERE = np.ones((1, len(_OUTLINE_RAD)), dtype=bool)
 _EDGE_RAD, _EDGE = CODE_ANGLES_RAD[::4], CODE_CIRCLE[::4]
 _MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
 _AXIS_ERROR_PX = 0.3  # of an outline
@@ -53,12 +53,12 @@ def _pose_of_outline(
 ) -> Observation:
     """Take the better one of the two poses that an outline has."""
     ring = match.ring
-    towards_x = camera.undistort(match.outer.points(np.radians(match.lag_deg)))
+    towards = camera.undistort(match.outer.points(math.radians(match.lag_deg) + _OUTLINE_RAD))
     poses = [
-        pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards_x)
-        for plane in circle_planes(_undistorted(camera, match.outer).conic)
+        pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards[0])
+        for plane in circle_planes(_ellipse_through(towards).conic)
     ]
-    seen = sample_grey(grey, np.stack([points_of_code(camera, pose, ring) for pose in poses]))
+    seen = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
     scores, lags_deg = match_code(seen, ring)
     best = int(scores.argmax())
     turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
@@ -81,21 +81,37 @@ def _pose_of_outline(
     )
 
 
-def _undistorted(camera: Camera, outline: Ellipse) -> Ellipse:
-    """Return an ellipse in normalised coordinates: nearly one still."""
-    points = camera.undistort(outline.centre + _OUTLINE @ outline.stretch)
-    x, y = points.mean(axis=0).tolist()
-    spokes = points - (x, y)
-    lengths = np.hypot(spokes[:, 0], spokes[:, 1])
-    unit = float(lengths.mean())
+def _ellipse_through(points: FloatArray) -> Ellipse:
+    """Fit an ellipse to points (n, 2) all around, which are nearly on one."""
+    lengths, directions = np.empty((1, len(points))), np.empty_like(points)
+    x, y, unit = _measure_spokes(points, lengths[0], directions)
     found, possible = np.empty((1, 5)), np.empty(1, dtype=bool)
-    fit_ellipses(
-        (lengths / unit)[None], _EVERYWHERE, spokes / lengths[:, None], math.inf, found, possible
-    )
+    fit_ellipses(lengths, _EVERYWHERE, directions, math.inf, found, possible)
     if not possible[0]:
         raise Rejection(Reason.POOR_ELLIPSE, "the outline is beyond the lens model's reach")
     right, down, a, b, angle_rad = found[0].tolist()
     return Ellipse(x + unit * right, y + unit * down, unit * a, unit * b, angle_rad)
+
+
+@compiled
+def _measure_spokes(
+    points: FloatArray, lengths: FloatArray, directions: FloatArray
+) -> tuple[float, float, float]:
+    """Fill in how far and in which direction points are from their mean, which is returned.
+
+    The unit of the lengths is their mean, which is returned, too.
+    """
+    x, y, unit, count = 0.0, 0.0, 0.0, len(points)
+    for i in range(count):
+        x, y = x + points[i, 0] / count, y + points[i, 1] / count
+    for i in range(count):
+        lengths[i] = math.hypot(points[i, 0] - x, points[i, 1] - y)
+        directions[i, 0] = (points[i, 0] - x) / lengths[i]
+        directions[i, 1] = (points[i, 1] - y) / lengths[i]
+        unit += lengths[i] / count
+    for i in range(count):
+        lengths[i] /= unit
+    return x, y, unit
 
 
 @dataclass(frozen=True, slots=True)
