@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +22,9 @@ _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its 
 _SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.15, 0.4
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
-_LARGE_GAIN = 4.0
+_LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
 _NEGLIGIBLE = 1e-6
-_DAMPING = 1e-3
+_DAMPING, _DAMPED = 1e-7, 1e-3
 _MAX_DAMPING = 1e6
 
 
@@ -198,7 +199,8 @@ def minimise(
     anew only while steps are large, and the normal matrix with it: near the minimum they hardly
     change, and cost most.
     """
-    damping = _DAMPING
+    damping, light = _DAMPING, parameters.light
+    relative_sd = float(sd.mean()) / (light.white - light.black)
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     scaled = jacobian[unknowns.free] / sd
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
@@ -212,7 +214,8 @@ def minimise(
             step[unknowns.free] = damped
             candidate = parameters.moved(step)
             promised = 0.5 * float(gradient @ damped)
-            if promised > _LARGE_GAIN and number < steps - 1:
+            change = relative_sd * math.sqrt(2.0 * max(promised, 0.0) / len(sd))
+            if change > _LARGE_CHANGE and number < steps - 1:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian
@@ -221,7 +224,7 @@ def minimise(
             is_better = trial_total <= total + _NEGLIGIBLE
             if is_better or promised < enough or damping > _MAX_DAMPING:
                 break
-            damping *= 10.0
+            damping = max(10.0 * damping, _DAMPED)
         if not is_better:
             break
         gain, total = total - trial_total, trial_total
