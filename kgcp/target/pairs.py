@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.target.plate import Circles, find_skips
+from kgcp.target.plate import Circles
 from kgcp.target.quadrature import quadrature_for
 
 REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
@@ -98,8 +98,8 @@ class EdgePairs:
     ----------
     circles : (c, 5) array
         Centre x, y, radius [m], sign and rule of integration.
-    starts : (n + 1,) array of int, members : (m,) array of int
-        The circles that pixel i feels are members[starts[i]:starts[i + 1]].
+    starts : (c + 1,) array of int, members : (m,) array of int
+        The pixels that feel circle i are members[starts[i]:starts[i + 1]].
     background : (n,) array
         White share of every pixel from the circles whose edge it does not feel.
     """
@@ -130,8 +130,7 @@ def pair_edges(
     table[:, 0], table[:, 1] = circles.centres_m
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs
     table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
-    skips = find_skips(circles.centres_m, circles.radii_m)
-    return EdgePairs(table, *_pair(points_m, table, *skips, reach_px(blur) * metres_per_px))
+    return EdgePairs(table, *_pair(points_m, table, reach_px(blur) * metres_per_px))
 
 
 def reach_px(blur: Blur) -> float:
@@ -141,33 +140,23 @@ def reach_px(blur: Blur) -> float:
 
 @compiled
 def _pair(
-    points_m: FloatArray,
-    circles: FloatArray,
-    out_m: FloatArray,
-    beyond: IndexArray,
-    reach_m: float,
+    points_m: FloatArray, circles: FloatArray, reach_m: float
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Return starts, members and background."""
     count, found = points_m.shape[1], 0
-    starts, background = np.zeros(count + 1, np.intp), np.ones(count)
-    members = np.empty(2 * count + len(circles), np.intp)
-    for i in range(count):
-        if found + len(circles) > len(members):
+    starts, background = np.zeros(len(circles) + 1, np.intp), np.ones(count)
+    members = np.empty(2 * count, np.intp)
+    for c in range(len(circles)):
+        if found + count > len(members):
             members = np.concatenate((members, np.empty_like(members)))
-        x, y, c = points_m[0, i], points_m[1, i], 0
-        rho = math.sqrt(x * x + y * y)
-        while c < len(circles):
-            radius = circles[c, 2]
-            if abs(rho - out_m[c]) > radius + reach_m:
-                c = beyond[c]
-                continue
-            dx, dy = x - circles[c, 0], y - circles[c, 1]
-            square, within = dx * dx + dy * dy, radius - reach_m
-            if within > 0.0 and square < within * within:
+        within_m, beyond_m = max(circles[c, 2] - reach_m, 0.0), circles[c, 2] + reach_m
+        for i in range(count):
+            dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
+            square = dx * dx + dy * dy
+            if square < within_m * within_m:
                 background[i] += circles[c, 3]
-            elif square <= (radius + reach_m) ** 2:
-                members[found] = c
+            elif square <= beyond_m * beyond_m:
+                members[found] = i
                 found += 1
-            c += 1
-        starts[i + 1] = found
+        starts[c + 1] = found
     return starts, members[:found], background

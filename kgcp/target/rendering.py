@@ -1,169 +1,88 @@
-"""The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach."""
+"""The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach.
+
+Pixels are worked on in batches, step by step, in loops without a branch: several at once in the
+vector units of the processor. A batch is one flat array, row after row: that much the compiler can
+see through.
+"""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from scipy.special import ndtr
 
 from kgcp.compiled import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.target.normal_series import BEND, EXPONENTIAL, FAR, SQUARINGS, TAIL_RATIO
 from kgcp.target.quadrature import CHORD_COUNTS, CHORDS, Quadrature
 
 _EDGE = float(Quadrature.EDGE)
-_SHORTEST_SMEAR = 1e-3  # of the blur: below, differences of the profile lose their digits
-_NOWHERE_M = 1e-12  # keeps directions finite in a circle's centre
-_FAR = 6.0  # standard deviations beyond which there is nothing to 1e-9
-_PER_SIGMA = 64  # entries of the table
-_ENTRIES = np.arange(2 * _FAR * _PER_SIGMA + 1) / _PER_SIGMA - _FAR
-_TABLE = np.stack((ndtr(_ENTRIES), np.exp(-0.5 * _ENTRIES**2) / math.sqrt(2.0 * math.pi)), axis=1)
-
+_SHORT_SMEAR = 0.1  # of the blur: below, differences of the profile lose their digits
+_SHORTEST_SMEAR = 0.01  # of the blur: from chords none shorter can be told
 _SHORTEST_STREAK = 0.1  # of the blur: below, it has no direction
+_NOWHERE_M = 1e-12  # keeps directions finite in a circle's centre
+_PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
+_BATCH = 16
+# rows of a batch: where on the plate from the circle's centre, and how the blur lies there …
+_X, _Y, _XX, _XY, _YY, _STREAK_X, _STREAK_Y, *_RESULTS = range(0, 32 * _BATCH, _BATCH)
+# … what comes of it: the white share, and its derivatives in the order of `render` …
+_VALUE, _BY_X, _BY_Y, _BY_DEPTH, _BY_XX, _BY_XY, _BY_YY, _BY_STREAK_X, _BY_STREAK_Y = _RESULTS[:9]
+# … and on the way there, for chords: directions, the blur along and across them, and sums
+_U, _V, _ALONG, _ACROSS, _MIXED, _SMEAR, _PER_SD, _PER_SD_ACROSS = _RESULTS[9:17]
+_FIRST, _SIDEWAYS, _SECOND, _BY_SLOPE, _BY_WIDTH, _BY_HALF = _RESULTS[17:23]
 
-_ChordProfile = tuple[float, float, float, float, float, float, float]
-_EdgeProfile = tuple[float, float, float, float, float]
-_Blur = tuple[float, float, float, float, float]  # on the plate: xx, xy, yy [m²], streak x, y [m]
-_Contribution = tuple[float, float, float, float, float, float, float, float, float]
+_E0, _E1, _E2, _E3, _E4, _E5, _E6 = EXPONENTIAL
+_R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7 = TAIL_RATIO
 
 
 @inlined
-def normal(z: float) -> tuple[float, float]:
-    """Return the standard normal distribution function, to 1e-9, and its density.
+def _normal(z: float) -> tuple[float, float]:
+    """Return the standard normal distribution function, to 3e-8, and its density.
 
-    Taylor's series about the nearest entry of a table: several times faster than an exponential.
+    By pairs of terms, which do not wait for each other (Estrin's scheme).
     """
-    if abs(z) >= _FAR:
-        return (0.0 if z < 0.0 else 1.0), 0.0
-    entry = int((z + _FAR) * _PER_SIGMA + 0.5)
-    below, density = _TABLE[entry, 0], _TABLE[entry, 1]
-    at = entry / _PER_SIGMA - _FAR
-    h, bend = z - at, 0.5 * (at * at - 1.0)
-    third = at * (at * at - 3.0) / 6.0
-    slope = 1.0 + h * (h * bend * (1.0 / 3.0) - 0.5 * at - 0.25 * third * h * h)
-    return below + density * h * slope, density * (1.0 + h * (h * (bend - h * third) - at))
+    far = min(abs(z), FAR)
+    q = far * far * (0.5 / 2**SQUARINGS)
+    q2 = q * q
+    root = _E0 + _E1 * q + (_E2 + _E3 * q) * q2 + (_E4 + _E5 * q + _E6 * q2) * (q2 * q2)
+    square = root * root
+    square *= square
+    square *= square
+    square *= square
+    density = _PER_ROOT_2PI * square * square
+    t = 1.0 / (1.0 + BEND * far)
+    t2 = t * t
+    low, high = _R0 + _R1 * t + (_R2 + _R3 * t) * t2, _R4 + _R5 * t + (_R6 + _R7 * t) * t2
+    tail = density * (low + high * (t2 * t2))
+    return (1.0 - tail if z > 0.0 else tail), density
 
 
 @inlined
-def smeared_normal(z: float, half: float) -> tuple[float, float, float]:
+def _long_smear(z: float, half: float) -> tuple[float, float, float]:
     """Return the mean of the normal distribution function from z − half to z + half.
 
-    And its derivatives by z and by `half`, which is at least 0.
+    And its derivatives by z and by `half`.
     """
-    if half == 0.0:
-        below, density = normal(z)
+    below_high, density_high = _normal(z + half)
+    below_low, density_low = _normal(z - half)
+    rise, both, per_length = below_high - below_low, below_high + below_low, 0.5 / half
+    mean = (z * rise + half * both + density_high - density_low) * per_length
+    return mean, rise * per_length, (both - 2.0 * mean) * per_length
+
+
+@inlined
+def _smeared_normal(z: float, half: float, smears: bool) -> tuple[float, float, float]:
+    """Do as `_long_smear` for any length; 0 unless it `smears`."""
+    below, density = _normal(z)
+    if not smears:
         return below, density, 0.0
-    half = max(half, _SHORTEST_SMEAR)
-    high, low = z + half, z - half
-    below_high, density_high = normal(high)
-    below_low, density_low = normal(low)
-    mean = (high * below_high - low * below_low + density_high - density_low) / (2.0 * half)
-    by_half = (0.5 * (below_high + below_low) - mean) / half
-    return mean, (below_high - below_low) / (2.0 * half), by_half
-
-
-@inlined
-def chord_profile(
-    x: float,
-    y: float,
-    radius: float,
-    along: float,
-    across: float,
-    mixed: float,
-    smear: float,
-    rule: int,
-) -> _ChordProfile:
-    """Return the coverage of a disc under Gaussian blur and a streak, from its chords.
-
-    Parameters
-    ----------
-    x, y : float
-        The point from the disc's centre, along the chords and across.
-    radius : float
-        Of the disc, in the same unit.
-    along, across, mixed : float
-        The blur's covariance in these directions, unit squared.
-    smear : float
-        Length of the streak, which is along the chords.
-    rule : int
-        A `Quadrature` by chords.
-
-    Returns
-    -------
-    value : float
-        0 outside, 1 inside.
-    d_x, d_y, d_along, d_across, d_mixed, d_smear : float
-        Its derivatives.
-    """
-    ratio = mixed / across
-    conditional = max(along - mixed * ratio, 1e-6 * along)
-    per_sd, per_sd_across = 1.0 / math.sqrt(conditional), 1.0 / math.sqrt(across)
-    half_smear = 0.5 * smear * per_sd
-    value = first = sideways = second = by_width = by_slope = by_half = 0.0
-    for k in range(CHORD_COUNTS[rule]):
-        off, half = radius * CHORDS[rule, 0, k] - y, radius * CHORDS[rule, 1, k]
-        there = off * per_sd_across
-        if abs(there) > _FAR:
-            continue
-        weight = half * normal(there)[1]
-        centre = x + ratio * off
-        far, near = (half - centre) * per_sd, (-half - centre) * per_sd
-        below_far, by_far, by_half_far = smeared_normal(far, half_smear)
-        below_near, by_near, by_half_near = smeared_normal(near, half_smear)
-        share = weight * (below_far - below_near)
-        slope = weight * (by_far - by_near)
-        by_length = weight * (by_half_far - by_half_near)
-        value += share
-        first += slope
-        sideways += share * there
-        second += weight * (by_far * far - by_near * near) + by_length * half_smear
-        by_slope -= slope * off
-        by_width += share * (there * there - 1.0)
-        by_half += by_length
-    step = math.pi / (CHORD_COUNTS[rule] + 1) * per_sd_across
-    by_conditional = -0.5 * step * second * per_sd * per_sd
-    first *= step * per_sd
-    by_slope *= step * per_sd
-    by_across = 0.5 * step * by_width + (by_conditional * mixed - by_slope) * ratio
+    third, is_short = half * half * (1.0 / 6.0), half < _SHORT_SMEAR
+    mean, by_z, by_half = _long_smear(z, _SHORT_SMEAR if is_short else half)
     return (
-        step * value,
-        -first,
-        step * sideways * per_sd_across + first * ratio,
-        by_conditional,
-        by_across / across,
-        by_slope / across - 2.0 * by_conditional * ratio,
-        0.5 * step * by_half * per_sd,
+        below - z * density * third if is_short else mean,
+        density + density * (z * z - 1.0) * third if is_short else by_z,
+        -z * density * half * (1.0 / 3.0) if is_short else by_half,
     )
-
-
-@inlined
-def edge_profile(
-    rho: float, radius: float, radial: float, tangential: float, smear: float
-) -> _EdgeProfile:
-    """Return the coverage of a disc that is large against the blur, in closed form.
-
-    The chord that tangential blur reaches is a parabola. To second order it shifts the edge inwards
-    by var_t/(2 r) + 3 var_t²/(8 r³) and widens it by var_t²/(2 r²). A uniform motion along the
-    radial direction averages the profile over its length, the smear.
-
-    Returns
-    -------
-    value : float
-    d_rho, d_radial, d_tangential, d_smear : float
-        Its derivatives.
-    """
-    bend = 0.5 / radius
-    sag = tangential * bend
-    sd = math.sqrt(radial + 2.0 * sag * sag)
-    z = (radius - sag * (1.0 + 3.0 * sag * bend) - rho) / sd
-    half = smear / (2.0 * sd)
-    value, by_z, by_half = smeared_normal(z, half)
-    by_variance = -0.5 * (by_z * z + by_half * half) / (sd * sd)
-    by_depth = by_z / sd
-    shift = bend + 6.0 * tangential * bend**3
-    widening = 4.0 * tangential * bend * bend
-    d_tangential = widening * by_variance - shift * by_depth
-    return value, -by_depth, by_variance, d_tangential, by_half / (2.0 * sd)
 
 
 @inlined
@@ -174,70 +93,143 @@ def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float,
 
 
 @inlined
-def _small(dx: float, dy: float, radius: float, blur: _Blur, rule: int) -> _Contribution:
-    """Return what a circle adds that is small against blur or streak.
+def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) -> None:
+    """Work out a batch of a circle that is large against the blur, in closed form.
 
-    Returns
-    -------
-    value, along_x, along_y, approach, by_xx, by_xy, by_yy, streak_x, streak_y : float
-        White share; its derivatives by the plate's motion along its two axes, by the relative
-        depth, by the blur and by the streak on the plate.
+    The chord that tangential blur reaches is a parabola. To second order it shifts the edge inwards
+    by var_t/(2 r) + 3 var_t²/(8 r³) and widens it by var_t²/(2 r²). Motion along the radius
+    averages the profile over its length; motion across bends the edge as blur does.
     """
-    xx, xy, yy, streak_x, streak_y = blur
-    smear = math.sqrt(streak_x * streak_x + streak_y * streak_y)
-    rho = math.sqrt(dx * dx + dy * dy) + _NOWHERE_M
-    u, v = (streak_x / smear, streak_y / smear) if smear > 0.0 else (dx / rho, dy / rho)
-    x, y = dx * u + dy * v, dy * u - dx * v
-    along, across, mixed = _turned(u, v, xx, xy, yy)
-    value, by_x, by_y, by_a, by_c, by_m, by_smear = chord_profile(
-        x, y, radius, along, across, mixed, smear, rule
-    )
-    sideways = 0.0
-    if smear > _SHORTEST_STREAK * math.sqrt(across):
-        turn = by_x * y - by_y * x + 2.0 * mixed * (by_a - by_c) + by_m * (across - along)
-        sideways = turn / smear
-    return (
-        value,
-        by_y * v - by_x * u,
-        -by_y * u - by_x * v,
-        2.0 * (by_a * along + by_c * across + by_m * mixed) + by_smear * smear,
-        by_a * u * u + by_c * v * v - by_m * u * v,
-        (by_a - by_c) * u * v + 0.5 * by_m * (u * u - v * v),
-        by_a * v * v + by_c * u * u + by_m * u * v,
-        by_smear * u - sideways * v,
-        by_smear * v + sideways * u,
-    )
+    bend = 0.5 / radius
+    for j in range(_BATCH):
+        dx, dy = w[_X + j], w[_Y + j]
+        rho = math.sqrt(dx * dx + dy * dy) + _NOWHERE_M
+        per_rho = 1.0 / rho
+        x, y = dx * per_rho, dy * per_rho
+        radial, across, mixed = _turned(x, y, w[_XX + j], w[_XY + j], w[_YY + j])
+        motion_r = w[_STREAK_X + j] * x + w[_STREAK_Y + j] * y if smears else 0.0
+        motion_t = w[_STREAK_Y + j] * x - w[_STREAK_X + j] * y if smears else 0.0
+        tangential = across + motion_t * motion_t * (1.0 / 12.0)
+        sag = tangential * bend
+        per_sd = 1.0 / math.sqrt(radial + 2.0 * sag * sag)
+        z = (radius - sag * (1.0 + 3.0 * sag * bend) - rho) * per_sd
+        half = 0.5 * abs(motion_r) * per_sd
+        w[_VALUE + j], by_z, by_half = _smeared_normal(z, half, smears)
+        if only_level:
+            continue
+        by_rho, by_r = -by_z * per_sd, -0.5 * (by_z * z + by_half * half) * per_sd * per_sd
+        by_t = 4.0 * tangential * bend * bend * by_r + bend * (1.0 + 6.0 * sag * bend) * by_rho
+        by_length = (0.5 if motion_r > 0.0 else -0.5) * by_half * per_sd
+        by_cross = by_t * motion_t * (1.0 / 6.0)
+        turn = (2.0 * (by_r - by_t) * mixed + by_length * motion_t - by_cross * motion_r) * per_rho
+        w[_BY_X + j], w[_BY_Y + j] = turn * y - by_rho * x, -turn * x - by_rho * y
+        w[_BY_DEPTH + j] = 2.0 * (by_r * radial + by_t * tangential) + by_length * motion_r
+        w[_BY_XX + j], w[_BY_XY + j] = by_r * x * x + by_t * y * y, (by_r - by_t) * x * y
+        w[_BY_YY + j] = by_r * y * y + by_t * x * x
+        w[_BY_STREAK_X + j] = by_length * x - by_cross * y
+        w[_BY_STREAK_Y + j] = by_length * y + by_cross * x
 
 
 @inlined
-def _large(dx: float, dy: float, radius: float, blur: _Blur) -> _Contribution:
-    """Return what a circle adds that is large against the blur, as `_small` does.
+def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_level: bool) -> None:
+    """Work out a batch of a circle that is small against blur or streak, chord by chord.
 
-    Motion across its edge bends it as blur does.
+    They are along the streak, or else along the radius. The blur across them weights each, that
+    along it, conditioned on where it is, has closed integrals.
     """
-    xx, xy, yy, streak_x, streak_y = blur
-    rho = math.sqrt(dx * dx + dy * dy) + _NOWHERE_M
-    x, y = dx / rho, dy / rho
-    radial, tangential, mixed = _turned(x, y, xx, xy, yy)
-    along, across = streak_x * x + streak_y * y, streak_y * x - streak_x * y
-    value, by_rho, by_r, by_t, by_smear = edge_profile(
-        rho, radius, radial, tangential + across * across / 12.0, abs(along)
-    )
-    by_along = by_smear if along > 0.0 else -by_smear
-    by_across = by_t * across / 6.0
-    turn = (2.0 * (by_r - by_t) * mixed + by_along * across - by_across * along) / rho
-    approach = 2.0 * (by_r * radial + by_t * tangential) + by_along * along + by_across * across
-    return (
-        value,
-        turn * y - by_rho * x,
-        -turn * x - by_rho * y,
-        approach,
-        by_r * x * x + by_t * y * y,
-        (by_r - by_t) * x * y,
-        by_r * y * y + by_t * x * x,
-        by_along * x - by_across * y,
-        by_along * y + by_across * x,
-    )
+    for j in range(_BATCH):
+        dx, dy = w[_X + j], w[_Y + j]
+        u, v = (w[_STREAK_X + j], w[_STREAK_Y + j]) if smears else (dx, dy)
+        length = math.sqrt(u * u + v * v)
+        per_length = 1.0 / (length + _NOWHERE_M)
+        u, v = u * per_length, v * per_length
+        along, across, mixed = _turned(u, v, w[_XX + j], w[_XY + j], w[_YY + j])
+        sd = math.sqrt(max(along - mixed * mixed / across, 1e-6 * along))
+        w[_U + j], w[_V + j] = u, v
+        w[_X + j], w[_Y + j] = dx * u + dy * v, dy * u - dx * v
+        w[_ALONG + j], w[_ACROSS + j], w[_MIXED + j] = along, across, mixed
+        w[_SMEAR + j] = max(length, 2.0 * _SHORTEST_SMEAR * sd) if smears else 0.0
+        w[_PER_SD + j], w[_PER_SD_ACROSS + j] = 1.0 / sd, 1.0 / math.sqrt(across)
+        w[_VALUE + j] = w[_FIRST + j] = w[_SIDEWAYS + j] = w[_SECOND + j] = 0.0
+        w[_BY_SLOPE + j] = w[_BY_WIDTH + j] = w[_BY_HALF + j] = 0.0
+    for k in range(CHORD_COUNTS[rule]):
+        at, half_length = radius * CHORDS[rule, 0, k], radius * CHORDS[rule, 1, k]
+        if _is_felt(w, at):
+            _add_chord(w, at, half_length, smears, only_level)
+    for j in range(_BATCH):
+        scale = math.pi / (CHORD_COUNTS[rule] + 1) * w[_PER_SD_ACROSS + j]
+        w[_VALUE + j] *= scale
+        if only_level:
+            continue
+        u, v, x, y = w[_U + j], w[_V + j], w[_X + j], w[_Y + j]
+        along, across, mixed = w[_ALONG + j], w[_ACROSS + j], w[_MIXED + j]
+        smear, per_sd, per_across = w[_SMEAR + j], w[_PER_SD + j], w[_PER_SD_ACROSS + j]
+        first, by_slope = w[_FIRST + j] * scale * per_sd, w[_BY_SLOPE + j] * scale * per_sd
+        ratio = mixed * per_across * per_across
+        by_a = -0.5 * scale * w[_SECOND + j] * per_sd * per_sd
+        by_c = 0.5 * scale * w[_BY_WIDTH + j] + (by_a * mixed - by_slope) * ratio
+        by_c *= per_across * per_across
+        by_m = by_slope * per_across * per_across - 2.0 * by_a * ratio
+        by_x, by_smear = -first, 0.5 * scale * w[_BY_HALF + j] * per_sd
+        by_y = scale * w[_SIDEWAYS + j] * per_across + first * ratio
+        turn = by_x * y - by_y * x + 2.0 * mixed * (by_a - by_c) + by_m * (across - along)
+        sideways = turn / smear if smear * per_across > _SHORTEST_STREAK else 0.0
+        w[_BY_X + j], w[_BY_Y + j] = by_y * v - by_x * u, -by_y * u - by_x * v
+        w[_BY_DEPTH + j] = 2.0 * (by_a * along + by_c * across + by_m * mixed) + by_smear * smear
+        w[_BY_XX + j] = by_a * u * u + by_c * v * v - by_m * u * v
+        w[_BY_XY + j] = (by_a - by_c) * u * v + 0.5 * by_m * (u * u - v * v)
+        w[_BY_YY + j] = by_a * v * v + by_c * u * u + by_m * u * v
+        w[_BY_STREAK_X + j] = by_smear * u - sideways * v
+        w[_BY_STREAK_Y + j] = by_smear * v + sideways * u
+
+
+@inlined
+def _is_felt(w: FloatArray, at: float) -> bool:
+    """Tell whether a chord weighs anything for any pixel of a batch."""
+    nearest = np.inf
+    for j in range(_BATCH):
+        nearest = min(nearest, abs(at - w[_Y + j]) * w[_PER_SD_ACROSS + j])
+    return nearest < FAR
+
+
+@inlined
+def _add_chord(
+    w: FloatArray, at: float, half_length: float, smears: bool, only_level: bool
+) -> None:
+    """Add one chord to the sums of a batch."""
+    for j in range(_BATCH):
+        off, per_sd, per_across = at - w[_Y + j], w[_PER_SD + j], w[_PER_SD_ACROSS + j]
+        there = off * per_across
+        _, density = _normal(there)
+        weight = half_length * density if abs(there) < FAR else 0.0
+        centre = w[_X + j] + w[_MIXED + j] * per_across * there
+        half_smear = 0.5 * w[_SMEAR + j] * per_sd
+        far, near = (half_length - centre) * per_sd, (-half_length - centre) * per_sd
+        if smears:
+            below_far, by_far, by_half_far = _long_smear(far, half_smear)
+            below_near, by_near, by_half_near = _long_smear(near, half_smear)
+        else:
+            (below_far, by_far), (below_near, by_near) = _normal(far), _normal(near)
+            by_half_far = by_half_near = 0.0
+        share = weight * (below_far - below_near)
+        w[_VALUE + j] += share
+        if only_level:
+            continue
+        slope, by_length = weight * (by_far - by_near), weight * (by_half_far - by_half_near)
+        w[_FIRST + j] += slope
+        w[_SIDEWAYS + j] += share * there
+        w[_SECOND + j] += weight * (by_far * far - by_near * near) + by_length * half_smear
+        w[_BY_SLOPE + j] -= slope * off
+        w[_BY_WIDTH + j] += share * (there * there - 1.0)
+        w[_BY_HALF + j] += by_length
+
+
+@inlined
+def _add(w: FloatArray, radius: float, rule: float, smears: bool, only_level: bool) -> None:
+    if rule == _EDGE:
+        _add_straight(w, radius, smears, only_level)
+    else:
+        _add_chords(w, radius, int(rule), smears, only_level)
 
 
 @compiled
@@ -259,36 +251,49 @@ def render(
         xx, yy, xy [px²], streak x, y [px].
     circles : (c, 5) array
         Centre x, y, radius, sign and rule of every circle.
-    starts : (n + 1,) array, members : (m,) array
-        The circles in reach of pixel i are members[starts[i]:starts[i + 1]].
+    starts : (c + 1,) array, members : (m,) array
+        The pixels in reach of circle i are members[starts[i]:starts[i + 1]].
     out : (9, n) or (1, n) array
         White share from circles out of reach; receives the share and, where there is room, its
-        derivatives on the plate. That a turn of the plate changes the blur on it is left out: of
-        second order.
+        derivatives by the plate's motion along its two axes, by the relative depth, by the blur on
+        the plate xx, xy, yy and by the streak there x, y. That a turn of the plate changes the blur
+        on it is left out: of second order.
     """
-    is_level = out.shape[0] == 1
-    for i in range(views.shape[1]):
-        xx, xy, yx, yy = views[2, i], views[3, i], views[4, i], views[5, i]
-        side_x, side_y = blur[0] * xx + blur[2] * xy, blur[2] * xx + blur[1] * xy
-        there = (
-            side_x * xx + side_y * xy,
-            side_x * yx + side_y * yy,
-            (blur[0] * yx + 2.0 * blur[2] * yy) * yx + blur[1] * yy * yy,
-            xx * blur[3] + xy * blur[4],
-            yx * blur[3] + yy * blur[4],
-        )
-        for m in range(starts[i], starts[i + 1]):
-            c = members[m]
-            dx, dy = views[0, i] - circles[c, 0], views[1, i] - circles[c, 1]
-            radius, sign, rule = circles[c, 2], circles[c, 3], circles[c, 4]
-            if is_level and rule == _EDGE:
-                out[0, i] += sign * _large(dx, dy, radius, there)[0]
-            elif is_level:
-                out[0, i] += sign * _small(dx, dy, radius, there, int(rule))[0]
+    w = np.zeros(32 * _BATCH)
+    only_level, smears = out.shape[0] == 1, blur[3] != 0.0 or blur[4] != 0.0
+    for c in range(len(circles)):
+        radius, sign, rule = circles[c, 2], circles[c, 3], circles[c, 4]
+        for first in range(starts[c], starts[c + 1], _BATCH):
+            pixels = members[first : min(first + _BATCH, starts[c + 1])]
+            _gather(views, blur, circles[c], pixels, w)
+            if only_level:  # constants, so that loops have no branch
+                _add(w, radius, rule, True, True) if smears else _add(w, radius, rule, False, True)
+            elif smears:
+                _add(w, radius, rule, True, False)
             else:
-                if rule == _EDGE:
-                    part = _large(dx, dy, radius, there)
-                else:
-                    part = _small(dx, dy, radius, there, int(rule))
-                for k in range(9):
-                    out[k, i] += sign * part[k]
+                _add(w, radius, rule, False, False)
+            for j in range(len(pixels)):
+                for k in range(out.shape[0]):
+                    out[k, pixels[j]] += sign * w[_VALUE + k * _BATCH + j]
+
+
+@inlined
+def _gather(
+    views: FloatArray, blur: FloatArray, circle: FloatArray, pixels: IndexArray, w: FloatArray
+) -> None:
+    """Fill a batch with where some pixels are, from the circle's centre, and their blur there."""
+    for j in range(_BATCH):
+        i = pixels[min(j, len(pixels) - 1)]
+        w[_X + j], w[_Y + j] = views[0, i] - circle[0], views[1, i] - circle[1]
+        w[_XX + j], w[_XY + j], w[_YY + j] = views[2, i], views[3, i], views[4, i]
+        w[_STREAK_X + j] = views[5, i]
+    xx, yy, xy, streak_x, streak_y = blur[0], blur[1], blur[2], blur[3], blur[4]
+    for j in range(_BATCH):
+        a, b, c, d = w[_XX + j], w[_XY + j], w[_YY + j], w[_STREAK_X + j]
+        side_x, side_y = xx * a + xy * b, xy * a + yy * b
+        w[_XX + j], w[_XY + j] = side_x * a + side_y * b, side_x * c + side_y * d
+        w[_YY + j] = (xx * c + 2.0 * xy * d) * c + yy * d * d
+        w[_STREAK_X + j], w[_STREAK_Y + j] = (
+            a * streak_x + b * streak_y,
+            c * streak_x + d * streak_y,
+        )

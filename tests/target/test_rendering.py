@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,10 +12,38 @@ from scipy.special import ndtr
 from scipy.stats import ncx2
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.target.normal_series import BEND, EXPONENTIAL, FAR, SQUARINGS, TAIL_RATIO
+from kgcp.target.plate_view import PLATE_ROWS, VIEW_ROWS
 from kgcp.target.quadrature import Quadrature, quadrature_for
-from kgcp.target.rendering import chord_profile, edge_profile, normal
+from kgcp.target.rendering import render
 
 CHORDS = [rule for rule in Quadrature if rule is not Quadrature.EDGE]
+BY_PLATE_X, BY_PLATE_Y, BY_DEPTH, BY_XX, BY_XY, BY_YY, BY_STREAK_X, BY_STREAK_Y = range(1, 9)
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A white disc about the origin, seen by pixels of unit size."""
+
+    radius: float
+    rule: Quadrature
+    xx: float = 0.49
+    yy: float = 0.49
+    xy: float = 0.0
+    streak_x: float = 0.0
+    streak_y: float = 0.0
+
+    def seen(self, x: FloatArray, y: FloatArray, rows: int = PLATE_ROWS) -> FloatArray:
+        views = np.zeros((VIEW_ROWS, len(x)))
+        views[0], views[1], views[2], views[5] = x, y, 1.0, 1.0
+        blur = np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
+        out = np.zeros((rows, len(x)))
+        circles = np.array([[0.0, 0.0, self.radius, 1.0, float(self.rule)]])
+        render(views, blur, circles, np.array([0, len(x)]), np.arange(len(x)), out)
+        return out
+
+    def level(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(self.seen(x, y, rows=1)[0])
 
 
 def isotropic(rho: FloatArray, radius: float, sigma: float) -> FloatArray:
@@ -21,83 +51,87 @@ def isotropic(rho: FloatArray, radius: float, sigma: float) -> FloatArray:
     return np.asarray(ncx2.cdf((radius / sigma) ** 2, 2, (rho / sigma) ** 2))
 
 
-def disc(
-    x: FloatArray,
-    radius: float,
-    blur: tuple[float, float, float],
-    rule: Quadrature,
-    y: float = 0.0,
-    smear: float = 0.0,
-) -> FloatArray:
-    """Value and derivatives, (7, n); blur along, across, mixed."""
-    return np.array([chord_profile(at, y, radius, *blur, smear, int(rule)) for at in x.tolist()]).T
-
-
-def edge(
-    rho: FloatArray, radius: float, radial: float, tangential: float, smear: float
-) -> FloatArray:
-    profiles = [edge_profile(r, radius, radial, tangential, smear) for r in rho.tolist()]
-    return np.array(profiles).T
-
-
-def test_the_normal_distribution() -> None:
-    z = np.linspace(-9.0, 9.0, 2001)
-    below, density = np.array([normal(value) for value in z.tolist()]).T
-    np.testing.assert_allclose(below, ndtr(z), rtol=0.0, atol=2e-9)
-    expected = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
-    np.testing.assert_allclose(density, expected, rtol=0.0, atol=1e-8)
-
-
 def rule_for(ratio_whole: float, ratio_sigma: float) -> Quadrature:
     return Quadrature(quadrature_for(np.array([ratio_whole]), np.array([ratio_sigma]))[0])
+
+
+def around(radius: float, reach: float, count: int = 211) -> tuple[FloatArray, FloatArray]:
+    """Points on both sides of the edge, spread evenly about the centre."""
+    rho = np.linspace(max(0.05, radius - reach), radius + reach, count)
+    angle = 2.399963 * np.arange(count)
+    return rho * np.cos(angle), rho * np.sin(angle)
+
+
+def test_series_of_the_normal_distribution() -> None:
+    z = np.linspace(0.0, FAR, 2001)
+    density = np.polynomial.Polynomial(EXPONENTIAL)(0.5 * z * z / 2**SQUARINGS) ** (2**SQUARINGS)
+    density /= np.sqrt(2.0 * np.pi)
+    tail = density * np.polynomial.Polynomial(TAIL_RATIO)(1.0 / (1.0 + BEND * z))
+    np.testing.assert_allclose(density, np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi), atol=3e-8)
+    np.testing.assert_allclose(tail, ndtr(-z), rtol=0.0, atol=4e-8)
 
 
 @settings(deadline=None)
 @given(ratio=st.floats(0.1, 60.0), sigma=st.floats(0.3, 3.0))
 def test_every_disc_is_the_noncentral_chi_square(ratio: float, sigma: float) -> None:
     radius = ratio * sigma
-    rho = np.linspace(max(1e-3, radius - 4.0 * sigma), radius + 4.0 * sigma, 41)
-    rule = rule_for(ratio, ratio)
-    if rule is Quadrature.EDGE:
-        level = edge(rho, radius, sigma**2, sigma**2, 0.0)[0]
-    else:
-        level = disc(rho, radius, (sigma**2, sigma**2, 0.0), rule)[0]
-    assert np.abs(level - isotropic(rho, radius, sigma)).max() < 4e-4
+    x, y = around(radius, 4.0 * sigma, 41)
+    disc = Disc(radius, rule_for(ratio, ratio), xx=sigma**2, yy=sigma**2)
+    assert np.abs(disc.level(x, y) - isotropic(np.hypot(x, y), radius, sigma)).max() < 4e-4
 
 
-@pytest.mark.parametrize("rule", CHORDS)
-@pytest.mark.parametrize("argument", range(6))
-@pytest.mark.parametrize("smear", [0.0, 3.0])
-def test_derivatives_are_those_of_the_value(rule: Quadrature, argument: int, smear: float) -> None:
-    if argument == 5 and smear == 0.0:
-        return  # a streak's length cannot be negative
-    radius = (0.7, 1.5, 2.5, 5.0, 8.0, 20.0)[rule]
-    x = np.linspace(max(0.05, radius - 2.5), radius + 2.5, 31)
-    base = [0.0, 0.4, 0.8, 1.3, 0.25, smear]
+@pytest.mark.parametrize("rule", Quadrature)
+def test_the_level_is_the_same_with_and_without_derivatives(rule: Quadrature) -> None:
+    disc = Disc((0.7, 1.5, 2.5, 5.0, 8.0, 20.0, 20.0)[rule], rule, xy=0.1, streak_x=2.0)
+    x, y = around(disc.radius, 3.0)
+    np.testing.assert_allclose(disc.level(x, y), disc.seen(x, y)[0], rtol=0.0, atol=1e-14)
 
-    def at(step: float) -> FloatArray:
-        values = [value + step * (number == argument) for number, value in enumerate(base)]
-        along, across, mixed = values[2:5]
-        return disc(x + values[0], radius, (along, across, mixed), rule, values[1], values[5])
 
-    numeric = (at(1e-5)[0] - at(-1e-5)[0]) / 2e-5
-    assert np.allclose(numeric, at(0.0)[1 + argument], atol=3e-6)
+@pytest.mark.parametrize("rule", Quadrature)
+@pytest.mark.parametrize("streak", [(0.0, 0.0), (2.1, -1.3), (-0.5, 6.0)])
+def test_derivatives_are_those_of_the_level(rule: Quadrature, streak: tuple[float, float]) -> None:
+    radius = (0.7, 1.5, 2.5, 5.0, 8.0, 20.0, 20.0)[rule]
+    disc = Disc(radius, rule, 0.8, 1.3, 0.25, *streak)
+    x, y = around(radius, 2.5)
+    seen, step = disc.seen(x, y), 3e-4
+
+    def slope(**fields: float) -> FloatArray:
+        ends = [
+            replace(disc, **{key: getattr(disc, key) + sign * step for key in fields})
+            for sign in (1.0, -1.0)
+        ]
+        return np.asarray((ends[0].level(x, y) - ends[1].level(x, y)) / (2.0 * step))
+
+    numeric = {
+        BY_PLATE_X: (disc.level(x - step, y) - disc.level(x + step, y)) / (2.0 * step),
+        BY_PLATE_Y: (disc.level(x, y - step) - disc.level(x, y + step)) / (2.0 * step),
+        BY_XX: slope(xx=step),
+        BY_XY: 0.5 * slope(xy=step),  # one of two equal elements
+        BY_YY: slope(yy=step),
+    }
+    if any(streak):
+        numeric |= {BY_STREAK_X: slope(streak_x=step), BY_STREAK_Y: slope(streak_y=step)}
+    for row, expected in numeric.items():
+        np.testing.assert_allclose(seen[row], expected, rtol=0.0, atol=3e-5, err_msg=str(row))
+    wider = 2.0 * (disc.xx * seen[BY_XX] + 2.0 * disc.xy * seen[BY_XY] + disc.yy * seen[BY_YY])
+    wider += streak[0] * seen[BY_STREAK_X] + streak[1] * seen[BY_STREAK_Y]
+    np.testing.assert_allclose(seen[BY_DEPTH], wider, rtol=0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize(("radius", "length"), [(2.0, 4.0), (3.5, 9.0), (9.0, 12.0), (20.0, 30.0)])
 def test_a_streak_is_the_mean_of_shifted_discs(radius: float, length: float) -> None:
     """Against the noncentral χ² distribution, averaged over the exposure."""
-    sigma = 0.7
+    sigma, direction = 0.7, np.array([0.8, -0.6])
     whole = np.hypot(sigma, length / np.sqrt(12.0))
     rule = rule_for(radius / whole, radius / sigma)
     assert rule is not Quadrature.EDGE
-    shifts = length * ((np.arange(600) + 0.5) / 600 - 0.5)
-    for y in (0.0, 0.6 * radius, 0.97 * radius, radius + sigma):
-        x = np.linspace(0.0, radius + 0.5 * length + 2.0, 25)
-        rho = np.hypot(x[:, None] + shifts, y)
-        expected = isotropic(rho, radius, sigma).mean(axis=1)
-        level = disc(x, radius, (sigma**2, sigma**2, 0.0), rule, y, length)[0]
-        assert np.abs(level - expected).max() < 4e-4
+    motion = length * direction
+    disc = Disc(radius, rule, sigma**2, sigma**2, 0.0, motion[0], motion[1])
+    shifts = np.outer(motion, (np.arange(600) + 0.5) / 600 - 0.5)
+    x, y = around(radius, 0.5 * length + 2.0, 100)
+    rho = np.hypot(x[:, None] + shifts[0], y[:, None] + shifts[1])
+    expected = isotropic(rho, radius, sigma).mean(axis=1)
+    assert np.abs(disc.level(x, y) - expected).max() < 4e-4
 
 
 def test_anisotropic_blur_against_random_shifts() -> None:
@@ -105,32 +139,30 @@ def test_anisotropic_blur_against_random_shifts() -> None:
     rng = np.random.default_rng(5)
     covariance = np.array([[0.9, 0.5], [0.5, 1.6]])
     shifts = rng.multivariate_normal(np.zeros(2), covariance, size=400_000)
-    radius = 2.2
-    rule = rule_for(2.2 / np.sqrt(1.6), 2.2 / np.sqrt(1.6))
+    ratio = 2.2 / np.sqrt(1.9)
+    disc = Disc(2.2, rule_for(ratio, ratio), 0.9, 1.6, 0.5)
     for rho in (0.5, 1.8, 2.4, 3.5):
-        covered = np.hypot(rho + shifts[:, 0], shifts[:, 1]) <= radius
+        covered = np.hypot(rho + shifts[:, 0], shifts[:, 1]) <= disc.radius
         expected = covered.mean()
-        level = disc(np.array([rho]), radius, (0.9, 1.6, 0.5), rule)[0, 0]
+        level = disc.level(np.array([rho]), np.zeros(1))[0]
         assert abs(level - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / len(shifts))
 
 
-@pytest.mark.parametrize("smear", [0.0, 0.4, 3.0, 9.0])
-def test_a_smeared_edge_is_the_mean_of_shifted_ones(smear: float) -> None:
+@pytest.mark.parametrize("length", [0.01, 0.13, 0.15, 0.4, 3.0, 9.0])
+def test_a_smeared_edge_is_the_mean_of_shifted_ones(length: float) -> None:
+    """Along the radius, where a streak does not bend the edge."""
+    sharp = Disc(20.0, Quadrature.EDGE, 0.9, 1.4)
     shifts = (np.arange(2000) + 0.5) / 2000 - 0.5
-    for rho in np.linspace(12.0, 28.0, 33).tolist():
-        mean = edge(rho + smear * shifts, 20.0, 0.9, 1.4, 0.0)[0].mean()
-        assert edge(np.array([rho]), 20.0, 0.9, 1.4, smear)[0, 0] == pytest.approx(mean, abs=1e-6)
+    rho = np.linspace(12.0, 28.0, 33)
+    mean = [sharp.level(at + length * shifts, np.zeros(2000)).mean() for at in rho.tolist()]
+    smeared = replace(sharp, streak_x=length).level(rho, np.zeros(33))
+    np.testing.assert_allclose(smeared, mean, rtol=0.0, atol=2e-6)
 
 
-@pytest.mark.parametrize("smear", [0.8, 4.0])
-@pytest.mark.parametrize("argument", range(4))
-def test_derivatives_of_the_smeared_edge(smear: float, argument: int) -> None:
-    rho = np.linspace(15.0, 25.0, 41)
-
-    def at(step: float) -> FloatArray:
-        values = [0.0, 0.9, 1.4, smear]
-        values[argument] += step
-        return edge(rho + values[0], 20.0, values[1], values[2], values[3])
-
-    numeric = (at(1e-5)[0] - at(-1e-5)[0]) / 2e-5
-    assert np.allclose(numeric, at(0.0)[1 + argument], atol=1e-6)
+def test_every_pixel_is_served_once() -> None:
+    """However many there are of them: batches have a last one that is not full."""
+    disc = Disc(3.0, Quadrature.CHORDS_9)
+    x, y = around(disc.radius, 3.0, 77)
+    together = disc.seen(x, y)
+    for count in (1, 15, 16, 17, 64, 76):
+        np.testing.assert_array_equal(disc.seen(x[:count], y[:count]), together[:, :count])
