@@ -74,8 +74,8 @@ def _edge_rows(ring: Ring) -> tuple[int, ...]:
 @compiled
 def _see(outwards: FloatArray, inwards: FloatArray, visible: BoolArray) -> int:
     """Fill in where the light rises at both edges, but for single samples; count the others."""
-    least = _MIN_STEP * np.sort(outwards)[_TYPICAL_RANK]
-    least_inwards = _MIN_STEP * np.sort(inwards)[_TYPICAL_RANK]
+    least = _MIN_STEP * np.partition(outwards, _TYPICAL_RANK)[_TYPICAL_RANK]
+    least_inwards = _MIN_STEP * np.partition(inwards, _TYPICAL_RANK)[_TYPICAL_RANK]
     for a in range(ANGLES):
         visible[a] = outwards[a] > least and inwards[a] > least_inwards
     core = np.zeros(ANGLES, np.bool_)
