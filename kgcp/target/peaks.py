@@ -16,7 +16,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 PEAK_RADIUS_PX = 2.8
 """Radius of the rings that the filters answer to most; a quarter more or less is as good."""
 _REACH = 4  # rows and columns that the filters look around a pixel, neighbours included
-_STRIP = 512 - 2 * _REACH  # columns
+_STRIP = 1024 - 2 * _REACH  # columns
 _VECTOR = 32  # columns that the processor may take at once
 _ROWS = 8  # rows of grey values that are kept, of which the filters look at seven
 _KEPT = 3  # rows of their answers that are kept
@@ -104,7 +104,7 @@ def _scan(image: GreyArray, first: int, found: FloatArray) -> int:
     grey, sums = np.zeros((_ROWS, longer), np.uint8), np.zeros((2, longer), np.uint16)
     core, disc = np.zeros((_KEPT, longer), np.uint16), np.zeros((_KEPT, longer), np.uint16)
     wide, extent = np.zeros((1, longer), np.uint16), np.zeros((_KEPT, longer), np.uint8)
-    score, highest = np.zeros((_KEPT, longer), np.int16), np.zeros((_KEPT, width), np.int16)
+    score = np.zeros((_KEPT, longer), np.int16)
     words, places = np.zeros(width // 8, np.uint64), np.empty(width + 8, np.int64)
     is_peak = words.view(np.uint8)
     for row in range(-_REACH, 2):
@@ -117,16 +117,13 @@ def _scan(image: GreyArray, first: int, found: FloatArray) -> int:
             continue
         last = (row - 1 + _KEPT) % _KEPT
         _score(core, disc, last, wide, score, width)
-        _highest_of_three(score, last, highest, width)
         if row < 2:
             continue
         _extents(grey, row - 2, extent, width)
-        _mark(score, highest, row - 2, extent, is_peak)
-        peaks = _list(words, is_peak, columns, places)
-        if peaks > 0:
-            more = found[count : count + peaks]
-            _describe(places, first, row - 2, score, core, disc, extent, more)
-            count += peaks
+        _mark(score, row - 2, extent, is_peak)
+        some = places[: _list(words, is_peak, columns, places)]
+        if len(some) > 0:
+            count += _describe(some, first, row - 2, score, core, disc, extent, found[count:])
     return count
 
 
@@ -177,12 +174,6 @@ def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width
 
 
 @inlined
-def _highest_of_three(score: _Rows, slot: int, out: _Rows, width: int) -> None:
-    for x in range(width):
-        out[slot, x] = max(score[slot, x], score[slot, x + 1], score[slot, x + 2])
-
-
-@inlined
 def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
     """Return the range of grey values in 5 x 5 pixels; rows 1 and 2 are for its use."""
     a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
@@ -199,16 +190,16 @@ def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
 
 
 @inlined
-def _mark(score: _Rows, highest: _Rows, row: int, extent: _Rows, is_peak: _Rows) -> None:
-    """Tell where peaks are. Of equal neighbours the first is one."""
+def _mark(score: _Rows, row: int, extent: _Rows, is_peak: _Rows) -> None:
+    """Tell where peaks may be: pixels above their four neighbours. Of equal ones it is the first."""
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     for x in range(len(is_peak)):
         value = score[at, x + 1]
         is_peak[x] = (
-            (value > highest[before, x])
+            (value > score[before, x + 1])
             & (value > score[at, x])
-            & (value >= highest[at, x])
-            & (value >= highest[after, x])
+            & (value >= score[at, x + 2])
+            & (value >= score[after, x + 1])
             & (value >= _MIN_SCORE)
             & (value >= np.int16(_MIN_SHARE * extent[0, x + 2]))
         )
@@ -236,16 +227,25 @@ def _describe(
     disc: _Rows,
     extent: _Rows,
     found: FloatArray,
-) -> None:
-    """Fill in column and row of a row's peaks, grey values between core and ring, and shares."""
+) -> int:
+    """Fill in column and row of a row's peaks, grey values between core and ring, and shares.
+
+    Count those that are also above their other four neighbours.
+    """
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
-    for i in range(len(found)):
-        x = places[i]
+    count = 0
+    for x in places:
         up, top, down = score[before, x + 1], score[at, x + 1], score[after, x + 1]
-        found[i, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
-        found[i, 1] = row + _beside(up, top, down)
-        found[i, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
-        found[i, 3] = top / max(extent[0, x + 2], 1)
+        if max(score[before, x], score[before, x + 2]) >= top:
+            continue
+        if max(score[after, x], score[after, x + 2]) > top:
+            continue
+        found[count, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
+        found[count, 1] = row + _beside(up, top, down)
+        found[count, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
+        found[count, 3] = top / max(extent[0, x + 2], 1)
+        count += 1
+    return count
 
 
 @compiled
