@@ -60,11 +60,14 @@ def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, Inde
     found, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
     count = 0
     for i in range(len(levels)):
-        at, end = levels[i], count
+        at, end, share = levels[i], count, _MIN_SHARE
         image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
         for first in range(0, image.shape[1], _STRIP):
-            end += _scan(image, first, found[end:])
-        count += _keep_best(found[count:end], _limit(at))
+            end += _scan(image, first, share, found[end:])
+            if end - count > _limit(at):
+                end = count + _keep_best(found[count:end], _limit(at))
+                share = np.int16(found[count:end, 3].min())  # what is less will not be kept
+        count = end
         ends[i] = count
     return found[:count], ends
 
@@ -78,8 +81,6 @@ def _limit(level: IndexArray) -> int:
 @compiled
 def _keep_best(found: FloatArray, limit: int) -> int:
     """Move the peaks with the largest shares, so many, to the begin; return their number."""
-    if len(found) <= limit:
-        return len(found)
     least = np.partition(found[:, 3].copy(), len(found) - limit)[len(found) - limit]
     count = 0
     for i in range(len(found)):
@@ -90,12 +91,13 @@ def _keep_best(found: FloatArray, limit: int) -> int:
 
 
 @compiled
-def _scan(image: GreyArray, first: int, found: FloatArray) -> int:
+def _scan(image: GreyArray, first: int, share: np.int16, found: FloatArray) -> int:
     """Fill in columns and rows of peaks, grey values between core and ring, shares; count them.
 
-    It is a strip from the first column on that is scanned. Entry 0 of what is kept of a row is left
-    of that column: by 4 columns in `grey` and `sums`, by 3 in `core`, by 2 in `disc`, `wide` and
-    `extent`, by 1 in `score`. Rows are kept at their numbers modulo 8 (`grey`) or 3.
+    It is a strip from the first column on that is scanned, for peaks of at least some share. Entry
+    0 of what is kept of a row is left of that column: by 4 columns in `grey` and `sums`, by 3 in
+    `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`. Rows are kept at their numbers
+    modulo 8 (`grey`) or 3.
     """
     count = 0
     columns = min(image.shape[1] - first, _STRIP)
@@ -120,7 +122,7 @@ def _scan(image: GreyArray, first: int, found: FloatArray) -> int:
         if row < 2:
             continue
         _extents(grey, row - 2, extent, width)
-        _mark(score, row - 2, extent, is_peak)
+        _mark(score, row - 2, extent, share, is_peak)
         some = places[: _list(words, is_peak, columns, places)]
         if len(some) > 0:
             count += _describe(some, first, row - 2, score, core, disc, extent, found[count:])
@@ -190,7 +192,7 @@ def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
 
 
 @inlined
-def _mark(score: _Rows, row: int, extent: _Rows, is_peak: _Rows) -> None:
+def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows) -> None:
     """Tell where peaks may be: pixels above their four neighbours. Of equal ones it is the first."""
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     for x in range(len(is_peak)):
@@ -201,7 +203,7 @@ def _mark(score: _Rows, row: int, extent: _Rows, is_peak: _Rows) -> None:
             & (value >= score[at, x + 2])
             & (value >= score[after, x + 1])
             & (value >= _MIN_SCORE)
-            & (value >= np.int16(_MIN_SHARE * extent[0, x + 2]))
+            & (value >= np.int16(share * extent[0, x + 2]))
         )
 
 
