@@ -82,9 +82,10 @@ def _limit(level: IndexArray) -> int:
 def _keep_best(found: FloatArray, limit: int) -> int:
     """Move the peaks with the largest shares, so many, to the begin; return their number."""
     least = np.partition(found[:, 3].copy(), len(found) - limit)[len(found) - limit]
-    count = 0
+    count, alike = 0, limit - np.sum(found[:, 3] > least)
     for i in range(len(found)):
-        if found[i, 3] >= least:
+        if found[i, 3] > least or (found[i, 3] == least and alike > 0):
+            alike -= found[i, 3] == least
             found[count] = found[i]
             count += 1
     return count
@@ -193,7 +194,7 @@ def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
 
 @inlined
 def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows) -> None:
-    """Tell where peaks may be: pixels above their four neighbours. Of equal ones it is the first."""
+    """Tell where peaks may be: pixels above four neighbours; of equal ones the first."""
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     for x in range(len(is_peak)):
         value = score[at, x + 1]
