@@ -88,7 +88,11 @@ class Parameters:
     def moved(self, step: FloatArray) -> Parameters:
         """Return the parameters after a step (19,) in the order of `Param`."""
         values = (self.nuisance_vector + step).tolist()
-        mean = max(values[Param.BLUR_MEAN], _MIN_VARIANCE_PX2)
+        mean = values[Param.BLUR_MEAN]
+        if step[Param.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
+            before = mean - step[Param.BLUR_MEAN]
+            mean = before * before / (2.0 * before - mean)
+        mean = max(float(mean), _MIN_VARIANCE_PX2)
         difference, xy = values[Param.BLUR_DIFFERENCE], values[Param.BLUR_XY]
         excess = math.hypot(difference, xy) / (_MAX_ANISOTROPY * mean)
         if excess > 1.0:  # the covariance must stay positive definite
