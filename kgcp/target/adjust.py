@@ -24,6 +24,7 @@ _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
 _NEGLIGIBLE = 1e-6
+_AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
 _MAX_DAMPING = 1e6
 
@@ -233,7 +234,7 @@ def minimise(
             jacobian, scaled = attempt_jacobian, attempt_jacobian[unknowns.free] / sd
             normal = normal_matrix(scaled, current, unknowns)
         damping = max(0.1 * damping, 1e-9)
-        if gain < enough:
+        if gain < enough or abs(gain - promised) < _AS_PROMISED:
             break
     return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)
 

@@ -26,7 +26,6 @@ from kgcp.target.imager import share_at
 from kgcp.target.light import plateau_levels
 from kgcp.target.noise import median_at_edges
 from kgcp.target.observation import Uncertainty
-from kgcp.target.plate import find_skips
 
 _ARC_PX = 6.0
 # Of a circle's edge as a whole: no print and no pixel is known better, …
@@ -130,40 +129,30 @@ def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> tuple[FloatA
 def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
     """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
     imaging = fit.sample.imaging
-    circles, points = imaging.circles, fit.prediction.points_m
+    circles = imaging.circles.part(slice(0, imaging.measured_count))
     px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
     counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
-    firsts = np.concatenate(([0], np.cumsum(counts)[:-1]))
-    skips = find_skips(circles.centres_m, circles.radii_m)
-    return _number_arcs(points, circles.centres_m, circles.radii_m, *skips, firsts, counts)
+    return _number_arcs(fit.prediction.points_m, circles.centres_m, circles.radii_m, counts)
 
 
 @compiled
 def _number_arcs(
-    points_m: FloatArray,
-    centres_m: FloatArray,
-    radii_m: FloatArray,
-    out_m: FloatArray,
-    beyond: IndexArray,
-    firsts: FloatArray,
-    counts: FloatArray,
+    points_m: FloatArray, centres_m: FloatArray, radii_m: FloatArray, counts: FloatArray
 ) -> tuple[IndexArray, IndexArray]:
     """Return the circle of every pixel's nearest edge, and the number of the arc there."""
-    circle, arc = np.zeros((2, points_m.shape[1]), np.intp)
-    for i in range(points_m.shape[1]):
-        x, y, c = points_m[0, i], points_m[1, i], 0
-        rho, nearest = math.sqrt(x * x + y * y), np.inf
-        while c < len(radii_m):
-            if abs(rho - out_m[c]) > radii_m[c] + nearest:
-                c = beyond[c]
-                continue
-            dx, dy = x - centres_m[0, c], y - centres_m[1, c]
-            off_edge = abs((rho if out_m[c] == 0.0 else math.sqrt(dx * dx + dy * dy)) - radii_m[c])
-            if off_edge < nearest:
-                nearest, circle[i] = off_edge, c
-            c += 1
+    nearest = np.full(points_m.shape[1], np.inf)
+    circle, arc = np.zeros((2, len(nearest)), np.intp)
+    for c in range(len(radii_m)):
+        for i in range(len(nearest)):
+            x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+            off_edge = abs(math.sqrt(x * x + y * y) - radii_m[c])
+            circle[i] = c if off_edge < nearest[i] else circle[i]
+            nearest[i] = min(nearest[i], off_edge)
+    firsts = np.cumsum(counts) - counts
+    for i in range(len(nearest)):
         c = circle[i]
-        turn = math.atan2(y - centres_m[1, c], x - centres_m[0, c]) / (2.0 * math.pi)
+        x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+        turn = math.atan2(y, x) / (2.0 * math.pi)
         turn -= math.floor(turn)
         arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
     return circle, arc
