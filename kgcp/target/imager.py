@@ -10,7 +10,15 @@ from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.target.coverage import WhiteShare
-from kgcp.target.light import PARAM_COUNT, Light, Param, decoded, encoded, srgb_slope
+from kgcp.target.light import (
+    PARAM_COUNT,
+    Light,
+    Param,
+    decoded,
+    encoded,
+    plateau_levels,
+    srgb_slope,
+)
 from kgcp.target.sharpening import Mask
 
 # The gradient of the light is left out: over a whole ring, it is flat over the mask.
@@ -32,14 +40,11 @@ class Imager:
         `linear` and `srgb` are applied as known; `unknown` uses the tone parameters.
     mask : Mask or None
         Of the camera's sharpening; None: it does not sharpen.
-    plateau : (q,) array
-        White share of the mask's other pixels as if there were no blur; empty without a mask.
     """
 
     offsets: FloatArray
     response: Response
     mask: Mask | None
-    plateau: FloatArray
 
     def levels(self, share: FloatArray, light: Light) -> FloatArray:
         """Return the modelled grey values (n,) before clipping."""
@@ -68,23 +73,22 @@ class Imager:
         jacobian[Param.SHARPENING] = detail
         return value + light.sharpening * detail, jacobian
 
-    def _core_of_plateau(self, light: Light) -> FloatArray:
-        """Return the light without blur; its gradient hardly changes over the mask."""
-        return light.black + (light.white - light.black) * self.plateau
-
     def _detail(self, mask: Mask, value: FloatArray, light: Light) -> FloatArray:
-        """Return what the mask adds to the grey values at full strength."""
-        others = encoded(self._core_of_plateau(light), self.response)
-        return mask.detail(np.concatenate((value, others)))
+        """Return what the mask adds to the grey values at full strength.
+
+        Where no edge is near there is no blur, and over the mask the light's gradient is flat.
+        """
+        return mask.detail(value, *plateau_levels(light, self.response))
 
     def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
         """Sharpen the rows of a Jacobian."""
         rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
         if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
             rows += _STREAK_ROWS
-        others = np.stack((1.0 - self.plateau, self.plateau))
+        others = (1.0, 1.0)
         if self.response is Response.SRGB:
-            others *= srgb_slope(self._core_of_plateau(light))
+            ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
+            others = (ink, plate)
         mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
 
 

@@ -196,9 +196,10 @@ def _imager(seen: SeenPlate, index: IndexArray) -> Imager:
     imaging, window = seen.imaging, seen.imaging.window
     offsets = (window.pixels(index) - imaging.centre_px[:, None]) / imaging.outer_radius_px
     if imaging.sharpening_px == 0.0:
-        return Imager(offsets, imaging.response, None, np.zeros(0))
-    mask = unsharp_mask(window.width, window.height, index, imaging.sharpening_px)
-    return Imager(offsets, imaging.response, mask, seen.bare.share[mask.others])
+        return Imager(offsets, imaging.response, None)
+    shape = (window.height, window.width)
+    mask = unsharp_mask(shape, index, seen.bare.share, imaging.sharpening_px)
+    return Imager(offsets, imaging.response, mask)
 
 
 def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> EdgePairs:

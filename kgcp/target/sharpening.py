@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -22,40 +23,48 @@ class Mask:
     """An unsharp mask over a window of which n pixels are modelled.
 
     The mask is separable. Its first pass, along rows, makes the m values that the second one, along
-    columns, needs; it draws on the modelled pixels and on q others.
+    columns, needs; both draw on the modelled pixels alone. All others are ink or plate.
 
     Attributes
     ----------
-    others : (q,) array of int
-        Pixels in reach that are not modelled, in the flattened window.
     along_rows : (m, 7) array of int
-        What the first pass adds up: modelled pixels by number, then the others.
+        What the first pass adds up: modelled pixels by number; n: none.
     along_columns : (n, 7) array of int
-        What the second pass adds up for each modelled pixel.
+        What the second pass adds up for each modelled pixel; m: nothing.
     kernel : (7,) array
         Weights of either pass, which add up to 1.
+    ink, plate : (n,) arrays
+        What part of the smoothed value the others are, at each modelled pixel.
     """
 
-    others: IndexArray
     along_rows: NumberArray
     along_columns: NumberArray
     kernel: FloatArray
+    ink: FloatArray
+    plate: FloatArray
 
-    def detail(self, values: FloatArray) -> FloatArray:
+    def detail(self, values: FloatArray, ink: float, plate: float) -> FloatArray:
         """Return what the mask adds at full strength (n,).
 
         Parameters
         ----------
-        values : (n + q,) array
-            Of the modelled pixels, then of the others.
+        values : (n,) array
+            Of the modelled pixels.
+        ink, plate : float
+            Values of the others.
         """
-        between, smooth = np.empty(len(self.along_rows)), np.empty(len(self.along_columns))
+        between = np.empty(len(self.along_rows))
+        smooth = ink * self.ink + plate * self.plate
         _smooth(values, self.along_rows, self.kernel, between)
-        _smooth(between, self.along_columns, self.kernel, smooth)
-        return values[: len(smooth)] - smooth
+        _add_smooth(between, self.along_columns, self.kernel, smooth)
+        return values - smooth
 
     def sharpen(
-        self, jacobian: FloatArray, rows: IndexArray, others: FloatArray, strength: float
+        self,
+        jacobian: FloatArray,
+        rows: IndexArray,
+        others: tuple[float, float],
+        strength: float,
     ) -> None:
         """Sharpen some rows of a Jacobian (…, n).
 
@@ -66,86 +75,104 @@ class Mask:
         jacobian : (…, n) array
             Changed in place.
         rows : (k,) array of int
-        others : (2, q) array
-            Values of the first two of these rows at the other pixels, where the rest is 0.
+            The first two are the derivatives by what ink and plate are.
+        others : (2,) tuple
+            By how much the other pixels change with them.
         strength : float
         """
-        count = len(self.along_columns)
-        layers = np.zeros((count + others.shape[1], _LAYERS), dtype=np.float32)
-        between = np.empty((len(self.along_rows), _LAYERS), dtype=np.float32)
-        kernel = self.kernel.astype(np.float32)
+        count, kernel = jacobian.shape[1], self.kernel.astype(np.float32)
+        layers = np.zeros((count + 1, _LAYERS), dtype=np.float32)
+        between = np.zeros((len(self.along_rows) + 1, _LAYERS), dtype=np.float32)
         _stack(jacobian, rows, layers)
-        layers[count:, :2] = others.T
         _smooth_layers(layers, self.along_rows, kernel, between)
-        smooth = np.empty((count, _LAYERS), dtype=np.float32)
-        _smooth_layers(between, self.along_columns, kernel, smooth)
-        _add_detail(layers, smooth, rows, strength, jacobian)
+        _add_detail(layers, between, self.along_columns, kernel, rows, strength, jacobian)
+        jacobian[rows[0]] -= strength * others[0] * self.ink
+        jacobian[rows[1]] -= strength * others[1] * self.plate
 
 
-def unsharp_mask(width: int, height: int, index: IndexArray, sigma_px: float) -> Mask:
+def unsharp_mask(
+    shape: tuple[int, int], index: IndexArray, share: FloatArray, sigma_px: float
+) -> Mask:
     """Return the mask of a Gaussian of this σ [px]; the window's border is repeated beyond it.
 
     Parameters
     ----------
-    width, height : int
-        Of the window [px].
+    shape : (2,) tuple of int
+        Rows and columns of the window.
     index : (n,) array of int
         The modelled pixels in the flattened window.
+    share : (rows · columns,) array
+        White share of all pixels as if there were no blur.
     sigma_px : float
     """
-    along_columns = np.empty((len(index), _TAPS), dtype=np.int32)
-    nothing = np.zeros(0, dtype=np.intp)
-    needed = _gather(index, nothing, width, height, along_columns, True)  # noqa: FBT003
-    along_rows = np.empty((len(needed), _TAPS), dtype=np.int32)
-    sources = _gather(needed, index, width, height, along_rows, False)  # noqa: FBT003
+    along_rows, along_columns = _gather(index, *shape)
     steps = np.arange(_TAPS) - _TAPS // 2
     kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
-    return Mask(sources[len(index) :], along_rows, along_columns, kernel / kernel.sum())
+    kernel /= kernel.sum()
+    others, plate = np.ones(len(share)), share.copy()
+    others[index] = plate[index] = 0.0
+    of_others, of_plate = (_filtered(values.reshape(shape), kernel) for values in (others, plate))
+    ink = (of_others - of_plate).ravel()[index]
+    return Mask(along_rows, along_columns, kernel, ink, of_plate.ravel()[index])
+
+
+def _filtered(image: FloatArray, kernel: FloatArray) -> FloatArray:
+    border = cv2.BORDER_REPLICATE
+    smooth = cv2.sepFilter2D(image, cv2.CV_64F, kernel, kernel, borderType=border)
+    return np.asarray(smooth, dtype=np.float64)
 
 
 @compiled
-def _gather(
-    index: IndexArray,
-    first: IndexArray,
-    width: int,
-    height: int,
-    numbers: NumberArray,
-    is_column: bool,  # noqa: FBT001 - compiled functions have no keywords
-) -> IndexArray:
-    """Return the pixels that are needed along columns or rows, given ones first.
-
-    The number among them of each that a pixel (n,) needs goes to `numbers` (n, 7).
-    """
-    reach = numbers.shape[1] // 2
-    number = np.full(width * height, -1, np.int32)
-    for i in range(len(index)):
+def _gather(index: IndexArray, height: int, width: int) -> tuple[NumberArray, NumberArray]:
+    """Return what the two passes add up, for the pixels (n,) of a window."""
+    reach, count = _TAPS // 2, len(index)
+    number = np.full((height, width), count, np.int32)  # of a modelled pixel
+    between = np.full((height, width), -2, np.int32)  # of a value between the passes; −1: not yet
+    for i in range(count):
         row, column = index[i] // width, index[i] % width
-        for j in range(numbers.shape[1]):
-            if is_column:
-                pixel = min(max(row + j - reach, 0), height - 1) * width + column
-            else:
-                pixel = row * width + min(max(column + j - reach, 0), width - 1)
-            numbers[i, j] = pixel
-            number[pixel] = 0
-    for pixel in first:
-        number[pixel] = -1
-    distinct = np.concatenate((first, np.flatnonzero(number == 0)))
-    for k in range(len(distinct)):
-        number[distinct[k]] = k
-    for i in range(len(index)):
-        for j in range(numbers.shape[1]):
-            numbers[i, j] = number[numbers[i, j]]
-    return distinct
+        number[row, column] = i
+        for there in range(max(column - reach, 0), min(column + reach + 1, width)):
+            between[row, there] = -1
+    along_columns = np.empty((count, _TAPS), np.int32)
+    places, found = np.empty(min(_TAPS * count, height * width), np.intp), 0
+    for i in range(count):
+        row, column = index[i] // width, index[i] % width
+        for j in range(_TAPS):
+            there = min(max(row + j - reach, 0), height - 1)
+            if between[there, column] == -1:
+                between[there, column] = found
+                places[found] = there * width + column
+                found += 1
+            along_columns[i, j] = between[there, column]
+    along_rows = np.empty((found, _TAPS), np.int32)
+    for k in range(found):
+        row, column = places[k] // width, places[k] % width
+        for j in range(_TAPS):
+            along_rows[k, j] = number[row, min(max(column + j - reach, 0), width - 1)]
+    for i in range(count):
+        for j in range(_TAPS):
+            along_columns[i, j] = found if along_columns[i, j] < 0 else along_columns[i, j]
+    return along_rows, along_columns
 
 
 @compiled
 def _smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: FloatArray) -> None:
-    """Add up weighted values: out[i] = Σ kernel[j] · source[at[i, j]]."""
+    """Fill in weighted sums: out[i] = Σ kernel[j] · source[at[i, j]], nothing beyond its end."""
     for i in range(at.shape[0]):
         total = 0.0
         for j in range(at.shape[1]):
-            total += kernel[j] * source[at[i, j]]
+            k = at[i, j]
+            total += kernel[j] * source[k] if k < len(source) else 0.0
         out[i] = total
+
+
+@compiled
+def _add_smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: FloatArray) -> None:
+    """Do as `_smooth`, but add to what is there."""
+    for i in range(at.shape[0]):
+        for j in range(at.shape[1]):
+            k = at[i, j]
+            out[i] += kernel[j] * source[k] if k < len(source) else 0.0
 
 
 @compiled
@@ -164,7 +191,7 @@ def _smooth_layers(
     far, farther, farthest, middle = kernel[2], kernel[1], kernel[0], kernel[3]
     for i in range(at.shape[0]):
         a, b, c, d, e, f, g = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5], at[i, 6]
-        for k in range(source.shape[1]):
+        for k in range(_LAYERS):
             out[i, k] = (
                 middle * source[d, k]
                 + far * (source[c, k] + source[e, k])
@@ -176,13 +203,16 @@ def _smooth_layers(
 @compiled
 def _add_detail(
     layers: SingleArray,
-    smooth: SingleArray,
+    between: SingleArray,
+    at: NumberArray,
+    kernel: SingleArray,
     rows: IndexArray,
     strength: float,
     jacobian: FloatArray,
 ) -> None:
     """Add what smoothing takes away."""
-    for k in range(len(rows)):
-        row = jacobian[rows[k]]
-        for i in range(len(row)):
-            row[i] += strength * (layers[i, k] - smooth[i, k])
+    smooth = np.empty((1, _LAYERS), np.float32)
+    for i in range(len(at)):
+        _smooth_layers(between, at[i : i + 1], kernel, smooth)
+        for k in range(len(rows)):
+            jacobian[rows[k], i] += strength * (layers[i, k] - smooth[0, k])

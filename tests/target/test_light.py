@@ -43,10 +43,10 @@ def make_imager(response: Response, sharpening_px: float) -> Imager:
     index = np.sort(rng.permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT * 2 // 3])
     offsets = np.stack((index % WIDTH / WIDTH - 0.5, index // WIDTH / HEIGHT - 0.5))
     if sharpening_px == 0.0:
-        return Imager(offsets, response, None, np.zeros(0))
-    mask = unsharp_mask(WIDTH, HEIGHT, index, sharpening_px)
-    plateau = rng.integers(0, 2, len(mask.others)).astype(np.float64)
-    return Imager(offsets, response, mask, plateau)
+        return Imager(offsets, response, None)
+    plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
+    mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, sharpening_px)
+    return Imager(offsets, response, mask)
 
 
 def make_share(imager: Imager) -> WhiteShare:
@@ -105,19 +105,23 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, atol=1e-7)
 
 
-def test_sharpening_is_an_unsharp_mask_on_the_whole_window() -> None:
-    """All pixels modelled: the same as OpenCV's blur of the plain image."""
-    index = np.arange(WIDTH * HEIGHT)
-    share = np.random.default_rng(1).random(WIDTH * HEIGHT)
-    even, nothing = np.zeros((2, len(index))), np.zeros(0)
-    plain = Imager(even, Response.UNKNOWN, None, nothing).levels(share, LIGHT)
-    plain = plain.reshape(HEIGHT, WIDTH)
-    smooth = cv2.GaussianBlur(plain, (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE)
-    mask = unsharp_mask(WIDTH, HEIGHT, index, SHARPENING_PX)
-    assert len(mask.others) == 0
-    sharp = Imager(even, Response.UNKNOWN, mask, nothing).levels(share, LIGHT)
-    expected = plain + LIGHT.sharpening * (plain - smooth)
-    np.testing.assert_allclose(sharp.reshape(HEIGHT, WIDTH), expected, atol=1e-12)
+@pytest.mark.parametrize("modelled", [0.05, 0.5, 1.0])
+def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> None:
+    """The same as OpenCV's blur of the plain image, in which other pixels are ink or plate."""
+    rng = np.random.default_rng(1)
+    index = np.flatnonzero(rng.random(WIDTH * HEIGHT) < modelled)
+    share = rng.random(len(index))
+    plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
+    even = np.zeros((2, len(index)))
+    plain = np.where(plateau > 0.5, LIGHT.white, LIGHT.black)
+    plain[index] = Imager(even, Response.UNKNOWN, None).levels(share, LIGHT)
+    smooth = cv2.GaussianBlur(
+        plain.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
+    ).ravel()
+    mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
+    sharp = Imager(even, Response.UNKNOWN, mask).levels(share, LIGHT)
+    expected = (plain + LIGHT.sharpening * (plain - smooth))[index]
+    np.testing.assert_allclose(sharp, expected, atol=1e-12)
 
 
 def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
