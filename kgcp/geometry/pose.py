@@ -46,6 +46,13 @@ class Pose:
             Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
         )
 
+    @property
+    def matrix(self) -> FloatArray:
+        """Rotation and translation side by side (3, 4)."""
+        matrix = np.empty((3, 4))
+        matrix[:, :3], matrix[:, 3] = self.rotation, self.translation_m
+        return matrix
+
     def transform(self, points_target: FloatArray) -> FloatArray:
         """Bring points (n, 3) or (n, 2) on the plate [m] into the camera frame (n, 3) [m]."""
         columns = points_target.shape[-1]

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT, Parameters
+from kgcp.target.light import PARAM_COUNT
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
+from kgcp.target.parameters import Parameters
 from kgcp.target.sample import Sample, choose_sample
 
 _MAX_ROUNDS = 4
@@ -58,15 +60,18 @@ class Unknowns:
         Estimated parameters, by `Param`.
     mean, precision : (19,) array
         Independent normal priors on the nuisance parameters; precision 0: none.
+    free_precision : (p,) array
+        Of the estimated parameters.
     """
 
     free: IndexArray
     mean: FloatArray
     precision: FloatArray
+    free_precision: FloatArray
 
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""
-        deviation = parameters.nuisance_vector - self.mean
+        deviation = parameters.vector - self.mean
         return float(0.5 * (self.precision * deviation) @ deviation)
 
 
@@ -98,7 +103,7 @@ class Fit:
     @property
     def scaled_jacobian(self) -> FloatArray:
         """Jacobian of the free parameters (p, n), in units of the noise."""
-        return self.jacobian[self.unknowns.free] / self.sd
+        return scaled_rows(self.jacobian, self.unknowns.free, self.sd)
 
     @property
     def total(self) -> float:
@@ -108,14 +113,14 @@ class Fit:
 
 def predict(sample: Sample, parameters: Parameters) -> Prediction:
     """Model the grey values of a sample."""
-    share = white_level(parameters.pose, sample.rays, parameters.blur, sample.pairs)
+    share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
     levels = sample.imager.levels(share.value, parameters.light)
     return Prediction(share.points_m, share.value, levels)
 
 
 def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
     """Model the grey values of a sample, and return their Jacobian (19, n) with them."""
-    share = white_share(parameters.pose, sample.rays, parameters.blur, sample.pairs)
+    share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
     levels, jacobian = sample.imager.linearised(share, parameters.light)
     return Prediction(share.points_m, share.value, levels), jacobian
 
@@ -203,19 +208,15 @@ def minimise(
     damping, light = _DAMPING, parameters.light
     relative_sd = float(sd.mean()) / (light.white - light.black)
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
-    scaled = jacobian[unknowns.free] / sd
+    scaled = scaled_rows(jacobian, unknowns.free, sd)
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = current.total + unknowns.penalty(parameters)
     normal = normal_matrix(scaled, current, unknowns)
     for number in range(steps):
-        gradient = _gradient(scaled, parameters, current, unknowns)
         while True:
-            step = np.zeros(PARAM_COUNT)
-            damped = _solve(_damped(normal, damping), gradient)
-            step[unknowns.free] = damped
+            step, promised = _propose(scaled, normal, current, parameters, unknowns, damping)
             candidate = parameters.moved(step)
-            promised = 0.5 * float(gradient @ damped)
-            change = relative_sd * math.sqrt(2.0 * max(promised, 0.0) / len(sd))
+            change = relative_sd * math.sqrt(2.0 * promised / len(sd))
             if change > _LARGE_CHANGE and number < steps - 1:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
@@ -231,7 +232,8 @@ def minimise(
         gain, total = total - trial_total, trial_total
         parameters, prediction, current = candidate, attempt, trial
         if attempt_jacobian is not jacobian:
-            jacobian, scaled = attempt_jacobian, attempt_jacobian[unknowns.free] / sd
+            jacobian = attempt_jacobian
+            scaled = scaled_rows(jacobian, unknowns.free, sd)
             normal = normal_matrix(scaled, current, unknowns)
         damping = max(0.1 * damping, 1e-9)
         if gain < enough or abs(gain - promised) < _AS_PROMISED:
@@ -242,27 +244,43 @@ def minimise(
 def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
     """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
     normal = (scaled * current.weight) @ scaled.T
-    normal.flat[:: len(normal) + 1] += unknowns.precision[unknowns.free]
+    normal.flat[:: len(normal) + 1] += unknowns.free_precision
     return normal
 
 
-def _gradient(
-    scaled: FloatArray, parameters: Parameters, current: Misfit, unknowns: Unknowns
-) -> FloatArray:
-    pull = unknowns.precision * (unknowns.mean - parameters.nuisance_vector)
-    return scaled @ current.score + pull[unknowns.free]
+def _propose(
+    scaled: FloatArray,
+    normal: FloatArray,
+    current: Misfit,
+    parameters: Parameters,
+    unknowns: Unknowns,
+    damping: float,
+) -> tuple[FloatArray, float]:
+    """Return a step (19,) and the gain that it promises.
 
-
-def _damped(normal: FloatArray, damping: float) -> FloatArray:
-    """Return a normal matrix with a share of its diagonal added."""
+    Raises
+    ------
+    Rejection
+        `POOR_FIT` if the equations cannot be solved.
+    """
+    pull = unknowns.precision * (unknowns.mean - parameters.vector)
+    gradient = scaled @ current.score + pull[unknowns.free]
     damped = normal.copy()
     damped.flat[:: len(normal) + 1] *= 1.0 + damping
-    return damped
-
-
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve normal equations by Cholesky's method; LAPACK itself, for they are small and many."""
-    _, solution, failure = dposv(matrix, right)
-    if failure or not np.isfinite(solution).all():
+    _, solution, failure = dposv(damped, gradient)  # LAPACK itself: they are small and many
+    promised = 0.5 * float(gradient @ solution)
+    if failure or not math.isfinite(promised):
         raise Rejection(Reason.POOR_FIT, "singular normal equations")
-    return np.asarray(solution)
+    step = np.zeros(PARAM_COUNT)
+    step[unknowns.free] = solution
+    return step, promised
+
+
+@compiled
+def scaled_rows(jacobian: FloatArray, rows: IndexArray, sd: FloatArray) -> FloatArray:
+    """Return some rows of a Jacobian (p, n), in units of the noise (n,)."""
+    scaled, per_sd = np.empty((len(rows), len(sd))), 1.0 / sd
+    for k in range(len(rows)):
+        for i in range(len(sd)):
+            scaled[k, i] = jacobian[rows[k], i] * per_sd[i]
+    return scaled

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.pose import Pose
-from kgcp.target.pairs import Blur, EdgePairs
+from kgcp.target.pairs import EdgePairs
 from kgcp.target.plate_view import PLATE_ROWS, SLOPE_ROWS, VIEW_ROWS, carry_slopes, meet_plate
 from kgcp.target.rendering import render
 
@@ -40,33 +39,41 @@ class WhiteShare:
     jacobian: FloatArray
 
 
-def white_share(pose: Pose, rays: FloatArray, blur: Blur, pairs: EdgePairs) -> WhiteShare:
-    """Return the white share of every pixel, with derivatives; rays (6, n) as of a window."""
-    views = _views(pose, rays)
-    on_plate = _rendered(views, blur, pairs, PLATE_ROWS)
+def white_share(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+) -> WhiteShare:
+    """Return the white share of every pixel, with derivatives.
+
+    Parameters
+    ----------
+    pose : (3, 4) array
+        `Pose.matrix`.
+    rays : (6, n) array
+        As of a window.
+    blur : (5,) array
+        `Blur.vector`.
+    pairs : EdgePairs
+    """
+    views, on_plate = _rendered(pose, rays, blur, pairs, PLATE_ROWS)
     slopes = np.empty((SLOPE_ROWS, rays.shape[1]))
-    carry_slopes(_matrix(pose), views, on_plate, slopes)
+    carry_slopes(pose, views, on_plate, slopes)
     return WhiteShare(views[:2], on_plate[0], slopes)
 
 
-def white_level(pose: Pose, rays: FloatArray, blur: Blur, pairs: EdgePairs) -> WhiteShare:
+def white_level(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+) -> WhiteShare:
     """Return the white share of every pixel alone, at less than half the cost."""
-    views = _views(pose, rays)
-    return WhiteShare(views[:2], _rendered(views, blur, pairs, 1)[0], np.empty((0, rays.shape[1])))
+    views, on_plate = _rendered(pose, rays, blur, pairs, 1)
+    return WhiteShare(views[:2], on_plate[0], np.empty((0, rays.shape[1])))
 
 
-def _matrix(pose: Pose) -> FloatArray:
-    return np.column_stack((pose.rotation, pose.translation_m))
-
-
-def _views(pose: Pose, rays: FloatArray) -> FloatArray:
-    views = np.empty((VIEW_ROWS, rays.shape[1]))
-    meet_plate(_matrix(pose), rays, views)
-    return views
-
-
-def _rendered(views: FloatArray, blur: Blur, pairs: EdgePairs, rows: int) -> FloatArray:
-    out = np.zeros((rows, views.shape[1]))
-    out[0] = pairs.background
-    render(views, blur.vector, pairs.circles, pairs.starts, pairs.members, out)
-    return out
+def _rendered(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs, rows: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return views (15, n) and what is seen (rows, n)."""
+    views, on_plate = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((rows, rays.shape[1]))
+    meet_plate(pose, rays, views)
+    on_plate[0] = pairs.background
+    render(views, blur, pairs.circles, pairs.starts, pairs.members, on_plate)
+    return views, on_plate

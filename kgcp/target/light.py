@@ -8,17 +8,13 @@ Together they are what displaces apparent edges: δ is a consequence here, not a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
-from kgcp.geometry.pose import Pose
-from kgcp.target.pairs import Blur
 
 
 class Param(IntEnum):
@@ -40,9 +36,6 @@ class Param(IntEnum):
 
 
 PARAM_COUNT = 19
-_NO_POSE = (0.0,) * 6
-_MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
-_MAX_ANISOTROPY = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,39 +68,6 @@ class Light:
         """All eight, in the order of `Param`."""
         levels = (self.black, self.white, self.slope_x, self.slope_y)
         return (*levels, self.tone_1, self.tone_2, self.tone_3, self.sharpening)
-
-
-@dataclass(frozen=True, eq=False)
-class Parameters:
-    """Everything that the adjustment estimates."""
-
-    pose: Pose
-    blur: Blur
-    light: Light
-
-    def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (19,) in the order of `Param`."""
-        values = (self.nuisance_vector + step).tolist()
-        mean = values[Param.BLUR_MEAN]
-        if step[Param.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
-            before = mean - step[Param.BLUR_MEAN]
-            mean = before * before / (2.0 * before - mean)
-        mean = max(float(mean), _MIN_VARIANCE_PX2)
-        difference, xy = values[Param.BLUR_DIFFERENCE], values[Param.BLUR_XY]
-        excess = math.hypot(difference, xy) / (_MAX_ANISOTROPY * mean)
-        if excess > 1.0:  # the covariance must stay positive definite
-            difference, xy = difference / excess, xy / excess
-        streak = values[Param.STREAK_X : Param.STREAK_Y + 1]
-        blur = Blur(mean + difference, mean - difference, xy, *streak)
-        return Parameters(self.pose.moved(step[:6]), blur, Light(*values[Param.BLACK :]))
-
-    @cached_property
-    def nuisance_vector(self) -> FloatArray:
-        """All parameters (19,) in the order of `Param`, with zeros for the pose."""
-        blur, light = self.blur, self.light
-        mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
-        values = (mean, difference, blur.xy, blur.streak_x, blur.streak_y, *light.values)
-        return np.array((*_NO_POSE, *values))
 
 
 def plateau_levels(light: Light, response: Response) -> tuple[float, float]:

@@ -216,10 +216,8 @@ def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Cen
     loss grows as the logarithm; that of a clipped pixel falls exponentially, its loss grows
     linearly.
     """
-    score, weight = np.empty_like(levels), np.empty_like(levels)
     clips = (censoring.at_low, censoring.at_high)
-    total = _misfit(levels, model, sd, *clips, censoring.low, censoring.high, score, weight)
-    return Misfit(total, score, weight)
+    return Misfit(*_misfit(levels, model, sd, *clips, censoring.low, censoring.high))
 
 
 @compiled
@@ -231,9 +229,8 @@ def _misfit(
     at_high: BoolArray,
     low: float,
     high: float,
-    score: FloatArray,
-    weight: FloatArray,
-) -> float:
+) -> tuple[float, FloatArray, FloatArray]:
+    score, weight = np.empty_like(levels), np.empty_like(levels)
     total = 0.0
     for i in range(len(levels)):
         if at_low[i] or at_high[i]:
@@ -256,4 +253,4 @@ def _misfit(
             total += 0.5 * _OUTLIER_SIGMAS * _OUTLIER_SIGMAS * (1.0 + math.log(square))
             weight[i] = 1.0 / square
         score[i] = z * weight[i]
-    return total
+    return total, score, weight

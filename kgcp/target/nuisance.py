@@ -9,8 +9,9 @@ import numpy as np
 from kgcp.geometry.camera import Response
 from kgcp.target.adjust import Fit, Unknowns, adjust
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT, Param, Parameters
+from kgcp.target.light import PARAM_COUNT, Param
 from kgcp.target.pairs import Blur
+from kgcp.target.parameters import Parameters
 
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 
@@ -45,7 +46,7 @@ def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = Tru
         if streak is None:
             return best
     unknowns = unknowns_of(imaging, has_streak=True, moves=moves)
-    streaked = Parameters(start.pose, streak, start.light)
+    streaked = Parameters.of(start.pose, streak, start.light)
     near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
     return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
@@ -62,7 +63,8 @@ def unknowns_of(imaging: Imaging, *, has_streak: bool, moves: bool = True) -> Un
         precision[param] = sd**-2 if param in free else 0.0
     if response is Response.UNKNOWN:
         mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
-    return Unknowns(np.array(sorted(free)[0 if moves else 6 :]), mean, precision)
+    estimated = np.array(sorted(free)[0 if moves else 6 :])
+    return Unknowns(estimated, mean, precision, precision[estimated])
 
 
 def _streak_of(blur: Blur) -> Blur | None:

@@ -12,10 +12,11 @@ from kgcp.geometry.pose import Pose
 from kgcp.target.adjust import predict
 from kgcp.target.foreign import first_levels
 from kgcp.target.layout import Target
-from kgcp.target.light import Parameters, plateau_levels
+from kgcp.target.light import plateau_levels
 from kgcp.target.model import imaging_of
 from kgcp.target.nuisance import adjust_with_streak
 from kgcp.target.pairs import Blur, variance_in_bins
+from kgcp.target.parameters import Parameters
 from kgcp.target.plate import circles_of
 from kgcp.target.sample import whole_plate
 from kgcp.target.verify import edge_noise
@@ -71,7 +72,7 @@ def residuals_of(
     imaging = imaging_of(grey, camera, target, pose)
     binning = imaging.window.binning
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
-    start = Parameters(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
+    start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
     fit = adjust_with_streak(imaging, start, moves=False)
     light = fit.parameters.light
     sample = whole_plate(imaging, pose, fit.parameters.blur, light)

@@ -212,5 +212,5 @@ def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> 
         return pairs
     others = imaging.circles.part(slice(imaging.measured_count, None))
     replicas = pair_edges(points_m, scale, others, blur)
-    added = white_level(pose, rays, blur, replicas).value - 1.0
+    added = white_level(pose.matrix, rays, blur.vector, replicas).value - 1.0
     return replace(pairs, background=pairs.background + added)

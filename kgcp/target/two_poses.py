@@ -16,10 +16,10 @@ from kgcp.target.adjust import Fit, adjust, approach, minimise, predict
 from kgcp.target.covariance import PoseCovariance, pose_covariance
 from kgcp.target.foreign import first_levels
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import Parameters
 from kgcp.target.noise import misfit
 from kgcp.target.nuisance import adjust_with_streak, unknowns_of
 from kgcp.target.pairs import Blur
+from kgcp.target.parameters import Parameters
 from kgcp.target.prior import NormalPrior
 from kgcp.target.sample import choose_sample
 from kgcp.target.verify import edge_noise
@@ -72,7 +72,7 @@ def _off_the_saddle(rough: Fit) -> Fit:
     turned = pose.tilted_across(math.acos(max(0.0, 1.0 - _TRIED_TILT_PX / radius_px)))
     other = minimise(
         rough.sample,
-        Parameters(turned, parameters.blur, parameters.light),
+        parameters.at(turned),
         rough.sd,
         rough.unknowns,
         steps=_ACROSS_STEPS,
@@ -86,7 +86,7 @@ def _with_sharpening(imaging: Imaging, parameters: Parameters) -> Parameters:
     if not imaging.sharpening_px:
         return parameters
     light = replace(parameters.light, sharpening=_HALF_SHARPENED)
-    return Parameters(parameters.pose, parameters.blur.scaled(_NARROWED), light)
+    return Parameters.of(parameters.pose, parameters.blur.scaled(_NARROWED), light)
 
 
 def _rough_fit(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
@@ -112,7 +112,7 @@ def _approach(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
     few = plain.few_pixels
     sample = choose_sample(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
     unknowns = unknowns_of(imaging, has_streak=False)
-    return approach(sample, Parameters(pose, blur, light), unknowns)
+    return approach(sample, Parameters.of(pose, blur, light), unknowns)
 
 
 def choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
@@ -142,7 +142,7 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
 
 def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
     parameters = fit.parameters
-    mirrored = Parameters(parameters.pose.mirrored(), parameters.blur, parameters.light)
+    mirrored = parameters.at(parameters.pose.mirrored())
     linear = None
     for steps in _MIRRORED_STEPS:
         other = minimise(
@@ -162,7 +162,7 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
 
 def _fit_at(fit: Fit, pose: Pose) -> Fit:
     """Fit another pose to the pixels of a fit, unless it is hopeless."""
-    parameters = Parameters(pose, fit.parameters.blur, fit.parameters.light)
+    parameters = fit.parameters.at(pose)
     prediction = predict(fit.sample, parameters)
     current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
     there = replace(fit, parameters=parameters, prediction=prediction, misfit=current)

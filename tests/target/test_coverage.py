@@ -66,15 +66,17 @@ def moved(step: FloatArray) -> tuple[Pose, Blur]:
 def test_jacobian_is_that_of_the_value(index: int) -> None:
     blur = moved(np.zeros(11))[1]
     pairs = pairs_of(POSE, RAYS, blur)
-    share = white_share(POSE, RAYS, blur, pairs)
-    assert np.allclose(white_level(POSE, RAYS, blur, pairs).value, share.value, atol=1e-12)
+    share = white_share(POSE.matrix, RAYS, blur.vector, pairs)
+    assert np.allclose(
+        white_level(POSE.matrix, RAYS, blur.vector, pairs).value, share.value, atol=1e-12
+    )
     assert np.allclose(share.points_m, plate_points(POSE, RAYS), rtol=0.0, atol=1e-12)
     step = np.zeros(11)
     step[index] = 1e-5
     levels = []
     for sign in (1.0, -1.0):
         pose, other = moved(sign * step)
-        levels.append(white_level(pose, RAYS, other, pairs).value)
+        levels.append(white_level(pose.matrix, RAYS, other.vector, pairs).value)
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order
     tolerance = 0.06 if index in {3, 4, 5} else 0.01 if index > 8 else 1e-3
@@ -107,7 +109,7 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     expected = blurred.reshape(size, fine, size, fine).mean(axis=(1, 3)).ravel()
     blur = Blur(0.75**2 + 1.0 / 12.0, 0.75**2 + 1.0 / 12.0, 0.0)
     rays = rays_of(pixels)
-    seen = white_level(pose, rays, blur, pairs_of(pose, rays, blur))
+    seen = white_level(pose.matrix, rays, blur.vector, pairs_of(pose, rays, blur))
     difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4

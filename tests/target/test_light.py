@@ -18,10 +18,10 @@ from kgcp.target.light import (
     PARAM_COUNT,
     Light,
     Param,
-    Parameters,
     srgb_encoded,
 )
 from kgcp.target.pairs import Blur
+from kgcp.target.parameters import Parameters
 from kgcp.target.sharpening import unsharp_mask
 
 WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
@@ -140,15 +140,15 @@ def test_srgb_decodes_to_the_light_it_encodes(light: float) -> None:
 
 
 def test_steps_add_to_every_parameter_in_order() -> None:
-    start = Parameters(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
+    start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
     of_light = np.linspace(-0.02, 0.02, len(fields(Light)))
     step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light])
     moved = start.moved(step)
-    np.testing.assert_allclose(moved.nuisance_vector, start.nuisance_vector + step)
+    np.testing.assert_allclose(moved.vector, start.vector + step)
 
 
 def test_a_step_never_leaves_a_blur_that_cannot_be() -> None:
-    start = Parameters(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
+    start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
     for mean, difference, xy in ((-3.0, 0.0, 0.0), (0.0, 2.0, 1.0), (-0.3, -5.0, 3.0)):
         step = np.zeros(PARAM_COUNT)
         step[Param.BLUR_MEAN : Param.STREAK_X] = mean, difference, xy
