@@ -21,7 +21,8 @@ def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
     """Return levels, clipping, blur and edge displacement of a fitted target."""
     imaging = fit.sample.imaging
     black, white = plateau_levels(fit.parameters.light, imaging.response)
-    inside = np.hypot(*fit.prediction.points_m) < imaging.outer_radius_m
+    x, y = fit.prediction.points_m
+    inside = x * x + y * y < imaging.outer_radius_m**2
     binning, clipped = imaging.window.binning, fit.sample.clipped
     blur_px, shift_px = fit.parameters.blur.mean_sd_px, _edge_shift_px(fit)
     if binning > 1:
@@ -30,8 +31,8 @@ def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
     contour = contour_px(camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m)
     return Appearance(
         radius_px=semi_major_axis_px(contour),
-        black=float(np.clip(black, 0.0, 1.0)),
-        white=float(np.clip(white, 0.0, 1.0)),
+        black=min(max(black, 0.0), 1.0),
+        white=min(max(white, 0.0), 1.0),
         saturated=float(np.mean(clipped[inside])),
         edge_shift_px=shift_px,
         blur_px=blur_px,
@@ -47,4 +48,4 @@ def _edge_shift_px(fit: Fit) -> float:
     light, imaging = fit.parameters.light, fit.sample.imaging
     black, white = plateau_levels(light, imaging.response)
     crossing = share_at(0.5 * (black + min(white, imaging.censoring.high)), light, imaging.response)
-    return float(-fit.parameters.blur.mean_sd_px * ndtri(np.clip(crossing, 1e-3, 1.0 - 1e-3)))
+    return float(-fit.parameters.blur.mean_sd_px * ndtri(min(max(crossing, 1e-3), 1.0 - 1e-3)))

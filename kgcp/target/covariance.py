@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtri
 
 from kgcp.compiled import compiled
@@ -58,16 +56,16 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     small common displacement of each circle's edge would do.
     """
     scaled = fit.scaled_jacobian
-    inverse = np.linalg.inv(normal_matrix(scaled, fit.misfit, fit.unknowns))
+    normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
+    inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     circle, arc = _nearest_edges(fit)
     sums, counts = _sum_by_arc(scaled, fit.misfit.score, arc)
     used = int(np.count_nonzero(counts))
     correction = used / max(used - len(scaled), 0.25 * used)
     half = inverse[:6] @ sums
-    robust, plain = correction * (half @ half.T), inverse[:6, :6]
-    at_least, inflation = _at_least(robust, plain)
+    at_least, ratio = _at_least(correction * (half @ half.T), inverse[:6, :6].copy())
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
-    return PoseCovariance(at_least + shifts @ shifts.T, inflation)
+    return PoseCovariance(at_least + shifts @ shifts.T, max(1.0, ratio))
 
 
 def _common_displacement_px(fit: Fit) -> float:
@@ -112,18 +110,18 @@ def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
     return np.asarray(scaled @ pulls.T)
 
 
-def _at_least(robust: npt.NDArray[Any], plain: npt.NDArray[Any]) -> tuple[FloatArray, float]:
-    """Return the robust covariance, nowhere below the plain one, and their mean ratio, at least 1.
+@compiled
+def _at_least(robust: FloatArray, plain: FloatArray) -> tuple[FloatArray, float]:
+    """Return the robust covariance, nowhere below the plain one, and their mean ratio.
 
     Few arcs can by chance agree too well in some direction; the noise of the pixels is there all
     the same.
     """
     root = np.linalg.cholesky(plain)
     to_white = np.linalg.inv(root)
-    whitened = to_white @ robust @ to_white.T
-    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    values, vectors = np.linalg.eigh(to_white @ robust @ to_white.T)
     raised = root @ (vectors * np.sqrt(np.maximum(values, 1.0)))
-    return raised @ raised.T, max(1.0, float(values.mean()))
+    return raised @ raised.T, values.mean()
 
 
 def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
@@ -211,18 +209,24 @@ def _angle_jacobian(camera: Camera, pose: Pose) -> FloatArray:
     A turn ω moves a direction d by ω × d, so that its component k changes by (d × e_k) · ω.
     """
     jacobian = np.zeros((3, 6))
-    normal, axis = pose.rotation[:, 2], pose.rotation[:, 0]
-    turned_normal, turned_axis = np.cross(normal, np.eye(3)), np.cross(axis, np.eye(3))
+    normal, axis = pose.rotation[:, 2].tolist(), pose.rotation[:, 0].tolist()
+    turned_normal, turned_axis = _across_axes(*normal), _across_axes(*axis)
     for row, k in ((0, 1), (1, 0)):  # atan2(−n_k, n_z)
         by_k, by_z = -normal[2] * turned_normal[k], normal[k] * turned_normal[2]
         jacobian[row, 3:] = (by_k + by_z) / (normal[2] ** 2 + normal[k] ** 2)
-    x, y, z = pose.translation_m
-    lens = camera.distort_jacobian(np.array([x / z, y / z]))
-    # the image of the axis is lens @ (d_xy − (x, y)/z · d_z)/z; how the lens changes is negligible
-    direction = lens @ (axis[:2] - np.array([x, y]) / z * axis[2])
-    across = np.array([-direction[1], direction[0]]) / (direction @ direction) @ lens
-    by_axis = np.array([across[0], across[1], -(across @ np.array([x, y])) / z])
-    jacobian[2, 3:] = by_axis @ turned_axis
-    by_offset = -axis[2] / z * across
-    jacobian[2, :3] = (*by_offset, -(by_offset @ np.array([x, y])) / z)
+    x, y, z = pose.translation_m.tolist()
+    x, y = x / z, y / z
+    (xx, xy), (yx, yy) = camera.distort_jacobian(np.array([x, y])).tolist()
+    # the image of the axis is lens @ (d_xy − (x, y) · d_z)/z; how the lens changes is negligible
+    along_x, along_y = axis[0] - x * axis[2], axis[1] - y * axis[2]
+    right, down = xx * along_x + xy * along_y, yx * along_x + yy * along_y
+    square = right * right + down * down
+    across_x, across_y = (right * yx - down * xx) / square, (right * yy - down * xy) / square
+    by_axis = np.array([across_x, across_y, -(across_x * x + across_y * y)])
+    jacobian[2, 3:], jacobian[2, :3] = by_axis @ turned_axis, -axis[2] / z * by_axis
     return np.degrees(jacobian)
+
+
+def _across_axes(x: float, y: float, z: float) -> FloatArray:
+    """Return the cross products (3, 3) of a vector with the three axes, as rows."""
+    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])

@@ -87,11 +87,7 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
     rays = np.ascontiguousarray(window.rays[:, some])
     bare = look_at_plate(imaging, pose, rays, reach_m=outer_m - inner_m)
-    inside, is_ink = bare.rho_m < imaging.outer_radius_m, bare.share < 0.5
-    black, white = (
-        _median_of_clearest(levels[chosen], bare.off_edge_m[chosen])
-        for chosen in (inside & is_ink, inside & ~is_ink)
-    )
+    black, white = _plateaus(levels, bare.rho_m, bare.share, bare.off_edge_m, outer_m)
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
     return light_of_levels(black, white, imaging.response)
@@ -105,10 +101,33 @@ def _uneven(step: int, width: int) -> int:
     return step
 
 
+@compiled
+def _plateaus(
+    levels: FloatArray,
+    rho_m: FloatArray,
+    share: FloatArray,
+    off_edge_m: FloatArray,
+    radius_m: float,
+) -> tuple[float, float]:
+    """Return the levels of ink and plate within a radius, as medians of what is clear of edges."""
+    seen, off, found = np.empty((2, len(levels))), np.empty((2, len(levels))), np.zeros(2, np.intp)
+    for i in range(len(levels)):
+        if rho_m[i] < radius_m:
+            kind = 0 if share[i] < 0.5 else 1
+            seen[kind, found[kind]], off[kind, found[kind]] = levels[i], off_edge_m[i]
+            found[kind] += 1
+    ink, plate = (
+        (seen[0, : found[0]], off[0, : found[0]]),
+        (seen[1, : found[1]], off[1, : found[1]]),
+    )
+    return _median_of_clearest(ink[0], ink[1]), _median_of_clearest(plate[0], plate[1])
+
+
+@compiled
 def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
     """Return the median of the levels that are farthest from edges; NaN without any."""
-    if not len(levels):
-        return math.nan
+    if len(levels) == 0:
+        return np.nan
     first = int(_BLURRED_SHARE * len(levels))
     return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
 

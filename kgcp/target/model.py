@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
-
 from kgcp.errors import Rejection
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.appearance import appearance_of
@@ -88,10 +86,11 @@ def _without_edge_shift(start: Observation) -> Pose:
 
 def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
-    count = _measured_count(camera, target, pose)
+    count = 0
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
         contour, seen = contour_px(camera, pose, radius_m), camera
+        count = count or _measured_count(camera, target, contour)
         size_px = semi_major_axis_px(contour)
         binning = max(1, math.ceil(size_px / _LARGEST_RADIUS_PX))
         if binning > 1:
@@ -119,13 +118,14 @@ def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> I
     raise cut
 
 
-def _measured_count(camera: Camera, target: Target, pose: Pose) -> int:
+def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:
     """Return how many of a target's circles are measured: the main ring's, or all if it is cut.
 
-    A whole main ring leaves its replicas little to add to the distance, at twice the time.
+    A whole main ring, which has this contour, leaves its replicas little to add to the distance, at
+    twice the time.
     """
-    contour = contour_px(camera, pose, 0.5 * target.ring.outer_diameter_m)
-    whole = np.all((contour > 0.0) & (contour < (camera.width - 1.0, camera.height - 1.0)))
+    (left, top), (right, bottom) = contour.min(axis=0), contour.max(axis=0)
+    whole = min(left, top) > 0.0 and right < camera.width - 1.0 and bottom < camera.height - 1.0
     rings = (target.ring,) if whole else target.rings
     return sum(2 + len(ring.code_deg) for ring in rings)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -53,9 +54,14 @@ def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = Tru
 
 def unknowns_of(imaging: Imaging, *, has_streak: bool, moves: bool = True) -> Unknowns:
     """Return which parameters are free, with weak priors on what one frame hardly tells."""
-    response = imaging.response
+    is_binned = imaging.window.binning > 1
+    return _unknowns(imaging.response, is_binned=is_binned, has_streak=has_streak, moves=moves)
+
+
+@cache
+def _unknowns(response: Response, *, is_binned: bool, has_streak: bool, moves: bool) -> Unknowns:
     of_response = _OF_RESPONSE[response]
-    if imaging.window.binning > 1 and of_response:
+    if is_binned and of_response:
         of_response = _OF_BINS
     free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *of_response]
     mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)

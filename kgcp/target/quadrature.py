@@ -36,7 +36,7 @@ class Quadrature(IntEnum):
 
 
 CHORD_COUNTS = np.array([4, 6, 9, 14, 24, 70])
-_LARGEST_RATIOS = (1.6, 2.6, 4.0, 6.2, 10.5, np.inf)  # of the radius to σ
+_LARGEST_RATIOS = np.array([1.6, 2.6, 4.0, 6.2, 10.5, np.inf])  # of the radius to σ
 _STRAIGHT_RATIO = 6.0
 
 
@@ -49,7 +49,8 @@ def quadrature_for(radius_over_whole: FloatArray, radius_over_sigma: FloatArray)
         Radii of discs, by the standard deviation with the streak and without.
     """
     by_chords = np.searchsorted(_LARGEST_RATIOS, radius_over_sigma)
-    return np.where(radius_over_whole > _STRAIGHT_RATIO, Quadrature.EDGE, by_chords)
+    by_chords[radius_over_whole > _STRAIGHT_RATIO] = Quadrature.EDGE
+    return by_chords
 
 
 def _chords(count: int) -> FloatArray:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.target.adjust import Fit
 from kgcp.target.layout import Ring
 from kgcp.target.light import plateau_levels
-from kgcp.target.noise import median_at_edges
+from kgcp.target.noise import BoolArray, median_at_edges
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3
@@ -80,24 +81,33 @@ def check_code(fit: Fit, ring: Ring) -> None:
         `OTHER_CODE`.
     """
     excess = _light_around_code_circle(fit, ring)
-    angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
-    off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
-    at_dot = np.abs(off_dot_deg).argmin(axis=0)
-    between = np.abs(off_dot_deg).min(axis=1) > 2.0 * ring.dot_half_angle_deg
+    at_dot, between, sides = _places_of_code(ring)
     extra = float(excess[between].max(initial=0.0))
     missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
-    moved = _largest_displacement(excess, off_dot_deg, ring)
+    moved = _largest_displacement(excess, sides)
     if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
         light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
         raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
 
 
-def _largest_displacement(excess: FloatArray, off_dot_deg: FloatArray, ring: Ring) -> float:
-    """Return the light that is too much on one side of a dot and too little on the other."""
+@cache
+def _places_of_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
+    """Return, of the positions, those of the dots (d,), which are clear of dots, and their sides.
+
+    The positions (72, d) beside each dot before it, and after it.
+    """
+    angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
+    off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
     reach_deg = 2.0 * ring.dot_half_angle_deg
-    left = (off_dot_deg < 0.0) & (off_dot_deg >= -reach_deg)
-    right = (off_dot_deg > 0.0) & (off_dot_deg <= reach_deg)
-    sides = np.stack((left, right))
+    before = (off_dot_deg < 0.0) & (off_dot_deg >= -reach_deg)
+    after = (off_dot_deg > 0.0) & (off_dot_deg <= reach_deg)
+    distance_deg = np.abs(off_dot_deg)
+    between = distance_deg.min(axis=1) > reach_deg
+    return distance_deg.argmin(axis=0), between, np.stack((before, after))
+
+
+def _largest_displacement(excess: FloatArray, sides: BoolArray) -> float:
+    """Return the light that is too much on one side of a dot and too little on the other."""
     known = excess[:, None] * sides
     most, lack = known.max(axis=1), -known.min(axis=1)
     return float(np.minimum(most, lack[::-1]).max())
