@@ -121,20 +121,18 @@ def _look(
         x = math.floor(coarser * (peaks[i, 0] + 0.5))  # the pixel that holds the point
         y = math.floor(coarser * (peaks[i, 1] + 0.5))
         dark, bright = math.ceil(peaks[i, 2]), math.floor(peaks[i, 2])
-        if reach <= x < width - reach and reach <= y < height - reach:
-            at = np.uintp(y * width + x)
-            rough = _roughly(pixels, at, first_shifts, dark, bright)
-            if rough < 0:
-                continue
-            found = _clearest(pixels, at, rest_shifts, rough, dark, bright, clear, values)
-        else:
-            at = np.uintp(0)
+        inside = reach <= x < width - reach and reach <= y < height - reach
+        at = np.uintp(y * width + x if inside else 0)
+        if not inside:
             _keep_inside(first, x, y, width, height, first_places)
-            rough = _roughly(pixels, at, first_places, dark, bright)
-            if rough < 0:
-                continue
+        samples = first_shifts if inside else first_places
+        rough = _roughly(pixels, at, samples, dark, bright)
+        if rough < 0:
+            continue
+        if not inside:
             _keep_inside(rest, x, y, width, height, rest_places)
-            found = _clearest(pixels, at, rest_places, rough, dark, bright, clear, values)
+        samples = rest_shifts if inside else rest_places
+        found = _clearest(pixels, at, samples, rough, dark, bright, clear, values)
         if found[0] > 0.0:
             rings[count, 0] = factor * coarser * (peaks[i, 0] + 0.5) - 0.5
             rings[count, 1] = factor * coarser * (peaks[i, 1] + 0.5) - 0.5
