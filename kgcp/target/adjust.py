@@ -127,7 +127,9 @@ def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, Float
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:
     """Come near the minimum from a rough start, on pixels chosen for that start."""
-    return _fit_with_noise(sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN)
+    return _fit_with_noise(
+        sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN, is_near=False
+    )
 
 
 def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | None = None) -> Fit:
@@ -145,7 +147,9 @@ def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | 
         pose, blur, light = parameters.pose, parameters.blur, parameters.light
         sample = choose_sample(imaging, pose, blur, light, most=most, slack_px=_SLACK_PX)
         enough = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
-        fit = _fit_with_noise(sample, parameters, unknowns, steps=_STEPS, enough=enough)
+        fit = _fit_with_noise(
+            sample, parameters, unknowns, steps=_STEPS, enough=enough, is_near=True
+        )
         if _is_settled(parameters, fit):
             break
         parameters = fit.parameters
@@ -153,13 +157,32 @@ def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | 
 
 
 def _fit_with_noise(
-    sample: Sample, parameters: Parameters, unknowns: Unknowns, *, steps: int, enough: float
+    sample: Sample,
+    parameters: Parameters,
+    unknowns: Unknowns,
+    *,
+    steps: int,
+    enough: float,
+    is_near: bool,
 ) -> Fit:
-    """Minimise until the noise that the residuals show is the one that they were weighed by."""
+    """Minimise until the noise that the residuals show is the one that they were weighed by.
+
+    A start that is near need not be followed to the minimum for the noise to show; one that is not
+    might then be drawn to a wrong one.
+    """
     linear = linearise(sample, parameters)
     sd = noise_of(sample, linear[0]).sd
-    for _ in range(_NOISE_ROUNDS):
-        fit = minimise(sample, parameters, sd, unknowns, steps=steps, enough=enough, linear=linear)
+    for number in range(_NOISE_ROUNDS):
+        fit = minimise(
+            sample,
+            parameters,
+            sd,
+            unknowns,
+            steps=steps,
+            enough=enough,
+            linear=linear,
+            pauses=is_near and number == 0,
+        )
         parameters, linear = fit.parameters, (fit.prediction, fit.jacobian)
         before, sd = sd, noise_of(sample, fit.prediction).sd
         if abs(float(sd.sum() / before.sum()) - 1.0) < _SETTLED_NOISE:
@@ -198,12 +221,13 @@ def minimise(
     steps: int,
     enough: float,
     linear: tuple[Prediction, FloatArray] | None = None,
+    pauses: bool = False,
 ) -> Fit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
     At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
     anew only while steps are large, and the normal matrix with it: near the minimum they hardly
-    change, and cost most.
+    change, and cost most. With `pauses`, one that is made anew ends it.
     """
     damping, light = _DAMPING, parameters.light
     relative_sd = float(sd.mean()) / (light.white - light.black)
@@ -234,6 +258,8 @@ def minimise(
         if attempt_jacobian is not jacobian:
             jacobian = attempt_jacobian
             scaled = scaled_rows(jacobian, unknowns.free, sd)
+            if pauses:
+                break
             normal = normal_matrix(scaled, current, unknowns)
         damping = max(0.1 * damping, 1e-9)
         if gain < enough or abs(gain - promised) < _AS_PROMISED:
