@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
-from kgcp.compiled import compiled
-from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray
 from kgcp.target.coverage import white_level, white_share
+from kgcp.target.equations import Unknowns, normal_matrix, propose, scaled_rows
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT
 from kgcp.target.noise import Misfit, Noise, estimate_noise, misfit
 from kgcp.target.parameters import Parameters
 from kgcp.target.sample import Sample, choose_sample
@@ -48,31 +45,6 @@ class Prediction:
     points_m: FloatArray
     share: FloatArray
     levels: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Unknowns:
-    """Which parameters are estimated, and what is known of them beforehand.
-
-    Attributes
-    ----------
-    free : (p,) array of int
-        Estimated parameters, by `Param`.
-    mean, precision : (19,) array
-        Independent normal priors on the nuisance parameters; precision 0: none.
-    free_precision : (p,) array
-        Of the estimated parameters.
-    """
-
-    free: IndexArray
-    mean: FloatArray
-    precision: FloatArray
-    free_precision: FloatArray
-
-    def penalty(self, parameters: Parameters) -> float:
-        """Return the priors' part of the negative log-likelihood."""
-        deviation = parameters.vector - self.mean
-        return float(0.5 * (self.precision * deviation) @ deviation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +210,7 @@ def minimise(
     normal = normal_matrix(scaled, current, unknowns)
     for number in range(steps):
         while True:
-            step, promised = _propose(scaled, normal, current, parameters, unknowns, damping)
+            step, promised = propose(scaled, normal, current, parameters, unknowns, damping)
             candidate = parameters.moved(step)
             change = relative_sd * math.sqrt(2.0 * promised / len(sd))
             if change > _LARGE_CHANGE and number < steps - 1:
@@ -265,48 +237,3 @@ def minimise(
         if gain < enough or abs(gain - promised) < _AS_PROMISED:
             break
     return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)
-
-
-def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
-    """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
-    normal = (scaled * current.weight) @ scaled.T
-    normal.flat[:: len(normal) + 1] += unknowns.free_precision
-    return normal
-
-
-def _propose(
-    scaled: FloatArray,
-    normal: FloatArray,
-    current: Misfit,
-    parameters: Parameters,
-    unknowns: Unknowns,
-    damping: float,
-) -> tuple[FloatArray, float]:
-    """Return a step (19,) and the gain that it promises.
-
-    Raises
-    ------
-    Rejection
-        `POOR_FIT` if the equations cannot be solved.
-    """
-    pull = unknowns.precision * (unknowns.mean - parameters.vector)
-    gradient = scaled @ current.score + pull[unknowns.free]
-    damped = normal.copy()
-    damped.flat[:: len(normal) + 1] *= 1.0 + damping
-    _, solution, failure = dposv(damped, gradient)  # LAPACK itself: they are small and many
-    promised = 0.5 * float(gradient @ solution)
-    if failure or not math.isfinite(promised):
-        raise Rejection(Reason.POOR_FIT, "singular normal equations")
-    step = np.zeros(PARAM_COUNT)
-    step[unknowns.free] = solution
-    return step, promised
-
-
-@compiled
-def scaled_rows(jacobian: FloatArray, rows: IndexArray, sd: FloatArray) -> FloatArray:
-    """Return some rows of a Jacobian (p, n), in units of the noise (n,)."""
-    scaled, per_sd = np.empty((len(rows), len(sd))), 1.0 / sd
-    for k in range(len(rows)):
-        for i in range(len(sd)):
-            scaled[k, i] = jacobian[rows[k], i] * per_sd[i]
-    return scaled

@@ -19,7 +19,8 @@ from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.target.adjust import Fit, noise_of, normal_matrix
+from kgcp.target.adjust import Fit, noise_of
+from kgcp.target.equations import normal_matrix
 from kgcp.target.imager import share_at
 from kgcp.target.light import plateau_levels
 from kgcp.target.noise import median_at_edges

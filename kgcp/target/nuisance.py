@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 
 from kgcp.geometry.camera import Response
-from kgcp.target.adjust import Fit, Unknowns, adjust
+from kgcp.target.adjust import Fit, adjust
+from kgcp.target.equations import Unknowns
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import PARAM_COUNT, Param
 from kgcp.target.pairs import Blur

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.target.adjust import Fit, normal_matrix
+from kgcp.target.adjust import Fit
 from kgcp.target.covariance import pose_covariance, propagate
+from kgcp.target.equations import normal_matrix
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.pairs import Blur

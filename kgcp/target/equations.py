@@ -1,0 +1,86 @@
+"""The equations of one step of the adjustment: what is unknown, and how it is moved."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from kgcp.compiled import compiled
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.target.light import PARAM_COUNT
+from kgcp.target.noise import Misfit
+from kgcp.target.parameters import Parameters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unknowns:
+    """Which parameters are estimated, and what is known of them beforehand.
+
+    Attributes
+    ----------
+    free : (p,) array of int
+        Estimated parameters, by `Param`.
+    mean, precision : (19,) array
+        Independent normal priors on the nuisance parameters; precision 0: none.
+    free_precision : (p,) array
+        Of the estimated parameters.
+    """
+
+    free: IndexArray
+    mean: FloatArray
+    precision: FloatArray
+    free_precision: FloatArray
+
+    def penalty(self, parameters: Parameters) -> float:
+        """Return the priors' part of the negative log-likelihood."""
+        deviation = parameters.vector - self.mean
+        return float(0.5 * (self.precision * deviation) @ deviation)
+
+
+def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
+    """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
+    normal = (scaled * current.weight) @ scaled.T
+    normal.flat[:: len(normal) + 1] += unknowns.free_precision
+    return normal
+
+
+def propose(
+    scaled: FloatArray,
+    normal: FloatArray,
+    current: Misfit,
+    parameters: Parameters,
+    unknowns: Unknowns,
+    damping: float,
+) -> tuple[FloatArray, float]:
+    """Return a step (19,) and the gain that it promises.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT` if the equations cannot be solved.
+    """
+    pull = unknowns.precision * (unknowns.mean - parameters.vector)
+    gradient = scaled @ current.score + pull[unknowns.free]
+    damped = normal.copy()
+    damped.flat[:: len(normal) + 1] *= 1.0 + damping
+    _, solution, failure = dposv(damped, gradient)  # LAPACK itself: they are small and many
+    promised = 0.5 * float(gradient @ solution)
+    if failure or not math.isfinite(promised):
+        raise Rejection(Reason.POOR_FIT, "singular normal equations")
+    step = np.zeros(PARAM_COUNT)
+    step[unknowns.free] = solution
+    return step, promised
+
+
+@compiled
+def scaled_rows(jacobian: FloatArray, rows: IndexArray, sd: FloatArray) -> FloatArray:
+    """Return some rows of a Jacobian (p, n), in units of the noise (n,)."""
+    scaled, per_sd = np.empty((len(rows), len(sd))), 1.0 / sd
+    for k in range(len(rows)):
+        for i in range(len(sd)):
+            scaled[k, i] = jacobian[rows[k], i] * per_sd[i]
+    return scaled
