@@ -12,16 +12,26 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-_FUSED = {"contract"}  # a · b + c in one step, with one rounding, where the processor has it
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
-    return cast("_Function", numba.njit(cache=True, error_model="numpy", fastmath=_FUSED)(function))
+    return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
 
 
 def inlined(function: _Function) -> _Function:
     """Compile a function into those that call it, which leave out what they do not use."""
-    made = numba.njit(cache=True, error_model="numpy", fastmath=_FUSED, forceinline=True)(function)
+    made = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
     return cast("_Function", made)
+
+
+def fused(function: _Function) -> _Function:
+    """Do as `inlined`; a · b + c may be one step with one rounding, if the processor has it.
+
+    Where, is up to the compiler. So what calls such a function is to be called by Python alone: of
+    a function that others call there may be two versions, and which one they get depends on what a
+    process has compiled itself and what it has found compiled.
+    """
+    made = numba.njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
+    return cast("_Function", made(function))

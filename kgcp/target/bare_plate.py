@@ -11,7 +11,7 @@ from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.imaging import Imaging
-from kgcp.target.plate import find_skips, plate_points
+from kgcp.target.plate import EVEN, find_skips, plate_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,8 @@ class BarePlate:
     off_edge_m : (n,) array
         Distance to the nearest edge; 0 in a small disc. Beyond the reach it may be too large.
     off_measured_m : (n,) array
-        The same, of the circles that are measured, and without regard to small discs.
+        The same, of the circles that are measured, and without regard to small discs; more, where
+        there is less blur across that edge than there may be.
     """
 
     points_m: FloatArray
@@ -46,6 +47,7 @@ def look_at_plate(
     *,
     small_m: float = 0.0,
     reach_m: float = math.inf,
+    spread: FloatArray = EVEN,
 ) -> BarePlate:
     """See what is where on the plate.
 
@@ -59,59 +61,73 @@ def look_at_plate(
         Radius below which a disc is small.
     reach_m : float
         How far edges are looked for.
+    spread : (3,) array
+        By `blur_on_plate`.
     """
     points_m, circles = plate_points(pose, rays), imaging.circles
     centres_m, radii_m, signs = circles.centres_m, circles.radii_m, circles.signs
-    skips = find_skips(centres_m, radii_m)
-    count = imaging.measured_count
-    seen = np.empty((4, points_m.shape[1]))
-    _look(points_m, centres_m, radii_m, signs, *skips, count, small_m, reach_m, seen)
-    return BarePlate(points_m, *seen)
+    circle_table = np.vstack((centres_m, radii_m, signs))
+    skips, count = find_skips(centres_m, radii_m), imaging.measured_count
+    return BarePlate(
+        points_m, *_look(points_m, circle_table, *skips, count, small_m, reach_m, spread)
+    )
 
 
 @compiled
 def _look(
     points_m: FloatArray,
-    centres_m: FloatArray,
-    radii_m: FloatArray,
-    signs: FloatArray,
+    circles: FloatArray,
     out_m: FloatArray,
     beyond: IndexArray,
     measured_count: int,
     small_m: float,
     reach_m: float,
-    seen: FloatArray,
-) -> None:
-    """Fill in (4, n): distance from the centre, white share, distances to the nearest edges.
+    spread: FloatArray,
+) -> FloatArray:
+    """Return (4, n): distance from the centre, white share, distances to the nearest edges.
 
     Circle by circle: loops over all pixels without a branch are several times faster.
     """
+    seen = np.empty((4, points_m.shape[1]))
     rho_m, share, off_edge_m, off_measured_m = seen[0], seen[1], seen[2], seen[3]
-    is_small = np.zeros(len(rho_m), np.bool_)
+    is_small, stretch = np.zeros(len(rho_m), np.bool_), np.empty(len(rho_m))
     for i in range(len(rho_m)):
-        rho_m[i] = math.sqrt(points_m[0, i] ** 2 + points_m[1, i] ** 2)
-        share[i], off_edge_m[i] = 1.0, np.inf
+        x, y = points_m[0, i], points_m[1, i]
+        rho_m[i] = math.sqrt(x * x + y * y)
+        stretch[i] = _stretch(x, y, spread)
+        share[i], off_edge_m[i], off_measured_m[i] = 1.0, np.inf, np.inf
     c = 0
-    while c < len(radii_m):
+    while c < len(beyond):
+        radius, sign = circles[2, c], circles[3, c]
         if out_m[c] == 0.0:
-            _add_ring(rho_m, radii_m[c], signs[c], share, off_edge_m)
-            if radii_m[c] < small_m:
-                is_small |= rho_m < radii_m[c]
+            _add_ring(rho_m, radius, sign, share, off_edge_m)
+            if c < measured_count:
+                np.minimum(off_measured_m, np.abs(rho_m - radius) * stretch, off_measured_m)
+            if radius < small_m:
+                is_small |= rho_m < radius
             c += 1
-        else:
-            dots = centres_m[:, c : beyond[c]]
-            within_m = radii_m[c] + reach_m
-            for i in range(len(rho_m)):
-                if abs(rho_m[i] - out_m[c]) < within_m:
-                    nearest = _nearest(points_m[0, i], points_m[1, i], dots) - radii_m[c]
-                    off_edge_m[i] = min(off_edge_m[i], abs(nearest))
-                    share[i] += signs[c] if nearest < 0.0 else 0.0
-                    is_small[i] |= nearest < 0.0 and radii_m[c] < small_m
-            c = beyond[c]
-        if c == measured_count:
-            off_measured_m[:] = off_edge_m
+            continue
+        for i in range(len(rho_m)):
+            if abs(rho_m[i] - out_m[c]) < radius + reach_m:
+                x, y = _from_nearest(points_m[0, i], points_m[1, i], circles[:2, c : beyond[c]])
+                beyond_m = math.sqrt(x * x + y * y) - radius
+                off_edge_m[i] = min(off_edge_m[i], abs(beyond_m))
+                if c < measured_count:
+                    felt_m = abs(beyond_m) * _stretch(x, y, spread)
+                    off_measured_m[i] = min(off_measured_m[i], felt_m)
+                share[i] += sign if beyond_m < 0.0 else 0.0
+                is_small[i] |= beyond_m < 0.0 and radius < small_m
+        c = beyond[c]
     for i in range(len(rho_m)):
         off_edge_m[i] = 0.0 if is_small[i] else off_edge_m[i]
+    return seen
+
+
+@compiled
+def _stretch(x: float, y: float, spread: FloatArray) -> float:
+    """Return how much less than it may be the blur is in a direction, as a factor above 1."""
+    square = spread[0] * x * x + 2.0 * spread[1] * x * y + spread[2] * y * y
+    return math.sqrt((x * x + y * y) / square) if square > 0.0 else 1.0
 
 
 @compiled
@@ -124,9 +140,11 @@ def _add_ring(
 
 
 @compiled
-def _nearest(x: float, y: float, centres_m: FloatArray) -> float:
-    """Return the distance from the nearest of some centres (2, k)."""
-    least = np.inf
+def _from_nearest(x: float, y: float, centres_m: FloatArray) -> tuple[float, float]:
+    """Return where a point is from the nearest of some centres (2, k)."""
+    least, nearest = np.inf, 0
     for k in range(centres_m.shape[1]):
-        least = min(least, (x - centres_m[0, k]) ** 2 + (y - centres_m[1, k]) ** 2)
-    return math.sqrt(least)
+        square = (x - centres_m[0, k]) ** 2 + (y - centres_m[1, k]) ** 2
+        nearest = k if square < least else nearest
+        least = min(least, square)
+    return x - centres_m[0, nearest], y - centres_m[1, nearest]

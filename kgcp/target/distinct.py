@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
+BoolArray = npt.NDArray[np.bool_]
 
-@compiled
+
 def distinct(
     centres: FloatArray, radii: FloatArray, clearness: FloatArray, near: float, alike: float
 ) -> IndexArray:
@@ -25,8 +27,20 @@ def distinct(
     alike : float
         Difference of the logarithms of their radii up to which they may be.
     """
-    order = np.argsort(-clearness, kind="mergesort")  # stable
-    by_row = np.argsort(centres[:, 1], kind="mergesort")
+    order, by_row = np.argsort(-clearness, kind="stable"), np.argsort(centres[:, 1], kind="stable")
+    return order[_is_first(centres, radii, order, by_row, near, alike)[order]]
+
+
+@compiled
+def _is_first(
+    centres: FloatArray,
+    radii: FloatArray,
+    order: IndexArray,
+    by_row: IndexArray,
+    near: float,
+    alike: float,
+) -> BoolArray:
+    """Tell which circles (n,) are like no clearer one, from their orders by clearness and row."""
     first = np.ones(len(radii), np.bool_)
     position, rank = np.empty(len(radii), np.intp), np.empty(len(radii), np.intp)
     for i in range(len(radii)):
@@ -46,4 +60,4 @@ def distinct(
                 if x * x + y * y <= reach * reach and rank[other] > rank[one]:
                     first[other] &= abs(math.log(radii[other] / radii[one])) > alike
                 place += step
-    return order[first[order]]
+    return first

@@ -17,7 +17,7 @@ from kgcp.target.imaging import Imaging
 from kgcp.target.light import Light, light_of_levels, plateau_levels
 from kgcp.target.noise import BoolArray
 from kgcp.target.pairs import REACH_SIGMAS, Blur
-from kgcp.target.plate import largest_metres_per_px
+from kgcp.target.plate import blur_on_plate, largest_metres_per_px
 
 _BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
 _ENOUGH_PIXELS = 2000  # for a median
@@ -45,6 +45,8 @@ class SeenPlate:
     metres_per_px : float
         Largest length on the plate that a pixel spans.
     blur : Blur
+    spread : (3,) array
+        By `blur_on_plate`.
     bare : BarePlate
         Under every pixel, with small discs and edges in reach by `see_plate`.
     """
@@ -52,6 +54,7 @@ class SeenPlate:
     imaging: Imaging
     metres_per_px: float
     blur: Blur
+    spread: FloatArray
     bare: BarePlate
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
@@ -67,10 +70,15 @@ def see_plate(imaging: Imaging, pose: Pose, blur: Blur, slack_px: float = 0.0) -
     step = max(1, rays.shape[1] // _SCALE_PIXELS)
     scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
     reach_px = max(REACH_SIGMAS * sd_px, _CLEAR_SIGMAS * sd_px + slack_px)
+    middle = imaging.window.nearest(imaging.centre_px)
+    spread = blur_on_plate(pose, rays[:, middle].copy(), blur.total_covariance, sd_px * scale)
     bare = look_at_plate(
-        imaging, pose, rays, small_m=_SMALL_SIGMAS * sd_px * scale, reach_m=reach_px * scale
+        *(imaging, pose, rays),
+        small_m=_SMALL_SIGMAS * sd_px * scale,
+        reach_m=reach_px * scale,
+        spread=spread,
     )
-    return SeenPlate(imaging, scale, blur, bare)
+    return SeenPlate(imaging, scale, blur, spread, bare)
 
 
 def first_levels(imaging: Imaging, pose: Pose) -> Light:
@@ -83,7 +91,7 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     """
     window = imaging.window
     some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
-    levels = window.levels[some]
+    levels = np.ascontiguousarray(window.levels[some])
     outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
     rays = np.ascontiguousarray(window.rays[:, some])
     bare = look_at_plate(imaging, pose, rays, reach_m=outer_m - inner_m)

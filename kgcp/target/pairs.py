@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.target.plate import Circles
+from kgcp.target.plate import EVEN, Circles
 from kgcp.target.quadrature import quadrature_for
 
 REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
@@ -111,7 +111,11 @@ class EdgePairs:
 
 
 def pair_edges(
-    points_m: FloatArray, metres_per_px: float, circles: Circles, blur: Blur
+    points_m: FloatArray,
+    metres_per_px: float,
+    circles: Circles,
+    blur: Blur,
+    spread: FloatArray = EVEN,
 ) -> EdgePairs:
     """Find the pairs of pixels and circles whose edges are within reach of the blur.
 
@@ -123,6 +127,8 @@ def pair_edges(
         Largest length on the plate that a pixel spans.
     circles : Circles
     blur : Blur
+    spread : (3,) array
+        By `blur_on_plate`.
     """
     sd_m = blur.largest_sd_px * metres_per_px
     sharpest_m = blur.smallest_sd_px * metres_per_px
@@ -130,7 +136,8 @@ def pair_edges(
     table[:, 0], table[:, 1] = circles.centres_m
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs
     table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
-    return EdgePairs(table, *_pair(points_m, table, reach_px(blur) * metres_per_px))
+    slack_m = _SLACK_PX * metres_per_px
+    return EdgePairs(table, *_pair(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
 
 
 def reach_px(blur: Blur) -> float:
@@ -140,22 +147,34 @@ def reach_px(blur: Blur) -> float:
 
 @compiled
 def _pair(
-    points_m: FloatArray, circles: FloatArray, reach_m: float
+    points_m: FloatArray,
+    circles: FloatArray,
+    reach_m: float,
+    slack_m: float,
+    spread: FloatArray,
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Return starts, members and background."""
-    count, found = points_m.shape[1], 0
+    """Return starts, members and background.
+
+    What is beyond the reach in its own direction from the circle's centre is so in all others.
+    """
+    count, found, most_m = points_m.shape[1], 0, reach_m + slack_m
     starts, background = np.zeros(len(circles) + 1, np.intp), np.ones(count)
     members = np.empty(2 * count, np.intp)
     for c in range(len(circles)):
         if found + count > len(members):
             members = np.concatenate((members, np.empty_like(members)))
-        within_m, beyond_m = max(circles[c, 2] - reach_m, 0.0), circles[c, 2] + reach_m
+        within_m, beyond_m = max(circles[c, 2] - most_m, 0.0), circles[c, 2] + most_m
         for i in range(count):
             dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
             square = dx * dx + dy * dy
             if square < within_m * within_m:
                 background[i] += circles[c, 3]
             elif square <= beyond_m * beyond_m:
+                out_m = math.sqrt(square)
+                felt = spread[0] * dx * dx + 2.0 * spread[1] * dx * dy + spread[2] * dy * dy
+                beyond = out_m - circles[c, 2] - slack_m
+                if beyond > 0.0 and beyond * out_m > reach_m * math.sqrt(felt):
+                    continue
                 members[found] = i
                 found += 1
         starts[c + 1] = found

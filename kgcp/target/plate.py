@@ -14,6 +14,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring
 
 _SAME_PLACE = 1e-6  # of a radius
+EVEN = np.array([1.0, 0.0, 1.0])  # a blur that is spread evenly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,21 +82,54 @@ def largest_metres_per_px(pose: Pose, rays: FloatArray) -> float:
 @compiled
 def _largest_square(axes: FloatArray, offset: FloatArray, rays: FloatArray) -> float:
     """Return the largest square of the length on the plate along x or y of a raw pixel [m²]."""
-    height, largest = 0.0, 0.0
-    for k in range(3):
-        height += axes[k, 2] * offset[k]
+    largest = 0.0
     for i in range(rays.shape[1]):
-        x, y = rays[0, i], rays[1, i]
-        facing = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2]
-        depth = height / facing
-        along_x = along_y = 0.0
-        for j in range(2):
-            share = (axes[0, j] * x + axes[1, j] * y + axes[2, j]) / facing
-            slide_x, slide_y = axes[0, j] - share * axes[0, 2], axes[1, j] - share * axes[1, 2]
-            along_x += (depth * (slide_x * rays[2, i] + slide_y * rays[4, i])) ** 2
-            along_y += (depth * (slide_x * rays[3, i] + slide_y * rays[5, i])) ** 2
-        largest = max(largest, along_x, along_y)
+        xx, xy, yx, yy = _scales(axes, offset, rays[:, i])
+        largest = max(largest, xx * xx + yx * yx, xy * xy + yy * yy)
     return largest
+
+
+@compiled
+def _scales(
+    axes: FloatArray, offset: FloatArray, ray: FloatArray
+) -> tuple[float, float, float, float]:
+    """Return the metres on the plate along its x and y per raw pixel along x, y: xx, xy, yx, yy."""
+    facing = axes[0, 2] * ray[0] + axes[1, 2] * ray[1] + axes[2, 2]
+    height = axes[0, 2] * offset[0] + axes[1, 2] * offset[1] + axes[2, 2] * offset[2]
+    depth, scales = height / facing, np.empty((2, 2))
+    for j in range(2):
+        share = (axes[0, j] * ray[0] + axes[1, j] * ray[1] + axes[2, j]) / facing
+        slide_x, slide_y = axes[0, j] - share * axes[0, 2], axes[1, j] - share * axes[1, 2]
+        for k in range(2):
+            scales[j, k] = depth * (slide_x * ray[2 + k] + slide_y * ray[4 + k])
+    return scales[0, 0], scales[0, 1], scales[1, 0], scales[1, 1]
+
+
+def blur_on_plate(
+    pose: Pose, ray: FloatArray, covariance: tuple[float, float, float], sd_m: float
+) -> FloatArray:
+    """Return how an image's blur is spread over the plate's directions.
+
+    Parameters
+    ----------
+    pose : Pose
+    ray : (6,) array
+        Of a pixel on the plate, as in `Window`.
+    covariance : (3,) tuple
+        Of the blur: xx, yy, xy [px²].
+    sd_m : float
+        Largest standard deviation that it may have on the plate.
+
+    Returns
+    -------
+    (3,) array
+        Its covariance there, xx, xy, yy, in units of sd_m².
+    """
+    a, b, c, d = _scales(pose.rotation, pose.translation_m, ray)
+    xx, yy, xy = covariance
+    along_x, along_y = xx * a + xy * b, xy * a + yy * b
+    mixed, across = along_x * c + along_y * d, (xx * c + 2.0 * xy * d) * c + yy * d * d
+    return np.array((along_x * a + along_y * b, mixed, across)) / (sd_m * sd_m)
 
 
 @compiled

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from kgcp.compiled import compiled, inlined
+from kgcp.compiled import compiled, fused
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.target.normal_series import BEND, EXPONENTIAL, FAR, SQUARINGS, TAIL_RATIO
 from kgcp.target.quadrature import CHORD_COUNTS, CHORDS, Quadrature
@@ -35,7 +35,7 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6 = EXPONENTIAL
 _R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7 = TAIL_RATIO
 
 
-@inlined
+@fused
 def _normal(z: float) -> tuple[float, float]:
     """Return the standard normal distribution function, to 3e-8, and its density.
 
@@ -57,7 +57,7 @@ def _normal(z: float) -> tuple[float, float]:
     return (1.0 - tail if z > 0.0 else tail), density
 
 
-@inlined
+@fused
 def _long_smear(z: float, half: float) -> tuple[float, float, float]:
     """Return the mean of the normal distribution function from z − half to z + half.
 
@@ -70,7 +70,7 @@ def _long_smear(z: float, half: float) -> tuple[float, float, float]:
     return mean, rise * per_length, (both - 2.0 * mean) * per_length
 
 
-@inlined
+@fused
 def _smeared_normal(z: float, half: float, smears: bool) -> tuple[float, float, float]:
     """Do as `_long_smear` for any length; 0 unless it `smears`."""
     below, density = _normal(z)
@@ -85,14 +85,14 @@ def _smeared_normal(z: float, half: float, smears: bool) -> tuple[float, float, 
     )
 
 
-@inlined
+@fused
 def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float, float]:
     """Return the blur's covariance along a direction, across it and mixed."""
     along = (xx * x + 2.0 * xy * y) * x + yy * y * y
     return along, xx + yy - along, (yy - xx) * x * y + xy * (x * x - y * y)
 
 
-@inlined
+@fused
 def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) -> None:
     """Work out a batch of a circle that is large against the blur, in closed form.
 
@@ -130,7 +130,7 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
         w[_BY_STREAK_Y + j] = by_length * y + by_cross * x
 
 
-@inlined
+@fused
 def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_level: bool) -> None:
     """Work out a batch of a circle that is small against blur or streak, chord by chord.
 
@@ -183,7 +183,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         w[_BY_STREAK_Y + j] = by_smear * v + sideways * u
 
 
-@inlined
+@fused
 def _is_felt(w: FloatArray, at: float) -> bool:
     """Tell whether a chord weighs anything for any pixel of a batch."""
     nearest = np.inf
@@ -192,7 +192,7 @@ def _is_felt(w: FloatArray, at: float) -> bool:
     return nearest < FAR
 
 
-@inlined
+@fused
 def _add_chord(
     w: FloatArray, at: float, half_length: float, smears: bool, only_level: bool
 ) -> None:
@@ -224,7 +224,7 @@ def _add_chord(
         w[_BY_HALF + j] += by_length
 
 
-@inlined
+@fused
 def _add(w: FloatArray, radius: float, rule: float, smears: bool, only_level: bool) -> None:
     if rule == _EDGE:
         _add_straight(w, radius, smears, only_level)
@@ -277,7 +277,7 @@ def render(
                     out[k, pixels[j]] += sign * w[_VALUE + k * _BATCH + j]
 
 
-@inlined
+@fused
 def _gather(
     views: FloatArray, blur: FloatArray, circle: FloatArray, pixels: IndexArray, w: FloatArray
 ) -> None:

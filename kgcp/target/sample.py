@@ -207,10 +207,10 @@ def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> 
     imaging, blur, scale = seen.imaging, seen.blur, seen.metres_per_px
     points_m = np.take(seen.bare.points_m, index, axis=1)
     measured = imaging.circles.part(slice(0, imaging.measured_count))
-    pairs = pair_edges(points_m, scale, measured, blur)
+    pairs = pair_edges(points_m, scale, measured, blur, seen.spread)
     if seen.bare.rho_m[index].min() > _unmeasured_m(seen):
         return pairs
     others = imaging.circles.part(slice(imaging.measured_count, None))
-    replicas = pair_edges(points_m, scale, others, blur)
+    replicas = pair_edges(points_m, scale, others, blur, seen.spread)
     added = white_level(pose.matrix, rays, blur.vector, replicas).value - 1.0
     return replace(pairs, background=pairs.background + added)

@@ -85,7 +85,7 @@ def _ellipse_through(points: FloatArray) -> Ellipse:
     """Fit an ellipse to points (n, 2) all around, which are nearly on one."""
     lengths, directions = np.empty((1, len(points))), np.empty_like(points)
     x, y, unit = _measure_spokes(points, lengths[0], directions)
-    found, possible = np.empty((1, 5)), np.empty(1, dtype=bool)
+    found, possible = np.empty((1, 5)), np.empty(1)
     fit_ellipses(lengths, _EVERYWHERE, directions, math.inf, found, possible)
     if not possible[0]:
         raise Rejection(Reason.POOR_ELLIPSE, "the outline is beyond the lens model's reach")

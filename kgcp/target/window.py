@@ -55,6 +55,12 @@ class Window:
     binning: int = 1
     clipped: FloatArray | None = None
 
+    def nearest(self, point_px: FloatArray) -> int:
+        """Return the index of the pixel nearest to a point (2,) of the raw image."""
+        x, y = (round(float(value)) for value in point_px)
+        column = min(max(x - self.x0, 0), self.width - 1)
+        return min(max(y - self.y0, 0), self.height - 1) * self.width + column
+
     def pixels(self, chosen: IndexArray) -> FloatArray:
         """Return raw pixel coordinates (2, m) of the chosen pixels, by their index."""
         rows, columns = np.divmod(chosen, self.width)
