@@ -26,7 +26,7 @@ from kgcp.target.verify import edge_noise
 
 _START_SLACK_PX = 1.5
 _HALF_SHARPENED, _NARROWED = 0.25, 1.12  # strength, and blur as a share of what seems to be
-_DOUBTFUL_EDGE_NOISE = 0.07  # of the contrast: more than a true pose leaves in most frames
+_DOUBTFUL_EDGE_NOISE = 0.12  # of the contrast: more than a true pose leaves in most frames
 _SPILT_PX = (0.7, 1.4, -0.7)  # by which edges may be displaced beyond what the start says
 _SLIGHT_TILT_PX, _TRIED_TILT_PX, _ACROSS_STEPS = 0.06, 0.2, 6  # of the minor axis, half
 _MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
