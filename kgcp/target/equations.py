@@ -42,8 +42,12 @@ class Unknowns:
 
 
 def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
-    """Return the normal matrix for a Jacobian (p, n) in units of the noise."""
-    normal = (scaled * current.weight) @ scaled.T
+    """Return the normal matrix for a Jacobian (p, n) in units of the noise.
+
+    Of a plate that a step has turned edge-on it is not finite, and cannot be solved.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        normal = (scaled * current.weight) @ scaled.T
     normal.flat[:: len(normal) + 1] += unknowns.free_precision
     return normal
 
