@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from threading import Timer
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
+_PATIENCE_S = 10.0  # that a bar may stand still at its begin
 _SHORTEST_STAGE_S = 0.0005  # of which digits show
 
 
@@ -62,6 +65,13 @@ class Log:
             self._due_s = time.monotonic() + _JSON_PROGRESS_S
             self.event("progress", done=done, total=total, found=found)
 
+    def explain_wait(self) -> None:
+        """Tell what takes so long where nothing is done yet."""
+        if not self.done:
+            self.note(
+                "no frame is done yet: a first run compiles its inner loops, for a minute or two"
+            )
+
     def stop(self) -> None:
         """Tell how far the work went, and how to go on."""
         self._bar.close()
@@ -82,7 +92,14 @@ def log_to_stderr(*, is_quiet: bool, as_json: bool) -> Iterator[Log]:
     from tqdm import tqdm
 
     with tqdm(unit="look", disable=is_quiet or as_json) as bar:
-        yield Log(bar, is_quiet=is_quiet, as_json=as_json)
+        log = Log(bar, is_quiet=is_quiet, as_json=as_json)
+        patience = Timer(_PATIENCE_S, log.explain_wait)
+        if sys.stderr.isatty():  # somebody may sit before it
+            patience.start()
+        try:
+            yield log
+        finally:
+            patience.cancel()
 
 
 @contextmanager
