@@ -15,6 +15,7 @@ from kgcp.target.light import PARAM_COUNT, Param
 from kgcp.target.pairs import Blur
 from kgcp.target.parameters import Parameters
 
+_MANY_PIXELS_RADIUS_PX = 40.0  # from there on, few pixels first save more than to choose them costs
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
 
 _PRIOR_SD = {
@@ -49,7 +50,8 @@ def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = Tru
             return best
     unknowns = unknowns_of(imaging, has_streak=True, moves=moves)
     streaked = Parameters.of(start.pose, streak, start.light)
-    near = adjust(imaging, streaked, unknowns, imaging.few_pixels)
+    is_large = imaging.outer_radius_px > _MANY_PIXELS_RADIUS_PX
+    near = adjust(imaging, streaked, unknowns, imaging.few_pixels if is_large else None)
     return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
