@@ -23,7 +23,7 @@ from kgcp.processes import use_one_core_each
 def main(flights: Path | None, photos: Path | None, frames: int) -> None:
     """Print the tables."""
     use_one_core_each()  # before any library of numbers is loaded
-    from benchmarks.speed_costs import HEADER, cost_line, cost_of_all, cv2_alone
+    from benchmarks.speed_costs import HEADER, Costs, cost_line, cv2_alone, print_costs
     from benchmarks.speed_runs import help_line, jobs_line, size_lines
     from benchmarks.speed_sources import flights_of, photograph_of, photographs_of
 
@@ -34,9 +34,9 @@ def main(flights: Path | None, photos: Path | None, frames: int) -> None:
         photographs = photographs_of(photos, sources[0])
         print("CPU time in one process, on one thread; decoding is 1", flush=True)
         print(HEADER, flush=True)
-        for source in (*sources, *photographs):
-            for costs in cost_of_all(source.spread(frames)):
-                print(cost_line(costs), flush=True)
+        of_flights = tuple(print_costs(sources, frames))
+        print(cost_line(Costs("flights together", "both", of_flights)), flush=True)
+        tuple(print_costs(photographs, frames))
         print(jobs_line(sources[0], work), flush=True)
         print(help_line(), flush=True)
         for line in size_lines(photograph_of(photographs, sources[0]), work):

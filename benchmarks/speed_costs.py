@@ -137,6 +137,14 @@ def cost_of_all(source: Source) -> Iterable[Costs]:
             yield Costs(source.name, targets, tuple(chosen))
 
 
+def print_costs(sources: Iterable[Source], count: int) -> Iterable[FrameCost]:
+    """Print the lines of some sources, and return their frames; of each some, spread over it."""
+    for source in sources:
+        for costs in cost_of_all(source.spread(count)):
+            print(cost_line(costs), flush=True)
+            yield from costs.frames
+
+
 def _found(costs: Sequence[FrameCost]) -> list[FrameCost]:
     return [cost for cost in costs if cost.found]
 
