@@ -65,6 +65,7 @@ class Journal:
         self._places: dict[str, int] = {}  # by key: part and offset in one number, to be small
         self._parts = 0
         self._waiting: dict[str, bytes] = {}
+        self._read_last: tuple[int, bytes] = (0, b"")  # the part's number, and all of it
         self._due_s = time.monotonic() + _SHORTEST_S
         self.seconds = 0.0
         try:
@@ -143,9 +144,10 @@ class Journal:
         number, offset = divmod(self._places[key], 1 << _OFFSET_BITS)
         path = self._part(number)
         try:
-            with path.open("rb") as stream:
-                stream.seek(offset)
-                result = from_text(stream.readline().split(b" ", 2)[2])
+            if number != self._read_last[0]:  # results are read in nearly the order of the parts
+                self._read_last = number, path.read_bytes()
+            part = self._read_last[1]
+            result = from_text(part[offset : part.index(b"\n", offset)].split(b" ", 2)[2])
         except OSError as error:
             raise self._unusable(error) from error
         except (ValueError, IndexError) as error:
@@ -158,6 +160,7 @@ class Journal:
         shutil.rmtree(self._folder, ignore_errors=True)
         self._places.clear()
         self._waiting.clear()
+        self._read_last = (0, b"")
 
     def _find_results(self) -> None:
         """Index the whole lines of all parts; what else is there counts as not done."""
