@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from kgcp.geometry.arrays import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _CORRELATIONS_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _SHARES = (0.1, 0.3, 1.0, 3.0, 10.0)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc, stdtr
 
-from kgcp.bias.regression import BoolArray, Fit, fit
+from kgcp.bias.regression import Fit, fit
 from kgcp.bias.residuals import QUANTITIES, Residuals, varies
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 SIGNIFICANT = 0.01
 """Largest probability, corrected for the number of terms, of what is called significant."""

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import stdtr
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _MAX_INFLATION = 100.0  # of a variance by the other unknowns: a deviation ten times larger
 _TANGLED_SHARE = 0.3
@@ -18,9 +17,6 @@ _SIGNIFICANT = 0.001
 _CHI2_3_MEDIAN = 2.366
 _OUTLIER_CHI2 = 25.0  # of three coordinates: exceeded by chance once in 65 000
 _ROBUST_ROUNDS = 30
-
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.carrier import Place, Whereabouts
-from kgcp.consistency.corrections import BoolArray, Estimate, estimate, find_outliers
+from kgcp.consistency.corrections import Estimate, estimate, find_outliers
 from kgcp.consistency.system import Meeting, System
 from kgcp.consistency.whitening import whiten
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.reference import ReferencePoses
 from kgcp.settings import VehicleSettings

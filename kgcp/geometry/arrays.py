@@ -9,4 +9,5 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.intp]
+BoolArray = npt.NDArray[np.bool_]
 GreyArray = npt.NDArray[Any]  # uint8, uint16 or float: one channel, (height, width)

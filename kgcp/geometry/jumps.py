@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _SIDE = 4  # neighbours in time on either side, at most
 _LEAST_ON_A_SIDE = 2  # a parabola does not foresee, it interpolates
@@ -15,8 +14,6 @@ _UNREST_FACTOR = 2.0  # gusts are not normally distributed
 _SD_OF_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median deviation
 _SD_OF_QUARTER = 3.138  # the same over the lowest quarter of deviations
 _MAX_ROUNDS = 1000
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 def find_jumps(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> BoolArray:

@@ -202,7 +202,8 @@ def minimise(
     change, and cost most. With `pauses`, one that is made anew ends it.
     """
     damping, light = _DAMPING, parameters.light
-    relative_sd = float(sd.mean()) / (light.white - light.black)
+    contrast = max(light.white - light.black, sample.imaging.window.levels_per_count)
+    relative_sd = float(sd.mean()) / contrast
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     scaled = scaled_rows(jacobian, unknowns.free, sd)
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)

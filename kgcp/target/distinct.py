@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray, IndexArray
-
-BoolArray = npt.NDArray[np.bool_]
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 
 def distinct(

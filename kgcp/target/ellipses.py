@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _RIDGE = 1e-9  # keeps the points of too few edges from a singular fit; they are refused anyway
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @compiled

@@ -10,12 +10,11 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.bare_plate import BarePlate, look_at_plate
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import Light, light_of_levels, plateau_levels
-from kgcp.target.noise import BoolArray
 from kgcp.target.pairs import REACH_SIGMAS, Blur
 from kgcp.target.plate import blur_on_plate, largest_metres_per_px
 
@@ -124,11 +123,8 @@ def _plateaus(
             kind = 0 if share[i] < 0.5 else 1
             seen[kind, found[kind]], off[kind, found[kind]] = levels[i], off_edge_m[i]
             found[kind] += 1
-    ink, plate = (
-        (seen[0, : found[0]], off[0, : found[0]]),
-        (seen[1, : found[1]], off[1, : found[1]]),
-    )
-    return _median_of_clearest(ink[0], ink[1]), _median_of_clearest(plate[0], plate[1])
+    ink = _median_of_clearest(seen[0, : found[0]], off[0, : found[0]])
+    return ink, _median_of_clearest(seen[1, : found[1]], off[1, : found[1]])
 
 
 @compiled

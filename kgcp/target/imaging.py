@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Response
-from kgcp.target.noise import BoolArray, Censoring
+from kgcp.target.noise import Censoring
 from kgcp.target.plate import Circles
 from kgcp.target.window import Window
 

@@ -8,12 +8,11 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.target.layout import Ring
-from kgcp.target.noise import BoolArray
 from kgcp.target.occlusion import best_partial_template, may_show_code, visible_angles
 from kgcp.target.polar import sample_ellipses, sample_grey
 from kgcp.target.template import (

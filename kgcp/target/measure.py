@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import BoolArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.settings import DetectSettings, Method
 from kgcp.target.chance import check_chance
@@ -18,7 +18,6 @@ from kgcp.target.explain import explain
 from kgcp.target.judgement import judge_at
 from kgcp.target.layout import Ring, Target
 from kgcp.target.model import measure_by_model
-from kgcp.target.noise import BoolArray
 from kgcp.target.observation import Considered, Miss, Observation, Outcome
 from kgcp.target.paper import points_of_code
 from kgcp.target.prior import NormalPrior

@@ -10,14 +10,14 @@ import math
 from dataclasses import replace
 
 from kgcp.errors import Rejection
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.target.appearance import appearance_of
 from kgcp.target.covariance import pose_covariance, propagate
 from kgcp.target.imaging import Imaging, apparent_response
 from kgcp.target.layout import Target
-from kgcp.target.noise import BoolArray, find_censoring
+from kgcp.target.noise import find_censoring
 from kgcp.target.observation import Alternative, Observation
 from kgcp.target.pairs import Blur, variance_in_bins
 from kgcp.target.plate import circles_of

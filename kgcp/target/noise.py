@@ -12,10 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _OUTLIER_SIGMAS = 3.5
 _FARTHEST_CLIPPED = (
@@ -26,8 +25,6 @@ _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
 _PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

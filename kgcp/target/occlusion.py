@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.target.layout import Ring
-from kgcp.target.noise import BoolArray
 from kgcp.target.template import (
     ANGLES,
     LOOKS,

@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.target.plate import EVEN, Circles
+from kgcp.target.plate import Circles
 from kgcp.target.quadrature import quadrature_for
 
 REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
@@ -115,7 +115,7 @@ def pair_edges(
     metres_per_px: float,
     circles: Circles,
     blur: Blur,
-    spread: FloatArray = EVEN,
+    spread: FloatArray,
 ) -> EdgePairs:
     """Find the pairs of pixels and circles whose edges are within reach of the blur.
 

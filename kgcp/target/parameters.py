@@ -10,7 +10,7 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.pose import Pose
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.target.light import Light, Param
 from kgcp.target.pairs import Blur
 
@@ -18,7 +18,6 @@ _NO_POSE = (0.0,) * 6
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 _MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(Param.BLUR_XY)
-_SMALL_TURN = 1e-4  # rad; below, its sine and cosine have lost their digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +67,9 @@ class Parameters:
 
         That of the pose is a translation [m] and a left rotation vector [rad].
         """
-        return Parameters(_moved_pose(self.matrix, step), _moved_others(self.vector, step))
-
-
-@compiled
-def _moved_pose(matrix: FloatArray, step: FloatArray) -> FloatArray:
-    """Return a pose after a step, turned by Rodrigues' formula."""
-    x, y, z = step[3], step[4], step[5]
-    square = x * x + y * y + z * z
-    angle = math.sqrt(square)
-    first = math.sin(angle) / angle if angle > _SMALL_TURN else 1.0 - square / 6.0
-    second = (1.0 - math.cos(angle)) / square if angle > _SMALL_TURN else 0.5 - square / 24.0
-    moved = np.empty((3, 4))
-    for k in range(3):  # R v = v + sin/θ · ω × v + (1 − cos)/θ² · ω × (ω × v)
-        a, b, c = matrix[0, k], matrix[1, k], matrix[2, k]
-        da, db, dc = y * c - z * b, z * a - x * c, x * b - y * a
-        moved[0, k] = a + first * da + second * (y * dc - z * db)
-        moved[1, k] = b + first * db + second * (z * da - x * dc)
-        moved[2, k] = c + first * dc + second * (x * db - y * da)
-        moved[k, 3] = matrix[k, 3] + step[k]
-    return moved
+        matrix = rotation_about(step[3:6]) @ self.matrix
+        matrix[:, 3] = self.matrix[:, 3] + step[:3]
+        return Parameters(matrix, _moved_others(self.vector, step))
 
 
 @compiled

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.compiled import compiled, inlined
-from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 
 RAYS = 40
 RAYS_RAD = 2.0 * np.pi / RAYS * np.arange(RAYS)
@@ -33,8 +32,6 @@ _INLIER = 0.07
 _MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6
 _FINEST_RADIUS_PX = 12.0  # of rings in the image that they are followed in, or twice that
 _RIDGE = 1e-3  # keeps the curve through few edges near the mean circle
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @compiled

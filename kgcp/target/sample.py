@@ -9,14 +9,14 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level
 from kgcp.target.foreign import SeenPlate, hidden_pixels, reached_by_surroundings, see_plate
 from kgcp.target.imager import Imager
 from kgcp.target.imaging import Imaging
 from kgcp.target.light import PARAM_COUNT, Light
-from kgcp.target.noise import BoolArray, Censoring
+from kgcp.target.noise import Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges, reach_px
 from kgcp.target.sharpening import unsharp_mask
 

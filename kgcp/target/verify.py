@@ -9,11 +9,11 @@ import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.target.adjust import Fit
 from kgcp.target.layout import Ring
 from kgcp.target.light import plateau_levels
-from kgcp.target.noise import BoolArray, median_at_edges
+from kgcp.target.noise import median_at_edges
 from kgcp.target.observation import Observation
 
 _MAX_OUTLIERS = 0.3

@@ -13,7 +13,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.layout import Ring
 from kgcp.target.pairs import Blur, EdgePairs, pair_edges
-from kgcp.target.plate import Circles, circles_of, largest_metres_per_px, plate_points
+from kgcp.target.plate import EVEN, Circles, circles_of, largest_metres_per_px, plate_points
 
 CAMERA = Camera(1100, 800, 2300.0, 2310.0, 560.3, 391.8, k1=-0.06, k2=0.05, p1=-4e-4, p2=6e-4)
 RING = Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0))
@@ -43,7 +43,7 @@ def rays_of(pixels: FloatArray) -> FloatArray:
 
 def pairs_of(pose: Pose, rays: FloatArray, blur: Blur) -> EdgePairs:
     scale = largest_metres_per_px(pose, rays)
-    return pair_edges(plate_points(pose, rays), scale, CIRCLES, blur)
+    return pair_edges(plate_points(pose, rays), scale, CIRCLES, blur, EVEN)
 
 
 CIRCLES = circles_of(RINGS)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kgcp.geometry.arrays import FloatArray
-from kgcp.target.noise import BoolArray, Censoring, estimate_noise, find_censoring, misfit
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.target.noise import Censoring, estimate_noise, find_censoring, misfit
 
 COUNT = 1.0 / 255.0
 OUTLYING = 3.5
