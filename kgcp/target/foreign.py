@@ -23,6 +23,7 @@ _ENOUGH_PIXELS = 2000  # for a median
 _CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 1.7  # … and so much farther its blur is felt
+_BESIDE_RING_SIGMAS = 0.85  # from there on, grey values hardly depend on the camera's tone
 _HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
 _NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
 _NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
@@ -136,37 +137,58 @@ def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
     return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
 
 
-def reached_by_surroundings(seen: SeenPlate, light: Light) -> BoolArray:
-    """Tell which pixels (n,) of the window blur may mix with something that is not plate."""
-    imaging, blur, rho_m = seen.imaging, seen.blur, seen.bare.rho_m
+def reached_by_surroundings(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
+    """Tell which pixels (n,) of the window blur may mix with something that is not plate.
+
+    The pose may be off by `slack_px`.
+    """
+    imaging, blur, bare, scale = seen.imaging, seen.blur, seen.bare, seen.metres_per_px
     black, white = plateau_levels(light, imaging.response)
-    clear = 1.0 + _CLEAR_SIGMAS * blur.largest_sd_px / imaging.outer_radius_px
-    off_level = _FOREIGN_CONTRAST * (white - black)
-    foreign = np.empty(len(rho_m), dtype=np.bool_)
-    smooth, level = imaging.window.smooth, min(white, 1.0)
-    if not _mark_foreign(smooth, rho_m, level, off_level, clear * imaging.outer_radius_m, foreign):
+    foreign = np.empty(len(bare.rho_m), dtype=np.bool_)
+    if not _mark_foreign(
+        *(imaging.window.smooth, bare.points_m, bare.rho_m, seen.spread, black, white),
+        *(imaging.outer_radius_m, blur.largest_sd_px * scale, slack_px * scale),
+        foreign,
+    ):
         return foreign
     reach_px = _FOREIGN_SIGMAS * blur.largest_sd_px
     half = math.ceil(reach_px)
     kernel = np.empty((2 * half + 1, 2 * half + 1), dtype=np.uint8)
     _fill_ellipse(*blur.total_covariance, _FOREIGN_SIGMAS, kernel)
     inmost_m = (1.0 - 2.0 * reach_px / imaging.outer_radius_px) * imaging.outer_radius_m
-    return np.asarray(seen.dilated(foreign, kernel) & (rho_m > inmost_m))
+    return np.asarray(seen.dilated(foreign, kernel) & (bare.rho_m > inmost_m))
 
 
 @compiled
 def _mark_foreign(
     smooth: FloatArray,
+    points_m: FloatArray,
     rho_m: FloatArray,
-    level: float,
-    off_level: float,
-    beyond_m: float,
+    spread: FloatArray,
+    black: float,
+    white: float,
+    radius_m: float,
+    sd_m: float,
+    slack_m: float,
     foreign: BoolArray,
 ) -> int:
-    """Mark the pixels farther out that are off the plate's level; return how many there are."""
-    count = 0
+    """Mark what is not plate outside a ring; return how many pixels that are.
+
+    Where the ring is not felt, by a level that is not the plate's; nearer, where the end of the
+    plate may be within the blur of the ring, by one that is darker than the ring makes it.
+    """
+    count, level = 0, min(white, 1.0)
     for i in range(len(smooth)):
-        foreign[i] = rho_m[i] > beyond_m and abs(smooth[i] - level) > off_level
+        beyond_m, foreign[i] = rho_m[i] - radius_m, False
+        if beyond_m > _CLEAR_SIGMAS * sd_m:
+            foreign[i] = abs(smooth[i] - level) > _FOREIGN_CONTRAST * (white - black)
+        elif beyond_m > slack_m:
+            x, y = points_m[0, i], points_m[1, i]
+            felt = spread[0] * x * x + 2.0 * spread[1] * x * y + spread[2] * y * y
+            sigmas = (beyond_m - slack_m) * rho_m[i] / (sd_m * math.sqrt(felt))
+            if sigmas > _BESIDE_RING_SIGMAS:
+                share = 1.0 - 0.5 * math.erfc(sigmas * math.sqrt(0.5)) - _FOREIGN_CONTRAST
+                foreign[i] = smooth[i] < min(black + (white - black) * share, 1.0)
         count += foreign[i]
     return count
 

@@ -1,8 +1,7 @@
 """The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach.
 
 Pixels are worked on in batches, step by step, in loops without a branch: several at once in the
-vector units of the processor. A batch is one flat array, row after row: that much the compiler can
-see through.
+vector units of the processor. A batch is one flat array, row after row.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from kgcp.target.normal_series import BEND, EXPONENTIAL, FAR, SQUARINGS, TAIL_RA
 from kgcp.target.quadrature import CHORD_COUNTS, CHORDS, Quadrature
 
 _EDGE = float(Quadrature.EDGE)
-_SHORT_SMEAR = 0.1  # of the blur: below, differences of the profile lose their digits
+_SHORT_SMEAR = 0.2  # of the blur: below, differences of the profile lose their digits
 _SHORTEST_SMEAR = 0.01  # of the blur: from chords none shorter can be told
 _SHORTEST_STREAK = 0.1  # of the blur: below, it has no direction
 _NOWHERE_M = 1e-12  # keeps directions finite in a circle's centre
@@ -37,20 +36,17 @@ _R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7 = TAIL_RATIO
 
 @fused
 def _normal(z: float) -> tuple[float, float]:
-    """Return the standard normal distribution function, to 3e-8, and its density.
-
-    By pairs of terms, which do not wait for each other (Estrin's scheme).
-    """
+    """Return the standard normal distribution function, to 3e-8, and its density."""
     far = min(abs(z), FAR)
     q = far * far * (0.5 / 2**SQUARINGS)
     q2 = q * q
+    # by pairs of terms, which do not wait for each other (Estrin's scheme)
     root = _E0 + _E1 * q + (_E2 + _E3 * q) * q2 + (_E4 + _E5 * q + _E6 * q2) * (q2 * q2)
     square = root * root
     square *= square
     square *= square
     square *= square
-    density = _PER_ROOT_2PI * square * square
-    t = 1.0 / (1.0 + BEND * far)
+    density, t = _PER_ROOT_2PI * square * square, 1.0 / (1.0 + BEND * far)
     t2 = t * t
     low, high = _R0 + _R1 * t + (_R2 + _R3 * t) * t2, _R4 + _R5 * t + (_R6 + _R7 * t) * t2
     tail = density * (low + high * (t2 * t2))
@@ -58,31 +54,43 @@ def _normal(z: float) -> tuple[float, float]:
 
 
 @fused
-def _long_smear(z: float, half: float) -> tuple[float, float, float]:
+def _long_smear(z: float, half: float) -> tuple[float, float, float, float, float]:
     """Return the mean of the normal distribution function from z − half to z + half.
 
-    And its derivatives by z and by `half`.
+    Also its derivatives by z and by `half`, and the densities at both ends.
     """
     below_high, density_high = _normal(z + half)
     below_low, density_low = _normal(z - half)
     rise, both, per_length = below_high - below_low, below_high + below_low, 0.5 / half
     mean = (z * rise + half * both + density_high - density_low) * per_length
-    return mean, rise * per_length, (both - 2.0 * mean) * per_length
+    by_half = (both - 2.0 * mean) * per_length
+    return mean, rise * per_length, by_half, density_low, density_high
 
 
 @fused
-def _smeared_normal(z: float, half: float, smears: bool) -> tuple[float, float, float]:
-    """Do as `_long_smear` for any length; 0 unless it `smears`."""
-    below, density = _normal(z)
+def _smeared_normal(
+    z: float, half: float, slant: float, motion_t: float, smears: bool
+) -> tuple[float, float, float, float]:
+    """Do as `_long_smear` for any length, 0 unless it `smears`; with what a unit of bend adds.
+
+    That is the mean over s, the place on the streak, −½ … ½, of φ(y) times
+    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y is the blur along the radius.
+    """
+    (below, density), slanted, moved = _normal(z), slant * slant, motion_t * motion_t
+    curving = (z * z - 1.0) * density
     if not smears:
-        return below, density, 0.0
-    third, is_short = half * half * (1.0 / 6.0), half < _SHORT_SMEAR
-    mean, by_z, by_half = _long_smear(z, _SHORT_SMEAR if is_short else half)
-    return (
-        below - z * density * third if is_short else mean,
-        density + density * (z * z - 1.0) * third if is_short else by_z,
-        -z * density * half * (1.0 / 3.0) if is_short else by_half,
-    )
+        return below, density, 0.0, slanted * curving
+    third, long = half * (1.0 / 3.0), max(half, _SHORT_SMEAR)
+    mean, by_z, by_half, low, high = _long_smear(z, long)
+    per_length, middle = 0.5 / long, 0.5 * (high + low)
+    leaning, mixed = z * (high - low) * per_length - middle, (middle - by_z) * per_length
+    apart = (by_z * (1.0 + z * z) + leaning) * per_length * per_length - by_z * (1.0 / 12.0)
+    bent = 2.0 * slant * motion_t * mixed + moved * apart - slanted * (leaning + 2.0 * middle)
+    if half < _SHORT_SMEAR:
+        mean, by_half = below - 0.5 * z * density * half * third, -z * density * third
+        by_z = density + 0.5 * curving * half * third
+        bent = curving * (slanted + (slant * motion_t + moved * half * (1.0 / 30.0)) * third)
+    return mean, by_z, by_half, bent
 
 
 @fused
@@ -98,23 +106,27 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
 
     The chord that tangential blur reaches is a parabola. To second order it shifts the edge inwards
     by var_t/(2 r) + 3 var_t²/(8 r³) and widens it by var_t²/(2 r²). Motion along the radius
-    averages the profile over its length; motion across bends the edge as blur does.
+    averages the profile over its length; motion across bends the edge as blur does, but widens it
+    less. Of blur or streak askew to the radius, what is met along it tells something of what is met
+    across, and so of the bend; derivatives of that, some per cent of the whole, are left out.
     """
     bend = 0.5 / radius
     for j in range(_BATCH):
-        dx, dy = w[_X + j], w[_Y + j]
-        rho = math.sqrt(dx * dx + dy * dy) + _NOWHERE_M
+        rho = math.sqrt(w[_X + j] * w[_X + j] + w[_Y + j] * w[_Y + j]) + _NOWHERE_M
         per_rho = 1.0 / rho
-        x, y = dx * per_rho, dy * per_rho
+        x, y = w[_X + j] * per_rho, w[_Y + j] * per_rho
         radial, across, mixed = _turned(x, y, w[_XX + j], w[_XY + j], w[_YY + j])
         motion_r = w[_STREAK_X + j] * x + w[_STREAK_Y + j] * y if smears else 0.0
         motion_t = w[_STREAK_Y + j] * x - w[_STREAK_X + j] * y if smears else 0.0
-        tangential = across + motion_t * motion_t * (1.0 / 12.0)
-        sag = tangential * bend
-        per_sd = 1.0 / math.sqrt(radial + 2.0 * sag * sag)
+        streaked = motion_t * motion_t * (1.0 / 12.0)
+        tangential, sag = across + streaked, (across + streaked) * bend
+        widened = (2.0 * tangential * tangential - 1.2 * streaked * streaked) * bend * bend
+        per_sd = 1.0 / math.sqrt(radial + widened)
         z = (radius - sag * (1.0 + 3.0 * sag * bend) - rho) * per_sd
         half = 0.5 * abs(motion_r) * per_sd
-        w[_VALUE + j], by_z, by_half = _smeared_normal(z, half, smears)
+        askew = motion_t if motion_r > 0.0 else -motion_t
+        level, by_z, by_half, bent = _smeared_normal(z, half, mixed * per_sd, askew, smears)
+        w[_VALUE + j] = level - bent * bend * per_sd
         if only_level:
             continue
         by_rho, by_r = -by_z * per_sd, -0.5 * (by_z * z + by_half * half) * per_sd * per_sd
@@ -141,8 +153,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         dx, dy = w[_X + j], w[_Y + j]
         u, v = (w[_STREAK_X + j], w[_STREAK_Y + j]) if smears else (dx, dy)
         length = math.sqrt(u * u + v * v)
-        per_length = 1.0 / (length + _NOWHERE_M)
-        u, v = u * per_length, v * per_length
+        u, v = u / (length + _NOWHERE_M), v / (length + _NOWHERE_M)
         along, across, mixed = _turned(u, v, w[_XX + j], w[_XY + j], w[_YY + j])
         sd = math.sqrt(max(along - mixed * mixed / across, 1e-6 * along))
         w[_U + j], w[_V + j] = u, v
@@ -154,7 +165,10 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         w[_BY_SLOPE + j] = w[_BY_WIDTH + j] = w[_BY_HALF + j] = 0.0
     for k in range(CHORD_COUNTS[rule]):
         at, half_length = radius * CHORDS[rule, 0, k], radius * CHORDS[rule, 1, k]
-        if _is_felt(w, at):
+        nearest = np.inf
+        for j in range(_BATCH):
+            nearest = min(nearest, abs(at - w[_Y + j]) * w[_PER_SD_ACROSS + j])
+        if nearest < FAR:  # weighs anything for any pixel of the batch
             _add_chord(w, at, half_length, smears, only_level)
     for j in range(_BATCH):
         scale = math.pi / (CHORD_COUNTS[rule] + 1) * w[_PER_SD_ACROSS + j]
@@ -184,15 +198,6 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
 
 
 @fused
-def _is_felt(w: FloatArray, at: float) -> bool:
-    """Tell whether a chord weighs anything for any pixel of a batch."""
-    nearest = np.inf
-    for j in range(_BATCH):
-        nearest = min(nearest, abs(at - w[_Y + j]) * w[_PER_SD_ACROSS + j])
-    return nearest < FAR
-
-
-@fused
 def _add_chord(
     w: FloatArray, at: float, half_length: float, smears: bool, only_level: bool
 ) -> None:
@@ -206,8 +211,8 @@ def _add_chord(
         half_smear = 0.5 * w[_SMEAR + j] * per_sd
         far, near = (half_length - centre) * per_sd, (-half_length - centre) * per_sd
         if smears:
-            below_far, by_far, by_half_far = _long_smear(far, half_smear)
-            below_near, by_near, by_half_near = _long_smear(near, half_smear)
+            below_far, by_far, by_half_far, _, _ = _long_smear(far, half_smear)
+            below_near, by_near, by_half_near, _, _ = _long_smear(near, half_smear)
         else:
             (below_far, by_far), (below_near, by_near) = _normal(far), _normal(near)
             by_half_far = by_half_near = 0.0
@@ -262,16 +267,14 @@ def render(
     w = np.zeros(32 * _BATCH)
     only_level, smears = out.shape[0] == 1, blur[3] != 0.0 or blur[4] != 0.0
     for c in range(len(circles)):
-        radius, sign, rule = circles[c, 2], circles[c, 3], circles[c, 4]
+        r, sign, rule = circles[c, 2], circles[c, 3], circles[c, 4]
         for first in range(starts[c], starts[c + 1], _BATCH):
             pixels = members[first : min(first + _BATCH, starts[c + 1])]
             _gather(views, blur, circles[c], pixels, w)
             if only_level:  # constants, so that loops have no branch
-                _add(w, radius, rule, True, True) if smears else _add(w, radius, rule, False, True)
-            elif smears:
-                _add(w, radius, rule, True, False)
+                _add(w, r, rule, True, True) if smears else _add(w, r, rule, False, True)
             else:
-                _add(w, radius, rule, False, False)
+                _add(w, r, rule, True, False) if smears else _add(w, r, rule, False, False)
             for j in range(len(pixels)):
                 for k in range(out.shape[0]):
                     out[k, pixels[j]] += sign * w[_VALUE + k * _BATCH + j]
@@ -287,13 +290,10 @@ def _gather(
         w[_X + j], w[_Y + j] = views[0, i] - circle[0], views[1, i] - circle[1]
         w[_XX + j], w[_XY + j], w[_YY + j] = views[2, i], views[3, i], views[4, i]
         w[_STREAK_X + j] = views[5, i]
-    xx, yy, xy, streak_x, streak_y = blur[0], blur[1], blur[2], blur[3], blur[4]
+    xx, yy, xy, move_x, move_y = blur[0], blur[1], blur[2], blur[3], blur[4]
     for j in range(_BATCH):
         a, b, c, d = w[_XX + j], w[_XY + j], w[_YY + j], w[_STREAK_X + j]
         side_x, side_y = xx * a + xy * b, xy * a + yy * b
         w[_XX + j], w[_XY + j] = side_x * a + side_y * b, side_x * c + side_y * d
         w[_YY + j] = (xx * c + 2.0 * xy * d) * c + yy * d * d
-        w[_STREAK_X + j], w[_STREAK_Y + j] = (
-            a * streak_x + b * streak_y,
-            c * streak_x + d * streak_y,
-        )
+        w[_STREAK_X + j], w[_STREAK_Y + j] = a * move_x + b * move_y, c * move_x + d * move_y

@@ -90,7 +90,8 @@ def choose_sample(
     seen = see_plate(imaging, pose, blur, slack_px)
     unused = np.zeros(len(seen.bare.rho_m), dtype=np.bool_)
     if light is not None:
-        unused = reached_by_surroundings(seen, light) | hidden_pixels(seen, light, slack_px)
+        unused = reached_by_surroundings(seen, light, slack_px)
+        unused |= hidden_pixels(seen, light, slack_px)
     if imaging.visible is not None:
         unused |= ~imaging.visible[_steps_about(seen.bare.points_m, len(imaging.visible))]
     index = _useful_pixels(seen, unused)
@@ -105,11 +106,13 @@ def choose_sample(
 def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sample:
     """Return all pixels of the ring and its border, hidden ones too: to be looked at.
 
-    Those that blur mixes with what surrounds the plate are left out.
+    Those that blur mixes with what surrounds the plate are left out, but for what shows only if the
+    pose is right.
     """
     seen = see_plate(imaging, pose, blur)
     reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
-    index = np.flatnonzero((seen.bare.rho_m < reach_m) & ~reached_by_surroundings(seen, light))
+    unused = reached_by_surroundings(seen, light, slack_px=math.inf)
+    index = np.flatnonzero((seen.bare.rho_m < reach_m) & ~unused)
     return _sample(seen, pose, index, is_thinned=False)
 
 

@@ -78,8 +78,9 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
         pose, other = moved(sign * step)
         levels.append(white_level(pose.matrix, RAYS, other.vector, pairs).value)
     numeric = (levels[0] - levels[1]) / 2e-5
-    # rotations and streaks leave out how they change the blur on the plate: second order
-    tolerance = 0.06 if index in {3, 4, 5} else 0.01 if index > 8 else 1e-3
+    # rotations and streaks leave out how they change the blur on the plate: second order; and all
+    # leave out derivatives of what blur askew to the radius adds
+    tolerance = 0.06 if index in {3, 4, 5} else 0.03
     assert np.abs(numeric - share.jacobian[index]).max() < tolerance * np.abs(numeric).max()
 
 
