@@ -15,6 +15,8 @@ from kgcp.target.light import PARAM_COUNT
 from kgcp.target.noise import Misfit
 from kgcp.target.parameters import Parameters
 
+_LIKE_A_TILT = 0.07  # of the distance: so great a change is held back like a tilt of 1 rad, at most
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
@@ -70,7 +72,7 @@ def propose(
     pull = unknowns.precision * (unknowns.mean - parameters.vector)
     gradient = scaled @ current.score + pull[unknowns.free]
     damped = normal.copy()
-    damped.flat[:: len(normal) + 1] *= 1.0 + damping
+    damped.flat[:: len(normal) + 1] += damping * _stiffness(normal, parameters, unknowns)
     _, solution, failure = dposv(damped, gradient)  # LAPACK itself: they are small and many
     promised = 0.5 * float(gradient @ solution)
     if failure or not math.isfinite(promised):
@@ -78,6 +80,19 @@ def propose(
     step = np.zeros(PARAM_COUNT)
     step[unknowns.free] = solution
     return step, promised
+
+
+def _stiffness(normal: FloatArray, parameters: Parameters, unknowns: Unknowns) -> FloatArray:
+    """Return what damping holds parameters (p,) back by: the diagonal of the normal matrix.
+
+    A plate seen from straight above hardly changes with its tilt. Unless that is held back like
+    the distance, every step turns it over, fails, and the distance stays where it is.
+    """
+    stiffness = normal.diagonal().copy()
+    if unknowns.free[0] == 0:
+        reach_m = _LIKE_A_TILT * parameters.pose.distance_m
+        stiffness[3:6] = np.maximum(stiffness[3:6], reach_m * reach_m * stiffness[2])
+    return stiffness
 
 
 @compiled

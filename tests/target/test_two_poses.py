@@ -44,3 +44,20 @@ def test_a_start_that_is_tilted_the_wrong_way_is_turned(
     off_m = abs(seen.pose.distance_m - pose.distance_m)
     assert off_m < 4.0 * seen.uncertainty.sd_distance_m
     assert seen.uncertainty.sd_distance_m < 2e-3 * pose.distance_m
+
+
+@pytest.mark.parametrize("seed", [67, 122, 144])
+def test_from_straight_above_the_distance_is_found(
+    photograph: Callable[..., GreyArray], start_near: Callable[..., Observation], seed: int
+) -> None:
+    """Where nothing tells which way to tilt: steps that turned the plate over got nowhere."""
+    rng = np.random.default_rng(seed)
+    pose = some_pose(rng)
+    grey = photograph(LENS, pose, rng)
+    above = Pose(pose.rotation, 1.03 * pose.translation_m).tilted_across(math.radians(0.5))
+    start = start_near(LENS, above, np.random.default_rng(seed))
+    seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    assert seen.uncertainty is not None
+    off_m = abs(seen.pose.distance_m - pose.distance_m)
+    assert off_m < 4.0 * seen.uncertainty.sd_distance_m
+    assert seen.uncertainty.sd_distance_m < 2e-3 * pose.distance_m
