@@ -4,7 +4,9 @@ The inverse normal matrix is the covariance only if residuals are independent fr
 Jagged print, JPEG, sharpening and the tails of unmodelled effects run along the contours. So the
 scores (derivatives of the log-likelihood) are summed over short arcs of every circle, and the
 scatter of these sums gives the covariance of the gradient: a cluster-robust ("sandwich") estimate
-(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980).
+(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980). The fit makes that scatter
+smaller, the more so the fewer arcs there are: it is held against what independent residuals of
+this very fit would leave of it (Bell & McCaffrey, Survey Methodology 28, 2002).
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ from kgcp.target.noise import median_at_edges
 from kgcp.target.observation import Uncertainty
 
 _ARC_PX = 6.0
+_ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
+_LEAST_LEFT = 0.25  # of the scatter, after the fit
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
 _TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
@@ -57,16 +61,18 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     small common displacement of each circle's edge would do.
     """
     scaled = fit.scaled_jacobian
-    normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
-    inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    inverse = np.linalg.inv(normal_matrix(scaled, fit.misfit, fit.unknowns))
     circle, arc = _nearest_edges(fit)
-    sums, counts = _sum_by_arc(scaled, fit.misfit.score, arc)
-    used = int(np.count_nonzero(counts))
-    correction = used / max(used - len(scaled), 0.25 * used)
-    half = inverse[:6] @ sums
-    at_least, ratio = _at_least(correction * (half @ half.T), inverse[:6, :6].copy())
+    root = np.linalg.cholesky(inverse[:6, :6])
+    of_pose = np.linalg.solve(root, inverse[:6]) @ scaled
+    of_all = np.linalg.cholesky(inverse).T @ scaled
+    sums, left, arcs = _over_arcs(of_pose, of_all, fit.misfit.score, fit.misfit.weight, arc)
+    ratios, directions = np.linalg.eigh(sums @ sums.T / max(left / 6.0, _LEAST_LEFT))
+    mean = float(ratios.mean())
+    ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
+    half = root @ (directions * np.sqrt(np.maximum(ratios, 1.0)))
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
-    return PoseCovariance(at_least + shifts @ shifts.T, max(1.0, ratio))
+    return PoseCovariance(half @ half.T + shifts @ shifts.T, max(1.0, mean))
 
 
 def _common_displacement_px(fit: Fit) -> float:
@@ -111,20 +117,6 @@ def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
     return np.asarray(scaled @ pulls.T)
 
 
-@compiled
-def _at_least(robust: FloatArray, plain: FloatArray) -> tuple[FloatArray, float]:
-    """Return the robust covariance, nowhere below the plain one, and their mean ratio.
-
-    Few arcs can by chance agree too well in some direction; the noise of the pixels is there all
-    the same.
-    """
-    root = np.linalg.cholesky(plain)
-    to_white = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(to_white @ robust @ to_white.T)
-    raised = root @ (vectors * np.sqrt(np.maximum(values, 1.0)))
-    return raised @ raised.T, values.mean()
-
-
 def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
     """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
     imaging = fit.sample.imaging
@@ -158,18 +150,26 @@ def _number_arcs(
 
 
 @compiled
-def _sum_by_arc(
-    scaled: FloatArray, score: FloatArray, arc: IndexArray
-) -> tuple[FloatArray, IndexArray]:
-    """Return the scores' sums (p, arcs), and how many pixels (arcs,) each of them has."""
+def _over_arcs(
+    of_pose: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
+) -> tuple[FloatArray, float, int]:
+    """Return the scores' sums (6, arcs), their expected square, and how many arcs have pixels.
+
+    Both derivatives, (6, n) and (p, n), are such that the inverse normal matrix becomes one. Of an
+    arc whose normal matrix is then A, a fit to independent residuals leaves A − A A.
+    """
     count = arc.max() + 1
-    sums, pixels = np.zeros((scaled.shape[0], count)), np.zeros(count, np.intp)
-    for k in range(scaled.shape[0]):
-        for i in range(scaled.shape[1]):
-            sums[k, arc[i]] += scaled[k, i] * score[i]
+    sums, products = np.zeros((6, count)), np.zeros((count, 6, len(of_all)))
+    pixels, expected = np.zeros(count, np.intp), 0.0
     for i in range(len(arc)):
         pixels[arc[i]] += 1
-    return sums, pixels
+        for k in range(6):
+            sums[k, arc[i]] += of_pose[k, i] * score[i]
+            weighted = of_pose[k, i] * weight[i]
+            expected += weighted * of_pose[k, i]
+            for j in range(len(of_all)):
+                products[arc[i], k, j] += weighted * of_all[j, i]
+    return sums, expected - np.sum(products * products), (pixels > 0).sum()
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:

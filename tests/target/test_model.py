@@ -92,8 +92,7 @@ def test_errors_are_as_large_as_reported(
     errors = errors_of(LENS, radius_px, 24)
     assert 0.6 < rms(errors.distance_sigmas) < 1.4
     assert 0.6 < rms(errors.centre_sigmas) < 1.4
-    # of χ² with 6 degrees of freedom: 5.3; the few arcs of a small ring make it too cautious
-    assert 2.5 < np.median(errors.pose_chi2) < 8.0
+    assert 3.2 < np.median(errors.pose_chi2) < 8.0  # of χ² with 6 degrees of freedom: 5.3
     assert errors.pose_chi2.max() < 30.0
     assert 0.2 * percent < rms(errors.distance_percent) < percent
 
