@@ -18,7 +18,7 @@ from kgcp.target.sample import Sample, choose_sample
 _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
-_SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.15, 0.4
+_SETTLED_BLUR, _SETTLED_NOISE, _SETTLED_PX = 0.05, 0.15, 0.4
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
