@@ -15,7 +15,7 @@ from kgcp.target.coverage import white_level
 from kgcp.target.foreign import SeenPlate, hidden_pixels, reached_by_surroundings, see_plate
 from kgcp.target.imager import Imager
 from kgcp.target.imaging import Imaging
-from kgcp.target.light import PARAM_COUNT, Light
+from kgcp.target.light import PARAM_COUNT, Light, plateau_levels
 from kgcp.target.noise import Censoring
 from kgcp.target.pairs import REACH_SIGMAS, Blur, EdgePairs, pair_edges, reach_px
 from kgcp.target.sharpening import unsharp_mask
@@ -24,6 +24,7 @@ _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate i
 _BORDER_RADII = 0.2  # … and how far it is looked for at most
 _NEAR_SIGMAS, _NEAR_PX = 2.0, 0.3  # half width of the band around an edge that is used
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
+_SMALL_PX = 40.0  # radius below which sharpening feels the far tails of edges
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
 
 
@@ -100,7 +101,7 @@ def choose_sample(
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
     if len(index) < 4 * PARAM_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
-    return _sample(seen, pose, index, is_thinned=is_thinned)
+    return _sample(seen, pose, light, index, is_thinned=is_thinned)
 
 
 def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sample:
@@ -113,10 +114,12 @@ def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sampl
     reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
     unused = reached_by_surroundings(seen, light, slack_px=math.inf)
     index = np.flatnonzero((seen.bare.rho_m < reach_m) & ~unused)
-    return _sample(seen, pose, index, is_thinned=False)
+    return _sample(seen, pose, light, index, is_thinned=False)
 
 
-def _sample(seen: SeenPlate, pose: Pose, index: IndexArray, *, is_thinned: bool) -> Sample:
+def _sample(
+    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, *, is_thinned: bool
+) -> Sample:
     imaging = seen.imaging
     window, clip = imaging.window, imaging.censoring
     rays = np.take(window.rays, index, axis=1)
@@ -126,7 +129,7 @@ def _sample(seen: SeenPlate, pose: Pose, index: IndexArray, *, is_thinned: bool)
         is_thinned=is_thinned,
         levels=window.levels[index],
         rays=rays,
-        imager=_imager(seen, index),
+        imager=_imager(seen, pose, light, index),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
         pairs=_pairs(seen, pose, rays, index),
     )
@@ -195,14 +198,33 @@ def _choose(
     return count
 
 
-def _imager(seen: SeenPlate, index: IndexArray) -> Imager:
+def _imager(seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray) -> Imager:
     imaging, window = seen.imaging, seen.imaging.window
     offsets = (window.pixels(index) - imaging.centre_px[:, None]) / imaging.outer_radius_px
-    if imaging.sharpening_px == 0.0:
+    if imaging.sharpening_px == 0.0 or light is None:
         return Imager(offsets, imaging.response, None)
-    shape = (window.height, window.width)
-    mask = unsharp_mask(shape, index, seen.bare.share, imaging.sharpening_px)
+    is_small = imaging.outer_radius_px < _SMALL_PX
+    shown = _shown(seen, pose, light, index) if is_small else seen.bare.share
+    mask = unsharp_mask((window.height, window.width), index, shown, imaging.sharpening_px)
     return Imager(offsets, imaging.response, mask)
+
+
+def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
+    """Return where between ink and plate the levels of all pixels are but those of `index`.
+
+    Under this pose, blur and light, for what sharpening takes from them.
+    """
+    imaging, scale, shown = seen.imaging, seen.metres_per_px, seen.bare.share.copy()
+    is_other = seen.bare.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
+    is_other[index] = False
+    others = np.flatnonzero(is_other)
+    rays, points_m = (np.take(a, others, axis=1) for a in (imaging.window.rays, seen.bare.points_m))
+    pairs = pair_edges(points_m, scale, imaging.circles, seen.blur, seen.spread)
+    share = white_level(pose.matrix, rays, seen.blur.vector, pairs).value
+    even = Imager(np.zeros((2, len(others))), imaging.response, None)
+    black, white = plateau_levels(light, imaging.response)
+    shown[others] = (even.levels(share, light) - black) / (white - black)
+    return shown
 
 
 def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> EdgePairs:

@@ -23,7 +23,8 @@ class Mask:
     """An unsharp mask over a window of which n pixels are modelled.
 
     The mask is separable. Its first pass, along rows, makes the m values that the second one, along
-    columns, needs; both draw on the modelled pixels alone. All others are ink or plate.
+    columns, needs; both draw on the modelled pixels alone. All others stay as they are, between ink
+    and plate.
 
     Attributes
     ----------
@@ -102,7 +103,7 @@ def unsharp_mask(
     index : (n,) array of int
         The modelled pixels in the flattened window.
     share : (rows · columns,) array
-        White share of all pixels as if there were no blur.
+        Where all other pixels are between ink, 0, and plate, 1.
     sigma_px : float
     """
     along_rows, along_columns = _gather(index, *shape)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,11 +16,15 @@ from kgcp.geometry.pose import Pose
 from kgcp.synthetic.imaging import Optics, Sensor
 from kgcp.synthetic.plate import Plate, PlateImage, image_plate
 from kgcp.synthetic.shapes import ConvexPolygon, regular_polygon
+from kgcp.target.adjust import predict
+from kgcp.target.coverage import white_level
+from kgcp.target.imager import Imager
 from kgcp.target.imaging import Imaging
 from kgcp.target.layout import Target
 from kgcp.target.light import Light
-from kgcp.target.pairs import Blur
-from kgcp.target.plate import plate_points
+from kgcp.target.pairs import Blur, pair_edges
+from kgcp.target.parameters import Parameters
+from kgcp.target.plate import EVEN, plate_points
 from kgcp.target.sample import Sample, choose_sample
 
 PlacePlate = Callable[..., Pose]
@@ -150,3 +156,27 @@ def test_a_target_outside_its_window_has_lost_its_edges(
     with pytest.raises(Rejection) as caught:
         choose_sample(imaging, elsewhere, BLUR, LIGHT)
     assert caught.value.reason is Reason.EDGES_LOST
+
+
+def test_sharpening_feels_the_far_tails_of_edges(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    """They take no part themselves. Against the whole window, exposed and sharpened by OpenCV."""
+    pose = place_plate((205.4, 190.7), 12.0, tilt_deg=20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, WIDE, WHITE)
+    imaging = replace(imaging_of(grey, camera, target, pose), sharpening_px=1.2)
+    light = Light(BLACK, WHITE, tone_1=1.0, tone_2=-0.3, sharpening=0.6)
+    sample = choose_sample(imaging, pose, BLUR, light)
+    seen = predict(sample, Parameters.of(pose, BLUR, light)).levels
+
+    window = imaging.window
+    points_m, px_m = plate_points(pose, window.rays), 0.45 / 12.0
+    pairs = pair_edges(points_m, 1.07 * px_m, imaging.circles, BLUR, EVEN)
+    share = white_level(pose.matrix, window.rays, BLUR.vector, pairs).value
+    plain = Imager(np.zeros((2, len(share))), imaging.response, None).levels(share, light)
+    kernel = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
+    kernel /= kernel.sum()
+    smooth = cv2.sepFilter2D(plain.reshape(window.height, -1), cv2.CV_64F, kernel, kernel).ravel()
+    expected = (plain + 0.6 * (plain - smooth))[sample.index]
+    assert len(sample.index) < 0.8 * len(share)
+    np.testing.assert_allclose(seen, expected, rtol=0.0, atol=1e-5)
