@@ -66,14 +66,6 @@ class Blur:
         return float(np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)))
 
     @property
-    def smallest_sd_px(self) -> float:
-        """Standard deviation that spaces chords: across a streak, or else the largest [px]."""
-        if not self.has_streak:
-            return self.largest_sd_px
-        half_range = math.hypot(0.5 * (self.xx - self.yy), self.xy)
-        return math.sqrt(0.5 * (self.xx + self.yy) - half_range)
-
-    @property
     def mean_sd_px(self) -> float:
         """Standard deviation averaged over directions [px]."""
         xx, yy, _ = self.total_covariance
@@ -131,7 +123,8 @@ def pair_edges(
         By `blur_on_plate`.
     """
     sd_m = blur.largest_sd_px * metres_per_px
-    sharpest_m = blur.smallest_sd_px * metres_per_px
+    half_range = math.hypot(0.5 * (spread[0] - spread[2]), spread[1])
+    sharpest_m = sd_m * math.sqrt(0.5 * (spread[0] + spread[2]) - half_range)
     table = np.empty((len(circles.radii_m), 5))
     table[:, 0], table[:, 1] = circles.centres_m
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs

@@ -46,7 +46,7 @@ def quadrature_for(radius_over_whole: FloatArray, radius_over_sigma: FloatArray)
     Parameters
     ----------
     radius_over_whole, radius_over_sigma : (c,) arrays
-        Radii of discs, by the standard deviation with the streak and without.
+        Radii of discs, by the largest standard deviation in any direction and the smallest.
     """
     by_chords = np.searchsorted(_LARGEST_RATIOS, radius_over_sigma)
     by_chords[radius_over_whole > _STRAIGHT_RATIO] = Quadrature.EDGE

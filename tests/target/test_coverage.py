@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -13,7 +15,15 @@ from kgcp.geometry.pose import Pose
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.layout import Ring
 from kgcp.target.pairs import Blur, EdgePairs, pair_edges
-from kgcp.target.plate import EVEN, Circles, circles_of, largest_metres_per_px, plate_points
+from kgcp.target.plate import (
+    EVEN,
+    Circles,
+    blur_on_plate,
+    circles_of,
+    largest_metres_per_px,
+    plate_points,
+)
+from kgcp.target.quadrature import Quadrature
 
 CAMERA = Camera(1100, 800, 2300.0, 2310.0, 560.3, 391.8, k1=-0.06, k2=0.05, p1=-4e-4, p2=6e-4)
 RING = Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0))
@@ -114,3 +124,23 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4
+
+
+@pytest.mark.parametrize("streak", [(0.0, 0.0), (3.0, -2.0)])
+def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
+    """Where a pixel spans half as much again along the tilt as across it."""
+    turn = Rotation.from_euler("xyz", [40.0, 25.0, 70.0], degrees=True).as_matrix()
+    pose = Pose(turn, POSE.translation_m * 1.6)
+    rays = rays_of(pixels_around(CAMERA.project(pose.translation_m[None])[0], 24))
+    blur = Blur(0.5, 0.5, 0.0, *streak)
+    scale = largest_metres_per_px(pose, rays)
+    middle = rays[:, rays.shape[1] // 2].copy()
+    spread = blur_on_plate(pose, middle, blur.total_covariance, blur.largest_sd_px * scale)
+    pairs = pair_edges(plate_points(pose, rays), scale, CIRCLES, blur, spread)
+    closest = pairs.circles.copy()
+    closest[closest[:, 4] < Quadrature.EDGE, 4] = Quadrature.CHORDS_70
+    chosen, exact = (
+        white_level(pose.matrix, rays, blur.vector, each).value
+        for each in (pairs, replace(pairs, circles=closest))
+    )
+    assert np.abs(chosen - exact).max() < 4e-4
