@@ -31,6 +31,7 @@ from kgcp.target.observation import Uncertainty
 _ARC_PX = 6.0
 _ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
 _LEAST_LEFT = 0.25  # of the scatter, after the fit
+_ROOM = 20  # for all parameters, in whole vectors of the processor
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
 _TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
@@ -60,14 +61,19 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
     small common displacement of each circle's edge would do.
     """
-    scaled = fit.scaled_jacobian
-    inverse = np.linalg.inv(normal_matrix(scaled, fit.misfit, fit.unknowns))
+    scaled, misfit = fit.scaled_jacobian, fit.misfit
+    inverse = np.linalg.inv(normal_matrix(scaled, misfit, fit.unknowns))
     circle, arc = _nearest_edges(fit)
     root = np.linalg.cholesky(inverse[:6, :6])
-    of_pose = np.linalg.solve(root, inverse[:6]) @ scaled
-    of_all = np.linalg.cholesky(inverse).T @ scaled
-    sums, left, arcs = _over_arcs(of_pose, of_all, fit.misfit.score, fit.misfit.weight, arc)
-    ratios, directions = np.linalg.eigh(sums @ sums.T / max(left / 6.0, _LEAST_LEFT))
+    to_pose = np.linalg.solve(root, inverse[:6])  # in units of N⁻¹
+    by_pixel = np.zeros((scaled.shape[1], _ROOM))
+    by_pixel[:, : len(scaled)] = scaled.T
+    of_pose = by_pixel[:, : len(scaled)] @ to_pose.T
+    sums, products, arcs = _over_arcs(of_pose, by_pixel, misfit.score, misfit.weight, arc)
+    products = products[:, :, : len(scaled)]
+    # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
+    left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
+    ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
     mean = float(ratios.mean())
     ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
     half = root @ (directions * np.sqrt(np.maximum(ratios, 1.0)))
@@ -152,24 +158,24 @@ def _number_arcs(
 @compiled
 def _over_arcs(
     of_pose: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
-) -> tuple[FloatArray, float, int]:
-    """Return the scores' sums (6, arcs), their expected square, and how many arcs have pixels.
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return sums over arcs, and how many of them have pixels.
 
-    Both derivatives, (6, n) and (p, n), are such that the inverse normal matrix becomes one. Of an
-    arc whose normal matrix is then A, a fit to independent residuals leaves A − A A.
+    Of the scores with derivatives `of_pose` (n, 6): (arcs, 6); and of the products of these and
+    those `of_all` (n, 20): (arcs, 6, 20).
     """
     count = arc.max() + 1
-    sums, products = np.zeros((6, count)), np.zeros((count, 6, len(of_all)))
-    pixels, expected = np.zeros(count, np.intp), 0.0
+    sums, products = np.zeros((count, 6)), np.zeros((count, 6, _ROOM))
+    pixels = np.zeros(count, np.intp)
     for i in range(len(arc)):
-        pixels[arc[i]] += 1
+        a, weighted = arc[i], weight[i] * of_pose[i]
+        pixels[a] += 1
         for k in range(6):
-            sums[k, arc[i]] += of_pose[k, i] * score[i]
-            weighted = of_pose[k, i] * weight[i]
-            expected += weighted * of_pose[k, i]
-            for j in range(len(of_all)):
-                products[arc[i], k, j] += weighted * of_all[j, i]
-    return sums, expected - np.sum(products * products), (pixels > 0).sum()
+            sums[a, k] += of_pose[i, k] * score[i]
+        for j in range(_ROOM):
+            for k in range(6):
+                products[a, k, j] += weighted[k] * of_all[i, j]
+    return sums, products, (pixels > 0).sum()
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:
