@@ -19,7 +19,7 @@ _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
 _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.4
-_SETTLED_BLUR, _SETTLED_BLUR_PER_PX = 0.15, 0.0025  # the smaller the ring, the more it feels
+_SETTLED_BLUR, _SETTLED_STREAK = 0.15, 0.05
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
@@ -171,7 +171,7 @@ def _is_settled(before: Parameters, fit: Fit) -> bool:
     distance_m = after.pose.distance_m
     across_px = float(np.linalg.norm(shift_m[:2])) / distance_m * imaging.focal_px
     growth_px = abs(float(shift_m[2])) / distance_m * imaging.outer_radius_px
-    enough = min(_SETTLED_BLUR, _SETTLED_BLUR_PER_PX * imaging.outer_radius_px)
+    enough = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
     return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
 
 
