@@ -176,8 +176,13 @@ def _is_settled(before: Parameters, fit: Fit) -> bool:
 
 
 def noise_of(sample: Sample, prediction: Prediction) -> Noise:
-    """Return the noise of every pixel of a sample, from its residuals."""
-    usable = ~(sample.censoring.at_high | sample.censoring.at_low)
+    """Return the noise of every pixel of a sample, from its residuals.
+
+    Of pixels that are clipped, or should be, there are none: a white that is not bounded would make
+    its own noise.
+    """
+    limits, levels = sample.censoring, prediction.levels
+    usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
     return estimate_noise(
         sample.levels - prediction.levels,
         prediction.share,

@@ -25,6 +25,8 @@ _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
 _PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
+_MOST_SMEARED = 6  # grey values below the top in which more pixels than in the next ones …
+_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # … are so many of those at the top; how far that is felt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +55,8 @@ class Censoring:
 def find_censoring(levels: FloatArray, count: float) -> Censoring:
     """Find where a window is clipped: at the ends of the range, or where values pile up.
 
+    Compression smears what is clipped over some grey values below; they say no more than it does.
+
     Parameters
     ----------
     levels : (n,) array
@@ -67,7 +71,28 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
             high = top - 0.5 * count
+    else:
+        high -= _smeared_over((1.0 - levels) / count) * count
+    low += _smeared_over(levels / count) * count
     return Censoring(high, low, levels >= high, levels <= low)
+
+
+def _smeared_over(counts: FloatArray) -> int:
+    """Return over how many grey values what is clipped is smeared; 0 if it is not.
+
+    Parameters
+    ----------
+    counts : (n,) array
+        Grey values from the end of the range.
+    """
+    near = counts[counts < 2 * _MOST_SMEARED + 0.5]
+    number = np.bincount(np.rint(near).astype(np.intp), minlength=2 * _MOST_SMEARED + 1)
+    steps = np.arange(1, _MOST_SMEARED + 1)
+    excess = np.maximum(number[steps] - number[_MOST_SMEARED + 1 :].mean(), 0.0)
+    piled_up = number[0] > max(_MIN_SAMPLES, _PILED_UP * len(counts))
+    if not piled_up or excess.sum() < _SMEARED * number[0]:
+        return 0
+    return math.ceil(_SMEAR_SIGMAS * math.sqrt(float(excess @ steps**2 / excess.sum())))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
