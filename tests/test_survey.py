@@ -111,8 +111,10 @@ def test_a_level_plate_and_reference_attitudes_find_the_right_side(
     assert level["ambiguity"].min() > 10.0
     assert is_right(level, flight).all()
     kept = is_right(plain, flight)
-    values = ["distance_m", "tx_m", "qw", "qx", "qy", "qz", "sd_distance_m", "x_px"]
+    values = ["distance_m", "tx_m", "qw", "qx", "qy", "qz", "x_px"]
     pd.testing.assert_frame_equal(plain.loc[kept, values], level.loc[kept, values])
+    surer = level.loc[kept, "sd_distance_m"] / plain.loc[kept, "sd_distance_m"]
+    assert surer.between(0.99, 1.0).all(), "the other pose is hardly elsewhere"
 
 
 def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_path: Path) -> None:

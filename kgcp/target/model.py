@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
@@ -29,6 +31,7 @@ from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
+_CERTAIN = 50.0  # log-odds: exp() stays finite
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 
 
@@ -149,6 +152,8 @@ def _observation(
     pose = best.parameters.pose
     covariance = pose_covariance(best)
     ambiguity = max(0.0, advantage(poses, covariance, prior))
+    pose_cov = covariance.pose_cov.copy()
+    pose_cov[:3, :3] += _spread_over_both(poses, ambiguity)
     return Observation(
         target=target.name,
         ring=start.ring,
@@ -159,5 +164,16 @@ def _observation(
         heading_deg=image_heading_deg(camera, pose),
         appearance=appearance_of(camera, target, best),
         alternative=Alternative(other.parameters.pose, ambiguity),
-        uncertainty=propagate(camera, pose, covariance.pose_cov),
+        uncertainty=propagate(camera, pose, pose_cov),
     )
+
+
+def _spread_over_both(poses: TwoPoses, ambiguity: float) -> FloatArray:
+    """Return what the other pose adds to the covariance of the translation (3, 3) [m²].
+
+    It may be the right one, with the probability that goes with the ambiguity: the mean square of
+    the deviation from the reported one.
+    """
+    best, other = (fit.parameters.pose.translation_m for fit in (poses.best, poses.other))
+    probability = 1.0 / (1.0 + math.exp(min(0.5 * ambiguity, _CERTAIN)))
+    return np.asarray(probability * np.outer(other - best, other - best))

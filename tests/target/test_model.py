@@ -152,6 +152,27 @@ def test_compression_does_not_hide_that_the_plate_is_burnt(
     assert error_m < 4.0 * seen.uncertainty.sd_distance_m
 
 
+def test_where_the_other_pose_may_be_right_its_place_is_within_the_deviations(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    """Never farther off than its probability allows: p d dᵀ is a part of the covariance."""
+    far = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        pose = random_pose(LENS, 9.0, rng)
+        seen = measure_by_model(
+            photograph(LENS, pose, rng), LENS, TARGET, start_near(LENS, pose, rng)
+        )
+        assert seen.uncertainty is not None
+        assert seen.alternative is not None
+        off_m = seen.alternative.pose.translation_m - seen.pose.translation_m
+        cov = seen.uncertainty.pose_cov[:3, :3]
+        odds = np.exp(0.5 * seen.alternative.ambiguity)
+        far.append(float(off_m @ np.linalg.solve(cov, off_m)))
+        assert far[-1] <= 1.0 + odds
+    assert max(far) > 1.0
+
+
 def test_both_poses_are_reported_whichever_the_start(
     photograph: Photograph, start_near: StartNear
 ) -> None:
