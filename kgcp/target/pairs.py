@@ -13,6 +13,7 @@ from kgcp.target.plate import Circles
 from kgcp.target.quadrature import quadrature_for
 
 REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
+_LEAST_SPREAD = 1e-4  # of the largest variance: of a plate that is all but edge-on
 _SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
 
 
@@ -124,7 +125,8 @@ def pair_edges(
     """
     sd_m = blur.largest_sd_px * metres_per_px
     half_range = math.hypot(0.5 * (spread[0] - spread[2]), spread[1])
-    sharpest_m = sd_m * math.sqrt(0.5 * (spread[0] + spread[2]) - half_range)
+    least = max(0.5 * (spread[0] + spread[2]) - half_range, _LEAST_SPREAD)
+    sharpest_m = sd_m * math.sqrt(least)
     table = np.empty((len(circles.radii_m), 5))
     table[:, 0], table[:, 1] = circles.centres_m
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs
