@@ -29,6 +29,13 @@ def some_pose(rng: np.random.Generator) -> Pose:
     return Pose((turn * heading).as_matrix(), ray * 0.45 * LENS.mean_focal_px / 13.0)
 
 
+def check_distance(seen: Observation, truth: Pose) -> None:
+    assert seen.uncertainty is not None
+    off_m = abs(seen.pose.distance_m - truth.distance_m)
+    assert off_m < 4.0 * seen.uncertainty.sd_distance_m
+    assert seen.uncertainty.sd_distance_m < 2e-3 * truth.distance_m
+
+
 @pytest.mark.parametrize("seed", [0, 1, 13, 20])
 def test_a_start_that_is_tilted_the_wrong_way_is_turned(
     photograph: Callable[..., GreyArray], start_near: Callable[..., Observation], seed: int
@@ -40,10 +47,7 @@ def test_a_start_that_is_tilted_the_wrong_way_is_turned(
     astray = Pose(pose.rotation, 1.01 * pose.translation_m).tilted_across(math.radians(10.0))
     start = start_near(LENS, astray, np.random.default_rng(seed))
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
-    assert seen.uncertainty is not None
-    off_m = abs(seen.pose.distance_m - pose.distance_m)
-    assert off_m < 4.0 * seen.uncertainty.sd_distance_m
-    assert seen.uncertainty.sd_distance_m < 2e-3 * pose.distance_m
+    check_distance(seen, pose)
 
 
 @pytest.mark.parametrize("seed", [67, 122, 144])
@@ -57,7 +61,4 @@ def test_from_straight_above_the_distance_is_found(
     above = Pose(pose.rotation, 1.03 * pose.translation_m).tilted_across(math.radians(0.5))
     start = start_near(LENS, above, np.random.default_rng(seed))
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
-    assert seen.uncertainty is not None
-    off_m = abs(seen.pose.distance_m - pose.distance_m)
-    assert off_m < 4.0 * seen.uncertainty.sd_distance_m
-    assert seen.uncertainty.sd_distance_m < 2e-3 * pose.distance_m
+    check_distance(seen, pose)
