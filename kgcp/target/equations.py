@@ -16,7 +16,6 @@ from kgcp.target.noise import Misfit
 from kgcp.target.parameters import Parameters
 
 _LIKE_A_TILT = 0.07  # of the distance: so great a change is held back like a tilt of 1 rad, at most
-_FARTHEST_SDS = 2.0  # of a prior: no step goes farther
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,11 +77,9 @@ def propose(
     promised = 0.5 * float(gradient @ solution)
     if failure or not math.isfinite(promised):
         raise Rejection(Reason.POOR_FIT, "singular normal equations")
-    in_sds = float(np.abs(solution * np.sqrt(unknowns.free_precision)).max())
-    part = _FARTHEST_SDS / max(in_sds, _FARTHEST_SDS)
     step = np.zeros(PARAM_COUNT)
-    step[unknowns.free] = part * solution
-    return step, part * (2.0 - part) * promised
+    step[unknowns.free] = solution
+    return step, promised
 
 
 def _stiffness(normal: FloatArray, parameters: Parameters, unknowns: Unknowns) -> FloatArray:

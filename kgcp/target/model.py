@@ -10,6 +10,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit
 
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
@@ -31,7 +32,6 @@ from kgcp.target.window import contour_px, cut_window, semi_major_axis_px
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
-_CERTAIN = 50.0  # log-odds: exp() stays finite
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 
 
@@ -175,5 +175,4 @@ def _spread_over_both(poses: TwoPoses, ambiguity: float) -> FloatArray:
     the deviation from the reported one.
     """
     best, other = (fit.parameters.pose.translation_m for fit in (poses.best, poses.other))
-    probability = 1.0 / (1.0 + math.exp(min(0.5 * ambiguity, _CERTAIN)))
-    return np.asarray(probability * np.outer(other - best, other - best))
+    return np.asarray(expit(-0.5 * ambiguity) * np.outer(other - best, other - best))

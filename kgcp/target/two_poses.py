@@ -61,7 +61,7 @@ def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
 
 
 def _off_the_saddle(rough: Fit) -> Fit:
-    """Try tilts across the one that was found and along it, if that is slight.
+    """Try a tilt across the one that was found, if that is slight.
 
     A start that is tilted the wrong way comes near the tilt of 0, where nothing pulls it across.
     """
@@ -69,19 +69,16 @@ def _off_the_saddle(rough: Fit) -> Fit:
     pose = parameters.pose
     if radius_px * (1.0 - pose.normal @ pose.translation_m / pose.distance_m) > _SLIGHT_TILT_PX:
         return rough
-    tilt_rad = math.acos(max(0.0, 1.0 - _TRIED_TILT_PX / radius_px))
-    for turned in (pose.tilted_across(tilt_rad), pose.tilted(tilt_rad)):
-        other = minimise(
-            rough.sample,
-            parameters.at(turned),
-            rough.sd,
-            rough.unknowns,
-            steps=_ACROSS_STEPS,
-            enough=_MIRRORED_GAIN,
-        )
-        if other.total < rough.total:
-            return other
-    return rough
+    turned = pose.tilted_across(math.acos(max(0.0, 1.0 - _TRIED_TILT_PX / radius_px)))
+    other = minimise(
+        rough.sample,
+        parameters.at(turned),
+        rough.sd,
+        rough.unknowns,
+        steps=_ACROSS_STEPS,
+        enough=_MIRRORED_GAIN,
+    )
+    return other if other.total < rough.total else rough
 
 
 def _with_sharpening(imaging: Imaging, parameters: Parameters) -> Parameters:

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
@@ -101,6 +102,21 @@ def test_a_confirmed_choice_keeps_every_value() -> None:
     assert np.array_equal(after.pose.rotation, before.pose.rotation)
     assert np.array_equal(after.pose.translation_m, before.pose.translation_m)
     assert other_pose(after).ambiguity > other_pose(before).ambiguity
+
+
+def test_a_confirmed_choice_is_surer_by_what_the_other_pose_added() -> None:
+    """The chance that it is the right one, times the square of how far it is off."""
+    _, grey, before = frame(0)
+    after = measure(grey, NormalPrior(before.pose.normal, SD_DEG))
+    assert before.uncertainty is not None
+    assert after.uncertainty is not None
+    often, hardly = (expit(-0.5 * other_pose(seen).ambiguity) for seen in (before, after))
+    assert hardly < 0.01
+    assert often > 0.05
+    off_m = other_pose(before).pose.translation_m - before.pose.translation_m
+    less = (before.uncertainty.pose_cov - after.uncertainty.pose_cov)[:3, :3]
+    expected = (often - hardly) * np.outer(off_m, off_m)
+    np.testing.assert_allclose(less, expected, rtol=0.0, atol=1e-3 * np.abs(expected).max())
 
 
 def test_a_vague_prior_says_nothing() -> None:
