@@ -13,10 +13,11 @@ _STOPS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stops_held() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back while locks are taken; they come when the block ends.
+    """Hold SIGINT and SIGTERM back while they would break something; they come when the block ends.
 
     An exception that a signal's handler raises between two lines of an executor's code leaves a
-    lock behind, for which another thread then waits for ever. Processes started in the block
+    lock behind, for which another thread then waits for ever; raised while a compiled function
+    makes Python's objects of its result, it ends as a `SystemError`. Processes started in the block
     inherit that Ctrl-C is none of their business.
     """
     if threading.current_thread() is not threading.main_thread():  # where no handler runs

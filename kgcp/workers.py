@@ -97,15 +97,16 @@ class Overdue(BrokenExecutor):
 
 
 class Inline(Executor):
-    """Works in this process, at once: its end is the end of all."""
+    """Works in this process, at once: its end is the end of all. Signals wait for a call's end."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
         """Return the result of a call as a future that is done."""
         future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:  # it belongs to who asks for the result
-            future.set_exception(error)
+        with stops_held():
+            try:
+                future.set_result(fn(*args, **kwargs))
+            except Exception as error:  # it belongs to who asks for the result
+                future.set_exception(error)
         return future
 
 

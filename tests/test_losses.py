@@ -94,6 +94,19 @@ def test_what_an_item_raises_arrives() -> None:
             list(careful_map(fail, (4,), start=start, jobs=jobs, limit_s=LIMIT_S))
 
 
+def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
+    steps: list[str] = []
+
+    def stop(item: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        steps.append(f"{item} ended")
+
+    inline = careful_map(stop, (1, 2), start=lambda _: Inline(), jobs=0, limit_s=LIMIT_S)
+    with pytest.raises(KeyboardInterrupt):
+        list(inline)
+    assert steps == ["1 ended"]
+
+
 def test_processes_that_cannot_start_are_a_line() -> None:
     with pytest.raises(KgcpError, match="end as soon as they are started; free memory"):
         list(careful_map(abs, (1, 2), start=broken_pool, jobs=1, limit_s=LIMIT_S))

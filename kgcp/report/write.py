@@ -40,6 +40,7 @@ from kgcp.report.reexpose import Reexposed, measure_again
 from kgcp.report.summary import Json, finite, summary_of
 from kgcp.report.verdict import Verdict, judge
 from kgcp.settings import DetectSettings
+from kgcp.stops import stops_held
 
 FIGURE_FILES = {
     "error": "bias_error.png",
@@ -170,9 +171,10 @@ def _look(
         if row in shown and (picture := closeup(grey, flight.camera, target, seen, row)):
             closeups.append(picture)
         if row in again:
-            reexposed += measure_again(
-                grey, flight.camera, target, settings, seen.centre_px, radius, row
-            )
+            with stops_held():
+                reexposed += measure_again(
+                    grey, flight.camera, target, settings, seen.centre_px, radius, row
+                )
     return closeups, reexposed
 
 
