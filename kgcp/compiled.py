@@ -20,6 +20,12 @@ def compiled(function: _Function) -> _Function:
     return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
 
 
+def summed(function: _Function) -> _Function:
+    """Do as `compiled`; sums are taken in whatever order lets vector units take several terms."""
+    made = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
+    return cast("_Function", made)
+
+
 def inlined(function: _Function) -> _Function:
     """Compile a function into those that call it, which leave out what they do not use."""
     made = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
@@ -126,12 +127,13 @@ class Pose:
         return math.degrees(math.atan2(-n[0], n[2]))
 
 
+@compiled
 def rotation_about(vector: FloatArray) -> FloatArray:
     """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad], by Rodrigues' formula.
 
     Adjustments take so many small turns that the overhead of a general library shows.
     """
-    x, y, z = vector.tolist()
+    x, y, z = vector[0], vector[1], vector[2]
     square = x * x + y * y + z * z
     angle = math.sqrt(square)
     first = math.sin(angle) / angle if angle > 1e-8 else 1.0

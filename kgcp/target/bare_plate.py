@@ -102,7 +102,7 @@ def _look(
         if out_m[c] == 0.0:
             _add_ring(rho_m, radius, sign, share, off_edge_m)
             if c < measured_count:
-                np.minimum(off_measured_m, np.abs(rho_m - radius) * stretch, off_measured_m)
+                _near_ring(rho_m, radius, stretch, off_measured_m)
             if radius < small_m:
                 is_small |= rho_m < radius
             c += 1
@@ -112,7 +112,7 @@ def _look(
                 x, y = _from_nearest(points_m[0, i], points_m[1, i], circles[:2, c : beyond[c]])
                 beyond_m = math.sqrt(x * x + y * y) - radius
                 off_edge_m[i] = min(off_edge_m[i], abs(beyond_m))
-                if c < measured_count:
+                if c < measured_count and abs(beyond_m) < off_measured_m[i]:
                     felt_m = abs(beyond_m) * _stretch(x, y, spread)
                     off_measured_m[i] = min(off_measured_m[i], felt_m)
                 share[i] += sign if beyond_m < 0.0 else 0.0
@@ -137,6 +137,14 @@ def _add_ring(
     for i in range(len(rho_m)):
         share[i] += sign if rho_m[i] < radius_m else 0.0
         off_edge_m[i] = min(off_edge_m[i], abs(rho_m[i] - radius_m))
+
+
+@compiled
+def _near_ring(
+    rho_m: FloatArray, radius_m: float, stretch: FloatArray, off_measured_m: FloatArray
+) -> None:
+    for i in range(len(rho_m)):
+        off_measured_m[i] = min(off_measured_m[i], abs(rho_m[i] - radius_m) * stretch[i])
 
 
 @compiled

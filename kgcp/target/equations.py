@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from kgcp.compiled import compiled
+from kgcp.compiled import compiled, summed
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.target.light import PARAM_COUNT
@@ -16,6 +16,7 @@ from kgcp.target.noise import Misfit
 from kgcp.target.parameters import Parameters
 
 _LIKE_A_TILT = 0.07  # of the distance: so great a change is held back like a tilt of 1 rad, at most
+_DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +40,7 @@ class Unknowns:
 
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""
-        deviation = parameters.vector - self.mean
-        return float(0.5 * (self.precision * deviation) @ deviation)
+        return _penalty(parameters.vector, self.mean, self.precision)
 
 
 def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
@@ -48,9 +48,35 @@ def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> Fl
 
     Of a plate that a step has turned edge-on it is not finite, and cannot be solved.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        normal = (scaled * current.weight) @ scaled.T
-    normal.flat[:: len(normal) + 1] += unknowns.free_precision
+    return _normal_matrix(scaled, current.weight, unknowns.free_precision)
+
+
+@summed
+def _normal_matrix(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
+    """Return Σ weight · row · rowᵀ with the precision on the diagonal, two by two rows at a time.
+
+    It takes half the time of a general product, which makes both of its like halves.
+    """
+    rows, pixels = scaled.shape
+    normal, one, two = np.empty((rows, rows)), np.empty(pixels), np.empty(pixels)
+    for k in range(0, rows, 2):
+        k2 = min(k + 1, rows - 1)
+        for i in range(pixels):
+            one[i], two[i] = scaled[k, i] * weight[i], scaled[k2, i] * weight[i]
+        for m in range(k, rows, 2):
+            m2 = min(m + 1, rows - 1)
+            a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            for i in range(pixels):
+                a += one[i] * scaled[m, i]
+                b += one[i] * scaled[m2, i]
+                c += two[i] * scaled[m, i]
+                d += two[i] * scaled[m2, i]
+            normal[k, m] = normal[m, k] = a
+            normal[k, m2] = normal[m2, k] = b
+            normal[k2, m] = normal[m, k2] = c
+            normal[k2, m2] = normal[m2, k2] = d
+    for k in range(rows):
+        normal[k, k] += precision[k]
     return normal
 
 
@@ -69,11 +95,11 @@ def propose(
     Rejection
         `POOR_FIT` if the equations cannot be solved.
     """
-    pull = unknowns.precision * (unknowns.mean - parameters.vector)
-    gradient = scaled @ current.score + pull[unknowns.free]
-    damped = normal.copy()
-    damped.flat[:: len(normal) + 1] += damping * _stiffness(normal, parameters, unknowns)
-    _, solution, failure = dposv(damped, gradient)  # LAPACK itself: they are small and many
+    damped, gradient = _damped_equations(
+        *(scaled, current.score, normal, damping, parameters.matrix[:, 3]),
+        *(parameters.vector, unknowns.mean, unknowns.precision, unknowns.free),
+    )
+    _, solution, failure = dposv(damped.T, gradient)  # LAPACK itself: they are small and many
     promised = 0.5 * float(gradient @ solution)
     if failure or not math.isfinite(promised):
         raise Rejection(Reason.POOR_FIT, "singular normal equations")
@@ -82,17 +108,40 @@ def propose(
     return step, promised
 
 
-def _stiffness(normal: FloatArray, parameters: Parameters, unknowns: Unknowns) -> FloatArray:
-    """Return what damping holds parameters (p,) back by: the diagonal of the normal matrix.
+@compiled
+def _damped_equations(
+    scaled: FloatArray,
+    score: FloatArray,
+    normal: FloatArray,
+    damping: float,
+    translation_m: FloatArray,
+    vector: FloatArray,
+    mean: FloatArray,
+    precision: FloatArray,
+    free: IndexArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the damped normal matrix (p, p), and the gradient (p,) with the pull of the priors.
 
     A plate seen from straight above hardly changes with its tilt. Unless that is held back like
     the distance, every step turns it over, fails, and the distance stays where it is.
     """
-    stiffness = normal.diagonal().copy()
-    if unknowns.free[0] == 0:
-        reach_m = _LIKE_A_TILT * parameters.pose.distance_m
-        stiffness[3:6] = np.maximum(stiffness[3:6], reach_m * reach_m * stiffness[2])
-    return stiffness
+    damped, gradient = normal.copy(), scaled @ score
+    reach_m = _LIKE_A_TILT * math.sqrt((translation_m**2).sum())
+    for k in range(len(free)):
+        row, stiffness = free[k], normal[k, k]
+        if _FIRST_TURN <= row <= _LAST_TURN:
+            stiffness = max(stiffness, reach_m * reach_m * normal[_DEPTH, _DEPTH])
+        damped[k, k] += damping * stiffness
+        gradient[k] += precision[row] * (mean[row] - vector[row])
+    return damped, gradient
+
+
+@compiled
+def _penalty(vector: FloatArray, mean: FloatArray, precision: FloatArray) -> float:
+    total = 0.0
+    for k in range(len(vector)):
+        total += 0.5 * precision[k] * (vector[k] - mean[k]) ** 2
+    return total
 
 
 @compiled

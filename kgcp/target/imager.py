@@ -141,7 +141,7 @@ def _expose_with_slopes(
 ) -> None:
     """Do as `_expose`, with derivatives by geometry (11, n), then in the order of `Param`."""
     black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
-    contrast = white - black
+    contrast, gains = white - black, np.empty(len(share))
     for i in range(len(share)):
         t = share[i]
         arch, lean = t * (1.0 - t), 2.0 * t - 1.0
@@ -152,11 +152,13 @@ def _expose_with_slopes(
         core = black + contrast * tone
         value[i] = core * lit
         gain = contrast * lit
-        for k in range(11):
-            jacobian[k, i] = gain * slope * by_geometry[k, i]
+        gains[i] = gain * slope
         jacobian[11, i] = lit * (1.0 - tone)
         jacobian[12, i] = lit * tone
         jacobian[13, i], jacobian[14, i] = core * offsets[0, i], core * offsets[1, i]
         bend = gain * arch if has_tone else 0.0
         jacobian[15, i], jacobian[16, i], jacobian[17, i] = bend, bend * lean, bend * lean * lean
         jacobian[18, i] = 0.0
+    for k in range(11):
+        for i in range(len(share)):
+            jacobian[k, i] = gains[i] * by_geometry[k, i]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.compiled import compiled
-from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 _OUTLIER_SIGMAS = 3.5
 _FARTHEST_CLIPPED = (
@@ -65,32 +65,46 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
         One grey value's step.
     """
     high, low = 1.0 - 0.5 * count, 0.5 * count
-    top = float(levels.max())
+    top, near_top, near_bottom = float(levels.max()), *_numbers_at_ends(levels, count)
     # a sensor of fewer bits than its files saturates below the end of the range
     if top < high:
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
             high = top - 0.5 * count
     else:
-        high -= _smeared_over((1.0 - levels) / count) * count
-    low += _smeared_over(levels / count) * count
+        high -= _smeared_over(near_top, len(levels)) * count
+    low += _smeared_over(near_bottom, len(levels)) * count
     return Censoring(high, low, levels >= high, levels <= low)
 
 
-def _smeared_over(counts: FloatArray) -> int:
+@compiled
+def _numbers_at_ends(levels: FloatArray, count: float) -> IndexArray:
+    """Return how many pixels (2, 13) are so many grey values from the top, and from the bottom."""
+    number = np.zeros((2, 2 * _MOST_SMEARED + 1), np.intp)
+    for level in levels:
+        from_top, from_bottom = (1.0 - level) / count, level / count
+        if from_top < number.shape[1] - 0.5:
+            number[0, int(np.rint(from_top))] += 1
+        if from_bottom < number.shape[1] - 0.5:
+            number[1, int(np.rint(from_bottom))] += 1
+    return number
+
+
+def _smeared_over(number: IndexArray, pixels: int) -> int:
     """Return over how many grey values what is clipped is smeared; 0 if it is not.
 
     Parameters
     ----------
-    counts : (n,) array
-        Grey values from the end of the range.
+    number : (13,) array of int
+        Pixels by grey values from the end of the range.
+    pixels : int
+        All there are.
     """
-    near = counts[counts < 2 * _MOST_SMEARED + 0.5]
-    number = np.bincount(np.rint(near).astype(np.intp), minlength=2 * _MOST_SMEARED + 1)
+    if number[0] <= max(_MIN_SAMPLES, _PILED_UP * pixels):
+        return 0
     steps = np.arange(1, _MOST_SMEARED + 1)
     excess = np.maximum(number[steps] - number[_MOST_SMEARED + 1 :].mean(), 0.0)
-    piled_up = number[0] > max(_MIN_SAMPLES, _PILED_UP * len(counts))
-    if not piled_up or excess.sum() < _SMEARED * number[0]:
+    if excess.sum() < _SMEARED * number[0]:
         return 0
     return math.ceil(_SMEAR_SIGMAS * math.sqrt(float(excess @ steps**2 / excess.sum())))
 

@@ -1,8 +1,9 @@
-"""From rays to the plate, pixel by pixel, and derivatives back from there; compiled."""
+"""From rays to the plate, pixel by pixel, and derivatives back from there; compiled.
+
+Loops go over all pixels for few numbers at a time: so the vector units take several at once.
+"""
 
 from __future__ import annotations
-
-import numpy as np
 
 from kgcp.compiled import compiled
 from kgcp.geometry.arrays import FloatArray
@@ -28,23 +29,23 @@ def meet_plate(pose: FloatArray, rays: FloatArray, views: FloatArray) -> None:
         b, as 3·j + k (6): the point moves by −b_j · v along plate axis j when the plate moves by v.
     """
     height = pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3]
-    arm, b = np.zeros(3), np.zeros(3)
+    normal_x, normal_y, normal_z = pose[0, 2], pose[1, 2], pose[2, 2]
     for i in range(rays.shape[1]):
         x, y = rays[0, i], rays[1, i]
-        facing = pose[0, 2] * x + pose[1, 2] * y + pose[2, 2]
-        depth = height / facing
-        arm[0], arm[1], arm[2] = depth * x - pose[0, 3], depth * y - pose[1, 3], depth - pose[2, 3]
-        for j in range(2):
-            share = (pose[0, j] * x + pose[1, j] * y + pose[2, j]) / facing
-            views[j, i] = 0.0
-            for k in range(3):
-                b[k] = pose[k, j] - share * pose[k, 2]
-                views[j, i] += pose[k, j] * arm[k]
-                views[9 + 3 * j + k, i] = b[k]
-            for k in range(2):
-                views[2 + 2 * j + k, i] = depth * (b[0] * rays[2 + k, i] + b[1] * rays[4 + k, i])
-        for k in range(3):
-            views[6 + k, i] = arm[k]
+        depth = height / (normal_x * x + normal_y * y + normal_z)
+        views[6, i], views[7, i] = depth * x - pose[0, 3], depth * y - pose[1, 3]
+        views[8, i] = depth - pose[2, 3]
+    for j in range(2):
+        axis_x, axis_y, axis_z = pose[0, j], pose[1, j], pose[2, j]
+        for i in range(rays.shape[1]):
+            x, y, depth = rays[0, i], rays[1, i], views[8, i] + pose[2, 3]
+            share = (axis_x * x + axis_y * y + axis_z) * depth / height
+            b_x, b_y = axis_x - share * normal_x, axis_y - share * normal_y
+            views[j, i] = axis_x * views[6, i] + axis_y * views[7, i] + axis_z * views[8, i]
+            views[9 + 3 * j, i], views[10 + 3 * j, i] = b_x, b_y
+            views[11 + 3 * j, i] = axis_z - share * normal_z
+            views[2 + 2 * j, i] = depth * (b_x * rays[2, i] + b_y * rays[4, i])
+            views[3 + 2 * j, i] = depth * (b_x * rays[3, i] + b_y * rays[5, i])
 
 
 @compiled
@@ -65,18 +66,22 @@ def carry_slopes(
         (xx − yy)/2, xy [px²] and streak x, y [px].
     """
     height = pose[0, 2] * pose[0, 3] + pose[1, 2] * pose[1, 3] + pose[2, 2] * pose[2, 3]
-    for i in range(views.shape[1]):
-        t, arm, b = on_plate[:, i], views[6:9, i], views[9:15, i]
+    count, t, arm, b = views.shape[1], on_plate, views[6:9], views[9:15]
+    for k in range(3):
+        by_height = pose[k, 2] / height
+        for i in range(count):
+            slopes[k, i] = t[1, i] * b[k, i] + t[2, i] * b[3 + k, i] + t[3, i] * by_height
+    for i in range(count):
+        slopes[3, i] = arm[1, i] * slopes[2, i] - arm[2, i] * slopes[1, i]
+        slopes[4, i] = arm[2, i] * slopes[0, i] - arm[0, i] * slopes[2, i]
+        slopes[5, i] = arm[0, i] * slopes[1, i] - arm[1, i] * slopes[0, i]
+    for i in range(count):
         a, c, d, e = views[2, i], views[3, i], views[4, i], views[5, i]
-        for k in range(3):
-            slopes[k, i] = t[1] * b[k] + t[2] * b[3 + k] + t[3] * pose[k, 2] / height
-        slopes[3, i] = arm[1] * slopes[2, i] - arm[2] * slopes[1, i]
-        slopes[4, i] = arm[2] * slopes[0, i] - arm[0] * slopes[2, i]
-        slopes[5, i] = arm[0] * slopes[1, i] - arm[1] * slopes[0, i]
-        by_xx = (t[4] * a + 2.0 * t[5] * d) * a + t[6] * d * d
-        by_yy = (t[4] * c + 2.0 * t[5] * e) * c + t[6] * e * e
-        slopes[6, i] = by_xx + by_yy
-        slopes[7, i] = by_xx - by_yy
-        slopes[8, i] = 2.0 * (t[4] * a * c + t[5] * (a * e + d * c) + t[6] * d * e)
-        slopes[9, i] = a * t[7] + d * t[8]
-        slopes[10, i] = c * t[7] + e * t[8]
+        by_xx = (t[4, i] * a + 2.0 * t[5, i] * d) * a + t[6, i] * d * d
+        by_yy = (t[4, i] * c + 2.0 * t[5, i] * e) * c + t[6, i] * e * e
+        slopes[6, i], slopes[7, i] = by_xx + by_yy, by_xx - by_yy
+        by_xy = t[4, i] * a * c + t[5, i] * (a * e + d * c) + t[6, i] * d * e
+        slopes[8, i] = 2.0 * by_xy
+    for i in range(count):
+        slopes[9, i] = views[2, i] * t[7, i] + views[4, i] * t[8, i]
+        slopes[10, i] = views[3, i] * t[7, i] + views[5, i] * t[8, i]

@@ -54,9 +54,10 @@ class Mask:
         ink, plate : float
             Values of the others.
         """
-        between = np.empty(len(self.along_rows))
+        seen, between = np.zeros(len(values) + 1), np.zeros(len(self.along_rows) + 1)
+        seen[:-1] = values
         smooth = ink * self.ink + plate * self.plate
-        _smooth(values, self.along_rows, self.kernel, between)
+        _add_smooth(seen, self.along_rows, self.kernel, between)
         _add_smooth(between, self.along_columns, self.kernel, smooth)
         return values - smooth
 
@@ -86,7 +87,9 @@ class Mask:
         between = np.zeros((len(self.along_rows) + 1, _LAYERS), dtype=np.float32)
         _stack(jacobian, rows, layers)
         _smooth_layers(layers, self.along_rows, kernel, between)
-        _add_detail(layers, between, self.along_columns, kernel, rows, strength, jacobian)
+        smooth = np.empty((count, _LAYERS), dtype=np.float32)
+        _smooth_layers(between, self.along_columns, kernel, smooth)
+        _add_detail(layers, smooth, rows, strength, jacobian)
         jacobian[rows[0]] -= strength * others[0] * self.ink
         jacobian[rows[1]] -= strength * others[1] * self.plate
 
@@ -157,23 +160,14 @@ def _gather(index: IndexArray, height: int, width: int) -> tuple[NumberArray, Nu
 
 
 @compiled
-def _smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: FloatArray) -> None:
-    """Fill in weighted sums: out[i] = Σ kernel[j] · source[at[i, j]], nothing beyond its end."""
-    for i in range(at.shape[0]):
-        total = 0.0
-        for j in range(at.shape[1]):
-            k = at[i, j]
-            total += kernel[j] * source[k] if k < len(source) else 0.0
-        out[i] = total
-
-
-@compiled
 def _add_smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: FloatArray) -> None:
-    """Do as `_smooth`, but add to what is there."""
+    """Add weighted sums: out[i] += Σ kernel[j] · source[at[i, j]]; the kernel is symmetric."""
+    farthest, farther, far, middle = kernel[0], kernel[1], kernel[2], kernel[3]
     for i in range(at.shape[0]):
-        for j in range(at.shape[1]):
-            k = at[i, j]
-            out[i] += kernel[j] * source[k] if k < len(source) else 0.0
+        total = middle * source[at[i, 3]]
+        total += far * (source[at[i, 2]] + source[at[i, 4]])
+        total += farther * (source[at[i, 1]] + source[at[i, 5]])
+        out[i] += total + farthest * (source[at[i, 0]] + source[at[i, 6]])
 
 
 @compiled
@@ -188,8 +182,8 @@ def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
 def _smooth_layers(
     source: SingleArray, at: NumberArray, kernel: SingleArray, out: SingleArray
 ) -> None:
-    """Do as `_smooth` for every layer; all taps at once make full use of vector units."""
-    far, farther, farthest, middle = kernel[2], kernel[1], kernel[0], kernel[3]
+    """Fill in what `_add_smooth` adds, for every layer."""
+    farthest, farther, far, middle = kernel[0], kernel[1], kernel[2], kernel[3]
     for i in range(at.shape[0]):
         a, b, c, d, e, f, g = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5], at[i, 6]
         for k in range(_LAYERS):
@@ -204,16 +198,13 @@ def _smooth_layers(
 @compiled
 def _add_detail(
     layers: SingleArray,
-    between: SingleArray,
-    at: NumberArray,
-    kernel: SingleArray,
+    smooth: SingleArray,
     rows: IndexArray,
     strength: float,
     jacobian: FloatArray,
 ) -> None:
     """Add what smoothing takes away."""
-    smooth = np.empty((1, _LAYERS), np.float32)
-    for i in range(len(at)):
-        _smooth_layers(between, at[i : i + 1], kernel, smooth)
-        for k in range(len(rows)):
-            jacobian[rows[k], i] += strength * (layers[i, k] - smooth[0, k])
+    for k in range(len(rows)):
+        row = rows[k]
+        for i in range(jacobian.shape[1]):
+            jacobian[row, i] += strength * (layers[i, k] - smooth[i, k])
