@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from kgcp.geometry.arrays import FloatArray
 from kgcp.target.coverage import white_level, white_share
 from kgcp.target.equations import Unknowns, normal_matrix, propose, scaled_rows
@@ -19,7 +17,7 @@ _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
 _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.4
-_SETTLED_BLUR, _SETTLED_STREAK = 0.15, 0.05
+_SETTLED_BLUR, _SETTLED_STREAK = 0.15, 0.01
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
@@ -167,10 +165,9 @@ def _is_settled(before: Parameters, fit: Fit) -> bool:
     """Tell whether the pixels of a round are right for what it found."""
     imaging, after = fit.sample.imaging, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
-    shift_m = after.pose.translation_m - before.pose.translation_m
-    distance_m = after.pose.distance_m
-    across_px = float(np.linalg.norm(shift_m[:2])) / distance_m * imaging.focal_px
-    growth_px = abs(float(shift_m[2])) / distance_m * imaging.outer_radius_px
+    (x, y, depth), (x0, y0, depth0) = after.matrix[:, 3].tolist(), before.matrix[:, 3].tolist()
+    across_px = math.hypot(x / depth - x0 / depth0, y / depth - y0 / depth0) * imaging.focal_px
+    growth_px = abs(depth / depth0 - 1.0) * imaging.outer_radius_px
     enough = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
     return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
 
