@@ -16,6 +16,11 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 
 FRAMES, FEW = 240, 4
+TELLING_ALL = """\
+from kgcp.cli import detect_log, main
+detect_log._JSON_PROGRESS_S = 0.0
+main(prog_name="kgcp")
+"""
 FLIGHT = """\
 [camera]
 width = 640
@@ -71,7 +76,7 @@ def run(flight: Path, out: Path, *options: str) -> Result:
 def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     number: signal.Signals, code: int, jobs: str, flight: Path, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "kgcp", "detect", str(flight), "--out", str(tmp_path)]
+    command = [sys.executable, "-c", TELLING_ALL, "detect", str(flight), "--out", str(tmp_path)]
     with subprocess.Popen(
         [*command, "--jobs", jobs, "--log-json"], stderr=subprocess.PIPE, text=True
     ) as process:
