@@ -162,7 +162,10 @@ def _fit_with_noise(
 
 
 def _is_settled(before: Parameters, fit: Fit) -> bool:
-    """Tell whether the pixels of a round are right for what it found."""
+    """Tell whether the pixels of a round are right for what it found.
+
+    They follow blur, direction and size: off the axis, too, a move along the ray is growth alone.
+    """
     imaging, after = fit.sample.imaging, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
     (x, y, depth), (x0, y0, depth0) = after.matrix[:, 3].tolist(), before.matrix[:, 3].tolist()

@@ -168,13 +168,13 @@ def _over_arcs(
     sums, products = np.zeros((count, 6)), np.zeros((count, 6, _ROOM))
     pixels = np.zeros(count, np.intp)
     for i in range(len(arc)):
-        a, weighted = arc[i], weight[i] * of_pose[i]
+        a = arc[i]
         pixels[a] += 1
         for k in range(6):
             sums[a, k] += of_pose[i, k] * score[i]
-        for j in range(_ROOM):
-            for k in range(6):
-                products[a, k, j] += weighted[k] * of_all[i, j]
+            weighted = of_pose[i, k] * weight[i]
+            for j in range(_ROOM):
+                products[a, k, j] += weighted * of_all[i, j]
     return sums, products, (pixels > 0).sum()
 
 

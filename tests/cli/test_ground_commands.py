@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import re
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,6 +20,7 @@ from kgcp.cli import main
 from kgcp.io.cells import time_cell
 from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
 from kgcp.io.tables import read_table, write_table
+from kgcp.report.reexpose import Reexposed
 
 _TOML = """\
 name = "six <frames>"
@@ -315,3 +318,22 @@ def test_a_flight_without_reference_says_so(flight: FlightFolder) -> None:
 def test_a_missing_reference_names_its_key(flight: FlightFolder) -> None:
     (flight.path / "reference.csv").unlink()
     assert "[reference] poses" in flight.fails("bias-report")
+
+
+def test_a_signal_waits_for_the_end_of_a_measurement_for_the_report(
+    flight: FlightFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in _FRAMES:
+        cv2.imwrite(str(flight.path / "frames" / name), np.zeros((1200, 1600), np.uint8))
+    steps: list[str] = []
+
+    def stop(*_: object) -> list[Reexposed]:
+        signal.raise_signal(signal.SIGINT)
+        steps.append("ended")
+        return []
+
+    monkeypatch.setattr("kgcp.report.write.measure_again", stop)
+    result = flight.run("bias-report", "--reexpose", "3")
+    assert result.exit_code == 130, result.output
+    assert steps == ["ended"]
+    assert not (flight.out / "bias_report.html").exists()
