@@ -24,10 +24,10 @@ from kgcp.io.flight import read_flight
 from kgcp.io.frames import list_frames
 from kgcp.io.simulated import write_simulated_flight
 from kgcp.planning.bound import Bound
-from kgcp.processes import use_one_core_each
 from kgcp.settings import DetectSettings, Method
 from kgcp.synthetic.flight import FlightPlan, FramePlan, frame_name, plan_flight
 from kgcp.synthetic.presets import SimulationSettings, preset
+from kgcp.threads import use_one_thread_each
 from kgcp.workers import ordered_map, usable_cores
 
 PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far")
@@ -64,7 +64,7 @@ def bounds_of(settings: SimulationSettings, frames: list[FramePlan], jobs: int) 
         _bound_in_worker,
         [(settings, frame) for frame in frames],
         jobs=jobs,
-        start=use_one_core_each,
+        start=use_one_thread_each,
         start_arguments=(),
     )
     rows = [

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 
-from kgcp.processes import use_one_core_each
+from kgcp.threads import use_one_thread_each
 
 
 @click.command()
@@ -22,7 +22,7 @@ from kgcp.processes import use_one_core_each
 @click.option("--frames", type=click.IntRange(2), default=10, show_default=True, help="Per line.")
 def main(flights: Path | None, photos: Path | None, frames: int) -> None:
     """Print the tables."""
-    use_one_core_each()  # before any library of numbers is loaded
+    use_one_thread_each()  # before any library of numbers is loaded
     from benchmarks.speed_costs import HEADER, Costs, cost_line, cv2_alone, print_costs
     from benchmarks.speed_runs import help_line, jobs_line, size_lines
     from benchmarks.speed_sources import flights_of, photograph_of, photographs_of

@@ -18,6 +18,7 @@ from kgcp.kgcps import Kgcp, Skip, build_kgcps, on_map
 from kgcp.mapchange import MapChange
 from kgcp.orientation import CameraPrior, camera_priors
 from kgcp.selection import Selection, select
+from kgcp.threads import single_threaded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +47,7 @@ class Delivery:
     consistency: Consistency | None
 
 
+@single_threaded()
 def prepare(flight: Flight, detections: Path, wanted: Selection, crs: str | None) -> Delivery:
     """Place, select and bring onto the map `crs` (None: the flight's) what was measured.
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import cv2
-
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
@@ -26,6 +24,7 @@ from kgcp.target.layout import Target
 from kgcp.target.measure import Examination, examine, miss_of
 from kgcp.target.observation import Considered, Miss, Observation, Outcome, is_unreadable
 from kgcp.target.prior import NormalPrior
+from kgcp.threads import single_threaded
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +92,9 @@ class SecondLook:
     expected: Mapping[str, Expectation]
 
 
+@single_threaded()
 def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     """Read and measure one frame; whatever a frame can do wrong becomes its result."""
-    cv2.setNumThreads(0)  # the processes are the parallelism
     place = task.frames_folder / note.frame
     exif = Exif()
     outcomes: tuple[Outcome, ...]
@@ -118,9 +117,9 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     return FrameResult(note.frame, time_s, exif, outcomes)
 
 
+@single_threaded()
 def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
-    cv2.setNumThreads(0)
     try:
         with at_hand(task.frames_folder, look.note.frame) as path:
             grey = read_grey(path, task.camera)

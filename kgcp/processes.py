@@ -12,17 +12,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
 from kgcp.stops import stops_held
-
-_THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def use_one_core_each() -> None:
-    """Tell numeric libraries not to start threads, here if not loaded yet and in new processes.
-
-    The processes are the parallelism: threads inside them only wait for each other.
-    """
-    for variable in _THREAD_VARIABLES:
-        os.environ.setdefault(variable, "1")
+from kgcp.threads import use_one_thread_each
 
 
 class LocalPool(ProcessPoolExecutor):
@@ -39,7 +29,7 @@ class LocalPool(ProcessPoolExecutor):
     """
 
     def __init__(self, jobs: int, limit_s: float) -> None:
-        use_one_core_each()
+        use_one_thread_each()
         context = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
         self._limit_s = limit_s
         self._held, self._leash = context.Pipe(duplex=False)

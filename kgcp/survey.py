@@ -33,6 +33,7 @@ from kgcp.settings import DetectSettings
 from kgcp.tally import Stopwatch, SurveySummary, Tally
 from kgcp.target.expected import Expectation
 from kgcp.target.prior import NormalPrior, normal_priors
+from kgcp.threads import single_threaded
 
 FRAME_TIMEOUT_S = 300.0  # hundreds of times what a large frame takes
 
@@ -47,6 +48,7 @@ class Nobody:
         """Do nothing."""
 
 
+@single_threaded()
 def detect_flight(
     flight: Flight,
     settings: DetectSettings,

@@ -20,8 +20,8 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from kgcp.errors import KgcpError
-from kgcp.processes import use_one_core_each
 from kgcp.stops import stops_held
+from kgcp.threads import use_one_thread_each
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -63,7 +63,7 @@ def ordered_map(
         start(*start_arguments)
         yield from map(function, items)
         return
-    use_one_core_each()
+    use_one_thread_each()
     pool = ProcessPoolExecutor(
         max_workers=min(jobs, len(items)),
         mp_context=multiprocessing.get_context("spawn"),  # forking a threaded parent may deadlock

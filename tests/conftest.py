@@ -2,7 +2,22 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+
+import pytest
 from hypothesis import settings
 
 settings.register_profile("kgcp", deadline=None)  # a busy machine is no failure
 settings.load_profile("kgcp")
+
+
+@pytest.fixture
+def sigint_raises() -> Iterator[None]:
+    """Let SIGINT raise `KeyboardInterrupt` here, and by default end processes started here.
+
+    A shell starts what it runs in the background with SIGINT ignored, and children inherit that.
+    """
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)

@@ -24,7 +24,7 @@ LAYERS = (
     ("kgcps", "printing", "synthetic", "views"),
     ("guide", "orientation", "planning"),
     ("bias", "consistency", "selection"),
-    ("stops",),
+    ("stops", "threads"),
     ("processes",),
     ("profiling", "workers"),
     ("io",),
@@ -46,6 +46,7 @@ LIBRARIES = {
     "compiled": {"numba"},
     "profiling": set(),
     "stops": set(),
+    "threads": {"cv2", "scipy", "threadpoolctl"},
     "processes": set(),
     "workers": set(),
     "geometry": {"numpy", "scipy"},
@@ -130,8 +131,8 @@ def test_parts_use_only_the_libraries_of_their_layer(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    # `processes` and `workers` ask the system for ends and cores, and that is all
-    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["processes"]],
+    # `threads`, `processes` and `workers` ask the system for ends and cores, and that is all
+    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["stops"]],
     ids=names,
 )
 def test_nothing_below_io_knows_files(path: Path) -> None:

@@ -94,6 +94,7 @@ def test_what_an_item_raises_arrives() -> None:
             list(careful_map(fail, (4,), start=start, jobs=jobs, limit_s=LIMIT_S))
 
 
+@pytest.mark.usefixtures("sigint_raises")
 def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
     steps: list[str] = []
 

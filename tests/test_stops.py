@@ -36,6 +36,7 @@ def hold(number: signal.Signals, steps: list[str]) -> None:
     steps.append("behind")
 
 
+@pytest.mark.usefixtures("sigint_raises")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_comes_when_the_block_has_ended(number: signal.Signals) -> None:
     steps: list[str] = []
@@ -45,6 +46,15 @@ def test_a_signal_comes_when_the_block_has_ended(number: signal.Signals) -> None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getsignal(signal.SIGTERM) is raise_it
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+@pytest.mark.usefixtures("sigint_raises")
+def test_an_ignored_signal_stays_ignored() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    steps: list[str] = []
+    hold(signal.SIGINT, steps)
+    assert steps == ["inside", "behind"]
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_other_threads_hear_no_signals_anyway() -> None:

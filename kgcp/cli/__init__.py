@@ -12,6 +12,7 @@ import click
 
 from kgcp import __version__
 from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.threads import use_one_thread_each
 
 # Name → module, in the order of the work; a module is imported when its command is called.
 COMMANDS = {
@@ -67,6 +68,7 @@ class Program(click.Group):
 
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; unexpected exceptions keep their traceback."""
+        use_one_thread_each()  # before a command imports numpy
         try:
             with _one_line_warnings():
                 return super().invoke(ctx)

@@ -147,10 +147,6 @@ def command(
     """
     if scheduler is not None and jobs == 0:
         raise click.UsageError("--jobs 0 works in this process, --scheduler in others: give one")
-    from kgcp.processes import use_one_core_each
-
-    use_one_core_each()  # before numpy is loaded
-
     from kgcp.examine import Debug
     from kgcp.io.flight import read_flight
     from kgcp.io.staging import workplace

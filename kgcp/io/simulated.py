@@ -28,6 +28,7 @@ from kgcp.synthetic.flight import (
     render_frame,
 )
 from kgcp.synthetic.ground import Ground
+from kgcp.threads import single_threaded
 from kgcp.workers import ordered_map
 
 _PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
@@ -43,6 +44,7 @@ _TRUTH_COLUMNS = (
 )
 
 
+@single_threaded()
 def write_simulated_flight(
     plan: FlightPlan, out: Path, *, jobs: int, on_frame: Callable[[], object]
 ) -> None:

@@ -41,6 +41,7 @@ from kgcp.report.summary import Json, finite, summary_of
 from kgcp.report.verdict import Verdict, judge
 from kgcp.settings import DetectSettings
 from kgcp.stops import stops_held
+from kgcp.threads import single_threaded
 
 FIGURE_FILES = {
     "error": "bias_error.png",
@@ -68,6 +69,7 @@ class Report:
         return {**self.numbers, "files": [str(path) for path in self.files]}
 
 
+@single_threaded()
 def write_report(
     study: BiasStudy,
     flight: Flight,

@@ -320,6 +320,7 @@ def test_a_missing_reference_names_its_key(flight: FlightFolder) -> None:
     assert "[reference] poses" in flight.fails("bias-report")
 
 
+@pytest.mark.usefixtures("sigint_raises")
 def test_a_signal_waits_for_the_end_of_a_measurement_for_the_report(
     flight: FlightFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

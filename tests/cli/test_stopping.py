@@ -70,6 +70,7 @@ def run(flight: Path, out: Path, *options: str) -> Result:
     return CliRunner().invoke(main, arguments, catch_exceptions=False)
 
 
+@pytest.mark.usefixtures("sigint_raises")
 @pytest.mark.parametrize(
     ("number", "code", "jobs"), [(signal.SIGINT, 130, "2"), (signal.SIGTERM, 143, "0")]
 )
@@ -98,6 +99,26 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     assert result.exit_code == 0
     assert f"kgcp: going on with an interrupted run: {done} of {FRAMES} frames are" in result.stderr
     assert f"{FRAMES} frames in" in result.stderr
+
+
+@pytest.mark.usefixtures("sigint_raises")
+@pytest.mark.parametrize("jobs", ["0", "2"])
+def test_a_run_started_with_sigint_ignored_stops_at_sigterm_alone(
+    jobs: str, flight: Path, tmp_path: Path
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for `kgcp detect &`
+    command = [sys.executable, "-c", TELLING_ALL, "detect", str(flight), "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [*command, "--jobs", jobs, "--log-json"], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        progress = (json.loads(line)["done"] for line in process.stderr)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            assert any(done >= 1 for done in progress)  # it goes on after the first one
+            process.send_signal(number)
+        rest = process.stderr.read()
+        assert process.wait() == 143
+    assert json.loads(rest.splitlines()[-1])["event"] == "stopped"
 
 
 def test_what_is_said_can_be_chosen(short_flight: Path, tmp_path: Path) -> None:
