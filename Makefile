@@ -38,26 +38,26 @@ format: $(VENV)/.develops ## bring the code into the project's format
 	$(BIN)/ruff format .
 
 bench-accuracy: $(VENV)/.runs ## measure simulated flights: errors, scatter, Cramér-Rao bound (minutes)
-	$(BIN)/python -m benchmarks.accuracy $(BENCH)
+	$(BIN)/python -m benchmarks.accuracy.presets $(BENCH)
 
 PHOTOS := ../shared/real
 
 bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed, wrong (half an hour)
-	$(BIN)/python -m benchmarks.search $(BENCH)
-	$(BIN)/python -m benchmarks.false_alarms $(PHOTOS)
+	$(BIN)/python -m benchmarks.search.hard_frames $(BENCH)
+	$(BIN)/python -m benchmarks.search.false_alarms $(PHOTOS)
 
 bench-speed: $(VENV)/.runs ## search and detection as multiples of decoding, jobs, memory, sizes (minutes)
-	$(BIN)/python -m benchmarks.speed --flights ../shared/flights --photos $(PHOTOS) $(BENCH)
+	$(BIN)/python -m benchmarks.speed.relative_costs --flights ../shared/flights --photos $(PHOTOS) $(BENCH)
 
 bench-aat: $(VENV)/.runs ## what KGCPs are worth in a simulated adjustment: table, figure (ten minutes)
 	$(PIP) --editable '.[aat]'
-	$(BIN)/python -m benchmarks.aat_benefit --figure docs/aat_benefit.png $(BENCH)
+	$(BIN)/python -m benchmarks.aat.benefit --figure docs/aat_benefit.png $(BENCH)
 
 torture: $(VENV)/.runs ## kill detect and its workers 50 times over 2 000 frames (a quarter of an hour)
-	$(BIN)/python -m benchmarks.torture $(BENCH)
+	$(BIN)/python -m benchmarks.reliability.torture $(BENCH)
 
 soak: $(VENV)/.runs ## memory and speed of detect over 20 000 small frames (a quarter of an hour)
-	$(BIN)/python -m benchmarks.soak $(BENCH)
+	$(BIN)/python -m benchmarks.reliability.soak $(BENCH)
 
 FUZZ_SECONDS ?= 300
 

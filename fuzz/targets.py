@@ -21,19 +21,19 @@ from typing import TypeVar
 
 from kgcp.errors import KgcpError, KgcpWarning, Rejection
 from kgcp.geometry.camera import Camera
-from kgcp.io.calibrations import FORMATS as CALIBRATION_FORMATS
-from kgcp.io.calibrations import read_calibration
-from kgcp.io.flight import read_camera_and_targets, read_flight, read_printed_targets
-from kgcp.io.frames import read_exif, read_grey
-from kgcp.io.frametimes import TimesFormat, read_times
-from kgcp.io.gpstime import TimeSystem
-from kgcp.io.journal_text import from_text
-from kgcp.io.poses import FORMATS as POSE_FORMATS
-from kgcp.io.poses import read_reference_poses
-from kgcp.io.poses.notation import PoseNotation
-from kgcp.io.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
-from kgcp.io.trajectories.notation import Wander
-from kgcp.mapframe import parse_crs
+from kgcp.georef.crs import parse_crs
+from kgcp.io.files.gps_time import TimeSystem
+from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
+from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
+from kgcp.io.formats.calibrations import read_calibration
+from kgcp.io.formats.frame_times import TimesFormat, read_times
+from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
+from kgcp.io.formats.orientations import read_reference_poses
+from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
+from kgcp.io.formats.trajectories.records import Wander
+from kgcp.io.images.frames import read_exif, read_grey
+from kgcp.pipeline.execution.journal import from_text
 
 CRS = "EPSG:25832"
 FRAME_WIDTH, FRAME_HEIGHT = 40, 30
@@ -59,7 +59,7 @@ OPF_PARTS = {
 LATE_MODULES = (
     *CALIBRATION_FORMATS.values(),
     *POSE_FORMATS.values(),
-    "kgcp.io.poses.georeference",
+    "kgcp.io.formats.orientations.georeference",
     *(f"PIL.{name}ImagePlugin" for name in ("Bmp", "Jpeg", "Jpeg2K", "Mpo")),
     *(f"PIL.{name}ImagePlugin" for name in ("Png", "Ppm", "Tiff", "WebP")),
 )

@@ -39,15 +39,15 @@ class DetectSettings:
     Attributes
     ----------
     method : Method
-        `model`: the image model of `kgcp.target.model`, started by an outline's pose;
-        `paper`: the search and the closed-form chain of Cucci (2016) alone.
+        `model`: the image model of `kgcp.measurement.adjustment.fit_target`, started by an
+        outline's pose; `paper`: the search and the closed-form chain of Cucci (2016) alone.
     min_radius_px : float
         Smallest radius of a ring's outer circle that is looked for [px]; μ_min of §2.2.
     min_score : float
         Threshold on the normalised cross-correlation of a ring with its code (§2.3).
     false_alarm : float
         Chance per frame, at most, that random light on a ring is taken for the code; see
-        `kgcp.target.chance`.
+        `kgcp.measurement.search.false_alarm`.
     is_guided : bool
         Whether frames without a target are looked at again where it must be.
     canny_low, canny_high : float

@@ -10,18 +10,17 @@ from click.testing import CliRunner
 
 from kgcp.cli import COMMANDS, main
 from kgcp.errors import Reason
-from kgcp.io.columns import (
+from kgcp.io.flight.camera_table import CAMERA_KEYS
+from kgcp.io.flight.flight import FRAMES_KEYS, REFERENCE_KEYS
+from kgcp.io.flight.target_table import PLATE_KEYS, REPLICA_KEYS
+from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
+from kgcp.io.tables.columns import (
     BIAS_COLUMNS,
     CONSISTENCY_COLUMNS,
     DETECTION_COLUMNS,
     KGCP_COLUMNS,
     Column,
 )
-from kgcp.io.flight import FRAMES_KEYS
-from kgcp.io.flight_camera import CAMERA_KEYS
-from kgcp.io.flight_reference import REFERENCE_KEYS
-from kgcp.io.flight_targets import PLATE_KEYS, REPLICA_KEYS
-from kgcp.io.flight_vehicle import VEHICLE_KEYS
 
 ROOT = Path(__file__).resolve().parents[1]
 CONVENTIONS = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from kgcp.cli import COMMANDS, main
-from kgcp.io.flight import read_flight
+from kgcp.io.flight.flight import read_flight
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -104,7 +104,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     for name in FRAMES:
         shutil.copy(ROOT / HERE / "frames" / name, flight / "frames")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgcp.crew.usable_cores", lambda: 0)  # in this process
+        patch.setattr("kgcp.pipeline.execution.executor.usable_cores", lambda: 0)  # in this process
         patch.chdir(folder)
         assert CliRunner().invoke(main, ["detect", HERE], catch_exceptions=False).exit_code == 0
         shutil.copytree(flight, folder, dirs_exist_ok=True)

@@ -16,56 +16,30 @@ PACKAGE = Path(__file__).resolve().parents[1] / "kgcp"
 LAYERS = (
     ("errors",),
     ("settings",),
-    ("compiled",),
     ("geometry",),
-    ("target",),
-    ("mapframe",),
-    ("carrier", "mapchange"),
-    ("kgcps", "printing", "synthetic", "views"),
-    ("guide", "orientation", "planning"),
-    ("bias", "consistency", "selection"),
-    ("stops", "threads"),
-    ("processes",),
-    ("profiling", "workers"),
+    ("targets",),
+    ("measurement",),
+    ("georef",),
+    ("simulation",),
+    ("quality",),
     ("io",),
-    ("outpost",),
-    ("cluster", "examine", "expectations", "tally"),
-    ("crew",),
-    ("looks",),
-    ("overlays",),
-    ("delivery", "survey", "report"),
+    ("report",),
+    ("pipeline",),
     ("cli",),
     ("__main__",),
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
-# What each part may use besides the standard library and kgcp; `io`, `survey` and `report`: all.
+# What each part may use besides the standard library and kgcp; `io`, `report`, `pipeline`: all.
 LIBRARIES = {
     "errors": set(),
     "settings": set(),
-    "compiled": {"numba"},
-    "profiling": set(),
-    "stops": set(),
-    "threads": {"cv2", "scipy", "threadpoolctl"},
-    "processes": set(),
-    "workers": set(),
-    "geometry": {"numpy", "scipy"},
-    "target": {"numpy", "scipy", "cv2"},
-    "mapframe": {"numpy", "pyproj"},
-    "mapchange": {"numpy", "pyproj"},
-    "carrier": {"numpy"},
-    "views": {"numpy"},
-    "guide": {"numpy"},
-    "selection": {"numpy"},
-    "consistency": {"numpy", "scipy"},
-    "kgcps": {"numpy"},
-    "printing": {"numpy"},
-    "planning": {"numpy", "scipy"},
-    "orientation": {"numpy"},
-    "bias": {"numpy", "scipy"},
-    "synthetic": {"numpy", "scipy", "cv2"},
-    "cluster": {"distributed"},
-    "outpost": {"distributed"},
+    "geometry": {"numpy", "scipy", "numba"},
+    "targets": {"numpy"},
+    "measurement": {"numpy", "scipy", "cv2"},
+    "georef": {"numpy", "scipy", "pyproj"},
+    "simulation": {"numpy", "scipy", "cv2"},
+    "quality": {"numpy", "scipy"},
     "cli": {"click", "tqdm"},
     "__main__": set(),
 }
@@ -131,8 +105,7 @@ def test_parts_use_only_the_libraries_of_their_layer(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    # `threads`, `processes` and `workers` ask the system for ends and cores, and that is all
-    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["stops"]],
+    [path for path in modules() if LEVEL.get(member(path) or "errors", 0) < LEVEL["io"]],
     ids=names,
 )
 def test_nothing_below_io_knows_files(path: Path) -> None:
@@ -141,7 +114,7 @@ def test_nothing_below_io_knows_files(path: Path) -> None:
 
 @pytest.mark.parametrize("path", modules(), ids=names)
 def test_files_stay_readable(path: Path) -> None:
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 300
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 500
 
 
 def body_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:

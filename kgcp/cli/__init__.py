@@ -12,7 +12,7 @@ import click
 
 from kgcp import __version__
 from kgcp.errors import KgcpError, KgcpWarning
-from kgcp.threads import use_one_thread_each
+from kgcp.pipeline.execution.threads import use_one_thread_each
 
 # Name → module, in the order of the work; a module is imported when its command is called.
 COMMANDS = {

@@ -10,7 +10,7 @@ import click
 from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
 
 if TYPE_CHECKING:
-    from kgcp.io.stores import StoredFolder
+    from kgcp.io.images.remote import StoredFolder
 
 
 @click.command()
@@ -42,17 +42,17 @@ def command(
 
     Example: kgcp bias-report sample_flight
     """
-    from kgcp.bias.study import study_bias
     from kgcp.errors import KgcpError
-    from kgcp.io.flight import read_flight
-    from kgcp.io.plotting import load_matplotlib
-    from kgcp.io.poses import read_flight_poses
-    from kgcp.io.sightings import read_attempts, read_settings
-    from kgcp.io.staging import DETECTIONS, workplace
-    from kgcp.io.whereabouts import read_whereabouts
+    from kgcp.io.flight.data import read_whereabouts
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.io.formats.orientations import read_flight_poses
+    from kgcp.io.tables.sightings import read_attempts, read_settings
+    from kgcp.pipeline.workspace import DETECTIONS, workplace
+    from kgcp.quality.bias_study import study_bias
+    from kgcp.report.style import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.report.write import write_report
+    from kgcp.pipeline.bias_report import write_report
 
     with workplace(flight, out, (DETECTIONS,)) as place:
         the_flight = read_flight(place.flight)

@@ -13,7 +13,7 @@ from kgcp.cli.options import flight_place_argument, json_option, out_place_optio
 from kgcp.settings import DetectSettings, Method
 
 if TYPE_CHECKING:
-    from kgcp.io.stores import StoredFolder
+    from kgcp.io.images.remote import StoredFolder
 
 _DEFAULTS = DetectSettings()
 
@@ -147,10 +147,10 @@ def command(
     """
     if scheduler is not None and jobs == 0:
         raise click.UsageError("--jobs 0 works in this process, --scheduler in others: give one")
-    from kgcp.examine import Debug
-    from kgcp.io.flight import read_flight
-    from kgcp.io.staging import workplace
-    from kgcp.survey import detect_flight
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.detect import detect_flight
+    from kgcp.pipeline.frame_task import Debug
+    from kgcp.pipeline.workspace import workplace
 
     settings = DetectSettings(
         method=Method(method),

@@ -19,7 +19,7 @@ import click
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from kgcp.tally import SurveySummary
+    from kgcp.pipeline.run_summary import SurveySummary
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress

@@ -18,11 +18,11 @@ from kgcp.cli.options import (
 from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export, not_renewed
 
 if TYPE_CHECKING:
-    from kgcp.carrier import Carrier
-    from kgcp.consistency.study import Consistency
-    from kgcp.delivery import Delivery
+    from kgcp.georef.target_positions import Carrier
     from kgcp.io.exporters.points import MapPoints
-    from kgcp.io.stores import StoredFolder
+    from kgcp.io.images.remote import StoredFolder
+    from kgcp.pipeline.export import Delivery
+    from kgcp.quality.consistency import Consistency
 
 ALL = "all"
 MANY = 12
@@ -86,16 +86,16 @@ def command(
 
     Example: kgcp export-gcp sample_flight --format odm
     """
-    from kgcp.delivery import prepare
-    from kgcp.io.columns import KGCP_COLUMNS
-    from kgcp.io.consistency_files import write_consistency
+    from kgcp.georef.selection import Selection
     from kgcp.io.exporters.points import MapPoints
-    from kgcp.io.flight import read_flight
-    from kgcp.io.kgcp_table import kgcp_row
-    from kgcp.io.provenance import provenance
-    from kgcp.io.staging import DETECTIONS, workplace
-    from kgcp.io.tables import write_table
-    from kgcp.selection import Selection
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.io.tables.columns import KGCP_COLUMNS
+    from kgcp.io.tables.consistency import write_consistency
+    from kgcp.io.tables.gcps import kgcp_row
+    from kgcp.io.tables.parquet import write_table
+    from kgcp.io.tables.provenance import provenance
+    from kgcp.pipeline.export import prepare
+    from kgcp.pipeline.workspace import DETECTIONS, workplace
 
     with workplace(flight, out, (DETECTIONS,)) as place:
         the_flight = read_flight(place.flight)
@@ -201,7 +201,7 @@ def _report_deviations(carrier: Carrier | None) -> None:
 
 
 def _report_consistency(found: Consistency) -> None:
-    from kgcp.consistency.advice import rms_m
+    from kgcp.quality.advice import rms_m
 
     along, across, up = rms_m(found)
     outliers = sum(one.is_outlier for one in found.discrepancies)
@@ -215,6 +215,6 @@ def _report_consistency(found: Consistency) -> None:
 
 
 def _advice(found: Consistency | None) -> tuple[str, ...]:
-    from kgcp.consistency.advice import advice
+    from kgcp.quality.advice import advice
 
     return () if found is None else advice(found)

@@ -12,7 +12,7 @@ detections_option : `detections`, Path or None
     The table of `kgcp detect`; None means the one in the results' folder.
 json_option : `as_json`, bool
     Print a machine-readable summary to stdout.
-selection_options : the fields of `kgcp.selection.Selection`
+selection_options : the fields of `kgcp.georef.selection.Selection`
     Which points to hand over.
 """
 
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from kgcp.io.stores import StoredFolder
+    from kgcp.io.images.remote import StoredFolder
 
 
 def _place(
@@ -36,7 +36,7 @@ def _place(
     """Tell the URL of a folder, `s3://…`, `gs://…` or `file://…`, from its path."""
     if value is None or "://" not in value:
         return None if value is None else Path(value)
-    from kgcp.io.stores import parsed_url
+    from kgcp.io.images.remote import parsed_url
 
     return parsed_url(value)
 

@@ -11,7 +11,7 @@ import click
 from kgcp.cli.options import flight_argument
 
 if TYPE_CHECKING:
-    from kgcp.planning.outlook import Conditions, Outlook
+    from kgcp.simulation.outlook import Conditions, Outlook
 
 
 @click.command()
@@ -90,18 +90,18 @@ def command(
     Example:
       kgcp plan sample_flight --height 20 --height 40 --exposure 0.0005 --plot plan.png
     """  # noqa: D301 - \b is click's mark for lines that stay
-    from kgcp.io.flight import read_camera_and_targets
-    from kgcp.planning.outlook import Conditions, look_ahead, usual_heights
-    from kgcp.printing.new import chosen_targets
+    from kgcp.io.flight.flight import read_camera_and_targets
+    from kgcp.simulation.outlook import Conditions, look_ahead, usual_heights
+    from kgcp.targets.code_design import chosen_targets
 
     conditions = Conditions(blur_px, exposure_s, psf_px, accuracy_percent)
     camera, calibration, targets = read_camera_and_targets(flight)
     target = chosen_targets(targets, (name,) if name else ())[0]
     if plot is not None:
-        from kgcp.io.plotting import load_matplotlib
+        from kgcp.report.style import load_matplotlib
 
         load_matplotlib()  # before the figure does
-        from kgcp.io.plan_files import check_figure_name
+        from kgcp.report.plan_figure import check_figure_name
 
         check_figure_name(plot)
     heights = sorted(set(heights_m)) or usual_heights(camera, target)
@@ -112,7 +112,7 @@ def command(
         for line in _table(target.name, conditions, outlooks):
             click.echo(line)
     if plot is not None:
-        from kgcp.io.plan_files import write_plan_figure
+        from kgcp.report.plan_figure import write_plan_figure
 
         write_plan_figure(outlooks, f"Target {target.name}", plot)
         click.echo(f"wrote {plot}", err=True)
@@ -142,7 +142,7 @@ _COLUMNS = (
 
 def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
     """Yield the table and what its columns mean."""
-    from kgcp.planning.outlook import SURE_PX, TILT_DEG
+    from kgcp.simulation.outlook import SURE_PX, TILT_DEG
 
     lines = [
         [heading for heading, _ in _COLUMNS],

@@ -70,10 +70,10 @@ def command(
 
     from tqdm import tqdm
 
-    from kgcp.io.simulated import write_simulated_flight
-    from kgcp.synthetic.flight import plan_flight
-    from kgcp.synthetic.presets import preset
-    from kgcp.workers import usable_cores
+    from kgcp.pipeline.execution.resilient_map import usable_cores
+    from kgcp.pipeline.simulate import write_simulated_flight
+    from kgcp.simulation.flight import plan_flight
+    from kgcp.simulation.presets import preset
 
     settings = preset(preset_name)
     if frames is not None:

@@ -11,7 +11,7 @@ import click
 from kgcp.cli.options import json_option
 
 if TYPE_CHECKING:
-    from kgcp.target.layout import Target
+    from kgcp.targets.layout import Target
 
 # Named here, not imported, because the modules that know them take numpy; a test compares.
 FORMATS = ("pdf", "svg", "dxf", "png")
@@ -128,13 +128,13 @@ def command(
       kgcp target --new 6 --diameter 0.15 --sheet A4
     """  # noqa: D301 - \b is click's mark for lines that stay
     from kgcp.errors import SettingError
-    from kgcp.io.flight import read_printed_targets
-    from kgcp.io.results import results_folder
-    from kgcp.io.sheets.write import check_stems, write_sheets
-    from kgcp.io.target_text import write_target_tables
-    from kgcp.printing.artwork import Plate, draw_target
-    from kgcp.printing.new import chosen_targets, new_targets
-    from kgcp.printing.sheets import Paper, lay_out
+    from kgcp.io.flight.flight import read_printed_targets
+    from kgcp.io.flight.target_table import write_target_tables
+    from kgcp.io.print.write import check_stems, write_sheets
+    from kgcp.pipeline.workspace import results_folder
+    from kgcp.targets.artwork import Plate, draw_target
+    from kgcp.targets.code_design import chosen_targets, new_targets
+    from kgcp.targets.sheets import Paper, lay_out
 
     is_new = bool(new_count or codes)
     if names and is_new:
@@ -180,7 +180,7 @@ def _tell(
     import warnings
 
     from kgcp.errors import KgcpWarning
-    from kgcp.printing.codes import LEAST_DISTANCE, least_apart
+    from kgcp.targets.code_design import LEAST_DISTANCE, least_apart
 
     apart = least_apart([target.ring for target in dict.fromkeys((*targets, *known))])
     if as_json:

@@ -1,1 +1,1 @@
-"""Geometry of cameras, conics, circles and poses: numpy and scipy only, no files."""
+"""Cameras, conics, circles and poses: numpy, scipy and numba only, no files."""

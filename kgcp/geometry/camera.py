@@ -14,7 +14,7 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.lens import (
+from kgcp.geometry.distortion import (
     Lens,
     Scale,
     distort_circles,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kgcp.compiled import compiled
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 

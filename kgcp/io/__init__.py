@@ -1,1 +1,1 @@
-"""Paths to records and back; decides nothing."""
+"""Files and the records that they hold: reading, writing, no decisions."""

@@ -1,1 +1,1 @@
-"""The bias study as a page, its figures and its numbers."""
+"""Pages and pictures for people."""

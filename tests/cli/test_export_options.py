@@ -14,10 +14,9 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.cells import time_cell
-from kgcp.io.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
-from kgcp.io.tables import read_table, write_table
-from kgcp.mapframe import MapFrame
+from kgcp.georef.crs import MapFrame
+from kgcp.io.tables.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, time_cell
+from kgcp.io.tables.parquet import read_table, write_table
 
 _TOML = """\
 crs = "EPSG:25831"

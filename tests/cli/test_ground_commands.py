@@ -17,10 +17,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
-from kgcp.io.cells import time_cell
-from kgcp.io.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS
-from kgcp.io.tables import read_table, write_table
-from kgcp.report.reexpose import Reexposed
+from kgcp.io.tables.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, time_cell
+from kgcp.io.tables.parquet import read_table, write_table
+from kgcp.report.bias.reexposure import Reexposed
 
 _TOML = """\
 name = "six <frames>"
@@ -333,7 +332,7 @@ def test_a_signal_waits_for_the_end_of_a_measurement_for_the_report(
         steps.append("ended")
         return []
 
-    monkeypatch.setattr("kgcp.report.write.measure_again", stop)
+    monkeypatch.setattr("kgcp.pipeline.bias_report.measure_again", stop)
     result = flight.run("bias-report", "--reexpose", "3")
     assert result.exit_code == 130, result.output
     assert steps == ["ended"]

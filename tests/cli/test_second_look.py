@@ -14,9 +14,9 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.synthetic.flight import TARGET_PLATE
-from kgcp.synthetic.imaging import Optics, Sensor
-from kgcp.synthetic.plate import image_plate
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import image_plate
 
 CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
 HAZY, FRAMES = 4, 9

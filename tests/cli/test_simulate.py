@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 from kgcp.cli import main
 from kgcp.cli.simulate import PRESET_NAMES
-from kgcp.synthetic.presets import PRESETS
+from kgcp.simulation.presets import PRESETS
 
 
 def test_every_preset_can_be_chosen() -> None:

@@ -9,11 +9,11 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.cli.target import FORMATS, PAPERS
-from kgcp.io.flight import read_printed_targets
-from kgcp.io.sheets import write
-from kgcp.printing.codes import LEAST_DISTANCE
-from kgcp.printing.sheets import Paper
-from kgcp.target.layout import Target
+from kgcp.io.flight.flight import read_printed_targets
+from kgcp.io.print import write
+from kgcp.targets.code_design import LEAST_DISTANCE
+from kgcp.targets.layout import Target
+from kgcp.targets.sheets import Paper
 
 TABLES = """
 [[target]]

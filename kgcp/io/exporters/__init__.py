@@ -131,7 +131,7 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
         If there are no points, the format cannot hold them, or a file cannot be written.
     """
     from kgcp.errors import KgcpError
-    from kgcp.io.wholefile import write_all
+    from kgcp.io.files.atomic import write_all
 
     if not points.kgcps:
         raise KgcpError(f"{name}: no point is left to write; select less strictly")

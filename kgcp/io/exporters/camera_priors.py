@@ -9,8 +9,8 @@ from itertools import combinations
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.camera_priors import opk_covs, opk_deg
 from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, decimals, deviations, upper
-from kgcp.orientation import opk_covs, opk_deg
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
 COLUMNS = (

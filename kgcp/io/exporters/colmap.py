@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from importlib.resources import files as resources
 
 from kgcp.errors import KgcpError
-from kgcp.io.exporters.local import describe_frame, local_cameras
+from kgcp.io.exporters.local_frame import describe_frame, local_cameras
 from kgcp.io.exporters.points import MapPoints, decimals, image_names, upper
 
 _FOLDER = "colmap"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from kgcp.io.exporters.attributes import attributes
+from kgcp.georef.crs import wgs84_from_map
 from kgcp.io.exporters.points import MapPoints
-from kgcp.io.exporters.wgs84 import wgs84_from_map
+from kgcp.io.exporters.shared import attributes
 
 _HOWTO = """\
 GeoJSON

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from pyproj import CRS
 from pyproj.enums import WktVersion
 
-from kgcp.io.exporters.attributes import ATTRIBUTES, attributes
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import MapPoints
-from kgcp.kgcps import Kgcp
+from kgcp.io.exporters.shared import ATTRIBUTES, attributes
 
 _TABLE = "kgcps"
 _APPLICATION_ID, _USER_VERSION = 0x47504B47, 10400  # "GPKG", 1.4.0

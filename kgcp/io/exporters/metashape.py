@@ -13,7 +13,8 @@ from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.io.exporters.distances import focal_length_note
+from kgcp.georef.camera_priors import CameraPrior, opk_covs, opk_deg
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -25,9 +26,7 @@ from kgcp.io.exporters.points import (
     labels,
     pixel,
 )
-from kgcp.io.exporters.xml_text import xml_text
-from kgcp.kgcps import Kgcp
-from kgcp.orientation import CameraPrior, opk_covs, opk_deg
+from kgcp.io.exporters.shared import focal_length_note, xml_text
 
 _FOLDER = "metashape"
 _HOWTO = """\

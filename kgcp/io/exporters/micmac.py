@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
-from kgcp.io.exporters.local import describe_frame, local_points
+from kgcp.io.exporters.local_frame import describe_frame, local_points
 from kgcp.io.exporters.points import (
     MapPoints,
     by_frame,
@@ -22,7 +22,7 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
-from kgcp.io.exporters.xml_text import add_text, xml_text
+from kgcp.io.exporters.shared import add_text, xml_text
 
 _FOLDER = "micmac"
 _HOWTO = """\

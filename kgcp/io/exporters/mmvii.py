@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters.distances import focal_length_note
-from kgcp.io.exporters.local import describe_frame, local_points, origin_of
+from kgcp.georef.gcp import Kgcp
+from kgcp.io.exporters.local_frame import describe_frame, local_points, origin_of
 from kgcp.io.exporters.points import (
     MapPoints,
     by_frame,
@@ -27,8 +27,7 @@ from kgcp.io.exporters.points import (
     pixel,
     upper,
 )
-from kgcp.io.exporters.xml_text import add_text, xml_text
-from kgcp.kgcps import Kgcp
+from kgcp.io.exporters.shared import add_text, focal_length_note, xml_text
 
 _FOLDER = "mmvii"
 _DISTANCE = 3

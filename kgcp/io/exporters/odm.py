@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.trajectory import ENU_FROM_NED
-from kgcp.io.exporters.local import local_cameras, local_points
+from kgcp.georef.camera_priors import CameraPrior
+from kgcp.georef.trajectory import ENU_FROM_NED
+from kgcp.io.exporters.local_frame import local_cameras, local_points
 from kgcp.io.exporters.points import (
     METRE_DECIMALS,
     MapPoints,
@@ -30,7 +31,6 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
-from kgcp.orientation import CameraPrior
 
 FILE_NAME = "gcp_list.txt"
 _WGS84_UTM = re.compile(r"32([67])(\d\d)")

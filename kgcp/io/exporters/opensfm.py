@@ -13,9 +13,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from kgcp.geometry.camera import Camera
+from kgcp.georef.crs import wgs84_from_map
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import MapPoints, by_id, image_names, largest_sd
-from kgcp.io.exporters.wgs84 import wgs84_from_map
-from kgcp.kgcps import Kgcp
 
 _FOLDER = "opensfm"
 _HOWTO = """\

@@ -16,6 +16,7 @@ from uuid import NAMESPACE_URL, uuid5
 from pyproj.enums import WktVersion
 
 from kgcp import __version__
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -26,7 +27,6 @@ from kgcp.io.exporters.points import (
     known_cov,
     largest_sd,
 )
-from kgcp.kgcps import Kgcp
 
 _FOLDER = "opf"
 _CODE = re.compile(r"[A-Za-z]+:\d+(\+([A-Za-z]+:)?\d+)?")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -21,7 +22,6 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
-from kgcp.kgcps import Kgcp
 
 _FOLDER = "pix4d"
 _HOWTO = """\

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.exporters.points import METRE_DECIMALS, MapPoints, decimals, deviations, pixel, upper
-from kgcp.io.times import format_time
+from kgcp.io.files.time_text import format_time
 
 COLUMNS = (
     *("id", "frame", "target", "time", "x", "y", "z", "sd_x", "sd_y", "sd_z"),

@@ -15,9 +15,9 @@ from pyproj import CRS
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.trajectory import IndexArray
-from kgcp.kgcps import Kgcp
-from kgcp.orientation import CameraPrior
+from kgcp.georef.camera_priors import CameraPrior
+from kgcp.georef.gcp import Kgcp
+from kgcp.georef.trajectory import IndexArray
 
 METRE_DECIMALS = 7  # points that differ never look the same
 DEGREE_DECIMALS = 12

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.georef.camera_priors import CameraPrior
+from kgcp.georef.gcp import Kgcp
 from kgcp.io.exporters.points import MapPoints
-from kgcp.kgcps import Kgcp
-from kgcp.orientation import CameraPrior
 
 Factory = Callable[..., MapPoints]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
+from kgcp.georef.camera_priors import opk_covs, opk_deg
 from kgcp.io.exporters import camera_priors
 from kgcp.io.exporters.points import MapPoints
-from kgcp.orientation import opk_covs, opk_deg
 
 Factory = Callable[..., MapPoints]
 

@@ -17,9 +17,9 @@ import pytest
 from pyproj import Transformer
 
 from kgcp.errors import KgcpError
+from kgcp.georef.camera_priors import opk_deg
 from kgcp.io.exporters import export, metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
-from kgcp.orientation import opk_deg
 
 Factory = Callable[..., MapPoints]
 

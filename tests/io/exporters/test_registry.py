@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.reference import CAMERA_FROM_PHOTO, rotation_from_opk
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
+from kgcp.georef.camera_priors import CameraPrior
+from kgcp.georef.crs import MapFrame
 from kgcp.io.exporters import (
     DEFAULT_FORMATS,
     FORMATS,
@@ -29,8 +31,6 @@ from kgcp.io.exporters import (
     pix4d,
 )
 from kgcp.io.exporters.points import MapPoints
-from kgcp.mapframe import MapFrame
-from kgcp.orientation import CameraPrior
 
 ROOT = Path(__file__).resolve().parents[3]
 Factory = Callable[..., MapPoints]

@@ -1,0 +1,1 @@
+"""What KGCPs are worth in aerial triangulation."""

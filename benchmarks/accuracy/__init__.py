@@ -1,0 +1,1 @@
+"""Errors of the measurement on simulated flights, against truth and bound."""

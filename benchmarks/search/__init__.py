@@ -1,0 +1,1 @@
+"""Frames that are hard to search, and photographs that show no target."""

@@ -1,0 +1,257 @@
+"""One simulated frame for the search: planned from a seed, rendered, with its truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.simulation.ground import Ground
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.plate import Plate, PlateImage
+from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
+from kgcp.simulation.shapes import ConvexPolygon, Disc
+
+_ROAD_RADIUS_M = 180.0
+_AROUND_M = (100.0, 260.0)  # where on the ground the plates are, from the road's centre
+_ROOF_M, _STAND_M = 1.95, 0.05  # height of plates with and without a vehicle
+_NEAREST_VEHICLE_M = 6.0  # nearer ones are larger than the view and reach behind the camera
+_OVERSAMPLING = 4
+_ATTEMPTS = 60
+_SEPARATION = 1.6  # of the sum of two plates' radii
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """A kind of camera, but for its size: how light becomes a file's grey values."""
+
+    name: str
+    sensor: Sensor
+    response: Response
+    jpeg_quality: int | None
+
+
+_FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
+LOOKS = (
+    Look("linear", Sensor(), Response.LINEAR, None),
+    Look("srgb", Sensor(tone=ToneCurve.SRGB), Response.SRGB, 95),
+    Look("consumer", _FILM, Response.UNKNOWN, 92),
+)
+CAMERAS = (
+    Camera(800, 600, 1182.0, 1179.0, 391.6, 307.4, -0.072, 0.055, 0.0004, -0.0003),
+    Camera(640, 900, 1384.0, 1390.0, 327.3, 441.9, -0.11, 0.08, -0.0006, 0.0005),
+    Camera(1000, 640, 1351.0, 1351.0, 507.8, 312.2, 0.03, 0.01, 0.0002, 0.0008),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """Something that lies on a plate, or its shadow.
+
+    Attributes
+    ----------
+    shape : Disc or ConvexPolygon
+        On the plate [m].
+    pose : Pose
+        Of the plate.
+    radiance : float or None
+        None: textured like ground.
+    opacity : float
+    """
+
+    shape: Disc | ConvexPolygon
+    pose: Pose
+    radiance: float | None
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Veil:
+    """Haze: what is left of the scene's light, and what is scattered into the view."""
+
+    share: float = 1.0
+    light: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """Everything about one frame but its noise.
+
+    Attributes
+    ----------
+    camera : Camera
+    look : Look
+    scene : Scene
+    wanted : tuple of PlatePose
+        Plates that should be found.
+    decoys : tuple of (kind, PlatePose)
+        Plates that should not.
+    obstacles : tuple of Obstacle
+    optics : Optics
+    gain : float
+        Exposure relative to the one at which radiance 1 fills the well.
+    veil : Veil
+    """
+
+    camera: Camera
+    look: Look
+    scene: Scene
+    wanted: tuple[PlatePose, ...]
+    decoys: tuple[tuple[str, PlatePose], ...]
+    obstacles: tuple[Obstacle, ...]
+    optics: Optics
+    gain: float
+    veil: Veil
+
+
+def stream(seed: int, name: str, index: int, purpose: str) -> np.random.Generator:
+    """Return the random numbers of one frame of one set."""
+    key = (*name.encode(), index, *purpose.encode())
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
+
+
+def radius_px(camera: Camera, seen: PlatePose) -> float:
+    """Return the radius that the main ring has in the image, seen frontally [px]."""
+    ring = seen.plate.target.ring
+    return 0.5 * ring.outer_diameter_m * camera.mean_focal_px / seen.pose.distance_m
+
+
+def tilt_deg(pose: Pose) -> float:
+    """Return the angle between a plate's normal and the viewing ray of its centre [deg]."""
+    return math.degrees(math.acos(float(pose.normal @ pose.translation_m) / pose.distance_m))
+
+
+def some_camera(rng: np.random.Generator) -> tuple[Camera, Look]:
+    """Return one of the cameras, of one of the kinds."""
+    look = LOOKS[rng.integers(len(LOOKS))]
+    return replace(CAMERAS[rng.integers(len(CAMERAS))], response=look.response), look
+
+
+def halved(camera: Camera) -> Camera:
+    """Return a camera of half the pixels per side: plates that fill the frame cost less."""
+    width, height = camera.width // 2, camera.height // 2
+    fx, fy, cx, cy = (0.5 * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def place(
+    camera: Camera,
+    plate: Plate,
+    pixel: FloatArray,
+    ring_px: float,
+    tilt: tuple[float, float],
+    rng: np.random.Generator,
+) -> PlatePose:
+    """Put a plate in front of the camera, tilted against the viewing ray by a range of degrees."""
+    ray = np.append(camera.undistort(pixel), 1.0)
+    ray /= np.linalg.norm(ray)
+    axis = np.cross((0.0, 0.0, 1.0), ray)
+    angle = math.asin(min(1.0, float(np.linalg.norm(axis))))
+    aligned = Rotation.from_rotvec(axis / max(float(np.linalg.norm(axis)), 1e-12) * angle)
+    way = rng.uniform(0.0, 2.0 * math.pi)
+    tilted = Rotation.from_rotvec(
+        math.radians(rng.uniform(*tilt)) * np.array([math.cos(way), math.sin(way), 0.0])
+    )
+    turned = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
+    distance_m = 0.5 * plate.target.ring.outer_diameter_m * camera.mean_focal_px / ring_px
+    return PlatePose(plate, Pose((aligned * tilted * turned).as_matrix(), distance_m * ray))
+
+
+def pixel_inside(camera: Camera, ring_px: float, rng: np.random.Generator) -> FloatArray:
+    """Return a place where a ring of this radius is wholly in the frame, if there is any."""
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    margin = np.minimum(1.2 * ring_px + 4.0, 0.5 * size)
+    pixel: FloatArray = margin + rng.random(2) * (size - 2.0 * margin) - 0.5
+    return pixel
+
+
+def place_apart(
+    camera: Camera,
+    plates: Sequence[Plate],
+    ring_px: tuple[float, float],
+    tilt: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[PlatePose | None, ...]:
+    """Put plates where they do not hide each other; None where there is no room."""
+    taken: list[tuple[FloatArray, float]] = []
+    placed: list[PlatePose | None] = []
+    for plate in plates:
+        place_found = None
+        for _ in range(_ATTEMPTS):
+            radius = float(np.exp(rng.uniform(*np.log(ring_px))))
+            pixel = pixel_inside(camera, radius, rng)
+            if all(
+                np.linalg.norm(pixel - other) > _SEPARATION * (radius + size)
+                for other, size in taken
+            ):
+                taken.append((pixel, radius))
+                place_found = place(camera, plate, pixel, radius, tilt, rng)
+                break
+        placed.append(place_found)
+    return tuple(placed)
+
+
+def scene_around(main: PlatePose, others: Sequence[PlatePose], rng: np.random.Generator) -> Scene:
+    """Lay ground below a plate, half the time with a vehicle between the two."""
+    driven = main.pose.distance_m > _NEAREST_VEHICLE_M and bool(rng.random() < 0.5)
+    turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True).as_matrix()
+    rotation = main.pose.rotation @ turn
+    way, radius_m = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*_AROUND_M)
+    below = np.array(
+        [radius_m * math.cos(way), radius_m * math.sin(way), -(_ROOF_M if driven else _STAND_M)]
+    )
+    ground = Pose(rotation, main.pose.translation_m - rotation @ below)
+    return Scene(ground, main, tuple(others)) if driven else Scene(ground, None, (*others, main))
+
+
+@lru_cache(maxsize=2)
+def _ground(seed: int) -> Ground:
+    return Ground.grown(stream(seed, "ground", 0, "texture"), _ROAD_RADIUS_M)
+
+
+def render(shot: Shot, seed: int, rng: np.random.Generator) -> GreyArray:
+    """Return the frame (height, width) of grey values, as it would be read from its file."""
+    ground = _ground(seed)
+    irradiance = render_irradiance(shot.camera, ground, shot.scene, shot.optics, rng)
+    for obstacle in shot.obstacles:
+        _cover(irradiance, shot, obstacle, ground)
+    irradiance *= shot.veil.share
+    irradiance += shot.veil.light
+    grey = shot.look.sensor.expose(irradiance, shot.gain, rng)
+    if shot.look.jpeg_quality is None:
+        return grey
+    _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, shot.look.jpeg_quality])
+    decoded: GreyArray = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return decoded
+
+
+def _cover(irradiance: FloatArray, shot: Shot, obstacle: Obstacle, ground: Ground) -> None:
+    """Lay an obstacle over what is rendered so far, in place."""
+    corner, size = outline_box(shot.camera, obstacle.pose, obstacle.shape)
+    margin = shot.optics.reach_px
+    column, row = np.floor(corner).astype(int) - margin
+    width, height = np.ceil(size).astype(int) + 2 * margin + 1
+    window = Window(int(column), int(row), int(width), int(height))
+    if not window.meets(shot.camera):
+        return
+    window = window.near(shot.camera, margin)
+    patch = Patch.of(shot.camera, obstacle.pose, window, _OVERSAMPLING)
+    opacity = np.zeros_like(patch.x_m)
+    patch.paint(opacity, obstacle.shape, obstacle.opacity)
+    if obstacle.radiance is None:
+        light = opacity * ground.radiance(patch)
+    else:
+        light = opacity * obstacle.radiance
+    spread = shot.optics.spread
+    PlateImage(window, spread(opacity, _OVERSAMPLING), spread(light, _OVERSAMPLING)).paste(
+        irradiance
+    )

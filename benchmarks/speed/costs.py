@@ -1,0 +1,162 @@
+"""CPU time of decoding, of the search and of the whole detection, frame by frame."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import cv2
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.images.frames import read_grey
+from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.records import Observation
+from kgcp.measurement.search.candidates import find_rings
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Target
+
+if TYPE_CHECKING:  # what workers import decides about their memory
+    from benchmarks.speed.sources import Source
+
+Result = TypeVar("Result")
+
+_REPEATS = 3  # the least of them counts: whatever else the machine does only adds
+HEADER = "set                     targets  frames   Mpx  decode ms   search   whole"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameCost:
+    """CPU times of one frame [s].
+
+    Attributes
+    ----------
+    pixels : int
+    decode_s, search_s, measure_s : float
+        Of decoding the file; of the search for rings alone; of search and measurement.
+    found : int
+        Targets that were measured.
+    """
+
+    pixels: int
+    decode_s: float
+    search_s: float
+    measure_s: float
+    found: int
+
+
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """The frames of one line.
+
+    Attributes
+    ----------
+    name, targets : str
+        Where they are from, and whether a target was measured in them.
+    frames : tuple of FrameCost
+    """
+
+    name: str
+    targets: str
+    frames: tuple[FrameCost, ...]
+
+    def mean(self, value: Callable[[FrameCost], float]) -> float:
+        """Return the mean of something over the frames."""
+        return sum(map(value, self.frames)) / len(self.frames)
+
+    @property
+    def decode_s(self) -> float:
+        """Mean CPU time of decoding [s]."""
+        return self.mean(lambda cost: cost.decode_s)
+
+    @property
+    def search(self) -> float:
+        """Search, as a multiple of decoding."""
+        return self.mean(lambda cost: cost.search_s) / self.decode_s
+
+    @property
+    def whole(self) -> float:
+        """Decoding, search and measurement, as a multiple of decoding."""
+        return 1.0 + self.mean(lambda cost: cost.measure_s) / self.decode_s
+
+
+def cv2_alone() -> None:
+    """Take OpenCV's threads away, as the workers of `kgcp detect` do."""
+    cv2.setNumThreads(0)
+
+
+def peak_memory_bytes() -> int:
+    """Return this process's peak memory; on Linux, `getrusage` counts its parent's, too."""
+    if sys.platform != "linux":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+def cost_and_memory(
+    path: Path, camera: Camera, targets: tuple[Target, ...]
+) -> tuple[FrameCost, int]:
+    """Time one frame; return its costs, and the peak memory of the process [bytes]."""
+    cost_of(path, camera, targets)  # compiles
+    return cost_of(path, camera, targets), peak_memory_bytes()
+
+
+def cost_of(path: Path, camera: Camera, targets: tuple[Target, ...]) -> FrameCost:
+    """Time what becomes of one frame."""
+    settings = DetectSettings()
+    decode_s, grey = _timed(lambda: read_grey(path, camera))
+    search_s, _ = _timed(lambda: find_rings(grey, settings))
+    measure_s, seen = _timed(lambda: measure_frame(grey, camera, targets, settings))
+    found = sum(isinstance(one, Observation) for one in seen)
+    return FrameCost(grey.size, decode_s, search_s, measure_s, found)
+
+
+def _timed(function: Callable[[], Result]) -> tuple[float, Result]:
+    best_s = float("inf")
+    for left in reversed(range(_REPEATS)):
+        begin_s = time.process_time()
+        result = function()
+        best_s = min(best_s, time.process_time() - begin_s)
+        if left:
+            del result  # workers do not have two frames at a time
+    return best_s, result
+
+
+def cost_of_all(source: Source) -> Iterable[Costs]:
+    """Time the frames of a source; those with a measured target and those without stand apart."""
+    flight = source.flight
+    paths = [flight.frames_folder / name for name in source.frames]
+    cost_of(paths[0], flight.camera, flight.targets)  # compiles
+    costs = [cost_of(path, flight.camera, flight.targets) for path in paths]
+    for targets, chosen in (("with", _found(costs)), ("without", _missed(costs))):
+        if chosen:
+            yield Costs(source.name, targets, tuple(chosen))
+
+
+def print_costs(sources: Iterable[Source], count: int) -> Iterable[FrameCost]:
+    """Print the lines of some sources, and return their frames; of each some, spread over it."""
+    for source in sources:
+        for costs in cost_of_all(source.spread(count)):
+            print(cost_line(costs), flush=True)
+            yield from costs.frames
+
+
+def _found(costs: Sequence[FrameCost]) -> list[FrameCost]:
+    return [cost for cost in costs if cost.found]
+
+
+def _missed(costs: Sequence[FrameCost]) -> list[FrameCost]:
+    return [cost for cost in costs if not cost.found]
+
+
+def cost_line(costs: Costs) -> str:
+    """Return one line of the table."""
+    megapixels = 1e-6 * costs.mean(lambda cost: cost.pixels)
+    return (
+        f"{costs.name:24s}{costs.targets:7s}{len(costs.frames):8d}{megapixels:6.1f}"
+        f"{1e3 * costs.decode_s:11.1f}{costs.search:9.2f}{costs.whole:8.2f}"
+    )

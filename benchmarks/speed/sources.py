@@ -1,0 +1,98 @@
+"""The frames that the benchmark of speed is run on: flights, photographs, or simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.io.images.frames import list_frames
+from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.simulate import write_simulated_flight
+from kgcp.simulation.flight import plan_flight
+from kgcp.simulation.presets import preset
+
+_PRESETS = ("clean", "consumer")
+_AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_FOCAL = 1.2  # of a photograph's width
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Frames of one camera.
+
+    Attributes
+    ----------
+    name : str
+    flight : Flight
+        Its frames folder, camera and targets.
+    frames : tuple of str
+        Paths relative to that folder.
+    """
+
+    name: str
+    flight: Flight
+    frames: tuple[str, ...]
+
+    def spread(self, count: int) -> Source:
+        """Return the source with so many of its frames, or all of fewer."""
+        chosen = np.unique(np.linspace(0, len(self.frames) - 1, count).round().astype(int))
+        return replace(self, frames=tuple(self.frames[i] for i in chosen))
+
+
+def flights_of(folder: Path | None, work: Path, count: int) -> list[Source]:
+    """Return the flights in a folder, or simulate some in `work`."""
+    if folder is not None and folder.is_dir():
+        found = sorted(path.parent for path in folder.glob("*/flight/flight.toml"))
+        if found:
+            return [_source(path.parent.name, path) for path in found]
+    sources = []
+    for name in _PRESETS:
+        plan = plan_flight(replace(preset(name), frames=count), 1)
+        write_simulated_flight(plan, work / name, jobs=usable_cores(), on_frame=lambda: None)
+        sources.append(_source(name, work / name))
+    return sources
+
+
+def _source(name: str, folder: Path) -> Source:
+    flight = read_flight(folder)
+    return Source(name, flight, tuple(list_frames(flight.frames_folder)))
+
+
+def photographs_of(folder: Path | None, like: Source) -> list[Source]:
+    """Return the photographs in a folder by their size, with the targets of a flight."""
+    if folder is None or not folder.is_dir():
+        return []
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for name in list_frames(folder):
+        picture = cv2.imread(
+            str(folder / name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        )
+        if picture is not None:
+            by_size.setdefault(picture.shape[:2], []).append(name)
+    return [
+        Source(
+            f"{folder.name} {width}x{height}",
+            flight_over(like, folder, width, height),
+            tuple(names),
+        )
+        for (height, width), names in sorted(by_size.items())
+    ]
+
+
+def flight_over(like: Source, folder: Path, width: int, height: int) -> Flight:
+    """Return the flight with other frames: those in a folder, of a camera of that size."""
+    focal_px = _FOCAL * width
+    camera = Camera(width, height, focal_px, focal_px, 0.5 * width, 0.5 * height)
+    return replace(like.flight, frames_folder=folder, camera=camera, times_file=None)
+
+
+def photograph_of(photographs: Sequence[Source], otherwise: Source) -> tuple[Path, Source]:
+    """Return a richly textured picture, and its source: the first photograph, or a frame."""
+    source = photographs[0] if photographs else otherwise
+    return source.flight.frames_folder / source.frames[0], source

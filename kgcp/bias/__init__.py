@@ -1,1 +1,0 @@
-"""Measured distances against reference poses, and the statistics of their differences."""

@@ -1,1 +1,0 @@
-"""Whether the vehicle and the reference poses put the target in the same places."""

@@ -1,0 +1,119 @@
+"""Brown-Conrady distortion in OpenCV's order of coefficients, point by point; compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray
+
+_MAX_NEWTON_STEPS = 30
+_NEWTON_TOLERANCE = 1e-8  # convergence is quadratic: the step leaves its square
+
+Lens = tuple[float, float, float, float, float, float, float, float]
+"""k1, k2, p1, p2, k3, k4, k5, k6."""
+
+Scale = tuple[float, float, float, float]
+"""fx, fy, cx, cy [px]."""
+
+
+@compiled
+def _radial(lens: Lens, r2: float) -> tuple[float, float]:
+    """Return the radial factor and its derivative with respect to r²."""
+    k1, k2, _, _, k3, k4, k5, k6 = lens
+    above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    factor = above / below
+    slope_above = k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
+    slope_below = k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6)
+    return factor, (slope_above - factor * slope_below) / below
+
+
+@compiled
+def _distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
+    p1, p2 = lens[2], lens[3]
+    r2 = x * x + y * y
+    factor, _ = _radial(lens, r2)
+    xy2 = 2.0 * x * y
+    return (
+        x * factor + p1 * xy2 + p2 * (r2 + 2.0 * x * x),
+        y * factor + p1 * (r2 + 2.0 * y * y) + p2 * xy2,
+    )
+
+
+@compiled
+def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
+    """Return the derivatives of the distorted x by x, of either by the other, and of y by y."""
+    p1, p2 = lens[2], lens[3]
+    factor, slope = _radial(lens, x * x + y * y)
+    return (
+        factor + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+        2.0 * (slope * x * y + p1 * x + p2 * y),
+        factor + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+    )
+
+
+@compiled
+def distort_points(lens: Lens, scale: Scale, points: FloatArray, pixels: FloatArray) -> None:
+    """Map normalised points (n, 2) to pixels."""
+    fx, fy, cx, cy = scale
+    for i in range(points.shape[0]):
+        x, y = _distorted(lens, points[i, 0], points[i, 1])
+        pixels[i, 0], pixels[i, 1] = fx * x + cx, fy * y + cy
+
+
+@compiled
+def distort_circles(
+    lens: Lens,
+    scale: Scale,
+    axes: FloatArray,
+    centre: FloatArray,
+    radii: FloatArray,
+    circle: FloatArray,
+    pixels: FloatArray,
+) -> None:
+    """Map circles of some radii (m,) in space to pixels (m, k, 2), by points of the unit circle.
+
+    Their common centre is given in the camera frame, their plane by the first two columns of a
+    rotation.
+    """
+    fx, fy, cx, cy = scale
+    for m in range(len(radii)):
+        for k in range(len(circle)):
+            u, v = radii[m] * circle[k, 0], radii[m] * circle[k, 1]
+            inverse = 1.0 / (centre[2] + axes[2, 0] * u + axes[2, 1] * v)
+            x = (centre[0] + axes[0, 0] * u + axes[0, 1] * v) * inverse
+            y = (centre[1] + axes[1, 0] * u + axes[1, 1] * v) * inverse
+            x, y = _distorted(lens, x, y)
+            pixels[m, k, 0], pixels[m, k, 1] = fx * x + cx, fy * y + cy
+
+
+@compiled
+def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatArray) -> None:
+    """Fill in the derivatives (n, 2, 2) of `distort_points`: rows of results, columns of points."""
+    fx, fy, _, _ = scale
+    for i in range(points.shape[0]):
+        xx, xy, yy = _slopes(lens, points[i, 0], points[i, 1])
+        slopes[i, 0, 0], slopes[i, 0, 1] = fx * xx, fx * xy
+        slopes[i, 1, 0], slopes[i, 1, 1] = fy * xy, fy * yy
+
+
+@compiled
+def undistort_points(lens: Lens, scale: Scale, pixels: FloatArray, points: FloatArray) -> None:
+    """Invert `distort_points` by Newton's method, to 1e-13; NaN where it does not converge."""
+    fx, fy, cx, cy = scale
+    for i in range(pixels.shape[0]):
+        x = wanted_x = (pixels[i, 0] - cx) / fx
+        y = wanted_y = (pixels[i, 1] - cy) / fy
+        is_found = False
+        for _ in range(_MAX_NEWTON_STEPS):
+            there_x, there_y = _distorted(lens, x, y)
+            xx, xy, yy = _slopes(lens, x, y)
+            off_x, off_y, determinant = there_x - wanted_x, there_y - wanted_y, xx * yy - xy * xy
+            step_x = (yy * off_x - xy * off_y) / determinant
+            step_y = (xx * off_y - xy * off_x) / determinant
+            x, y = x - step_x, y - step_y
+            if abs(step_x) <= _NEWTON_TOLERANCE and abs(step_y) <= _NEWTON_TOLERANCE:
+                is_found = True
+                break
+        points[i, 0], points[i, 1] = (x, y) if is_found else (np.nan, np.nan)

@@ -1,0 +1,1 @@
+"""From sightings to points on the map: CRS, trajectory, target positions, GCPs."""

@@ -1,0 +1,252 @@
+"""Exterior orientation of the camera from a moving plate: the vehicle tells how the plate lies.
+
+The pose of the plate in the camera and the attitude of the vehicle that carries it give the
+attitude of the camera; from the plate's place it is then one vector to the projection centre:
+
+    R(map ← camera) = R(map ← body) R(body ← plate) R(camera ← plate)ᵀ
+    X(camera)       = X(plate) − R(map ← camera) t
+
+R(body ← plate) is the mount of docs/conventions.md. A small error of the plate's normal moves the
+camera by the whole distance times that angle: these are priors, and their covariances say how weak.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
+from kgcp.geometry.pose import rotation_about
+from kgcp.georef.crs import MapFrame
+from kgcp.georef.gcp import Kgcp
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Carrier, Whereabouts
+from kgcp.settings import VehicleSettings
+
+MIN_AMBIGUITY = 2.0 * math.log(100.0)
+"""Δχ² of the other pose from which on a pose counts as told apart: odds of 100 to 1."""
+
+_BODY_FROM_LEVEL_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Default mount: plate x = body y, plate y = −body x, plate z = body z, as columns."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """Exterior orientation of one frame, as the plate and its vehicle tell it.
+
+    Attributes
+    ----------
+    frame : str
+        As in the sighting.
+    position_map : (3,) array
+        Projection centre x, y, z in the KGCPs' CRS.
+    map_from_camera : (3, 3) array
+        Camera axes (x right, y down, z forward) along the map's axes, as columns.
+    cov : (6, 6) array or None
+        Position along the map's axes [m], then a small rotation about the map's axes, applied to
+        `map_from_camera` from the left [rad]. Errors that all frames share (calibration, print)
+        are in it. None: the trajectory or the measurement has no deviations.
+    """
+
+    frame: str
+    position_map: FloatArray
+    map_from_camera: FloatArray
+    cov: FloatArray | None
+
+
+def opk_deg(priors: Sequence[CameraPrior]) -> FloatArray:
+    """Return omega, phi, kappa (n, 3) [deg] as docs/conventions.md defines them."""
+    rotations = np.array([prior.map_from_camera for prior in priors]).reshape(-1, 3, 3)
+    return opk_from_rotation(rotations @ CAMERA_FROM_PHOTO)
+
+
+def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
+    """Return the covariances (6, 6) of x, y, z [m], omega, phi, kappa [deg]; None: not known.
+
+    R = Rx(ω) Ry(φ) Rz(κ) turns about x, then the y that ω has turned, then the z that both have.
+    """
+    omega, phi, _ = np.radians(opk_deg(priors)).T
+    zero, one = np.zeros_like(omega), np.ones_like(omega)
+    sin, cos = np.sin(omega), np.cos(omega)
+    about_y = np.stack((zero, cos, sin), axis=-1)
+    about_z = np.stack((np.sin(phi), -sin * np.cos(phi), cos * np.cos(phi)), axis=-1)
+    axes = np.stack((np.stack((one, zero, zero), axis=-1), about_y, about_z), axis=-1)
+    change = np.tile(np.eye(6), (len(priors), 1, 1))
+    change[:, 3:, 3:] = np.degrees(np.linalg.inv(axes))
+    return [
+        None if prior.cov is None else matrix @ prior.cov @ matrix.T
+        for prior, matrix in zip(priors, change, strict=True)
+    ]
+
+
+def body_from_plate(mount_deg: float) -> FloatArray:
+    """Return the plate's axes (3, 3) in body axes, as columns, for a turn from the default."""
+    turn = rotation_about(np.array([0.0, 0.0, math.radians(mount_deg)]))
+    mounted: FloatArray = _BODY_FROM_LEVEL_PLATE @ turn
+    return mounted
+
+
+def camera_priors(
+    kgcps: Sequence[Kgcp],
+    sightings: Sequence[Sighting],
+    whereabouts: Whereabouts,
+    frame: MapFrame,
+) -> tuple[CameraPrior, ...]:
+    """Orient the camera in every frame where the plate on the vehicle tells its attitude.
+
+    Left out are static targets, whose attitude nobody knows, measurements without a pose, and
+    those whose two poses cannot be told apart: the wrong one moves the camera by metres.
+
+    Parameters
+    ----------
+    kgcps : sequence of Kgcp
+    sightings : sequence of Sighting
+        Of which the KGCPs were made.
+    whereabouts : Whereabouts
+        Of the flight's targets; without a vehicle there is no prior.
+    frame : MapFrame
+        Of the KGCPs' coordinates.
+    """
+    carrier = whereabouts.carrier
+    if carrier is None:
+        return ()
+    seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
+    chosen = [
+        (point, seen[point.frame, point.target], point.time_s)
+        for point in kgcps
+        if point.time_s is not None
+        and point.target not in whereabouts.static
+        and _is_told_apart(seen[point.frame, point.target])
+    ]
+    if not chosen:
+        return ()
+    times = np.array([time_s for _, _, time_s in chosen])
+    return _oriented([(point, one) for point, one, _ in chosen], times, carrier, frame)
+
+
+def _is_told_apart(seen: Sighting) -> bool:
+    is_clear = seen.ambiguity is None or seen.ambiguity >= MIN_AMBIGUITY
+    return seen.pose is not None and is_clear
+
+
+def _oriented(
+    pairs: Sequence[tuple[Kgcp, Sighting]], time_s: FloatArray, carrier: Carrier, frame: MapFrame
+) -> tuple[CameraPrior, ...]:
+    """Orient the camera in frames with a pose, at times (n,) by the trajectory's clock."""
+    states = carrier.motion.states(time_s)
+    level = carrier.frame.level_rotations(states.position_m)
+    plate = frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
+    # East, north and up are those of the plate, whatever datum the points' CRS has.
+    level_from_body = np.swapaxes(level, -1, -2) @ states.frame_from_body
+    enu_from_body = frame.level_rotations(plate) @ level_from_body
+    poses = [seen.pose for _, seen in pairs if seen.pose is not None]
+    plate_from_camera = np.swapaxes(np.array([pose.rotation for pose in poses]), -1, -2)
+    mount = body_from_plate(carrier.settings.mount_deg)
+    enu_from_camera = enu_from_body @ mount @ plate_from_camera
+    rays = np.array([pose.translation_m for pose in poses])
+    camera = plate - np.einsum("nij,nj->ni", enu_from_camera, rays)
+    map_from_enu = np.swapaxes(frame.grid_rotation(camera), -1, -2)
+    to_enu = frame.grid_rotation(plate)
+    positions = frame.map_from_enu(camera)
+    sds = states.sd_attitude_deg
+    priors = []
+    for i, (point, seen) in enumerate(pairs):
+        cov = None
+        cov_pose = _whole_pose_cov(seen)
+        if point.cov_m2 is not None and cov_pose is not None and sds is not None:
+            cov_plate = to_enu[i] @ point.cov_m2 @ to_enu[i].T
+            attitude = _Attitude(enu_from_body[i], sds[i], carrier.settings)
+            turn = np.kron(np.eye(2), map_from_enu[i])
+            cov = turn @ _cov(cov_plate, cov_pose, attitude, enu_from_camera[i], rays[i]) @ turn.T
+        attitude_map = map_from_enu[i] @ enu_from_camera[i]
+        priors.append(CameraPrior(point.frame, positions[i], attitude_map, cov))
+    return tuple(priors)
+
+
+def _whole_pose_cov(seen: Sighting) -> FloatArray | None:
+    """Return the pose's covariance with the errors that all frames share; None: not known."""
+    if seen.pose_cov is None or seen.common_pose_cov is None:
+        return seen.pose_cov
+    whole: FloatArray = seen.pose_cov + seen.common_pose_cov
+    return whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attitude:
+    """The vehicle's attitude at one time, in ENU, and how well it is known [deg]."""
+
+    enu_from_body: FloatArray
+    sd_deg: FloatArray
+    settings: VehicleSettings
+
+
+def _attitude_cov(enu_from_body: FloatArray, sd_deg: FloatArray) -> FloatArray:
+    """Return the covariance (3, 3) of the vehicle's attitude as a left rotation in ENU [rad²].
+
+    Roll turns about the body's x, heading about the vertical, pitch about the horizontal axis that
+    is square to both.
+    """
+    forward, down = enu_from_body[:, 0], np.array([0.0, 0.0, -1.0])
+    right = np.cross(down, forward)
+    axes = np.column_stack((forward, right / np.linalg.norm(right), down))
+    scaled = axes * np.radians(sd_deg)
+    cov: FloatArray = scaled @ scaled.T
+    return cov
+
+
+def _mount_cov(enu_from_body: FloatArray, level_sd_deg: float | None) -> FloatArray:
+    """Return the covariance (3, 3) of how the plate lies on its vehicle, in ENU [rad²].
+
+    That the plate is level within `level_sd_deg` is the only thing known of its mount; none given
+    counts as exact, as does `mount_deg`.
+    """
+    tilts = enu_from_body[:, :2] * math.radians(level_sd_deg or 0.0)
+    cov: FloatArray = tilts @ tilts.T
+    return cov
+
+
+def _cov(
+    cov_plate: FloatArray,
+    cov_pose: FloatArray,
+    vehicle: _Attitude,
+    enu_from_camera: FloatArray,
+    translation: FloatArray,
+) -> FloatArray:
+    """Return the covariance (6, 6) of position [m] and left rotation [rad] in ENU, first order.
+
+    With r = R t (camera → plate, in ENU), errors α of the vehicle's attitude and μ of the mount, ρ
+    of the plate's place, and τ, δ of the pose (t + τ, exp(δ) R(camera ← plate)):
+
+        rotation  α + μ − R δ
+        position  ρ − (α + μ) × r − R (τ + t × δ)
+
+    ρ holds the attitude's effect on the lever arm, α × lever, from which it correlates with α.
+    """
+    body = vehicle.enu_from_body
+    cov_attitude = _attitude_cov(body, vehicle.sd_deg)
+    cov_mount = _mount_cov(body, vehicle.settings.level_sd_deg)
+    lever = body @ np.array(vehicle.settings.lever_arm_m)
+    arm = _cross_matrix(enu_from_camera @ translation)
+    from_pose = np.block(
+        [
+            [-enu_from_camera, -enu_from_camera @ _cross_matrix(translation)],
+            [np.zeros((3, 3)), -enu_from_camera],
+        ]
+    )
+    from_turn = np.vstack((arm, np.eye(3)))
+    shared = np.zeros((6, 6))
+    shared[:3] = -_cross_matrix(lever) @ cov_attitude @ from_turn.T
+    cov: FloatArray = from_pose @ cov_pose @ from_pose.T
+    cov = cov + from_turn @ (cov_attitude + cov_mount) @ from_turn.T + shared + shared.T
+    cov[:3, :3] += cov_plate
+    return cov
+
+
+def _cross_matrix(vector: FloatArray) -> FloatArray:
+    """Return [v]×, with [v]× w = v × w."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,68 @@
+"""Reference poses of the camera in the Cartesian frame of the flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
+from kgcp.geometry.camera import Camera
+from kgcp.georef.crs import MapFrame
+
+_FOLD_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Exterior orientations of n frames.
+
+    Attributes
+    ----------
+    centre_m : (n, 3) array
+        Projection centres in the ENU frame [m].
+    enu_from_camera : (n, 3, 3) array
+        Camera axes (x right, y down, z forward) in the ENU frame, as columns.
+    cov_m2 : (n, 3, 3) array or None
+        Covariance of the centres in ENU axes [m²]; None: the poses have no deviations.
+    """
+
+    centre_m: FloatArray
+    enu_from_camera: FloatArray
+    cov_m2: FloatArray | None
+
+    @classmethod
+    def of(cls, poses: ReferencePoses, frame: MapFrame) -> Self:
+        """Bring reference poses from the map into the ENU frame."""
+        centre = frame.enu_from_map(poses.position_map)
+        enu_from_map = frame.grid_rotation(centre)
+        cov = None
+        if poses.sd_position_m is not None:
+            scaled = enu_from_map * poses.sd_position_m[:, None, :]
+            cov = scaled @ np.swapaxes(scaled, 1, 2)
+        # diag(1, -1, -1) is its own inverse
+        enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
+        return cls(centre, enu_from_camera, cov)
+
+
+def visible_pixel(camera: Camera, point_camera: FloatArray) -> FloatArray:
+    """Project one point (3,) in the camera frame [px], as `visible_pixels`."""
+    (pixel,) = visible_pixels(camera, point_camera[None])
+    return np.asarray(pixel)
+
+
+def visible_pixels(camera: Camera, points_camera: FloatArray) -> FloatArray:
+    """Project points (n, 3) in the camera frame to raw pixels (n, 2).
+
+    NaN behind the camera, and beyond the fold of its distortion.
+    """
+    pixels = np.full((len(points_camera), 2), np.nan)
+    ahead = points_camera[:, 2] > 0.0
+    normalised = points_camera[ahead, :2] / points_camera[ahead, 2:]
+    seen = camera.distort(normalised)
+    error = np.linalg.norm(camera.undistort(seen) - normalised, axis=1)
+    seen[~(error < _FOLD_TOLERANCE)] = np.nan
+    pixels[ahead] = seen
+    return pixels

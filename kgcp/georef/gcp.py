@@ -1,0 +1,216 @@
+"""Kinematic ground control points: sightings in frames, placed by the carrier's trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.georef.crs import MapChange
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Absence, Place, Whereabouts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kgcp:
+    """One kinematic ground control point: a point of the ground, seen in one frame.
+
+    Attributes
+    ----------
+    id : str
+        `K` and the number of the frame; for a static target its name, in every frame.
+    frame, target : str
+        As in the sighting.
+    time_s : float or None
+        When the target's row was exposed, by the trajectory's clock, Unix UTC [s]; None: not
+        known, which only a static target can afford.
+    position_map : (3,) array
+        x, y, z in the flight's CRS.
+    cov_m2 : (3, 3) array or None
+        Covariance along the map's axes [m²]; None: the trajectory has no standard deviations.
+    centre_px, centre_cov_px2, distance_m, sd_distance_m, sd_common_distance_m
+        As in the sighting.
+    common_m : (3, k) array or None
+        How one standard deviation of each of k errors that all points share moves this one,
+        along the map's axes [m]; k = 4: lever arm x, y, z and synchronisation. It is part of
+        `cov_m2`. None: the target stands still, and its points are one point.
+    score, ambiguity
+        As in the sighting.
+    is_checkpoint : bool
+        Whether the point is to check an adjustment instead of controlling it.
+    flag : Flag or None
+        What does not fit a smooth flight; None: nothing, or it could not be examined.
+    """
+
+    id: str
+    frame: str
+    target: str
+    time_s: float | None
+    position_map: FloatArray
+    cov_m2: FloatArray | None
+    centre_px: FloatArray
+    centre_cov_px2: FloatArray | None
+    distance_m: float
+    sd_distance_m: float | None
+    sd_common_distance_m: float | None
+    common_m: FloatArray | None = None
+    score: float | None = None
+    ambiguity: float | None = None
+    is_checkpoint: bool = False
+    flag: Flag | None = None
+
+    @property
+    def cov_common_m2(self) -> FloatArray | None:
+        """Share (3, 3) of `cov_m2` that is one error in all points [m²]."""
+        if self.common_m is None or self.cov_m2 is None:
+            return self.cov_m2
+        product: FloatArray = self.common_m @ self.common_m.T
+        return product
+
+
+class Flag(StrEnum):
+    """What of a point does not fit a smooth flight."""
+
+    DISTANCE = "distance_jump"
+    HEIGHT = "height_jump"
+
+
+class Omission(StrEnum):
+    """Why a sighting that could be placed is no KGCP."""
+
+    SECOND_PLATE = "second_plate"
+    DISTANCE_JUMP = Flag.DISTANCE.value
+    HEIGHT_JUMP = Flag.HEIGHT.value
+    UNCERTAIN = "uncertain"
+    LOW_SCORE = "low_score"
+    AMBIGUOUS = "ambiguous"
+    CLOSE = "too_close"
+
+
+@dataclass(frozen=True, slots=True)
+class Skip:
+    """A sighting that did not become a KGCP.
+
+    Attributes
+    ----------
+    frame, target : str
+        As in the sighting.
+    reason : Absence or Omission
+        Why it is not known where the target was, or why the point is left out.
+    """
+
+    frame: str
+    target: str
+    reason: Absence | Omission
+
+
+def build_kgcps(
+    sightings: Sequence[Sighting], whereabouts: Whereabouts, camera: Camera
+) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    """Place every sighting on the ground.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        In the frames' order.
+    whereabouts : Whereabouts
+        Of the flight's targets.
+    camera : Camera
+        For the rolling shutter.
+
+    Returns
+    -------
+    kgcps : tuple of Kgcp
+        In the sightings' order.
+    skipped : tuple of Skip
+        What could not be placed, and why.
+
+    Raises
+    ------
+    KgcpError
+        As `Whereabouts.places`.
+    """
+    first = [sighting for sighting in sightings if sighting.instance == 0]
+    times = [seen.row_time_s(camera) for seen in first]
+    places = whereabouts.places([seen.target for seen in first], times)
+    skipped = [
+        Skip(seen.frame, seen.target, Omission.SECOND_PLATE)
+        for seen in sightings
+        if seen.instance > 0
+    ]
+    placed = []
+    for seen, time_s, place in zip(first, times, places, strict=True):
+        if isinstance(place, Place):
+            placed.append((seen, time_s, place))
+        else:
+            skipped.append(Skip(seen.frame, seen.target, place))
+    return _on_the_map(placed, whereabouts), tuple(skipped)
+
+
+def _on_the_map(
+    placed: Sequence[tuple[Sighting, float | None, Place]], whereabouts: Whereabouts
+) -> tuple[Kgcp, ...]:
+    if not placed:
+        return ()
+    frame = whereabouts.frame
+    positions = np.array([place.position_m for _, _, place in placed])
+    on_map, axes = frame.map_from_enu(positions), frame.grid_rotation(positions)
+    return tuple(
+        _kgcp(*one, position, turn, whereabouts)
+        for one, position, turn in zip(placed, on_map, axes, strict=True)
+    )
+
+
+def _kgcp(
+    seen: Sighting,
+    time_s: float | None,
+    place: Place,
+    position_map: FloatArray,
+    axes: FloatArray,
+    whereabouts: Whereabouts,
+) -> Kgcp:
+    moves = seen.target not in whereabouts.static
+    offset_s = whereabouts.carrier.settings.time_offset_s if whereabouts.carrier else 0.0
+    return Kgcp(
+        id=f"K{seen.number:04d}" if moves else seen.target,
+        frame=seen.frame,
+        target=seen.target,
+        time_s=None if time_s is None else time_s + offset_s,
+        position_map=position_map,
+        cov_m2=None if place.cov_m2 is None else axes.T @ place.cov_m2 @ axes,
+        common_m=None if place.common_m is None else axes.T @ place.common_m,
+        centre_px=seen.centre_px,
+        centre_cov_px2=seen.centre_cov_px2,
+        distance_m=seen.distance_m,
+        sd_distance_m=seen.sd_distance_m,
+        sd_common_distance_m=seen.sd_common_distance_m,
+        score=seen.score,
+        ambiguity=seen.ambiguity,
+    )
+
+
+def on_map(kgcps: Sequence[Kgcp], change: MapChange) -> tuple[Kgcp, ...]:
+    """Return the points with positions and covariances on another map.
+
+    Raises
+    ------
+    KgcpError
+        As `MapChange.positions` and `MapChange.axes`.
+    """
+    if not kgcps:
+        return ()
+    here = np.array([point.position_map for point in kgcps])
+    return tuple(map(_moved, kgcps, change.positions(here), change.axes(here)))
+
+
+def _moved(point: Kgcp, position_map: FloatArray, axes: FloatArray) -> Kgcp:
+    return replace(
+        point,
+        position_map=position_map,
+        cov_m2=None if point.cov_m2 is None else axes @ point.cov_m2 @ axes.T,
+        common_m=None if point.common_m is None else axes @ point.common_m,
+    )

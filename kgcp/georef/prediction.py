@@ -1,0 +1,178 @@
+"""Where a target must be in frames in which it was not found.
+
+Two sources tell: the frames before and after, and reference poses with the target's place. Either
+is believed as far as it has proved itself on the frames in which the target was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import Views, visible_pixel
+from kgcp.georef.target_positions import Place, Whereabouts
+from kgcp.measurement.guided import Expectation
+from kgcp.measurement.records import Observation
+from kgcp.targets.layout import Target
+
+_MIN_FOUND = 4  # frames that a reference must have proved itself on
+_MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
+_MEDIAN_OF_1D = 0.6745  # of the absolute value
+_FLOOR_PX, _FLOOR_LOG = 0.5, 0.02  # what no prediction is better than
+_TRIPLES = 8  # of neighbours, nearest in time, that tell how the target moves
+_MIN_TRIPLES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One target through the frames of a flight, n of them in their order.
+
+    Attributes
+    ----------
+    time_s : (n,) array
+        Mid-exposures [s]; NaN: not known.
+    state : (n, 3) array
+        Centre x, y [px] and logarithm of the radius [px]; NaN: not found.
+    """
+
+    time_s: FloatArray
+    state: FloatArray
+
+    @property
+    def is_found(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Say for each frame whether the target was found (n,)."""
+        return np.asarray(np.isfinite(self.state[:, 0]))
+
+
+def state_of(observation: Observation) -> FloatArray:
+    """Return centre [px] and logarithm of the radius [px] of an observation (3,)."""
+    return np.append(observation.centre_px, np.log(observation.appearance.radius_px))
+
+
+def expect(track: Track, by_reference: FloatArray | None) -> list[Expectation | None]:
+    """Return what is expected of the frames (n,) in which a target was not found.
+
+    Parameters
+    ----------
+    track : Track
+    by_reference : (n, 3) array or None
+        States by `reference_states`.
+
+    Returns
+    -------
+    list of Expectation or None
+        The surer one of the two sources; None where neither tells, and where it was found.
+    """
+    sources = [expect_between(track)]
+    if by_reference is not None:
+        sources.append(expect_by_reference(track, by_reference))
+    return [
+        min(
+            (one for one in options if one is not None and not found),
+            key=lambda one: one.sd_px,
+            default=None,
+        )
+        for found, options in zip(track.is_found, zip(*sources, strict=True), strict=True)
+    ]
+
+
+def expect_by_reference(track: Track, predicted: FloatArray) -> list[Expectation | None]:
+    """Turn states (n, 3) by the reference into expectations.
+
+    Their deviations are those of the frames in which the target was found, by medians, so that a
+    wrong frame does no harm; a bias counts as deviation. Nothing is expected where fewer than four
+    frames tell, or where most are off by more than a radius.
+    """
+    error = (track.state - predicted)[np.isfinite(track.state + predicted).all(axis=1)]
+    if len(error) < _MIN_FOUND:
+        return [None] * len(predicted)
+    off_px = np.hypot(error[:, 0], error[:, 1])
+    if np.median(off_px / np.exp(np.nanmedian(track.state[:, 2]))) > 1.0:
+        return [None] * len(predicted)
+    sd_px = max(float(np.median(off_px)) / _MEDIAN_OF_2D, _FLOOR_PX)
+    sd_log = max(float(np.median(np.abs(error[:, 2]))) / _MEDIAN_OF_1D, _FLOOR_LOG)
+    return [
+        Expectation(state[:2], sd_px, float(np.exp(state[2])), sd_log, "the reference")
+        if np.isfinite(state).all()
+        else None
+        for state in predicted
+    ]
+
+
+def expect_between(track: Track) -> list[Expectation | None]:
+    """Interpolate between the found frames before and after.
+
+    The target moves on a straight line with an unknown acceleration α, so that at a time τ between
+    a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
+    triples of found frames, of which each predicts its middle one.
+    """
+    nothing: list[Expectation | None] = [None] * len(track.time_s)
+    found = np.flatnonzero(track.is_found & np.isfinite(track.time_s))
+    found = found[np.unique(track.time_s[found], return_index=True)[1]]
+    time, state = track.time_s[found], track.state[found]
+    if len(time) < _MIN_TRIPLES + 2:
+        return nothing
+    middle, lever = _between(time[1:-1], time[:-2], time[2:], state[:-2], state[2:])
+    acceleration2 = ((state[1:-1] - middle) / lever[:, None]) ** 2
+    for index in np.flatnonzero(~track.is_found & np.isfinite(track.time_s)):
+        now = track.time_s[index]
+        after = int(np.searchsorted(time, now))
+        if not 0 < after < len(time) or now == time[after]:
+            continue
+        ends = slice(after - 1, after), slice(after, after + 1)
+        here, arm = _between(
+            track.time_s[index, None], *(time[i] for i in ends), *(state[i] for i in ends)
+        )
+        near = np.argsort(np.abs(time[1:-1] - now), kind="stable")[:_TRIPLES]
+        sd = arm[0] * np.sqrt(acceleration2[near].mean(axis=0))
+        nothing[index] = Expectation(
+            here[0, :2],
+            float(np.hypot(np.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)), _FLOOR_PX)),
+            float(np.exp(here[0, 2])),
+            float(np.hypot(sd[2], _FLOOR_LOG)),
+            "its neighbours",
+        )
+    return nothing
+
+
+def _between(
+    now: FloatArray, before: FloatArray, after: FloatArray, start: FloatArray, end: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return states (m, 3) on the line between two, and what an acceleration is to be times."""
+    share = (now - before) / (after - before)
+    return start + share[:, None] * (end - start), 0.5 * (now - before) * (after - now)
+
+
+def reference_states(
+    frames: Sequence[str],
+    time_s: Sequence[float | None],
+    target: Target,
+    poses: ReferencePoses,
+    whereabouts: Whereabouts,
+    camera: Camera,
+) -> FloatArray:
+    """Return the states (n, 3) that reference poses give a target; NaN where it cannot be said.
+
+    Raises
+    ------
+    KgcpError
+        As `Whereabouts.places`.
+    """
+    rows: Mapping[str, int] = {frame: row for row, frame in enumerate(poses.frames)}
+    views = Views.of(poses, whereabouts.frame)
+    states = np.full((len(frames), 3), np.nan)
+    posed = [index for index, frame in enumerate(frames) if frame in rows]
+    places = whereabouts.places([target.name] * len(posed), [time_s[index] for index in posed])
+    for index, place in zip(posed, places, strict=True):
+        if isinstance(place, Place):
+            row = rows[frames[index]]
+            sight = place.position_m - views.centre_m[row]
+            radius_px = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
+            states[index, :2] = visible_pixel(camera, sight @ views.enu_from_camera[row])
+            states[index, 2] = np.log(radius_px / np.linalg.norm(sight))
+    return states

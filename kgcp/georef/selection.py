@@ -1,0 +1,223 @@
+"""Which points to hand over: good enough, far enough apart, fitting a smooth flight."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.georef.crs import MapFrame
+from kgcp.georef.gcp import Flag, Kgcp, Omission, Skip
+from kgcp.georef.jumps import find_jumps
+from kgcp.georef.sighting import Sighting
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What points must be to be handed over; None: whatever.
+
+    Attributes
+    ----------
+    max_sd_m : float or None
+        Longest semi-axis of the position's standard ellipsoid [m].
+    min_score, min_ambiguity : float or None
+        As the columns of the detections.
+    min_spacing_m : float
+        Least distance along the track [m].
+    checkpoint_share : float
+        Share of the points that are to check, 0 … 1.
+    keep_flagged : bool
+        Whether points that do not fit a smooth flight stay.
+    """
+
+    max_sd_m: float | None = None
+    min_score: float | None = None
+    min_ambiguity: float | None = None
+    min_spacing_m: float = 0.0
+    checkpoint_share: float = 0.0
+    keep_flagged: bool = False
+
+
+def select(
+    kgcps: Sequence[Kgcp],
+    sightings: Sequence[Sighting],
+    frame: MapFrame,
+    camera: Camera,
+    wanted: Selection,
+) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    """Return the points to hand over, flagged and with their roles, and those left out.
+
+    Parameters
+    ----------
+    kgcps : sequence of Kgcp
+    sightings : sequence of Sighting
+        In which they were seen.
+    frame : MapFrame
+        Of the points' positions.
+    camera : Camera
+    wanted : Selection
+    """
+    good, faulty = pass_gates(flag_jumps(kgcps, sightings, frame), wanted)
+    spaced, close = thin(good, frame, camera, wanted.min_spacing_m)
+    return set_checkpoints(spaced, frame, wanted.checkpoint_share), (*faulty, *close)
+
+
+def flag_jumps(
+    kgcps: Sequence[Kgcp], sightings: Sequence[Sighting], frame: MapFrame
+) -> tuple[Kgcp, ...]:
+    """Flag points whose distance, or camera height, jumps out of a smooth flight.
+
+    Both follow parabolas over some frames: the distance between camera and target, and the
+    camera's height above the map, which is the point's plus that above the plate. The plate's
+    normal carries the latter, so that a camera under any tilt will do.
+
+    Parameters
+    ----------
+    kgcps : sequence of Kgcp
+        Those of static targets are passed over.
+    sightings : sequence of Sighting
+        In which they were seen.
+    frame : MapFrame
+        Of the points' positions.
+    """
+    seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
+    moving = [index for index, point in enumerate(kgcps) if _moves(point)]
+    order = sorted(moving, key=lambda index: kgcps[index].time_s or 0.0)
+    if not order:
+        return tuple(kgcps)
+    times = np.array([kgcps[index].time_s for index in order], dtype=np.float64)
+    ups = frame.enu_from_map(np.array([kgcps[index].position_map for index in order]))[:, 2]
+    sights = [seen[kgcps[index].frame, kgcps[index].target] for index in order]
+    series = {
+        Flag.DISTANCE: np.array([(one.distance_m, one.sd_distance_m or 0.0) for one in sights]),
+        Flag.HEIGHT: np.array([_height(*pair) for pair in zip(sights, ups, strict=True)]),
+    }
+    flagged = list(kgcps)
+    for flag, values in series.items():
+        known = np.flatnonzero(np.isfinite(values).all(axis=1))
+        for place in known[find_jumps(times[known], *values[known].T)]:
+            if flagged[order[place]].flag is None:
+                flagged[order[place]] = replace(flagged[order[place]], flag=flag)
+    return tuple(flagged)
+
+
+def _height(seen: Sighting, up_m: float) -> tuple[float, float]:
+    """Return the camera's height and its standard deviation [m]; NaN without a pose.
+
+    h = n·t with the plate's normal n = R e_z: dh = n·dt + (n × t)·dδ for a left rotation δ.
+    """
+    if seen.pose is None or seen.pose_cov is None:
+        return np.nan, np.nan
+    normal, sight = seen.pose.normal, seen.pose.translation_m
+    effect = np.concatenate((normal, np.cross(normal, sight)))
+    return up_m + float(normal @ sight), float(np.sqrt(effect @ seen.pose_cov @ effect))
+
+
+def pass_gates(
+    kgcps: Sequence[Kgcp], gates: Selection
+) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    """Return the points that are good enough, and the others with what they failed on.
+
+    A value that is not known does not pass the gate that asks for it.
+    """
+    kept, skipped = [], []
+    for point in kgcps:
+        fault = _fault(point, gates)
+        if fault is None:
+            kept.append(point)
+        else:
+            skipped.append(Skip(point.frame, point.target, fault))
+    return tuple(kept), tuple(skipped)
+
+
+def _fault(point: Kgcp, gates: Selection) -> Omission | None:
+    if point.flag is not None and not gates.keep_flagged:
+        return Omission(point.flag.value)
+    if gates.max_sd_m is not None and not longest_semi_axis(point.cov_m2) <= gates.max_sd_m:
+        return Omission.UNCERTAIN
+    if gates.min_score is not None and not _or_nan(point.score) >= gates.min_score:
+        return Omission.LOW_SCORE
+    if gates.min_ambiguity is not None and not _or_nan(point.ambiguity) >= gates.min_ambiguity:
+        return Omission.AMBIGUOUS
+    return None
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def longest_semi_axis(cov: FloatArray | None) -> float:
+    """Return the longest semi-axis of a standard ellipsoid; NaN where it is not known."""
+    return np.nan if cov is None else float(np.sqrt(np.linalg.eigvalsh(cov)[-1]))
+
+
+def thin(
+    kgcps: Sequence[Kgcp], frame: MapFrame, camera: Camera, min_spacing_m: float
+) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    """Keep points at least `min_spacing_m` apart along the track, of near ones the best.
+
+    The best has the least variance on the ground, of position and image point. Along the track
+    means along the way: a second pass over the same road has points of its own.
+    """
+    along = tracks_m(kgcps, frame)
+    by_quality = sorted(along, key=lambda index: (_sd_on_ground(kgcps[index], camera), index))
+    taken: list[float] = []
+    dropped = set()
+    for index in by_quality:
+        place = bisect.bisect(taken, along[index])
+        beside = taken[max(0, place - 1) : place + 1]
+        if any(abs(other - along[index]) < min_spacing_m for other in beside):
+            dropped.add(index)
+        else:
+            taken.insert(place, along[index])
+    kept = tuple(point for index, point in enumerate(kgcps) if index not in dropped)
+    lost = (kgcps[index] for index in sorted(dropped))
+    return kept, tuple(Skip(point.frame, point.target, Omission.CLOSE) for point in lost)
+
+
+def _sd_on_ground(point: Kgcp, camera: Camera) -> float:
+    of_image = longest_semi_axis(point.centre_cov_px2) * point.distance_m / camera.mean_focal_px
+    return float(np.nan_to_num(np.hypot(longest_semi_axis(point.cov_m2), of_image), nan=np.inf))
+
+
+def tracks_m(kgcps: Sequence[Kgcp], frame: MapFrame) -> Mapping[int, float]:
+    """Return for each moving point, by its index, how far along the vehicle's way it lies [m]."""
+    order = sorted(
+        (index for index, point in enumerate(kgcps) if _moves(point)),
+        key=lambda index: (kgcps[index].time_s or 0.0, index),
+    )
+    if not order:
+        return {}
+    enu = frame.enu_from_map(np.array([kgcps[index].position_map for index in order]))
+    steps = np.linalg.norm(np.diff(enu, axis=0), axis=1)
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    return dict(zip(order, along.tolist(), strict=True))
+
+
+def set_checkpoints(kgcps: Sequence[Kgcp], frame: MapFrame, share: float) -> tuple[Kgcp, ...]:
+    """Make a share of the moving points check points, evenly along the track.
+
+    They lie in the middle of as many equal pieces of the way; its first and last point, beyond
+    which nothing controls, stay control points.
+    """
+    along = tracks_m(kgcps, frame)
+    inner = sorted(along, key=along.__getitem__)[1:-1]
+    count = min(round(share * len(along)), len(inner))
+    if not count:
+        return tuple(kgcps)
+    length = max(along.values())
+    free = np.array([along[index] for index in inner])
+    chosen = set()
+    for piece in range(count):
+        nearest = int(np.argmin(np.abs(free - (piece + 0.5) / count * length)))
+        chosen.add(inner[nearest])
+        free[nearest] = np.inf
+    return tuple(replace(point, is_checkpoint=index in chosen) for index, point in enumerate(kgcps))
+
+
+def _moves(point: Kgcp) -> bool:
+    return point.common_m is not None and point.time_s is not None

@@ -1,0 +1,292 @@
+"""Where a target was at some time: carried by the vehicle, or standing still."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Self
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import MapFrame
+from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
+from kgcp.settings import VehicleSettings
+from kgcp.targets.layout import Target
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ride:
+    """How the vehicle moved while it carried a target to its place.
+
+    Attributes
+    ----------
+    velocity_m_s : (3,) array
+        Of the target's centre, in the ENU frame [m/s].
+    frame_from_body : (3, 3) array
+        The vehicle's body axes in the ENU frame, as columns.
+    """
+
+    velocity_m_s: FloatArray
+    frame_from_body: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where the centre of a target was.
+
+    Attributes
+    ----------
+    position_m : (3,) array
+        In the ENU frame [m].
+    cov_m2 : (3, 3) array or None
+        Covariance in ENU axes [m²]; None where the trajectory has no standard deviations.
+    common_m : (3, 4) array or None
+        How one standard deviation of lever arm x, y, z and of the synchronisation moves the
+        place, ENU axes, as columns [m]. These four errors are the same in all frames; between
+        the places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
+    ride : Ride or None
+        None: the target stands still.
+    """
+
+    position_m: FloatArray
+    cov_m2: FloatArray | None
+    common_m: FloatArray | None = None
+    ride: Ride | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carrier:
+    """The vehicle that carries the target.
+
+    Attributes
+    ----------
+    motion : Motion
+        Its trajectory in the ENU frame of `frame`.
+    settings : VehicleSettings
+        Lever arm, time offset and their standard deviations.
+    frame : MapFrame
+    """
+
+    motion: Motion
+    settings: VehicleSettings
+    frame: MapFrame
+
+    @classmethod
+    def on(cls, trajectory: Trajectory, settings: VehicleSettings, frame: MapFrame) -> Self:
+        """Bring a trajectory from the map into the ENU frame."""
+        position = frame.enu_from_map(trajectory.position_map)
+        frame_from_ned = frame.level_rotations(position) @ ENU_FROM_NED
+        motion = Motion(
+            time_s=trajectory.time_s,
+            position_m=position,
+            frame_from_body=frame_from_ned @ body_to_ned(*trajectory.attitude_deg.T),
+            sd_position_m=trajectory.sd_position_m,
+            sd_attitude_deg=trajectory.sd_attitude_deg,
+            cov_position_m2=trajectory.cov_position_m2,
+        )
+        return cls(motion, settings, frame)
+
+    def coverage(self, time_s: FloatArray) -> list[Coverage]:
+        """Return for frame times (n,) whether the trajectory covers them."""
+        return self.motion.coverage(time_s + self.settings.time_offset_s)
+
+    def places(self, time_s: FloatArray) -> list[Place]:
+        """Return the target's places at frame times (n,) that the trajectory covers.
+
+        position = trajectory point + R(frame ← body) · lever arm. The covariance adds up, with
+        first-order propagation: trajectory, attitude times lever arm, lever arm, and the target's
+        velocity times the synchronisation. Attitude deviations that the file lacks count as zero.
+        """
+        states = self.motion.states(time_s + self.settings.time_offset_s)
+        lever = states.frame_from_body @ np.array(self.settings.lever_arm_m)
+        velocity = states.velocity_m_s + np.cross(states.angular_velocity_rad_s, lever)
+        common = self._common_effects(states.frame_from_body, velocity)
+        cov: Sequence[FloatArray | None] = [None] * len(time_s)
+        if states.sd_position_m is not None:
+            own = self._trajectory_cov(states, states.sd_position_m)
+            own = own + self._attitude_cov(states, lever)
+            cov = list(own + common @ np.swapaxes(common, 1, 2))
+        rides = map(Ride, velocity, states.frame_from_body)
+        return list(map(Place, states.position_m + lever, cov, common, rides))
+
+    def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
+        """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
+        axes = self.frame.grid_rotation(states.position_m)
+        if states.cov_position_m2 is None:
+            return _spread(axes, sd_position_m)
+        turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
+        return turned
+
+    def _attitude_cov(self, states: States, lever: FloatArray) -> FloatArray:
+        """Return the share (n, 3, 3) of attitude times lever arm."""
+        if states.sd_attitude_deg is None:
+            return np.zeros_like(states.frame_from_body)
+        up = self.frame.level_rotations(states.position_m)[:, :, 2]
+        axes = _attitude_axes(states.frame_from_body, -up)
+        effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
+        return _spread(effects, np.radians(states.sd_attitude_deg))
+
+    def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
+        """Return what `Place.common_m` holds, (n, 3, 4)."""
+        arm = frame_from_body * np.array(self.settings.sd_lever_arm_m)
+        shift = velocity_m_s * self.settings.sd_time_s
+        return np.concatenate((arm, shift[:, :, None]), axis=2)
+
+
+class Absence(StrEnum):
+    """Why it is not known where a target was."""
+
+    NO_TIME = "no_time"
+    BEFORE_TRAJECTORY = Coverage.BEFORE.value
+    AFTER_TRAJECTORY = Coverage.AFTER.value
+    IN_TRAJECTORY_GAP = Coverage.GAP.value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Whereabouts:
+    """Where each target of a flight was at any time.
+
+    Attributes
+    ----------
+    frame : MapFrame
+        The flight's map, and the ENU frame of all places.
+    static : mapping of str to Place
+        Targets that stand still, by name.
+    carrier : Carrier or None
+        The vehicle that carries the other one.
+    """
+
+    frame: MapFrame
+    static: Mapping[str, Place]
+    carrier: Carrier | None
+
+    @classmethod
+    def of(
+        cls,
+        crs: str,
+        targets: Sequence[Target],
+        trajectory: Trajectory | None,
+        settings: VehicleSettings,
+    ) -> Self:
+        """Prepare the flight's targets, in an ENU frame over the first position that is known.
+
+        Raises
+        ------
+        KgcpError
+            If no target has a position, of its own or by a trajectory, or the CRS is unusable.
+        """
+        known = [np.array(target.position_m) for target in targets if target.position_m is not None]
+        if trajectory is not None:
+            known.insert(0, trajectory.position_map[0])
+        if not known:
+            raise KgcpError(
+                "flight.toml: no target has a position; give a [vehicle] with a trajectory,"
+                " or position_m in [[target]]"
+            )
+        frame = MapFrame.at(crs, known[0])
+        carrier = None if trajectory is None else Carrier.on(trajectory, settings, frame)
+        return cls(frame, _static_places(targets, frame), carrier)
+
+    def places(
+        self, targets: Sequence[str], time_s: Sequence[float | None]
+    ) -> list[Place | Absence]:
+        """Return the place of each named target at its time (Unix UTC, frames' clock) [s].
+
+        Raises
+        ------
+        KgcpError
+            If a moving target has no vehicle, two targets would ride on its one lever arm, no
+            frame has a time, or none of the times lies within the trajectory.
+        """
+        found: list[Place | Absence] = [
+            self.static.get(target, Absence.NO_TIME) for target in targets
+        ]
+        moving = [index for index, target in enumerate(targets) if target not in self.static]
+        if not moving:
+            return found
+        carrier = self._carrier_of(sorted({targets[index] for index in moving}))
+        timed = [(index, time) for index in moving if (time := time_s[index]) is not None]
+        if not timed:
+            raise KgcpError(
+                "no frame has a time; give [frames] times = 'frames.csv' in flight.toml and run"
+                " 'kgcp detect' again"
+            )
+        indices = np.array([index for index, _ in timed])
+        for index, place in zip(indices, _ride(carrier, [t for _, t in timed]), strict=True):
+            found[index] = place
+        return found
+
+    def _carrier_of(self, moving: Sequence[str]) -> Carrier:
+        names = " and ".join(repr(name) for name in moving)
+        if self.carrier is None:
+            raise KgcpError(
+                f"flight.toml: target {names} has no position; give a [vehicle] with a trajectory,"
+                " or position_m in its [[target]]"
+            )
+        if len(moving) > 1:
+            raise KgcpError(
+                f"flight.toml: targets {names} share one lever_arm_m; give position_m to those"
+                " that stand still and leave out those that are not to be used"
+            )
+        return self.carrier
+
+
+def _ride(carrier: Carrier, time_s: Sequence[float]) -> list[Place | Absence]:
+    """Return the carrier's places at frame times, or why there is none."""
+    times = np.array(time_s)
+    coverage = carrier.coverage(times)
+    inside = np.array([kind is Coverage.INSIDE for kind in coverage])
+    if not inside.any():
+        raise KgcpError(_no_overlap(carrier, times))
+    places = iter(carrier.places(times[inside]))
+    return [next(places) if kind is Coverage.INSIDE else Absence(kind.value) for kind in coverage]
+
+
+def _no_overlap(carrier: Carrier, time_s: FloatArray) -> str:
+    covered, gap_s = carrier.motion.time_s, carrier.motion.max_gap_s
+    return (
+        f"none of the {len(time_s)} frames with the target lies within the vehicle's trajectory:"
+        f" frames {_utc(time_s.min())} to {_utc(time_s.max())}, time_offset_s ="
+        f" {carrier.settings.time_offset_s:g}, trajectory {_utc(covered[0])} to"
+        f" {_utc(covered[-1])} without gaps over {gap_s:g} s; correct [vehicle] time_offset_s in"
+        " flight.toml (GPS time is 18 s ahead of UTC) or give the trajectory of this flight"
+    )
+
+
+def _utc(unix_s: float) -> str:
+    moment = datetime.fromtimestamp(unix_s, UTC).replace(tzinfo=None)
+    return f"{moment.isoformat(timespec='milliseconds')}Z"
+
+
+def _static_places(targets: Sequence[Target], frame: MapFrame) -> dict[str, Place]:
+    places = {}
+    for target in targets:
+        if target.position_m is not None:
+            position = frame.enu_from_map(np.array([target.position_m]))[0]
+            axes = frame.grid_rotation(position)
+            cov = _spread(axes, np.array(target.sd_position_m))
+            places[target.name] = Place(position, cov)
+    return places
+
+
+def _attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:
+    """Return the axes (n, 3, 3) about which roll, pitch and heading turn the body, as columns.
+
+    Roll turns about the body's x, heading about the vertical, pitch about the horizontal axis
+    that is square to both.
+    """
+    forward = frame_from_body[:, :, 0]
+    right = np.cross(down, forward)
+    right = right / np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack((forward, right, down), axis=-1)
+
+
+def _spread(columns: FloatArray, deviations: FloatArray) -> FloatArray:
+    """Return A diag(σ²) Aᵀ for matrices A (..., 3, 3) and deviations σ (..., 3)."""
+    scaled = columns * deviations[..., None, :]
+    product: FloatArray = scaled @ np.swapaxes(scaled, -1, -2)
+    return product

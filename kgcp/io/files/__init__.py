@@ -1,0 +1,1 @@
+"""What all readers and writers stand on: safe reading, atomic writing, locks, times."""

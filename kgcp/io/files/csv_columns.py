@@ -1,0 +1,142 @@
+"""Comma-separated files whose columns are known by name: one text key and numbers."""
+
+from __future__ import annotations
+
+import csv
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.safe_read import is_sound, read_lines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvColumns:
+    """The wanted columns of one file, row by row.
+
+    Attributes
+    ----------
+    path : Path
+        Where they come from.
+    lines : tuple of int
+        Line of each row in the file, from 1.
+    keys : tuple of str
+        The key column.
+    names : tuple of str
+        Names of the number columns that the file has.
+    numbers : (n, len(names)) array
+        Their values, all finite.
+    """
+
+    path: Path
+    lines: tuple[int, ...]
+    keys: tuple[str, ...]
+    names: tuple[str, ...]
+    numbers: FloatArray
+
+    def block(self, names: Sequence[str]) -> FloatArray:
+        """Return columns (n, len(names)) by name."""
+        return self.numbers[:, [self.names.index(name) for name in names]]
+
+    def deviations(self, names: Sequence[str]) -> FloatArray | None:
+        """Return optional columns of standard deviations; None if the file has none of them."""
+        present = [name for name in names if name in self.names]
+        if not present:
+            return None
+        absent = [name for name in names if name not in self.names]
+        if absent:
+            raise KgcpError(
+                f"{self.path}, line 1: has {', '.join(present)} but not {', '.join(absent)};"
+                " give all of them or none"
+            )
+        block = self.block(names)
+        negative = np.argwhere(block < 0.0)
+        if negative.size:
+            row, column = negative[0]
+            raise KgcpError(
+                f"{self.path}, line {self.lines[row]}: {names[column]} is"
+                f" {block[row, column]:g}; a standard deviation is not negative"
+            )
+        return block
+
+
+def read_csv_columns(
+    path: Path, key: str, required: Sequence[str], optional: Sequence[str], toml_key: str
+) -> CsvColumns:
+    """Read one text column and number columns, in any order; other columns are ignored.
+
+    Parameters
+    ----------
+    path : Path
+        The file: comma-separated, UTF-8, first line names the columns.
+    key : str
+        Name of the text column.
+    required, optional : sequence of str
+        Names of number columns.
+    toml_key : str
+        Where flight.toml names the file, for the message if it is missing.
+
+    Raises
+    ------
+    KgcpError
+        With the line: missing file or column, a cell that is not a finite number, a short row.
+    """
+    rows = _read_rows(path, toml_key)
+    first = next(rows, None)
+    if first is None:
+        raise KgcpError(f"{path}: is empty; its first line names the columns {key}, …")
+    header = [name.strip() for name in first[1]]
+    _check_header(header, (key, *required), f"{path}, line {first[0]}")
+    names = tuple(name for name in (*required, *optional) if name in header)
+    places, key_place = [header.index(name) for name in names], header.index(key)
+    lines, keys, numbers = [], [], array("d")
+    for line, cells in rows:
+        if len(cells) != len(header):
+            raise KgcpError(
+                f"{path}, line {line}: has {len(cells)} cells, the first line has {len(header)};"
+                " repair the line"
+            )
+        lines.append(line)
+        keys.append(cells[key_place].strip())
+        numbers.extend(
+            _number(cells[place], f"{path}, line {line}: {name}")
+            for place, name in zip(places, names, strict=True)
+        )
+    block = np.array(numbers).reshape(len(lines), len(names))
+    return CsvColumns(path, tuple(lines), tuple(keys), names, block)
+
+
+def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> None:
+    lacking = [name for name in wanted if name not in header]
+    if lacking:
+        raise KgcpError(
+            f"{where}: lacks the columns {', '.join(lacking)};"
+            f" the first line must name {', '.join(wanted)}"
+        )
+    doubled = sorted({name for name in header if name and header.count(name) > 1})
+    if doubled:
+        raise KgcpError(f"{where}: names {doubled[0]} twice; keep one of them")
+
+
+def _read_rows(path: Path, toml_key: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows that are not blank, with their line numbers."""
+    reader = csv.reader(read_lines(path, toml_key))
+    try:
+        yield from ((reader.line_num, cells) for cells in reader if any(map(str.strip, cells)))
+    except csv.Error as error:
+        raise KgcpError(f"{path}: is not a readable CSV file ({error}); repair it") from error
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not is_sound(value):
+        raise KgcpError(f"{where} is {text.strip()!r}; give a finite number")
+    return value

@@ -1,0 +1,1 @@
+"""The flight folder: flight.toml and the files that it names."""

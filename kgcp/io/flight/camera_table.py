@@ -1,0 +1,119 @@
+"""The [camera] table of flight.toml: the camera, how well it is calibrated, and how it hangs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
+from kgcp.geometry.camera import Camera, Response, TimeReference
+from kgcp.io.flight.toml_table import TomlTable
+from kgcp.settings import require_range
+
+_NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
+DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
+CAMERA_KEYS = (
+    "file",
+    "format",
+    "camera",
+    "width",
+    "height",
+    *CALIBRATION_PARAMETERS,
+    *DEVIATION_KEYS,
+    "cov_of",
+    "cov",
+    "plumb_sd_deg",
+    "response",
+    "readout_s",
+    "time_reference",
+)
+
+
+def read_camera(table: TomlTable, folder: Path) -> Camera:
+    """Return the camera, from the table or the calibration file that it names.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    response = table.choice("response", tuple(Response)) if "response" in table else "unknown"
+    readout_s = table.number("readout_s", 0.0)
+    moment = "middle"
+    if "time_reference" in table:
+        moment = table.choice("time_reference", tuple(TimeReference))
+    camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
+    with table.located():
+        return replace(
+            camera,
+            response=Response(response),
+            readout_s=readout_s,
+            time_reference=TimeReference(moment),
+        )
+
+
+def _inline_camera(table: TomlTable) -> Camera:
+    from kgcp.io.formats.calibrations.entry import camera_of
+
+    for key in ("format", "camera"):
+        if key in table:
+            raise table.error(key, "stands without a file", "give file, too, or delete it")
+    width, height = table.integer("width"), table.integer("height")
+    values = {
+        key: table.number(key, None if key in _NEEDED else 0.0) for key in CALIBRATION_PARAMETERS
+    }
+    with table.located():
+        return camera_of(width, height, values)
+
+
+def _file_camera(table: TomlTable, folder: Path) -> Camera:
+    from kgcp.io.formats.calibrations import FORMATS, read_calibration
+
+    for key in CALIBRATION_PARAMETERS:
+        if key in table:
+            raise table.error(key, "stands beside a calibration file", "delete one of the two")
+    width = table.integer("width") if "width" in table else None
+    height = table.integer("height") if "height" in table else None
+    form = table.choice("format", tuple(FORMATS)) if "format" in table else None
+    camera = table.text("camera") if "camera" in table else None
+    return read_calibration(table.existing_file("file", folder), (width, height), form, camera)
+
+
+def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | None:
+    """Return how well the camera is calibrated; None where the table says nothing about it.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy: for negative deviations, a matrix that is no covariance, or
+        both of them.
+    """
+    deviations = [key for key in DEVIATION_KEYS if key in table]
+    if "cov" in table or "cov_of" in table:
+        if deviations:
+            raise table.error(deviations[0], "stands beside cov", "delete one of the two")
+        numbers, names = np.array(table.numbers("cov")), table.texts("cov_of")
+        size = len(names)
+        cov = numbers.reshape(size, size) if numbers.size == size * size else numbers
+        with table.located():
+            return CalibrationCovariance.of(names, cov)
+    if not deviations:
+        return None
+    sd = np.array([table.number(key) for key in deviations])
+    with table.located():
+        for key, value in zip(deviations, sd, strict=True):
+            require_range(key, float(value), 0.0, 1e4)
+        names = tuple(key.removeprefix("sd_") for key in deviations)
+        return CalibrationCovariance.of(names, np.diag(sd**2))
+
+
+def read_plumb_sd_deg(table: TomlTable) -> float | None:
+    """Return how plumb the optical axis is [deg]; None where the table says nothing about it."""
+    if "plumb_sd_deg" not in table:
+        return None
+    sd_deg = table.number("plumb_sd_deg")
+    with table.located():
+        require_range("plumb_sd_deg", sd_deg, 0.0, 45.0, unit="deg")
+    return sd_deg

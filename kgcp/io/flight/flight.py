@@ -1,0 +1,231 @@
+"""The flight folder: flight.toml into validated records."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.safe_read import is_file, is_folder, read_bytes
+from kgcp.io.flight.camera_table import (
+    CAMERA_KEYS,
+    read_calibration_covariance,
+    read_camera,
+    read_plumb_sd_deg,
+)
+from kgcp.io.flight.target_table import read_targets
+from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.flight.vehicle_table import read_vehicle
+from kgcp.io.formats.frame_times import TimesFormat
+from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.trajectories.records import TrajectoryNotation
+from kgcp.settings import VehicleSettings
+from kgcp.targets.layout import Target
+
+REFERENCE_KEYS = ("poses", "format", "crs", "offset")
+
+FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
+FRAMES_KEYS = ("folder", "times", "times_format")
+_MOST_BYTES = 1 << 18
+# tomllib takes the square of the number of a key's parts.
+_LONG_KEY = re.compile(
+    r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')[ \t]*+\.[ \t]*+){50}"""
+)
+
+
+def read_reference(flight: TomlTable, folder: Path) -> tuple[Path | None, PoseNotation]:
+    """Return the file of the reference poses, if there is one, and how to understand it.
+
+    It is not looked for until a command needs it.
+
+    Raises
+    ------
+    KgcpError
+        If a key is unknown, missing or of the wrong type.
+    """
+    from kgcp.io.formats.orientations import FORMATS
+
+    if "reference" not in flight:
+        return None, PoseNotation()
+    table = flight.table("reference", REFERENCE_KEYS)
+    notation = PoseNotation(
+        form=table.choice("format", tuple(FORMATS)) if "format" in table else None,
+        crs=table.text("crs") if "crs" in table else None,
+        offset_file=table.existing_file("offset", folder) if "offset" in table else None,
+    )
+    return folder / table.text("poses"), notation
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One flight folder.
+
+    Attributes
+    ----------
+    folder : Path
+        Where flight.toml lies.
+    name : str
+        Of the flight; the folder's where flight.toml gives none.
+    crs : str or None
+        Coordinate reference system of vehicle, reference and static targets, for pyproj.
+    frames_folder : Path
+        Where the images lie.
+    times_file : Path or None
+        Frame times; None: EXIF says when.
+    times_format : TimesFormat or None
+        Of that file; None: its content tells.
+    camera : Camera
+    calibration_covariance : CalibrationCovariance or None
+        How well the camera is calibrated; None: flight.toml does not say.
+    plumb_sd_deg : float or None
+        Standard deviation of the camera's optical axis against the vertical, about either
+        horizontal axis, in frames without reference attitude [deg]; None: not known.
+    targets : tuple of Target
+        In the order of the file.
+    vehicle : VehicleSettings or None
+    trajectory_file : Path or None
+        Of the vehicle; it is not looked for until a command needs it.
+    trajectory_notation : TrajectoryNotation or None
+        How that file is to be understood.
+    reference_file : Path or None
+        Reference poses of the camera; it is not looked for until a command needs it.
+    reference_notation : PoseNotation
+        How that file is to be understood.
+    toml_text : str
+        flight.toml as it was read.
+    """
+
+    folder: Path
+    name: str
+    crs: str | None
+    frames_folder: Path
+    times_file: Path | None
+    times_format: TimesFormat | None
+    camera: Camera
+    calibration_covariance: CalibrationCovariance | None
+    plumb_sd_deg: float | None
+    targets: tuple[Target, ...]
+    vehicle: VehicleSettings | None
+    trajectory_file: Path | None
+    trajectory_notation: TrajectoryNotation | None
+    reference_file: Path | None
+    reference_notation: PoseNotation
+    toml_text: str
+
+
+def read_flight(folder: Path) -> Flight:
+    """Read and validate the flight.toml of a flight folder.
+
+    Raises
+    ------
+    KgcpError
+        In one line with file, table, key and remedy: if the file is missing or not TOML, a key
+        is unknown, missing or of the wrong type, a value impossible, or the frames' folder, the
+        times file or the calibration file does not exist.
+    """
+    table, text = _read_toml(folder / "flight.toml")
+    frames_folder, times_file, times_format = _read_frames(table, folder)
+    camera = table.table("camera", CAMERA_KEYS)
+    vehicle = read_vehicle(table, folder)
+    reference_file, reference_notation = read_reference(table, folder)
+    plumb_sd_deg = read_plumb_sd_deg(camera)
+    if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
+        raise camera.error(
+            "plumb_sd_deg", "stands without [vehicle] level_sd_deg", "give both or none"
+        )
+    return Flight(
+        folder=folder,
+        name=table.name("name") if "name" in table else _name_of(folder),
+        crs=table.text("crs") if "crs" in table else None,
+        frames_folder=frames_folder,
+        times_file=times_file,
+        times_format=times_format,
+        camera=read_camera(camera, folder),
+        calibration_covariance=read_calibration_covariance(camera),
+        plumb_sd_deg=plumb_sd_deg,
+        targets=read_targets(table),
+        vehicle=None if vehicle is None else vehicle.settings,
+        trajectory_file=None if vehicle is None else vehicle.trajectory_file,
+        trajectory_notation=None if vehicle is None else vehicle.notation,
+        reference_file=reference_file,
+        reference_notation=reference_notation,
+        toml_text=text,
+    )
+
+
+def read_printed_targets(folder: Path) -> tuple[Target, ...]:
+    """Read the targets alone: of a flight that has no frames yet, nor perhaps a camera.
+
+    Raises
+    ------
+    KgcpError
+        As `read_flight`, for what is wrong with the targets.
+    """
+    return read_targets(_read_toml(folder / "flight.toml")[0])
+
+
+def read_camera_and_targets(
+    folder: Path,
+) -> tuple[Camera, CalibrationCovariance | None, tuple[Target, ...]]:
+    """Read the camera, how well it is known, and the targets of a flight without frames yet.
+
+    Raises
+    ------
+    KgcpError
+        As `read_flight`, for what is wrong with them.
+    """
+    table, _ = _read_toml(folder / "flight.toml")
+    camera = table.table("camera", CAMERA_KEYS)
+    return read_camera(camera, folder), read_calibration_covariance(camera), read_targets(table)
+
+
+def _name_of(folder: Path) -> str:
+    """Return a folder's own name, as far as it is text."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
+
+
+def _read_toml(path: Path) -> tuple[TomlTable, str]:
+    """Return the whole file as a table, and as text."""
+    text = _read_text(path)
+    if _LONG_KEY.search(text):
+        raise KgcpError(f"{path}: has a key of very many parts; delete it")
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
+    except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
+        raise KgcpError(f"{path}: is not TOML that can be read ({error}); write it anew") from error
+    return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
+
+
+def _read_text(path: Path) -> str:
+    if not is_file(path):
+        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
+    data = read_bytes(path, "FLIGHT", _MOST_BYTES)
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
+
+
+def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, TimesFormat | None]:
+    """Return the frames' folder, the times file and its format, all but the last by default."""
+    table = flight.table("frames", FRAMES_KEYS, required=False)
+    name = table.text("folder") if "folder" in table else "frames"
+    if not is_folder(folder / name):
+        raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
+    default = folder / "frames.csv"
+    times = default if is_file(default) else None
+    if "times" in table:
+        times = table.existing_file("times", folder)
+    times_format = None
+    if "times_format" in table:
+        if times is None:
+            raise table.error("times_format", "stands without a file", "give times, too")
+        times_format = TimesFormat(table.choice("times_format", list(TimesFormat)))
+    return folder / name, times, times_format

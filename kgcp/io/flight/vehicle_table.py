@@ -1,0 +1,110 @@
+"""The [vehicle] table of flight.toml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp.io.files.gps_time import TimeSystem
+from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.formats.trajectories.records import TrajectoryFormat, TrajectoryNotation, Wander
+from kgcp.settings import VehicleSettings
+
+VEHICLE_KEYS = (
+    "trajectory",
+    "format",
+    "crs",
+    "time_system",
+    "date",
+    "accuracies",
+    "wander",
+    "attitude",
+    "sd_attitude_deg",
+    "lever_arm_m",
+    "sd_lever_arm_m",
+    "mount_deg",
+    "sd_time_s",
+    "time_offset_s",
+    "level_sd_deg",
+    "correlation_s",
+)
+_COURSE = "course"
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """The target's carrier.
+
+    Attributes
+    ----------
+    settings : VehicleSettings
+    trajectory_file : Path
+        It is not looked for until a command needs it.
+    notation : TrajectoryNotation
+        How the file is to be understood.
+    """
+
+    settings: VehicleSettings
+    trajectory_file: Path
+    notation: TrajectoryNotation
+
+
+def read_vehicle(flight: TomlTable, folder: Path) -> Vehicle | None:
+    """Read the table of the vehicle, if the flight has one.
+
+    Raises
+    ------
+    KgcpError
+        If a key is unknown, missing, of the wrong type or without its companion, or a value
+        impossible.
+    """
+    if "vehicle" not in flight:
+        return None
+    table = flight.table("vehicle", VEHICLE_KEYS)
+    with table.located():
+        settings = VehicleSettings(
+            lever_arm_m=table.vector("lever_arm_m"),  # a forgotten one would be metres
+            sd_lever_arm_m=table.vector("sd_lever_arm_m", (0.0, 0.0, 0.0)),
+            mount_deg=table.number("mount_deg", 0.0),
+            sd_time_s=table.number("sd_time_s", 0.0),
+            time_offset_s=table.number("time_offset_s", 0.0),
+            level_sd_deg=table.number("level_sd_deg") if "level_sd_deg" in table else None,
+            correlation_s=table.number("correlation_s", 60.0),
+        )
+    return Vehicle(settings, folder / table.text("trajectory"), _read_notation(table, folder))
+
+
+def _read_notation(table: TomlTable, folder: Path) -> TrajectoryNotation:
+    return TrajectoryNotation(
+        format=TrajectoryFormat(table.choice("format", list(TrajectoryFormat)))
+        if "format" in table
+        else None,
+        crs=table.text("crs") if "crs" in table else None,
+        time_system=TimeSystem(table.choice("time_system", list(TimeSystem)))
+        if "time_system" in table
+        else None,
+        first_day=table.day("date") if "date" in table else None,
+        accuracies_file=folder / table.text("accuracies") if "accuracies" in table else None,
+        wander=Wander(table.choice("wander", list(Wander))) if "wander" in table else None,
+        course_sd_deg=_read_course(table),
+    )
+
+
+def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
+    """Return the deviations of an attitude that is taken from the course, if it is."""
+    if ("attitude" in table) != ("sd_attitude_deg" in table):
+        absent = "sd_attitude_deg" if "attitude" in table else "attitude"
+        raise table.error(
+            absent,
+            "is missing",
+            'attitude = "course" and sd_attitude_deg = [roll, pitch, heading] stand together',
+        )
+    if "attitude" not in table:
+        return None
+    table.choice("attitude", [_COURSE])
+    deviations = table.vector("sd_attitude_deg")
+    if min(deviations) < 0.0 or max(deviations) > 180.0:
+        raise table.error(
+            "sd_attitude_deg", f"{list(deviations)} is out of range", "give values of 0 to 180 deg"
+        )
+    return deviations

@@ -1,0 +1,75 @@
+"""What a reader of calibrations returns: the cameras of a file, not yet converted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.sniff import ForeignFile
+
+CORNER_TO_CENTRE_PX = -0.5
+"""From pixels that count from the corner of the top-left one to those from its centre."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entry:
+    """One camera of a file.
+
+    Attributes
+    ----------
+    name : str
+        What `[camera] camera` calls it.
+    size : tuple of int or None
+        Width and height [px] that the file gives; None: it does not.
+    convert : callable
+        Makes the `Camera` for a width and height [px], or raises `KgcpError` where the model
+        cannot be represented exactly.
+    is_relative : bool
+        Whether the parameters are relative to the frame's size, so that they hold for any size
+        of the same shape.
+    """
+
+    name: str
+    size: tuple[int, int] | None
+    convert: Callable[[int, int], Camera]
+    is_relative: bool = False
+
+
+def camera_of(width: int, height: int, values: Mapping[str, float]) -> Camera:
+    """Return the `Camera` of its parameters by name; distortion that is not named is 0."""
+    return Camera(
+        width=width,
+        height=height,
+        fx=values["fx"],
+        fy=values["fy"],
+        cx=values["cx"],
+        cy=values["cy"],
+        k1=values.get("k1", 0.0),
+        k2=values.get("k2", 0.0),
+        p1=values.get("p1", 0.0),
+        p2=values.get("p2", 0.0),
+        k3=values.get("k3", 0.0),
+        k4=values.get("k4", 0.0),
+        k5=values.get("k5", 0.0),
+        k6=values.get("k6", 0.0),
+    )
+
+
+def unsupported(file: ForeignFile, where: str, term: str) -> KgcpError:
+    """Return the error for a model, or a term of it, that `Camera` cannot represent."""
+    return file.error(
+        where,
+        f"has {term}, which kgcp has not",
+        "calibrate with OpenCV's k1 k2 p1 p2 k3 or rational model",
+    )
+
+
+def refuse_terms(
+    file: ForeignFile, where: str, names: Sequence[str], values: Sequence[float]
+) -> None:
+    """Raise `KgcpError` for the first of these terms that is not zero."""
+    for name, value in zip(names, values, strict=True):
+        if value != 0.0:
+            raise unsupported(file, where, f"{name} = {value:g}")

@@ -1,0 +1,94 @@
+"""Cameras of OpenSfM and OpenDroneMap: cameras.json, camera_models(_overrides).json.
+
+By OpenSfM's geometry.rst and io.py: lengths are in units of the frame's longer side, so that they
+hold for the original frames where width and height are those of resized ones; the principal point
+counts from the frame's middle, ((w − 1)/2, (h − 1)/2) px from the centre of the top-left pixel;
+k1, k2, k3, p1, p2 are OpenCV's. A reconstruction.json holds such cameras, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.formats.calibrations.entry import Entry, camera_of, unsupported
+
+# Models → the distortion terms that they have.
+_TERMS = {
+    "perspective": ("k1", "k2"),
+    "simple_radial": ("k1",),
+    "radial": ("k1", "k2"),
+    "brown": ("k1", "k2", "p1", "p2", "k3"),
+}
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the content is an object of cameras with a projection_type, or a reconstruction."""
+    if isinstance(file.document, list):
+        return bool(file.document) and all(_has_cameras(item) for item in file.document)
+    if not isinstance(file.document, dict):
+        return False
+    values = list(file.document.values())
+    return bool(values) and all(isinstance(v, dict) and "projection_type" in v for v in values)
+
+
+def entries(file: ForeignFile) -> tuple[Entry, ...]:
+    """Return the cameras, named by their keys.
+
+    Raises
+    ------
+    KgcpError
+        If the file is no such JSON.
+    """
+    if isinstance(file.document, list):
+        parts = [JsonObject.of(file, f"[{i}]", v) for i, v in enumerate(file.document)]
+        groups = [part.child("cameras") for part in parts]
+    else:
+        groups = [JsonObject.of(file, "", file.document)]
+    found = {key: group.child(key) for group in groups for key in group.values}
+    return tuple(
+        Entry(name, _size(camera), _Normalised(camera).convert, is_relative=True)
+        for name, camera in found.items()
+    )
+
+
+def _has_cameras(item: object) -> bool:
+    return isinstance(item, dict) and "cameras" in item and "shots" in item
+
+
+def _size(camera: JsonObject) -> tuple[int, int] | None:
+    width, height = camera.number("width", 0.0), camera.number("height", 0.0)
+    return (int(width), int(height)) if width and height else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normalised:
+    """One camera, in units of the longer side of whatever frame it is for."""
+
+    camera: JsonObject
+
+    def convert(self, width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
+        camera = self.camera
+        model = camera.text("projection_type")
+        if model not in _TERMS:
+            raise unsupported(camera.file, camera.where, f"the projection_type {model!r}")
+        longer = max(width, height)
+        terms = {term: camera.number(term, 0.0) for term in _TERMS[model]}
+        x, y, cx, cy = self._matrix(model)
+        matrix = {
+            "fx": longer * x,
+            "fy": longer * y,
+            "cx": longer * cx + 0.5 * (width - 1),
+            "cy": longer * cy + 0.5 * (height - 1),
+        }
+        return camera_of(width, height, {**matrix, **terms})
+
+    def _matrix(self, model: str) -> tuple[float, float, float, float]:
+        camera = self.camera
+        if model == "perspective":
+            return camera.number("focal"), camera.number("focal"), 0.0, 0.0
+        focal_x = camera.number("focal_x")
+        focal_y = camera.number("focal_y", focal_x)  # files of ODM may lack it: one focal length
+        return focal_x, focal_y, camera.number("c_x"), camera.number("c_y")

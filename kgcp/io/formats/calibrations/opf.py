@@ -1,0 +1,72 @@
+"""The Open Photogrammetry Format: sensors of calibrated_cameras.json or input_cameras.json.
+
+By opf-spec: the principal point counts from the corner of the top-left pixel; radial R1 R2 R3 and
+tangential T1 T2 are OpenCV's k1 k2 k3 and p1 p2 (so Pix4D's own opf2colmap takes them).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.formats.calibrations.entry import CORNER_TO_CENTRE_PX, Entry, unsupported
+
+FILE_FORMATS = ("application/opf-calibrated-cameras+json", "application/opf-input-cameras+json")
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the content says that it is one of the two."""
+    return isinstance(file.document, dict) and file.document.get("format") in FILE_FORMATS
+
+
+def entries(file: ForeignFile) -> tuple[Entry, ...]:
+    """Return the sensors, named by their ids; only input cameras know the size of their images.
+
+    Raises
+    ------
+    KgcpError
+        If the file is no such JSON.
+    """
+    sensors = JsonObject.of(file, "", file.document).children("sensors")
+    return tuple(
+        Entry(sensor.text("id"), _size(sensor), _Sensor(sensor).convert) for sensor in sensors
+    )
+
+
+def _size(sensor: JsonObject) -> tuple[int, int] | None:
+    if "image_size_px" not in sensor:
+        return None
+    width, height = sensor.vector("image_size_px", 2)
+    return int(width), int(height)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sensor:
+    """One sensor."""
+
+    sensor: JsonObject
+
+    def convert(self, width: int, height: int) -> Camera:
+        """Return it as `Camera`."""
+        internals = self.sensor.child("internals")
+        model = internals.text("type")
+        if model != "perspective":
+            raise unsupported(internals.file, internals.where, f"the type {model!r}")
+        focal = internals.number("focal_length_px")
+        cx, cy = internals.vector("principal_point_px", 2)
+        k1, k2, k3 = internals.vector("radial_distortion", 3)
+        p1, p2 = internals.vector("tangential_distortion", 2)
+        return Camera(
+            width,
+            height,
+            focal,
+            focal,
+            cx + CORNER_TO_CENTRE_PX,
+            cy + CORNER_TO_CENTRE_PX,
+            k1=k1,
+            k2=k2,
+            p1=p1,
+            p2=p2,
+            k3=k3,
+        )

@@ -1,0 +1,121 @@
+"""Pix4D's calibrated_camera_parameters.txt and pix4d_calibrated_internal_camera_parameters.cam.
+
+Pixels count from the corner of the top-left one; radial and tangential coefficients are OpenCV's
+k1 k2 k3 and p1 p2. The text has a block of ten lines per image: name and size, camera matrix,
+radial, tangential, position, rotation. The .cam gives lengths in millimetres on a sensor whose
+size it states; the other .cam, of Inpho, has another model and is refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.calibrations.entry import CORNER_TO_CENTRE_PX, Entry, unsupported
+
+_TEXT_HEAD = re.compile(r"\s*fileName\s+imageWidth\s+imageHeight\b")
+_LAST_OF_HEAD = re.compile(r"camera model\b")
+_CAM_HEAD = re.compile(r"^[^\S\n]*Pix4D camera calibration file\s+(\S+)", re.MULTILINE)
+_SENSOR = re.compile(r"sensor width of\s+([\d.eE+-]+)\s*x\s*([\d.eE+-]+)\s*mm")
+_BLOCK_LINES = 10
+
+# fx fy cx cy k1 k2 k3 p1 p2
+_Parameters = tuple[float, ...]
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the content begins like one of the two."""
+    return _TEXT_HEAD.match(file.text) is not None or _CAM_HEAD.match(file.text) is not None
+
+
+def entries(file: ForeignFile) -> tuple[Entry, ...]:
+    """Return the cameras: of the text one per set of parameters, named by its first image.
+
+    Raises
+    ------
+    KgcpError
+        Naming the line or the block that is not as it should be.
+    """
+    if _CAM_HEAD.match(file.text):
+        blocks = _CAM_HEAD.split(file.text)[1:]
+        return tuple(
+            _mm_entry(file, name, block)
+            for name, block in zip(blocks[::2], blocks[1::2], strict=True)
+        )
+    return _image_entries(file)
+
+
+def _image_entries(file: ForeignFile) -> tuple[Entry, ...]:
+    head = next((i for i, (_, row) in enumerate(file.rows) if _LAST_OF_HEAD.match(row)), -1)
+    rows = file.rows[head + 1 :]
+    if head < 0 or not rows or len(rows) % _BLOCK_LINES:
+        raise file.error(
+            "", "is not made of blocks of ten lines per image", "export it from Pix4D again"
+        )
+    found: dict[tuple[tuple[int, int], _Parameters], str] = {}
+    for start in range(0, len(rows), _BLOCK_LINES):
+        name, size, parameters = _image_block(file, rows[start : start + _BLOCK_LINES])
+        found.setdefault((size, parameters), name)
+    return tuple(
+        Entry(name, size, _converter(*parameters)) for (size, parameters), name in found.items()
+    )
+
+
+def _image_block(
+    file: ForeignFile, rows: Sequence[tuple[int, str]]
+) -> tuple[str, tuple[int, int], _Parameters]:
+    """Return name, size [px], and fx fy cx cy k1 k2 k3 p1 p2 of one image."""
+    line, head = rows[0]
+    name, *size = head.rsplit(maxsplit=2)
+    width, height = file.numbers(" ".join(size), 2, f"line {line}")
+    counts = (3, 3, 3, 3, 2)
+    (fx, skew, cx), (_, fy, cy), _, radial, tangential = (
+        file.numbers(row, count, f"line {number}")
+        for count, (number, row) in zip(counts, rows[1:6], strict=True)
+    )
+    if skew:
+        raise unsupported(file, f"line {rows[1][0]}", f"a skew of {skew:g}")
+    return name, (int(width), int(height)), (fx, fy, cx, cy, *radial, *tangential)
+
+
+def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
+    where = f"camera {name!r}"
+    sensor = _SENSOR.search(block)
+    if sensor is None:
+        raise file.error(where, "does not say its sensor width", "export it from Pix4D again")
+    width_mm, height_mm = file.numbers(f"{sensor[1]} {sensor[2]}", 2, where)
+    if min(width_mm, height_mm) <= 0.0:
+        raise file.error(where, "has a sensor of no size", "export it from Pix4D again")
+    values = dict(re.findall(r"^[^\S\n]*([A-Z]\w*)[^\S\n]+(\S+)[^\S\n]*$", block, re.MULTILINE))
+
+    def number(key: str) -> float:
+        return file.numbers(values.get(key), 1, f"{where} {key}")[0]
+
+    def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
+        per_mm = width / width_mm
+        if abs(height - per_mm * height_mm) > 1.0:
+            raise file.error(
+                where,
+                f"has a sensor of {width_mm:g} x {height_mm:g} mm, which is not of the shape of"
+                f" {width} x {height} px",
+                "correct width and height in [camera]",
+            )
+        lengths = (number("F"), number("F"), number("Px"), number("Py"))
+        terms = (number("K1"), number("K2"), number("K3"), number("T1"), number("T2"))
+        return _converter(*(per_mm * length for length in lengths), *terms)(width, height)
+
+    return Entry(name, None, convert)
+
+
+def _converter(*parameters: float) -> Callable[[int, int], Camera]:
+    fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
+
+    def convert(width: int, height: int) -> Camera:
+        """Return it for frames of this size [px]."""
+        x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
+        return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+    return convert

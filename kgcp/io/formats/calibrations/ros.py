@@ -1,0 +1,50 @@
+"""The camera_info YAML of ROS: OpenCV's model and pixels under other keys."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+
+from kgcp.io.files.safe_yaml import load_yaml
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.calibrations.entry import Entry, unsupported
+from kgcp.io.formats.calibrations.opencv import matrix_entry
+
+_MODELS = ("plumb_bob", "rational_polynomial")
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the content has the keys of a camera_info."""
+    keys = ("camera_matrix", "distortion_coefficients")
+    return all(re.search(rf"^{key}:", file.text, re.MULTILINE) for key in keys)
+
+
+def entries(file: ForeignFile) -> tuple[Entry, ...]:
+    """Return the one camera of the file.
+
+    Raises
+    ------
+    KgcpError
+        If it is no camera_info, or of a model that `Camera` has not.
+    """
+    try:
+        info = load_yaml(file.text)
+        if not isinstance(info, dict):
+            raise TypeError("no mapping")
+        model, name = info.get("distortion_model", "plumb_bob"), info.get("camera_name", "")
+        size = (int(info["image_width"]), int(info["image_height"]))
+        flat = [float(value) for value in info["camera_matrix"]["data"]]
+        coefficients = [float(value) for value in info["distortion_coefficients"]["data"]]
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise file.error("", f"is no camera_info of ROS ({error})", "write it again") from error
+    if model not in _MODELS:
+        raise unsupported(file, "", f"the distortion model {reprlib.repr(model)}")
+    return (
+        matrix_entry(
+            file,
+            name if isinstance(name, str) else "",
+            size,
+            [flat[0:3], flat[3:6], flat[6:]],
+            coefficients,
+        ),
+    )

@@ -1,0 +1,184 @@
+"""The Open Photogrammetry Format: calibrated_cameras.json, or the project that names it.
+
+By opf-spec: positions are in the canonical frame, which the scene reference frame makes of its
+base CRS: axes scaled to be isometric, x and y swapped if the CRS has northing first, shifted.
+orientation_deg is ω, φ, κ of docs/conventions.md relative to that frame's axes. Image names stand
+in the camera list. A constant geoid_height leads from the heights to ellipsoidal ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import rotation_from_opk
+from kgcp.georef.crs import crs_of
+from kgcp.io.files.safe_read import is_file
+from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.formats.orientations.source import SourcePoses
+
+_CAMERAS = "calibrated-cameras"
+_SCENE = "scene-reference-frame"
+_LIST = "camera-list"
+_PROJECT = "project"
+_KEY = "[reference] poses"
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the content says that it is one of the two."""
+    return _kind(file) in (_CAMERAS, _PROJECT)
+
+
+def poses(file: ForeignFile) -> SourcePoses:
+    """Return the poses, in the base CRS of the scene.
+
+    Raises
+    ------
+    KgcpError
+        If a file of the project is missing or lacks something, or its CRS is unusable.
+    """
+    calibrated = JsonObject.of(*_part(file, _CAMERAS))
+    cameras = calibrated.children("cameras")
+    names = _names(JsonObject.of(*_part(file, _LIST)))
+    for camera in cameras:
+        if camera.text("id") not in names:
+            raise camera.file.error(
+                camera.where, "has an id that the camera list lacks", "export the project again"
+            )
+    scene = _Scene.of(JsonObject.of(*_part(file, _SCENE)))
+    position = np.array([camera.vector("position", 3) for camera in cameras]).reshape(-1, 3)
+    opk = np.array([camera.vector("orientation_deg", 3) for camera in cameras]).reshape(-1, 3)
+    return SourcePoses(
+        tuple(names[camera.text("id")] for camera in cameras),
+        scene.map_from_canonical(position),
+        rotation_from_opk(opk),
+        crs=scene.crs,
+        unreferenced="is in a scene of no map",
+    )
+
+
+def _kind(file: ForeignFile) -> str:
+    """Return what an OPF file says that it is; nothing for other files."""
+    said = file.document.get("format") if isinstance(file.document, dict) else None
+    word = said if isinstance(said, str) else ""
+    return word.removeprefix("application/opf-").removesuffix("+json")
+
+
+def _part(file: ForeignFile, kind: str) -> tuple[ForeignFile, str, object]:
+    """Return the file of one kind: this one, one that the project names, or one beside it."""
+    if _kind(file) == kind:
+        return file, "", file.document
+    path = file.path.parent / f"{kind.replace('-', '_')}.json"
+    if _kind(file) == _PROJECT:
+        path = _resource(file, kind)
+    if not is_file(path):
+        raise file.error(
+            "", f"needs {path}, which does not exist", f"name the project, an .opf, in {_KEY}"
+        )
+    part = ForeignFile.read(path, _KEY)
+    if _kind(part) != kind:
+        raise part.error("", f"is no {kind} of OPF", "export the project again")
+    return part, "", part.document
+
+
+def _resource(project: ForeignFile, kind: str) -> Path:
+    for item in JsonObject.of(project, "", project.document).children("items"):
+        for resource in item.children("resources"):
+            if resource.text("format") == f"application/opf-{kind}+json":
+                return project.path.parent / unquote(urlsplit(resource.text("uri")).path)
+    raise project.error("", f"names no {kind}", "export the calibrated project again")
+
+
+def _names(cameras: JsonObject) -> dict[str, str]:
+    """Return image names by camera id; URIs without their scheme and page."""
+    return {
+        camera.text("id"): unquote(urlsplit(camera.text("uri")).path)
+        for camera in cameras.children("cameras")
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """The way from the canonical frame to the map; crs None: to a frame that is no map.
+
+    Heights z of the base become (z + geoid_height) · height_factor: ellipsoidal and in metres
+    where the CRS has none of its own, or OPF gives it a constant geoid.
+    """
+
+    crs: str | None
+    shift: FloatArray
+    scale: FloatArray
+    height_factor: float
+    geoid_height: float
+
+    @classmethod
+    def of(cls, scene: JsonObject) -> _Scene:
+        """Read a scene reference frame.
+
+        Raises
+        ------
+        KgcpError
+            If something is missing, a scale is not positive, or the CRS is not projected or has
+            axes that OPF's swapping does not bring into the order x, y.
+        """
+        transform, said = scene.child("base_to_canonical"), scene.child("crs")
+        shift, scale = (
+            np.array(transform.vector("shift", 3)),
+            np.array(transform.vector("scale", 3)),
+        )
+        if not np.all(scale > 0.0):
+            raise scene.file.error(transform.where, "has no positive scale", "export it again")
+        swaps = transform["swap_xy"] is True
+        if swaps:
+            scale = scale[[1, 0, 2]]
+        crs = _parsed(said)
+        if crs is None:
+            return cls(None, shift, scale, 1.0, 0.0)
+        _check_axes(said, crs, swaps=swaps)
+        if len(crs.axis_info) > 2 and "geoid_height" not in said:
+            return cls(crs.to_wkt(), shift, scale, 1.0, 0.0)
+        factor = crs.axis_info[-1].unit_conversion_factor
+        if len(crs.axis_info) == 2:  # heights are as long as eastings once both are scaled
+            factor *= float(scale[2] / scale[0])
+        horizontal = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
+        return cls(horizontal.to_wkt(), shift, scale, factor, said.number("geoid_height", 0.0))
+
+    def map_from_canonical(self, position: FloatArray) -> FloatArray:
+        """Bring positions (n, 3) into the map, x first."""
+        base = (position - self.shift) / self.scale
+        base[:, 2] = (base[:, 2] + self.geoid_height) * self.height_factor
+        return base
+
+
+def _parsed(said: JsonObject) -> CRS | None:
+    """Return the CRS; None where it is of no place on the Earth."""
+    text = said.text("definition")
+    try:
+        crs = crs_of(text)
+    except CRSError as error:
+        raise said.file.error(
+            said.where, f"is no CRS that pyproj reads ({text[:40]!r})", "export it again"
+        ) from error
+    if crs.geodetic_crs is None:
+        return None
+    if not crs.is_projected:
+        raise said.file.error(said.where, f"{crs.name!r} is not projected", "export it again")
+    return crs
+
+
+def _check_axes(said: JsonObject, crs: CRS, *, swaps: bool) -> None:
+    """Refuse axes that swapping would not bring into the order x, y."""
+    directions = [axis.direction for axis in crs.axis_info[:2]]
+    swapped = {"north east": True, "east north": False, "west south": False}
+    if swapped.get(" ".join(directions)) is not swaps:
+        raise said.file.error(
+            said.where,
+            f"has the axes {' and '.join(directions)} with swap_xy {str(swaps).lower()}",
+            "export the project in a CRS of easting and northing",
+        )

@@ -1,0 +1,116 @@
+"""What a reader of poses returns: the poses of a file, in the file's own frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO
+from kgcp.georef.crs import MapFrame
+from kgcp.io.files.sniff import ForeignFile
+
+_MAX_DISTORTION = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourcePoses:
+    """Exterior orientations of n frames.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the frames, as the other program calls them.
+    position : (n, 3) array
+        Projection centres.
+    frame_from_photo : (n, 3, 3) array
+        Rotations from the axes of photogrammetry (x right, y up, z backward) to those of the
+        file's frame: of a map its x, y and z at the projection centre.
+    crs : str or None
+        Of the positions, x first; None: the file does not say it.
+    level : MapFrame or None
+        Where the file's frame is east, north, up in metres over a point that it names.
+    unreferenced : str or None
+        Why the coordinates are of no map, unless flight.toml says of which; None: they are of the
+        flight's.
+    sd_position_m : (n, 3) array or None
+        Standard deviations along the map's axes [m]; None: not given.
+    sd_angle_deg : (n,) array or None
+        Of each of the three angles [deg]; None: not given.
+    has_our_names : bool
+        Whether the names are those of the flight's frames already, and no other program's.
+    """
+
+    names: tuple[str, ...]
+    position: FloatArray
+    frame_from_photo: FloatArray
+    crs: str | None = None
+    level: MapFrame | None = None
+    unreferenced: str | None = None
+    sd_position_m: FloatArray | None = None
+    sd_angle_deg: FloatArray | None = None
+    has_our_names: bool = False
+
+
+def photo_rotation(file: ForeignFile, where: str, frame_from_camera: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) frame ← photo of one frame ← camera (y down, z forward).
+
+    Raises
+    ------
+    KgcpError
+        If the matrix is no rotation.
+    """
+    require_rotation(file, where, frame_from_camera)
+    rotation: FloatArray = frame_from_camera @ CAMERA_FROM_PHOTO
+    return rotation
+
+
+def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:
+    """Refuse a matrix (3, 3) that is no rotation.
+
+    Raises
+    ------
+    KgcpError
+    """
+    departure = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not departure < _MAX_DISTORTION or np.linalg.det(matrix) < 0.0:
+        raise file.error(where, "has a rotation matrix that is none", "export it again")
+
+
+def from_geocentric(
+    names: tuple[str, ...], ecef_m: FloatArray, ecef_from_photo: FloatArray, geodetic: str
+) -> SourcePoses:
+    """Bring Earth-centred poses into longitude, latitude and height and their local axes.
+
+    Parameters
+    ----------
+    names : tuple of str
+    ecef_m : (n, 3) array
+        Projection centres [m].
+    ecef_from_photo : (n, 3, 3) array
+    geodetic : str
+        Three-dimensional geographic CRS of the same datum.
+    """
+    earth = MapFrame.at(geodetic, np.zeros(3))
+    enu = (ecef_m - earth.origin_ecef_m) @ earth.ecef_from_enu
+    return from_level(names, enu, earth.ecef_from_enu.T @ ecef_from_photo, earth)
+
+
+def from_level(
+    names: tuple[str, ...], enu_m: FloatArray, enu_from_photo: FloatArray, frame: MapFrame
+) -> SourcePoses:
+    """Bring poses in the ENU axes of one point into a geographic CRS and their own local axes.
+
+    Parameters
+    ----------
+    names : tuple of str
+    enu_m : (n, 3) array
+        Projection centres in the ENU frame [m].
+    enu_from_photo : (n, 3, 3) array
+    frame : MapFrame
+        Of a geographic CRS.
+    """
+    here_from_enu = np.swapaxes(frame.level_rotations(enu_m), 1, 2)
+    position = frame.map_from_enu(enu_m)
+    return SourcePoses(names, position, here_from_enu @ enu_from_photo, crs=frame.crs)

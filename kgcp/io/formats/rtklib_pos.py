@@ -1,0 +1,159 @@
+"""RTKLIB's solution files: `.pos` of trajectories and `_events.pos` of time marks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.gps_time import TimeSystem, clock_from_week, unix_from_clock, unwrap_week
+from kgcp.io.files.safe_read import LARGEST, read_lines
+
+_COLUMNS = re.compile(r"%\s*(GPST|UTC|JST)\b(.*)")
+_NAME = re.compile(r"([A-Za-z][\w-]*)(?:\(([^()]*)\))?")
+_HEIGHTS = re.compile(r"lat/lon/height=(\w+)/(\w+)")
+_DATE = re.compile(r"(\d{4})/(\d{1,2})/(\d{1,2})\s+(\d{1,2}):(\d{1,2}):(\d{1,2}(?:\.\d*)?)")
+_JST_AHEAD_S = 9.0 * 3600.0
+_SEXAGESIMAL = "d'\""  # degrees, minutes, seconds in three cells
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The rows of a solution file.
+
+    Attributes
+    ----------
+    path : Path
+    lines : tuple of int
+        Line of each row in the file, from 1.
+    time_s : (n,) array
+        Unix time, UTC [s].
+    columns : mapping of (n,) arrays
+        By the header's names without units, angles in degrees: `latitude`, `x-ecef`, `sdn`, ….
+    datum, heights : str
+        As the header has them, `WGS84` and `ellipsoidal`; empty where it has neither.
+    """
+
+    path: Path
+    lines: tuple[int, ...]
+    time_s: FloatArray
+    columns: Mapping[str, FloatArray]
+    datum: str
+    heights: str
+
+
+def looks_like_solution(head: bytes) -> bool:
+    """Return whether a file that begins with `head` is a solution, with or without its header."""
+    text = head.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
+    return text.startswith("%") or _DATE.match(text) is not None
+
+
+def read_solution(path: Path, toml_key: str) -> Solution:
+    """Read the rows of a solution file, which flight.toml names under a key, by its own header.
+
+    Raises
+    ------
+    KgcpError
+        Naming the line: no header, a row that is too short, or a cell that is not a number.
+    """
+    rows = _rows(path, toml_key)
+    header = next((match for _, row in rows if (match := _COLUMNS.match(row))), None)
+    if header is None:
+        raise KgcpError(
+            f"{path}: lacks the header line '% GPST …' that says what its columns are;"
+            " write the solution with its header (out-outhead = on)"
+        )
+    names, places, width = _layout(header[2])
+    data = [(line, row) for line, row in rows if not row.startswith("%")]
+    clocks, cells = _split(path, data, width)
+    kind = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
+    return Solution(
+        path,
+        tuple(line for line, _ in data),
+        _unix(clocks, header[1]),
+        {name: _column(cells, *place) for name, place in zip(names, places, strict=True)},
+        kind[1] if kind else "",
+        kind[2] if kind else "",
+    )
+
+
+def _rows(path: Path, toml_key: str) -> list[tuple[int, str]]:
+    lines = enumerate(read_lines(path, toml_key), start=1)
+    return [(number, row.strip()) for number, row in lines if row.strip()]
+
+
+def _layout(header: str) -> tuple[list[str], list[tuple[int, int]], int]:
+    """Return names of columns, first cell and number of cells of each, and the sum of these."""
+    names, places, cell = [], [], 0
+    for name, unit in _NAME.findall(header):
+        cells = 3 if unit == _SEXAGESIMAL else 1
+        names.append(name)
+        places.append((cell, cells))
+        cell += cells
+    return names, places, cell
+
+
+def _split(
+    path: Path, data: Sequence[tuple[int, str]], width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return clock times (n,) and cells (n, width); what stands in further cells is dropped."""
+    separator = next((mark for mark in ",;\t" if data and mark in data[0][1]), None)
+    clocks, cells = np.empty(len(data)), np.empty((len(data), width))
+    weeks = np.full(len(data), np.nan)
+    for index, (line, row) in enumerate(data):
+        try:
+            if match := _DATE.match(row):
+                clocks[index], rest = _calendar(match), row[match.end() :]
+                texts = _cells(rest.removeprefix(separator or ""), separator)
+            else:
+                week, seconds, *texts = _cells(row, separator)
+                weeks[index], clocks[index] = int(week), float(seconds)
+            if len(texts) < width:
+                raise KgcpError(
+                    f"{path}, line {line}: has {len(texts)} cells after the time, the header names"
+                    f" {width}; repair the line"
+                )
+            cells[index] = [float(text) for text in texts[:width]]
+        except (ValueError, OverflowError) as error:
+            raise KgcpError(
+                f"{path}, line {line}: is not a time and numbers ({error}); repair the line"
+            ) from error
+    in_weeks = ~np.isnan(weeks)
+    if in_weeks.any():
+        clocks = np.where(in_weeks, clock_from_week(weeks, clocks), clocks)
+    lost = np.flatnonzero(~(np.abs(np.column_stack((clocks, cells))) < LARGEST).all(axis=1))
+    if lost.size:
+        line = data[lost[0]][0]
+        raise KgcpError(f"{path}, line {line}: holds a number that is not finite; delete it")
+    return unwrap_week(clocks) if in_weeks.any() else clocks, cells
+
+
+def _cells(text: str, separator: str | None) -> list[str]:
+    return [cell.strip() for cell in text.split(separator)]
+
+
+def _calendar(match: re.Match[str]) -> float:
+    year, month, day, hour, minute = (int(match[group]) for group in range(1, 6))
+    midnight = datetime(year, month, day, tzinfo=UTC).timestamp()
+    return midnight + 3600.0 * hour + 60.0 * minute + float(match[6])
+
+
+def _unix(clock_s: FloatArray, name: str) -> FloatArray:
+    if name == "GPST":
+        return unix_from_clock(clock_s, TimeSystem.GPS)
+    return clock_s - (_JST_AHEAD_S if name == "JST" else 0.0)
+
+
+def _column(cells: FloatArray, first: int, count: int) -> FloatArray:
+    """Return the values of one column; degrees, minutes, seconds have one sign, at the degrees."""
+    if count == 1:
+        return cells[:, first]
+    degrees, minutes, seconds = cells[:, first : first + count].T
+    angle: FloatArray = np.copysign(np.abs(degrees) + minutes / 60.0 + seconds / 3600.0, degrees)
+    return angle

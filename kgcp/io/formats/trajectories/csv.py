@@ -1,0 +1,45 @@
+"""The project's own trajectories: CSV with named columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
+from kgcp.io.formats.trajectories.times import times_from_texts
+
+_POSITION = ("x", "y", "z")
+_ATTITUDE = ("roll_deg", "pitch_deg", "heading_deg")
+_SD_POSITION = tuple(f"sd_{name}" for name in _POSITION)
+_SD_ATTITUDE = tuple(f"sd_{name}" for name in _ATTITUDE)
+
+
+def read_csv(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
+    """Read a trajectory from a CSV file by docs/conventions.md.
+
+    Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
+    in any order. The attitude may be absent where it is not wanted.
+
+    Raises
+    ------
+    KgcpError
+        Naming the line: missing columns, values that are not finite, times that do not ascend.
+    """
+    with_attitude = notation.course_sd_deg is None
+    columns = read_csv_columns(
+        path,
+        "time",
+        (*_POSITION, *_ATTITUDE) if with_attitude else _POSITION,
+        (*_SD_POSITION, *_SD_ATTITUDE),
+        "[vehicle] trajectory",
+    )
+    time_s = times_from_texts(path, columns.lines, columns.keys, notation)
+    check_times(path, time_s, lambda row: f"line {columns.lines[row]} ({columns.keys[row]})")
+    return Epochs(
+        time_s=time_s,
+        crs=notation.crs or flight_crs,
+        position=columns.block(_POSITION),
+        attitude_deg=columns.block(_ATTITUDE) if with_attitude else None,
+        sd_position_m=columns.deviations(_SD_POSITION),
+        sd_attitude_deg=columns.deviations(_SD_ATTITUDE) if with_attitude else None,
+    )

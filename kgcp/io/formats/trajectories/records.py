@@ -1,0 +1,113 @@
+"""A trajectory as its file has it, and what flight.toml says about the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import date
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.gps_time import TimeSystem
+
+
+class TrajectoryFormat(StrEnum):
+    """A notation of trajectories, by its name in flight.toml."""
+
+    CSV = "csv"
+    SBET = "sbet"
+    RTKLIB = "rtklib"
+    TUM = "tum"
+
+
+class Wander(StrEnum):
+    """What makes the true heading of the heading and the wander angle of an SBET record."""
+
+    IGNORE = "ignore"
+    SUBTRACT = "subtract"
+    ADD = "add"
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryNotation:
+    """The keys of [vehicle] about its trajectory's file.
+
+    Attributes
+    ----------
+    format : TrajectoryFormat or None
+        None: the content tells.
+    crs : str or None
+        Of the file's positions, for pyproj; None: the format's default.
+    time_system : TimeSystem or None
+        Of the file's times; None: as the format has it.
+    first_day : date or None
+        When the trajectory begins, by its own clock; given, the file's numbers are seconds of the
+        week.
+    accuracies_file : Path or None
+        With SBET: smrmsg file of its standard deviations.
+    wander : Wander or None
+        With SBET: what to do with the wander angle; None: it has to be zero.
+    course_sd_deg : tuple of float or None
+        Given, the attitude is that of the course over ground, level, with these standard
+        deviations of roll, pitch and heading; None: the file has the attitude.
+    """
+
+    format: TrajectoryFormat | None = None
+    crs: str | None = None
+    time_system: TimeSystem | None = None
+    first_day: date | None = None
+    accuracies_file: Path | None = None
+    wander: Wander | None = None
+    course_sd_deg: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epochs:
+    """A trajectory in the coordinates of its file.
+
+    Attributes
+    ----------
+    time_s : (n,) array
+        Unix time, UTC, strictly ascending, n ≥ 2 [s].
+    crs : str
+        Of the positions, for pyproj.
+    position : (n, 3) array
+        x = easting or longitude, y = northing or latitude, z, in the units of `crs`.
+    attitude_deg : (n, 3) array or None
+        Roll, pitch, heading against the local level and true north [deg]; None: not in the file.
+    sd_position_m : (n, 3) array or None
+        Standard deviations along the axes of `crs` [m].
+    cov_position_m2 : (n, 3, 3) array or None
+        Covariances along the axes of `crs` [m²], where the file has more than deviations.
+    sd_attitude_deg : (n, 3) array or None
+        Of roll, pitch, heading [deg].
+    """
+
+    time_s: FloatArray
+    crs: str
+    position: FloatArray
+    attitude_deg: FloatArray | None
+    sd_position_m: FloatArray | None = None
+    cov_position_m2: FloatArray | None = None
+    sd_attitude_deg: FloatArray | None = None
+
+
+def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> None:
+    """Refuse fewer than two epochs, or times that do not ascend.
+
+    `place` names the place of an epoch in the file, for the message.
+    """
+    if len(time_s) < 2:
+        raise KgcpError(f"{path}: has {len(time_s)} epochs; interpolation needs at least two")
+    wrong = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if wrong.size:
+        row = int(wrong[0]) + 1
+        how = "repeats" if time_s[row] == time_s[row - 1] else "lies before"
+        raise KgcpError(
+            f"{path}, {place(row)}: the time {how} that of {place(row - 1)}, by"
+            f" {time_s[row - 1] - time_s[row]:g} s; sort the epochs and keep one of each"
+        )

@@ -1,0 +1,92 @@
+"""Trajectories of RTKLIB: `.pos`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import WGS84_3D
+from kgcp.io.formats.rtklib_pos import Solution, read_solution
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
+
+GEOCENTRIC = "EPSG:4978"
+# Of each kind of solution: its columns in the order x, y, z, their deviations, and the roots of
+# the covariances xy, yz, zx.
+_GEODETIC = (("longitude", "latitude", "height"), ("sde", "sdn", "sdu"), ("sdne", "sdun", "sdeu"))
+_ECEF = (("x-ecef", "y-ecef", "z-ecef"), ("sdx", "sdy", "sdz"), ("sdxy", "sdyz", "sdzx"))
+
+
+def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
+    """Read a solution file; it has no attitude.
+
+    Raises
+    ------
+    KgcpError
+        As `kgcp.io.formats.rtklib_pos.read_solution`, and for vectors from a base, heights above a
+        geoid or a datum that the file does not define.
+    """
+    solution = read_solution(path, "[vehicle] trajectory")
+    check_times(path, solution.time_s, lambda row: f"line {solution.lines[row]}")
+    if "e-baseline" in solution.columns:
+        raise KgcpError(
+            f"{path}: holds vectors from a base whose place it does not tell; write the solution"
+            " as latitude, longitude and height (out-solformat = llh)"
+        )
+    geocentric = "x-ecef" in solution.columns
+    position, deviations, roots = _ECEF if geocentric else _GEODETIC
+    lacking = [name for name in position if name not in solution.columns]
+    if lacking:
+        raise KgcpError(
+            f"{path}: its header names no {', '.join(lacking)}; write the solution as latitude,"
+            " longitude and height (out-solformat = llh)"
+        )
+    if notation.crs is None and not geocentric:
+        _check_heights(solution)
+    cov = None
+    if set(deviations) | set(roots) <= solution.columns.keys():
+        cov = _covariances(_block(solution, deviations), _block(solution, roots))
+    return Epochs(
+        time_s=solution.time_s,
+        crs=notation.crs or (GEOCENTRIC if geocentric else WGS84_3D),
+        position=_block(solution, position),
+        attitude_deg=None,
+        sd_position_m=None if cov is None else np.sqrt(np.diagonal(cov, axis1=1, axis2=2)),
+        cov_position_m2=cov,
+    )
+
+
+def _check_heights(solution: Solution) -> None:
+    if (solution.datum.upper(), solution.heights) == ("WGS84", "ellipsoidal"):
+        return
+    found = f"{solution.datum}/{solution.heights}" if solution.datum else "nothing"
+    raise KgcpError(
+        f"{solution.path}: its header says {found} of datum and heights, not WGS84/ellipsoidal;"
+        " write ellipsoidal heights (out-height = ellipsoidal), or name the file's CRS with its"
+        " heights under [vehicle] crs in flight.toml"
+    )
+
+
+def _block(solution: Solution, names: tuple[str, ...]) -> FloatArray:
+    return np.column_stack([solution.columns[name] for name in names])
+
+
+def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
+    """Return covariances (n, 3, 3) of deviations (n, 3) and signed roots of xy, yz, zx (n, 3).
+
+    RTKLIB writes sign(c)·√|c| of a covariance c. Rounding to 0.1 mm can make a matrix that is no
+    covariance: its negative eigenvalues become 0.
+    """
+    cov = np.zeros((len(deviations), 3, 3))
+    cov[:, range(3), range(3)] = deviations**2
+    for (row, column), root in zip(((0, 1), (1, 2), (2, 0)), roots.T, strict=True):
+        cov[:, row, column] = cov[:, column, row] = np.copysign(root**2, root)
+    values, vectors = np.linalg.eigh(cov)
+    if values.min() >= 0.0:
+        return cov
+    positive: FloatArray = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(
+        vectors, -1, -2
+    )
+    return positive

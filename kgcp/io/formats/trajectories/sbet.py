@@ -1,0 +1,123 @@
+"""Applanix's smoothed best estimate of trajectory (SBET), and its accuracies (smrmsg)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import WGS84_3D
+from kgcp.io.files.gps_time import unwrap_week
+from kgcp.io.files.safe_read import LARGEST, read_bytes
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, Wander, check_times
+from kgcp.io.formats.trajectories.times import times_from_week
+
+_RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, heading, wander, …
+_ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
+_DOUBLE = 8
+_MOST_BYTES = (1 << 30) - 1  # ten hours at 200 Hz
+_MAX_WANDER_RAD = 1e-6
+_TINY = 1e-12  # zeros, and what other bytes are as doubles
+
+
+def looks_like_sbet(head: bytes, size: int) -> bool:
+    """Return whether a file of `size` bytes that begins with `head` can be one of records."""
+    if size % (_RECORD * _DOUBLE) or len(head) < _RECORD * _DOUBLE:
+        return False
+    values = np.frombuffer(head, dtype="<f8", count=_RECORD)
+    if not np.isfinite(values).all():
+        return False
+    seconds, latitude, longitude, height = values[:4]
+    sound = -86400.0 < seconds < 3e6 and abs(height) < 1e5
+    on_earth = _TINY < abs(latitude) <= np.pi / 2.0 and _TINY < abs(longitude) <= 2.0 * np.pi
+    return bool(sound and on_earth)
+
+
+def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
+    """Read records of 17 little-endian doubles: seconds of the week, radians, metres.
+
+    Deviations are those of the smrmsg file that flight.toml names, if it does.
+
+    Raises
+    ------
+    KgcpError
+        If the file is cut or holds impossible values, flight.toml lacks the day or the time
+        system, or does not say what the wander angle means where it is not zero.
+    """
+    records = _read_records(path, _RECORD, "trajectory")
+    _check_values(path, records)
+    seconds = records[:, 0]
+    time_s = times_from_week(path, seconds, notation)
+    check_times(path, time_s, lambda row: f"record {row + 1}")
+    sd_position_m, sd_attitude_deg = None, None
+    if notation.accuracies_file is not None:
+        sd_position_m, sd_attitude_deg = _read_accuracies(notation.accuracies_file, seconds)
+    return Epochs(
+        time_s=time_s,
+        crs=notation.crs or WGS84_3D,
+        position=np.column_stack((np.degrees(records[:, [2, 1]]), records[:, 3])),
+        attitude_deg=_attitude_deg(path, records, notation.wander),
+        sd_position_m=sd_position_m,
+        sd_attitude_deg=sd_attitude_deg,
+    )
+
+
+def _read_records(path: Path, columns: int, key: str) -> FloatArray:
+    data = read_bytes(path, f"[vehicle] {key}", _MOST_BYTES)
+    size = columns * _DOUBLE
+    if not data or len(data) % size:
+        raise KgcpError(
+            f"{path}: has {len(data)} bytes, which are no whole records of {size} bytes;"
+            " the file is cut or of another format: export it again"
+        )
+    records: FloatArray = np.frombuffer(data, dtype="<f8").reshape(-1, columns).astype(float)
+    return records
+
+
+def _check_values(path: Path, records: FloatArray) -> None:
+    finite = (np.abs(records[:, [0, 1, 2, 3, 7, 8, 9, 10]]) < LARGEST).all(axis=1)
+    on_earth = (np.abs(records[:, 1]) <= np.pi / 2.0) & (np.abs(records[:, 2]) <= 2.0 * np.pi)
+    wrong = np.flatnonzero(~(finite & on_earth))
+    if wrong.size:
+        time, latitude, longitude, height = records[wrong[0], :4]
+        raise KgcpError(
+            f"{path}, record {wrong[0] + 1}: time {time:g}, latitude {latitude:g} rad, longitude"
+            f" {longitude:g} rad, height {height:g} m cannot be; the file is damaged or of another"
+            " format: export it again"
+        )
+
+
+def _attitude_deg(path: Path, records: FloatArray, wander: Wander | None) -> FloatArray:
+    roll, pitch, heading, angle = records[:, 7:11].T
+    if wander is None and np.abs(angle).max() > _MAX_WANDER_RAD:
+        raise KgcpError(
+            f"{path}: has wander angles up to {np.degrees(np.abs(angle).max()):.4f} deg; say under"
+            ' [vehicle] in flight.toml how the true heading follows: wander = "subtract" if the'
+            ' headings are the platform\'s, "ignore" if they are true ones already, or "add"'
+        )
+    sign = {Wander.SUBTRACT: -1.0, Wander.ADD: 1.0}.get(wander or Wander.IGNORE, 0.0)
+    attitude = np.column_stack((roll, pitch, (heading + sign * angle) % (2.0 * np.pi)))
+    attitude_deg: FloatArray = np.degrees(attitude)
+    return attitude_deg
+
+
+def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return deviations of east, north, up [m] and roll, pitch, heading [deg] at these seconds."""
+    records = _read_records(path, _ACCURACY, "accuracies")
+    own, wanted = unwrap_week(records[:, 0]), unwrap_week(seconds)
+    steps = np.diff(own)
+    if len(own) < 2 or steps.min() <= 0.0:
+        raise KgcpError(f"{path}: its times do not ascend; export it again")
+    margin = steps.max()
+    if wanted[0] < own[0] - margin or wanted[-1] > own[-1] + margin:
+        raise KgcpError(
+            f"{path}: covers the seconds {own[0]:g} to {own[-1]:g}, the trajectory {wanted[0]:g} to"
+            f" {wanted[-1]:g}; give the accuracies of this trajectory"
+        )
+    deviations = records[:, [2, 1, 3, 7, 8, 9]]
+    if not np.isfinite(deviations).all() or deviations.min() < 0.0:
+        raise KgcpError(f"{path}: holds deviations that are not finite or below 0; export it again")
+    at_epochs = np.column_stack([np.interp(wanted, own, column) for column in deviations.T])
+    return at_epochs[:, :3], at_epochs[:, 3:] / 60.0

@@ -1,0 +1,1 @@
+"""Frames from disk or from an object store, their headers and their EXIF."""

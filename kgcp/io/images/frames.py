@@ -1,0 +1,224 @@
+"""Frames: their names, their grey values and their times. The EXIF orientation is never applied."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from kgcp.errors import KgcpError, Reason, Rejection, SettingError
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.safe_read import is_file, is_folder, read_lines
+from kgcp.io.files.time_text import parse_time
+from kgcp.io.images.exif import Exif, read_exif
+from kgcp.io.images.header import image_size, is_cut_png, upright
+
+__all__ = ["Exif", "list_frames", "read_exif", "read_frame_times", "read_grey"]
+
+FRAME_SUFFIXES = frozenset(
+    {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
+)
+
+# The pixels as they lie in the file: raw orientation, full depth, one channel.
+_RAW_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+_UNDECODED = re.compile("[\\udc80-\\udcff]")  # how bytes that are not UTF-8 come from the system
+
+# Of a file: text takes most space, ten characters for a colour of 16 bits; metadata come on top.
+_MOST_BYTES_PER_PIXEL = 32
+_MOST_METADATA_BYTES = 1 << 26
+
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+# libjpeg's words for data that it had to guess; it decodes on and only mentions it on stderr.
+_GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
+
+
+def list_frames(folder: Path) -> list[str]:
+    """List the images below a folder, as sorted relative paths with `/`.
+
+    Hidden files and folders are passed over; the suffix decides, in any case. Links to files
+    are followed, links to folders below `folder` are not (they may run in circles).
+
+    Raises
+    ------
+    KgcpError
+        If the folder is missing or unreadable, holds no image, or a name is not UTF-8.
+    """
+    if not is_folder(folder):
+        raise KgcpError(f"{folder}: is not a folder; correct [frames] folder in flight.toml")
+    frames = []
+    for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        frames += [
+            (Path(parent) / name).relative_to(folder).as_posix()
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in FRAME_SUFFIXES
+        ]
+    if not frames:
+        raise KgcpError(
+            f"{folder}: holds no images; put the frames there or correct [frames] folder"
+            " in flight.toml"
+        )
+    for name in frames:
+        if _UNDECODED.search(name):
+            raise KgcpError(f"{folder}: the name {name!r} is not UTF-8; rename the file")
+    return sorted(frames)
+
+
+def _refuse_folder(error: OSError) -> None:
+    raise KgcpError(f"{error.filename}: {error.strerror}; make the folder readable") from error
+
+
+def read_grey(path: Path, camera: Camera) -> GreyArray:
+    """Decode a frame to grey values in its raw orientation.
+
+    Parameters
+    ----------
+    path : Path
+        An image of 8 or 16 bits, grey or colour (of which the luma is taken).
+    camera : Camera
+        Says what size the frame must have.
+
+    Returns
+    -------
+    (height, width) array of uint8 or uint16
+
+    Raises
+    ------
+    Rejection
+        `decode_failed`: not an image, damaged in whole or in part (also where the decoder would
+        fill the gap), or of another depth; `wrong_size`: not the camera's, which is known before
+        anything is decoded.
+    """
+    grey = _decode(_encoded(path, camera))
+    if grey.dtype not in (np.uint8, np.uint16):
+        raise Rejection(Reason.DECODE_FAILED, f"pixels are {grey.dtype}, not of 8 or 16 bits")
+    height, width = grey.shape
+    _require_size(width, height, camera)
+    return grey
+
+
+def _encoded(path: Path, camera: Camera) -> bytes:
+    """Return the content of an image file, once its header says that it may be a frame."""
+    if os.path.lexists(path) and not is_file(path):  # opening a pipe would wait for ever
+        raise Rejection(Reason.DECODE_FAILED, "is no regular file")
+    try:
+        with path.open("rb") as stream:
+            found, size = image_size(stream), os.fstat(stream.fileno()).st_size
+            if found is None:
+                raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that begin like no image")
+            _require_size(*found, camera)
+            most = _MOST_BYTES_PER_PIXEL * camera.width * camera.height + _MOST_METADATA_BYTES
+            if size > most:
+                raise Rejection(Reason.DECODE_FAILED, f"{size} bytes are too many for its pixels")
+            data = upright(stream)
+    except OSError as error:  # without the path: a table is the same wherever its flight lies
+        raise Rejection(Reason.DECODE_FAILED, error.strerror or str(error)) from error
+    except ValueError as error:  # names that no file has
+        raise Rejection(Reason.DECODE_FAILED, str(error)) from error
+    if is_cut_png(data):
+        raise Rejection(Reason.DECODE_FAILED, f"a chunk ends beyond the {size} bytes of the file")
+    return data
+
+
+def _require_size(width: int, height: int, camera: Camera) -> None:
+    if (width, height) != (camera.width, camera.height):
+        raise Rejection(
+            Reason.WRONG_SIZE,
+            f"{width} x {height} px, the camera has {camera.width} x {camera.height}",
+        )
+
+
+def _decode(encoded: bytes) -> GreyArray:
+    size = len(encoded)
+    if encoded.startswith(_JPEG_START):
+        # A truncated file gets an end: then every version of the decoder notices what is missing.
+        encoded += _JPEG_END
+    grey = None
+    with _collected_stderr() as messages, suppress(cv2.error):
+        grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
+    if grey is None:
+        raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are no whole image")
+    for message in messages:
+        if message.startswith(_GUESSED_PIXELS):
+            raise Rejection(Reason.DECODE_FAILED, message)
+    return grey
+
+
+@contextmanager
+def _collected_stderr() -> Iterator[list[str]]:
+    """Collect what libraries write to the process's stderr, as lines, until the block ends.
+
+    The image decoders below OpenCV report damage in no other way. The whole process is
+    affected, so the block must be short and the process must not have other busy threads.
+    """
+    messages: list[str] = []
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as sink:
+        os.dup2(sink.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            sink.seek(0)
+            messages += sink.read().decode(errors="replace").splitlines()
+
+
+def read_frame_times(path: Path) -> dict[str, float]:
+    """Read the times of frames from a CSV file with the columns frame and time.
+
+    Parameters
+    ----------
+    path : Path
+        Further columns are passed over. Frames are named as `list_frames` does; times are
+        mid-exposure, in the notations of `parse_time`.
+
+    Returns
+    -------
+    dict of float
+        Unix seconds (UTC) by frame.
+
+    Raises
+    ------
+    KgcpError
+        For a missing file or column, a bad time or a frame named twice, with the line's number.
+    """
+    reader = csv.DictReader(read_lines(path, "[frames] times"))
+    try:
+        missing = {"frame", "time"} - set(reader.fieldnames or ())
+        if missing:
+            raise KgcpError(
+                f"{path}: has no column {' and '.join(sorted(missing))};"
+                " start it with the line 'frame,time'"
+            )
+        return _collect_times(path, reader)
+    except csv.Error as error:
+        raise KgcpError(f"{path}: is not CSV in UTF-8 ({error}); export it again") from error
+
+
+def _collect_times(path: Path, reader: csv.DictReader[str]) -> dict[str, float]:
+    times: dict[str, float] = {}
+    for row in reader:
+        line = f"{path}:{reader.line_num}"
+        frame, time = (row["frame"] or "").replace("\\", "/"), row["time"]
+        if not frame or time is None:
+            raise KgcpError(f"{line}: lacks a frame or a time; complete or delete the line")
+        if frame in times:
+            raise KgcpError(f"{line}: frame {frame!r} is named a second time; delete one line")
+        try:
+            times[frame] = parse_time(time)
+        except SettingError as error:
+            raise KgcpError(f"{line}: {error}") from None
+    return times

@@ -1,0 +1,297 @@
+"""Folders of object stores, `s3://…` and `gs://…`, through the file systems of Arrow."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from kgcp.errors import KgcpError
+from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
+
+if TYPE_CHECKING:
+    from pyarrow.fs import FileInfo, FileSystem
+
+_PAUSES_S = (1.0, 4.0, 16.0)  # before a read is tried again, beyond what Arrow itself tries
+_KNOWN = ("s3", "gs", "gcs")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFolder:
+    """A folder of an object store.
+
+    Attributes
+    ----------
+    url : str
+        As the user gave it: `s3://bucket/flights/7?region=eu-central-1`.
+    below : str
+        Path below that, with `/`; empty: the folder itself.
+    """
+
+    url: str
+    below: str = ""
+
+    def __truediv__(self, name: str) -> StoredFolder:
+        """Return what has this name in the folder."""
+        return replace(self, below=f"{self.below}/{name}".strip("/"))
+
+    def __str__(self) -> str:
+        """Name it without keys and options, which are nobody's business."""
+        parts = urlsplit(self.url)
+        place = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
+        return f"{place}/{self.below}" if self.below else place
+
+    @property
+    def name(self) -> str:
+        """The last part of its path."""
+        return str(self).rpartition("/")[2]
+
+    def files(self, *, is_deep: bool) -> list[tuple[str, FileInfo]]:
+        """List what is in the folder, and with `is_deep` below it: names relative to it.
+
+        Folders are listed where `is_deep` is not.
+
+        Raises
+        ------
+        KgcpError
+            If it does not exist or cannot be read, or a name leads out of it.
+        """
+        from pyarrow.fs import FileSelector, FileType
+
+        system, path = self._opened()
+        with self._told():
+            found = system.get_file_info(FileSelector(path, recursive=is_deep))
+        named = [(info.path[len(path) :].strip("/"), info) for info in found]
+        for name, _ in named:
+            if {"", ".", ".."} & set(name.split("/")) or "\\" in name:
+                raise KgcpError(f"{self}: the name {name!r} is no path below it; rename the object")
+        return [each for each in named if not is_deep or each[1].type == FileType.File]
+
+    def tree(self, passed_over: Sequence[str]) -> Iterator[str]:
+        """Yield what files are below the folder: names relative to it.
+
+        Hidden ones are left out, and the folders `passed_over`, which S3 does not even list; in
+        `gs://` Arrow sees no folder that it does not list. Raises as `files`.
+        """
+        above = [f"{each}/" for each in passed_over]
+        folders = [""]
+        for folder in folders:
+            for name, info in (self / folder).files(is_deep=self.url.startswith("g")):
+                path = f"{folder}/{name}".lstrip("/")
+                if "/." in f"/{path}" or any(map(f"{path}/".startswith, above)):
+                    continue
+                if info.is_file:
+                    yield path
+                else:
+                    folders.append(path)
+
+    def read(self) -> bytes:
+        """Return the content of an object.
+
+        Raises
+        ------
+        KgcpError
+            If it does not exist or cannot be read.
+        """
+        system, path = self._opened()
+        for pause_s in _PAUSES_S:
+            try:
+                return _content(system, path)
+            except FileNotFoundError:
+                break
+            except OSError:
+                time.sleep(pause_s)
+        with self._told():
+            return _content(system, path)
+
+    def write(self, source: Path) -> None:
+        """Put a file here; it appears as a whole.
+
+        Raises
+        ------
+        KgcpError
+            If it cannot be written.
+        """
+        import pyarrow as pa
+
+        system, path = self._opened()
+        with (
+            self._told("cannot be written"),
+            pa.memory_map(str(source)) as content,
+            system.open_output_stream(path) as stream,
+        ):
+            # In one piece, since the end of the stream would make an object of half a file, too.
+            stream.write(content.read_buffer())
+
+    def require_writable(self) -> None:
+        """Write and delete an object, so that hours of work do not end here.
+
+        Raises
+        ------
+        KgcpError
+            If that cannot be done.
+        """
+        system, path = (self / ".kgcp")._opened()
+        with self._told("cannot be written"):
+            with system.open_output_stream(path) as stream:
+                stream.write(b"kgcp")
+            system.delete_file(path)
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a file of this name.
+
+        Raises
+        ------
+        KgcpError
+            If the store does not answer.
+        """
+        system, path = (self / name)._opened()
+        with self._told():
+            return bool(system.get_file_info(path).is_file)
+
+    def _opened(self) -> tuple[FileSystem, str]:
+        system, base = _system(self.url)
+        return system, f"{base}/{self.below}".rstrip("/")
+
+    @contextmanager
+    def _told(self, what: str = "cannot be read") -> Iterator[None]:
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise KgcpError(
+                f"{self}: does not exist; correct the URL, or put it there and give the same"
+                " command again"
+            ) from error
+        except OSError as error:
+            raise KgcpError(
+                f"{self}: {what} ({_line(error)}); see URL, keys and network, and give the same"
+                " command again"
+            ) from error
+
+
+def parsed_url(text: str) -> Path | StoredFolder:
+    """Return what a URL or a path of the command line names; `file://` is a path as any other.
+
+    Raises
+    ------
+    KgcpError
+        If it is no URL that Arrow can open.
+    """
+    if "://" not in text:
+        return Path(text)
+    parts = urlsplit(text)
+    if parts.scheme == "file":
+        return Path(parts.path)
+    if parts.scheme not in _KNOWN or not parts.netloc:
+        raise KgcpError(
+            f"{text}: is no place that kgcp knows; give a folder, or s3://bucket/folder,"
+            " gs://bucket/folder"
+        )
+    return StoredFolder(text)
+
+
+def frames_below(folder: Path | StoredFolder) -> list[str]:
+    """List the images below a folder, by the rules of `kgcp.io.images.frames.list_frames`.
+
+    Raises
+    ------
+    KgcpError
+        As that, and if the store cannot be read.
+    """
+    if isinstance(folder, Path):
+        return list_frames(folder)
+    names = [
+        name
+        for name, _ in folder.files(is_deep=True)
+        if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES
+        and not any(part.startswith(".") for part in name.split("/"))
+    ]
+    if not names:
+        raise KgcpError(
+            f"{folder}: holds no images; put the frames there or correct [frames] folder"
+            " in flight.toml"
+        )
+    return sorted(names)
+
+
+def stamps_of(
+    folder: Path | StoredFolder, names: Sequence[str]
+) -> Iterator[tuple[int, int] | None]:
+    """Yield size and time of change [ns] of files, by which a changed one is told; None: missing.
+
+    Raises
+    ------
+    KgcpError
+        If a store cannot be read.
+    """
+    if isinstance(folder, Path):
+        yield from (_stamp(folder / name) for name in names)
+        return
+    found: Mapping[str, Any] = dict(folder.files(is_deep=True))
+    for name in names:
+        info = found.get(name)
+        yield None if info is None else (info.size, info.mtime_ns or 0)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+@contextmanager
+def at_hand(folder: Path | StoredFolder, name: str) -> Iterator[Path]:
+    """Have a file of a folder as one that can be opened, until the block ends.
+
+    An object's content is in memory, and nowhere on a disk.
+
+    Raises
+    ------
+    KgcpError
+        If an object cannot be read: it is no frame's fault.
+    """
+    if isinstance(folder, Path):
+        yield folder / name
+        return
+    content = (folder / name).read()
+    descriptor = os.memfd_create("frame")
+    try:
+        with os.fdopen(descriptor, "wb", closefd=False) as stream:
+            stream.write(content)
+        del content
+        yield Path(f"/proc/self/fd/{descriptor}")
+    finally:
+        os.close(descriptor)
+
+
+@cache
+def _system(url: str) -> tuple[FileSystem, str]:
+    """Open a store, once in a process."""
+    from pyarrow import ArrowInvalid
+    from pyarrow.fs import FileSystem
+
+    try:
+        system, path = FileSystem.from_uri(url)
+    except (ArrowInvalid, OSError, NotImplementedError) as error:
+        raise KgcpError(f"{StoredFolder(url)}: {_line(error)}; correct the URL") from error
+    return system, path.rstrip("/")
+
+
+def _content(system: FileSystem, path: str) -> bytes:
+    with system.open_input_file(path) as stream:
+        if stream.closed:  # a stream of gs:// that has failed already
+            raise OSError("the store has broken off")
+        content: bytes = stream.read()
+    return content
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

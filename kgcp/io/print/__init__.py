@@ -1,0 +1,1 @@
+"""Printable sheets as files at true scale: PDF, SVG, DXF and PNG."""

@@ -1,1 +1,0 @@
-"""Sheets of paper as files at true scale: PDF, SVG, DXF and PNG."""

@@ -1,0 +1,1 @@
+"""Tables that kgcp writes and reads: columns, Parquet, provenance."""

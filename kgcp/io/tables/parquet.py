@@ -1,0 +1,125 @@
+"""Parquet tables with declared columns, written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kgcp.errors import KgcpError
+from kgcp.io.files.atomic import whole_file
+from kgcp.io.files.safe_read import is_file
+from kgcp.io.tables.columns import DETECTION_COLUMNS, Column, ColumnType, Row
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_ARROW_TYPES = {
+    ColumnType.TEXT: pa.string(),
+    ColumnType.INTEGER: pa.int64(),
+    ColumnType.BOOLEAN: pa.bool_(),
+    ColumnType.NUMBER: pa.float64(),
+    ColumnType.TIME: pa.timestamp("us", tz="UTC"),
+    ColumnType.NUMBERS: pa.list_(pa.float64()),
+}
+_KEYS = ("frame", "target", "instance", "status")  # no row is without
+_ROWS_PER_GROUP = 4096  # of the file's row groups: so many are in memory at once
+
+
+def write_table(
+    path: Path, columns: Sequence[Column], rows: Iterable[Row], metadata: Mapping[str, str]
+) -> None:
+    """Write rows as Parquet under `path`, by a temporary name and a rename.
+
+    Parameters
+    ----------
+    path : Path
+        Target file; its folder is made if need be.
+    columns : sequence of Column
+        The declared columns; a row that lacks one or has others is a programming error.
+    rows : iterable of mapping
+        Column name to value; None is null. Only a part of them is in memory at a time.
+    metadata : mapping of str
+        Goes into the Parquet schema's key-value metadata.
+
+    Raises
+    ------
+    KgcpError
+        If the file cannot be written.
+    """
+    schema = pa.schema(
+        [pa.field(column.name, _ARROW_TYPES[column.type]) for column in columns],
+        metadata={f"kgcp.{key}": value for key, value in metadata.items()},
+    )
+    remaining = iter(rows)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+            writer.write_table(_table(schema, islice(remaining, _ROWS_PER_GROUP)))
+            for row in remaining:
+                group = chain((row,), islice(remaining, _ROWS_PER_GROUP - 1))
+                writer.write_table(_table(schema, group))
+    except OSError as error:
+        raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+
+
+def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:
+    cells: dict[str, list[Any]] = {name: [] for name in schema.names}
+    for row in rows:
+        if row.keys() != cells.keys():
+            raise ValueError(f"row and columns differ in {sorted(row.keys() ^ cells.keys())}")
+        for name, column in cells.items():
+            column.append(row[name])
+    return pa.table(cells, schema=schema)
+
+
+def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
+    """Read a table that `write_table` wrote.
+
+    Raises
+    ------
+    KgcpError
+        If the file is missing, not Parquet, lacks declared columns, or has others in their place.
+    """
+    if not is_file(path):
+        raise KgcpError(f"{path}: does not exist; run the command that writes it first")
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        reason = (str(error).splitlines() or ["damaged"])[0]
+        raise KgcpError(f"{path}: is not a readable Parquet table ({reason}); remake it") from error
+    missing = [column.name for column in columns if column.name not in table.column_names]
+    if missing:
+        raise KgcpError(
+            f"{path}: lacks the columns {', '.join(missing)}; remake it with this version of kgcp"
+        )
+    _check_columns(path, table, columns)
+    frame: pd.DataFrame = table.to_pandas()
+    return frame
+
+
+def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column]) -> None:
+    """Refuse columns of other types than are written, and gaps among keys."""
+    for column in columns:
+        places = table.schema.get_all_field_indices(column.name)
+        found = table.schema.field(places[0]).type
+        wanted = _ARROW_TYPES[column.type]
+        if len(places) > 1 or found != wanted:
+            problem = "is there twice" if len(places) > 1 else f"is of {found}, not {wanted}"
+            raise KgcpError(f"{path}: the column {column.name} {problem}; remake it with kgcp")
+        if column.name in _KEYS and table.column(column.name).null_count:
+            raise KgcpError(f"{path}: the column {column.name} has gaps; remake it with kgcp")
+
+
+def read_detections(path: Path) -> pd.DataFrame:
+    """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
+    if not is_file(path):
+        raise KgcpError(
+            f"{path}: does not exist; run 'kgcp detect' on this flight first, or name with"
+            " --detections what it wrote elsewhere"
+        )
+    return read_table(path, DETECTION_COLUMNS)

@@ -1,0 +1,1 @@
+"""One grey array in, measurements or named rejections out."""

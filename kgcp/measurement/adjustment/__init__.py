@@ -1,0 +1,1 @@
+"""Least-squares fit of a target's image: pixels, solver, covariance, tests."""

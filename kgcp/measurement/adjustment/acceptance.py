@@ -1,0 +1,158 @@
+"""Is it really this target? What a fit must show before it is reported."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.image_model.noise import median_at_edges
+from kgcp.measurement.image_model.photometry import plateau_levels
+from kgcp.measurement.records import Observation
+from kgcp.targets.layout import Ring
+
+_MAX_OUTLIERS = 0.3
+_MAX_EDGE_NOISE = 0.15  # of the contrast: the largest residuals near edges
+_NO_SENSE = 2.0
+_MAX_RELATIVE_SD = 0.01
+_POSITIONS = 72  # around the code circle
+_MIN_PIXELS = 3
+_EXTRA, _LACK = 0.45, 0.6  # of a dot's contrast: another dot, or the lack of one
+_MOVED = 0.2  # of a dot's contrast: so much more light on one side of a dot and less on the other
+_DOTS_PER_MISSING = 4  # one dot in so many may be dirty
+
+
+def edge_noise(fit: Fit) -> float:
+    """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
+    black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
+    residual = median_at_edges(fit.sd, fit.prediction.share, 0.2, 0.8, math.nan)
+    return residual / (white - black) if residual > 0.0 and white > black else _NO_SENSE
+
+
+def check_fit(fit: Fit) -> None:
+    """Refuse a fit that leaves too many outliers or too large residuals.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`.
+    """
+    censoring = fit.sample.censoring
+    seen = ~(censoring.at_high | censoring.at_low)
+    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
+    noise = edge_noise(fit)
+    if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE:
+        raise Rejection(
+            Reason.POOR_FIT, f"{outlying:.0%} outliers, residuals {noise:.0%} of the contrast"
+        )
+
+
+def check_precision(observation: Observation) -> None:
+    """Refuse a measurement so uncertain that it can hardly be of this target.
+
+    Even far, blurred and badly exposed targets are measured to some parts in a thousand; clutter
+    that happens to be round and dotted leaves residuals that say otherwise.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`.
+    """
+    if observation.uncertainty is None:
+        return
+    share = observation.uncertainty.sd_distance_m / observation.pose.distance_m
+    if share > _MAX_RELATIVE_SD:
+        raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
+
+
+def check_code(fit: Fit, ring: Ring) -> None:
+    """Refuse a ring that shows a dot where this code has none, or lacks more than a dirty one.
+
+    The residuals of the fit are averaged over discs of a dot's size all around the code circle.
+
+    Raises
+    ------
+    Rejection
+        `OTHER_CODE`.
+    """
+    excess = _light_around_code_circle(fit, ring)
+    at_dot, between, sides = _places_of_code(ring)
+    extra = float(excess[between].max(initial=0.0))
+    missing = int(np.count_nonzero(excess[at_dot] < -_LACK))
+    moved = _largest_displacement(excess, sides)
+    if extra > _EXTRA or missing > len(ring.code_deg) // _DOTS_PER_MISSING or moved > _MOVED:
+        light = f"{extra:.0%} of a dot's light elsewhere, {moved:.0%} beside its place"
+        raise Rejection(Reason.OTHER_CODE, f"{missing} dots missing, {light}")
+
+
+@cache
+def _places_of_code(ring: Ring) -> tuple[IndexArray, BoolArray, BoolArray]:
+    """Return, of the positions, those of the dots (d,), which are clear of dots, and their sides.
+
+    The positions (72, d) beside each dot before it, and after it.
+    """
+    angles_deg = np.arange(_POSITIONS) * (360.0 / _POSITIONS)
+    off_dot_deg = (angles_deg[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0
+    reach_deg = 2.0 * ring.dot_half_angle_deg
+    before = (off_dot_deg < 0.0) & (off_dot_deg >= -reach_deg)
+    after = (off_dot_deg > 0.0) & (off_dot_deg <= reach_deg)
+    distance_deg = np.abs(off_dot_deg)
+    between = distance_deg.min(axis=1) > reach_deg
+    return distance_deg.argmin(axis=0), between, np.stack((before, after))
+
+
+def _largest_displacement(excess: FloatArray, sides: BoolArray) -> float:
+    """Return the light that is too much on one side of a dot and too little on the other."""
+    known = excess[:, None] * sides
+    most, lack = known.max(axis=1), -known.min(axis=1)
+    return float(np.minimum(most, lack[::-1]).max())
+
+
+def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
+    """Return what the fit lacks of light all around the code circle, 1: a whole dot.
+
+    0, which says nothing, where too few pixels are seen.
+    """
+    sample, clip = fit.sample, fit.sample.censoring.high
+    black, white = plateau_levels(fit.parameters.light, sample.imaging.response)
+    lack = sample.levels - np.minimum(fit.prediction.levels, clip)
+    lack = lack / max(min(white, clip) - black, sample.imaging.window.levels_per_count)
+    code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m
+    counts, sums = np.zeros(_POSITIONS), np.zeros(_POSITIONS)
+    _gather_around(fit.prediction.points_m, lack, code_m, dot_m, counts, sums)
+    px_per_m = sample.imaging.outer_radius_px / sample.imaging.outer_radius_m
+    ratio = dot_m * px_per_m / fit.parameters.blur.mean_sd_px
+    visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
+    return np.where(counts >= _MIN_PIXELS, sums / np.maximum(counts, 1.0) / visible, 0.0)
+
+
+@compiled
+def _gather_around(
+    points_m: FloatArray,
+    lack: FloatArray,
+    code_m: float,
+    dot_m: float,
+    counts: FloatArray,
+    sums: FloatArray,
+) -> None:
+    """Count the pixels within discs on the code circle, and add up what they lack."""
+    step = 2.0 * math.pi / len(counts)
+    reach = math.ceil(math.asin(min(1.0, dot_m / code_m)) / step)
+    angles = np.arange(len(counts)) * step
+    centres_x, centres_y = code_m * np.cos(angles), code_m * np.sin(angles)
+    for i in range(points_m.shape[1]):
+        x, y = points_m[0, i], points_m[1, i]
+        if abs(math.sqrt(x * x + y * y) - code_m) > dot_m:
+            continue
+        nearest = round(math.atan2(y, x) / step)
+        for beside in range(-reach, reach + 1):
+            k = (nearest + beside) % len(counts)
+            dx, dy = x - centres_x[k], y - centres_y[k]
+            if dx * dx + dy * dy < dot_m * dot_m:
+                counts[k] += 1.0
+                sums[k] += lack[i]

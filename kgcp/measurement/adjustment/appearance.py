@@ -1,0 +1,50 @@
+"""What the image looked like at a target, from the fit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import ndtri
+
+from kgcp.geometry.camera import Camera
+from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.image_model.blur import variance_in_pixels
+from kgcp.measurement.image_model.photometry import plateau_levels, share_at
+from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
+from kgcp.measurement.records import Appearance
+from kgcp.targets.layout import Target
+
+
+def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
+    """Return levels, clipping, blur and edge displacement of a fitted target."""
+    imaging = fit.sample.imaging
+    black, white = plateau_levels(fit.parameters.light, imaging.response)
+    x, y = fit.prediction.points_m
+    inside = x * x + y * y < imaging.outer_radius_m**2
+    binning, clipped = imaging.window.binning, fit.sample.clipped
+    blur_px, shift_px = fit.parameters.blur.mean_sd_px, _edge_shift_px(fit)
+    if binning > 1:
+        blur_px = math.sqrt(variance_in_pixels(blur_px * blur_px, binning))
+        shift_px *= binning
+    contour = contour_px(camera, fit.parameters.pose, 0.5 * target.ring.outer_diameter_m)
+    return Appearance(
+        radius_px=semi_major_axis_px(contour),
+        black=min(max(black, 0.0), 1.0),
+        white=min(max(white, 0.0), 1.0),
+        saturated=float(np.mean(clipped[inside])),
+        edge_shift_px=shift_px,
+        blur_px=blur_px,
+    )
+
+
+def _edge_shift_px(fit: Fit) -> float:
+    """Return how far a straight edge seems displaced towards the dark side.
+
+    The apparent edge is where the grey value passes midway between the plateaus as they are seen,
+    clipped; the true one is where half the light comes from either side.
+    """
+    light, imaging = fit.parameters.light, fit.sample.imaging
+    black, white = plateau_levels(light, imaging.response)
+    crossing = share_at(0.5 * (black + min(white, imaging.censoring.high)), light, imaging.response)
+    return float(-fit.parameters.blur.mean_sd_px * ndtri(min(max(crossing, 1e-3), 1.0 - 1e-3)))

@@ -1,0 +1,238 @@
+"""Covariances that hold up: from the residuals as they are, correlation included.
+
+The inverse normal matrix is the covariance only if residuals are independent from pixel to pixel.
+Jagged print, JPEG, sharpening and the tails of unmodelled effects run along the contours. So the
+scores (derivatives of the log-likelihood) are summed over short arcs of every circle, and the
+scatter of these sums gives the covariance of the gradient: a cluster-robust ("sandwich") estimate
+(Liang & Zeger, Biometrika 73, 1986; White, Econometrica 48, 1980). The fit makes that scatter
+smaller, the more so the fewer arcs there are: it is held against what independent residuals of
+this very fit would leave of it (Bell & McCaffrey, Survey Methodology 28, 2002).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.normal_equations import normal_matrix
+from kgcp.measurement.adjustment.solver import Fit, noise_of
+from kgcp.measurement.image_model.noise import median_at_edges
+from kgcp.measurement.image_model.photometry import plateau_levels, share_at
+from kgcp.measurement.records import Uncertainty
+
+_ARC_PX = 6.0
+_ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
+_LEAST_LEFT = 0.25  # of the scatter, after the fit
+_ROOM = 20  # for all parameters, in whole vectors of the processor
+# Of a circle's edge as a whole: no print and no pixel is known better, …
+_EDGE_FLOOR_PX = 0.0005
+_TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
+_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
+_EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCovariance:
+    """Covariance of a pose.
+
+    Attributes
+    ----------
+    pose_cov : (6, 6) array
+        Translation [m] and rotation vector [rad], left perturbation in the camera frame.
+    inflation : float
+        Mean ratio of these variances to those of independent residuals.
+    """
+
+    pose_cov: FloatArray
+    inflation: float
+
+
+def pose_covariance(fit: Fit) -> PoseCovariance:
+    """Return the covariance of the pose of a fit.
+
+    From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
+    small common displacement of each circle's edge would do.
+    """
+    scaled, misfit = fit.scaled_jacobian, fit.misfit
+    inverse = np.linalg.inv(normal_matrix(scaled, misfit, fit.unknowns))
+    circle, arc = _nearest_edges(fit)
+    root = np.linalg.cholesky(inverse[:6, :6])
+    to_pose = np.linalg.solve(root, inverse[:6])  # in units of N⁻¹
+    by_pixel = np.zeros((scaled.shape[1], _ROOM))
+    by_pixel[:, : len(scaled)] = scaled.T
+    of_pose = by_pixel[:, : len(scaled)] @ to_pose.T
+    sums, products, arcs = _over_arcs(of_pose, by_pixel, misfit.score, misfit.weight, arc)
+    products = products[:, :, : len(scaled)]
+    # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
+    left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
+    ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
+    mean = float(ratios.mean())
+    ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
+    half = root @ (directions * np.sqrt(np.maximum(ratios, 1.0)))
+    shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
+    return PoseCovariance(half @ half.T + shifts @ shifts.T, max(1.0, mean))
+
+
+def _common_displacement_px(fit: Fit) -> float:
+    """Return the standard deviation of the displacement that all of a circle's edge shares [px].
+
+    From the residuals: what edges scatter beyond the noise of the plateaus (coarse sampling of a
+    print, compression, tails of what is not modelled) averages out along a circle only in part. And
+    of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
+    """
+    imaging = fit.sample.imaging
+    is_plain = imaging.window.binning == 1 or imaging.response is Response.LINEAR
+    floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / imaging.window.binning
+    floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
+    noise = noise_of(fit.sample, fit.prediction)
+    excess = noise.sd**2 - noise.plateau_sd**2
+    at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
+    black, white = plateau_levels(fit.parameters.light, imaging.response)
+    slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
+    return max(floor_px, _COMMON_SHARE * math.sqrt(at_edges) / slope_per_px)
+
+
+def _clipped_reach_px(fit: Fit) -> float:
+    """Return how far the middle of a straight edge is within what is clipped [px]."""
+    light, imaging = fit.parameters.light, fit.sample.imaging
+    burnt = share_at(imaging.censoring.high, light, imaging.response)
+    sunk = share_at(imaging.censoring.low, light, imaging.response)
+    hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
+    return float(fit.parameters.blur.mean_sd_px * ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
+
+
+def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
+    """Return the gradient (p, 2) by one pixel's growth of the outer and of the inner circle.
+
+    Coming nearer by the share 1/r grows a circle of r pixels by one pixel.
+    """
+    imaging = fit.sample.imaging
+    per_pixel = -fit.misfit.weight / (fit.sd * imaging.outer_radius_px / imaging.outer_radius_m)
+    by_approach = per_pixel * (fit.parameters.pose.translation_m @ fit.jacobian[:3])
+    pulls = np.zeros((2, len(by_approach)))
+    for index, radius_m in enumerate(imaging.circles.radii_m[:2]):
+        np.divide(by_approach, radius_m, out=pulls[index], where=circle == index)
+    return np.asarray(scaled @ pulls.T)
+
+
+def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
+    """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
+    imaging = fit.sample.imaging
+    circles = imaging.circles.part(slice(0, imaging.measured_count))
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
+    return _number_arcs(fit.prediction.points_m, circles.centres_m, circles.radii_m, counts)
+
+
+@compiled
+def _number_arcs(
+    points_m: FloatArray, centres_m: FloatArray, radii_m: FloatArray, counts: FloatArray
+) -> tuple[IndexArray, IndexArray]:
+    """Return the circle of every pixel's nearest edge, and the number of the arc there."""
+    nearest = np.full(points_m.shape[1], np.inf)
+    circle, arc = np.zeros((2, len(nearest)), np.intp)
+    for c in range(len(radii_m)):
+        for i in range(len(nearest)):
+            x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+            off_edge = abs(math.sqrt(x * x + y * y) - radii_m[c])
+            circle[i] = c if off_edge < nearest[i] else circle[i]
+            nearest[i] = min(nearest[i], off_edge)
+    firsts = np.cumsum(counts) - counts
+    for i in range(len(nearest)):
+        c = circle[i]
+        x, y = points_m[0, i] - centres_m[0, c], points_m[1, i] - centres_m[1, c]
+        turn = math.atan2(y, x) / (2.0 * math.pi)
+        turn -= math.floor(turn)
+        arc[i] = int(firsts[c] + min(math.floor(turn * counts[c]), counts[c] - 1.0))
+    return circle, arc
+
+
+@compiled
+def _over_arcs(
+    of_pose: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return sums over arcs, and how many of them have pixels.
+
+    Of the scores with derivatives `of_pose` (n, 6): (arcs, 6); and of the products of these and
+    those `of_all` (n, 20): (arcs, 6, 20).
+    """
+    count = arc.max() + 1
+    sums, products = np.zeros((count, 6)), np.zeros((count, 6, _ROOM))
+    pixels = np.zeros(count, np.intp)
+    for i in range(len(arc)):
+        a = arc[i]
+        pixels[a] += 1
+        for k in range(6):
+            sums[a, k] += of_pose[i, k] * score[i]
+            weighted = of_pose[i, k] * weight[i]
+            for j in range(_ROOM):
+                products[a, k, j] += weighted * of_all[i, j]
+    return sums, products, (pixels > 0).sum()
+
+
+def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:
+    """Carry the covariance of a pose to everything that is reported of it.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+    pose_cov : (6, 6) array
+        As in `Uncertainty`.
+    """
+    ray = pose.translation_m / pose.distance_m
+    centre = _centre_jacobian(camera, pose)
+    angles = _angle_jacobian(camera, pose)
+    sd_angles = np.sqrt(np.einsum("ij,jk,ik->i", angles, pose_cov, angles))
+    return Uncertainty(
+        pose_cov=pose_cov,
+        centre_cov_px2=centre @ pose_cov[:3, :3] @ centre.T,
+        sd_distance_m=float(np.sqrt(ray @ pose_cov[:3, :3] @ ray)),
+        sd_roll_deg=float(sd_angles[0]),
+        sd_pitch_deg=float(sd_angles[1]),
+        sd_heading_deg=float(sd_angles[2]),
+    )
+
+
+def _centre_jacobian(camera: Camera, pose: Pose) -> FloatArray:
+    x, y, z = pose.translation_m
+    normalised = np.array([[x / z, y / z]])
+    by_translation = np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]])
+    jacobian: FloatArray = camera.distort_jacobian(normalised)[0] @ by_translation
+    return jacobian
+
+
+def _angle_jacobian(camera: Camera, pose: Pose) -> FloatArray:
+    """Return the derivatives (3, 6) of roll, pitch and heading [deg].
+
+    A turn ω moves a direction d by ω × d, so that its component k changes by (d × e_k) · ω.
+    """
+    jacobian = np.zeros((3, 6))
+    normal, axis = pose.rotation[:, 2].tolist(), pose.rotation[:, 0].tolist()
+    turned_normal, turned_axis = _across_axes(*normal), _across_axes(*axis)
+    for row, k in ((0, 1), (1, 0)):  # atan2(−n_k, n_z)
+        by_k, by_z = -normal[2] * turned_normal[k], normal[k] * turned_normal[2]
+        jacobian[row, 3:] = (by_k + by_z) / (normal[2] ** 2 + normal[k] ** 2)
+    x, y, z = pose.translation_m.tolist()
+    x, y = x / z, y / z
+    (xx, xy), (yx, yy) = camera.distort_jacobian(np.array([x, y])).tolist()
+    # the image of the axis is lens @ (d_xy − (x, y) · d_z)/z; how the lens changes is negligible
+    along_x, along_y = axis[0] - x * axis[2], axis[1] - y * axis[2]
+    right, down = xx * along_x + xy * along_y, yx * along_x + yy * along_y
+    square = right * right + down * down
+    across_x, across_y = (right * yx - down * xx) / square, (right * yy - down * xy) / square
+    by_axis = np.array([across_x, across_y, -(across_x * x + across_y * y)])
+    jacobian[2, 3:], jacobian[2, :3] = by_axis @ turned_axis, -axis[2] / z * by_axis
+    return np.degrees(jacobian)
+
+
+def _across_axes(x: float, y: float, z: float) -> FloatArray:
+    """Return the cross products (3, 3) of a vector with the three axes, as rows."""
+    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])

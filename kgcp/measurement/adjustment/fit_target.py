@@ -1,0 +1,183 @@
+"""The measurement: a model of the image fitted to the grey values around all circles.
+
+Started by the closed-form pose of an outline, good to a per cent or so. Both poses of the circle
+are adjusted; the one that fits better is reported, the other one kept with how much worse it fits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import expit
+
+from kgcp.errors import Rejection
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
+from kgcp.measurement.adjustment.appearance import appearance_of
+from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
+from kgcp.measurement.adjustment.problem import Imaging, apparent_response
+from kgcp.measurement.adjustment.two_poses import (
+    TwoPoses,
+    advantage,
+    choose_by_prior,
+    fit_both_poses,
+)
+from kgcp.measurement.image_model.blur import Blur, variance_in_bins
+from kgcp.measurement.image_model.noise import find_censoring
+from kgcp.measurement.image_model.plate import circles_of
+from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
+from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.records import Alternative, Observation
+from kgcp.targets.layout import Target
+
+_MARGIN_PX = 12.0
+_SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
+_LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
+_SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
+
+
+def measure_by_model(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    prior: NormalPrior | None = None,
+    visible: BoolArray | None = None,
+) -> Observation:
+    """Measure a target that the search has found.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame.
+    camera : Camera
+    target : Target
+        Its layout.
+    start : Observation
+        By `kgcp.measurement.search.initial_pose`.
+    prior : NormalPrior, optional
+        Of the plate's normal. It only helps to choose between the two poses, whose values remain
+        those of the image.
+    visible : (m,) array of bool, optional
+        Where the target is seen, in equal steps about its normal from its +x axis on.
+
+    Raises
+    ------
+    Rejection
+        `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
+    """
+    pose = _without_edge_shift(start)
+    imaging = replace(imaging_of(grey, camera, target, pose), visible=visible)
+    poses = fit_both_poses(imaging, pose, _start_blur(start, imaging.window.binning))
+    if prior is not None:
+        poses = choose_by_prior(imaging, poses, prior)
+    check_fit(poses.best)
+    check_code(poses.best, target.ring)
+    observation = _observation(camera, target, start, poses, prior)
+    check_precision(observation)
+    return observation
+
+
+def _without_edge_shift(start: Observation) -> Pose:
+    """Return the pose that the start would have if the outer edge were not displaced.
+
+    Its distance is from the outer circle alone, of which the radius is short by δ.
+    """
+    radius_px = start.appearance.radius_px
+    shrink = radius_px / (radius_px + (start.appearance.edge_shift_px or 0.0))
+    return Pose(start.pose.rotation, shrink * start.pose.translation_m)
+
+
+def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+    """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
+    count = 0
+    for ring in target.rings:
+        radius_m = 0.5 * ring.outer_diameter_m
+        contour, seen = contour_px(camera, pose, radius_m), camera
+        count = count or _measured_count(camera, target, contour)
+        size_px = semi_major_axis_px(contour)
+        binning = max(1, math.ceil(size_px / _LARGEST_RADIUS_PX))
+        if binning > 1:
+            seen = camera.binned(binning)
+            contour = contour_px(seen, pose, radius_m)
+            size_px = semi_major_axis_px(contour)
+        try:
+            window = cut_window(grey, seen, contour, _MARGIN_PX, binning)
+        except Rejection as rejection:
+            cut = rejection
+            continue
+        is_plain = binning > 1 or camera.response is Response.LINEAR
+        return Imaging(
+            window=window,
+            circles=circles_of(target.rings),
+            measured_count=count,
+            outer_radius_m=radius_m,
+            outer_radius_px=size_px,
+            centre_px=seen.project(pose.translation_m[None])[0],
+            focal_px=seen.mean_focal_px,
+            censoring=find_censoring(window.levels, window.levels_per_count),
+            response=apparent_response(camera.response, window),
+            sharpening_px=0.0 if is_plain else _SHARPENING_PX,
+        )
+    raise cut
+
+
+def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:
+    """Return how many of a target's circles are measured: the main ring's, or all if it is cut.
+
+    A whole main ring, which has this contour, leaves its replicas little to add to the distance, at
+    twice the time.
+    """
+    (left, top), (right, bottom) = contour.min(axis=0), contour.max(axis=0)
+    whole = min(left, top) > 0.0 and right < camera.width - 1.0 and bottom < camera.height - 1.0
+    rings = (target.ring,) if whole else target.rings
+    return sum(2 + len(ring.code_deg) for ring in rings)
+
+
+def _start_blur(start: Observation, binning: int) -> Blur:
+    """Return the blur that the start has seen, in bins; that of a sharp frame at least."""
+    appearance = start.appearance
+    seen_px = min(appearance.blur_px or 0.0, _LARGEST_START_BLUR * appearance.radius_px)
+    variance = variance_in_bins(max(_SHARP_PX2, seen_px * seen_px), binning)
+    return Blur(variance, variance, 0.0)
+
+
+def _observation(
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    poses: TwoPoses,
+    prior: NormalPrior | None,
+) -> Observation:
+    best, other = poses.best, poses.other
+    pose = best.parameters.pose
+    covariance = pose_covariance(best)
+    ambiguity = max(0.0, advantage(poses, covariance, prior))
+    pose_cov = covariance.pose_cov.copy()
+    pose_cov[:3, :3] += _spread_over_both(poses, ambiguity)
+    return Observation(
+        target=target.name,
+        ring=start.ring,
+        instance=start.instance,
+        score=start.score,
+        pose=pose,
+        centre_px=camera.project(pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, pose),
+        appearance=appearance_of(camera, target, best),
+        alternative=Alternative(other.parameters.pose, ambiguity),
+        uncertainty=propagate(camera, pose, pose_cov),
+    )
+
+
+def _spread_over_both(poses: TwoPoses, ambiguity: float) -> FloatArray:
+    """Return what the other pose adds to the covariance of the translation (3, 3) [m²].
+
+    It may be the right one, with the probability that goes with the ambiguity: the mean square of
+    the deviation from the reported one.
+    """
+    best, other = (fit.parameters.pose.translation_m for fit in (poses.best, poses.other))
+    return np.asarray(expit(-0.5 * ambiguity) * np.outer(other - best, other - best))

@@ -1,0 +1,275 @@
+"""What is not the target: surroundings of its plate, and what hides a part of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
+from kgcp.measurement.image_model.photometry import Light, light_of_levels, plateau_levels
+from kgcp.measurement.image_model.plate import blur_on_plate, largest_metres_per_px
+from kgcp.measurement.image_model.unblurred import BarePlate, look_at_plate
+
+_BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
+_ENOUGH_PIXELS = 2000  # for a median
+_CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
+_FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
+_FOREIGN_SIGMAS = 2.0  # … and so much farther its blur is felt
+_BESIDE_RING_SIGMAS = 0.85  # from there on, grey values hardly depend on the camera's tone
+_HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
+_NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
+_NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
+_HIDDEN_SIGMAS = 4.0  # from there through the next edge
+_SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
+_MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
+_DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
+_SCALE_PIXELS = 100  # enough to see how the plate's scale varies
+_SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPlate:
+    """A window under an approximate pose, blur and light.
+
+    Attributes
+    ----------
+    imaging : Imaging
+    metres_per_px : float
+        Largest length on the plate that a pixel spans.
+    blur : Blur
+    spread : (3,) array
+        By `blur_on_plate`.
+    bare : BarePlate
+        Under every pixel, with small discs and edges in reach by `see_plate`.
+    """
+
+    imaging: Imaging
+    metres_per_px: float
+    blur: Blur
+    spread: FloatArray
+    bare: BarePlate
+
+    def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
+        """Return pixels (n,) with all that a kernel around them covers."""
+        shape = self.imaging.window.height, self.imaging.window.width
+        reached = cv2.dilate(pixels.reshape(shape).view(np.uint8), kernel)
+        return np.asarray(reached.ravel().view(np.bool_))
+
+
+def see_plate(imaging: Imaging, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
+    """Prepare a window for what is asked of it; the pose may be off by so many pixels."""
+    rays, sd_px = imaging.window.rays, blur.largest_sd_px
+    step = max(1, rays.shape[1] // _SCALE_PIXELS)
+    scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
+    reach_px = max(REACH_SIGMAS * sd_px, _CLEAR_SIGMAS * sd_px + slack_px)
+    middle = imaging.window.nearest(imaging.centre_px)
+    spread = blur_on_plate(pose, rays[:, middle].copy(), blur.total_covariance, sd_px * scale)
+    bare = look_at_plate(
+        *(imaging, pose, rays),
+        small_m=_SMALL_SIGMAS * sd_px * scale,
+        reach_m=reach_px * scale,
+        spread=spread,
+    )
+    return SeenPlate(imaging, scale, blur, spread, bare)
+
+
+def first_levels(imaging: Imaging, pose: Pose) -> Light:
+    """Return black and white as medians of what an approximate pose takes for ink and plate.
+
+    Raises
+    ------
+    Rejection
+        `NO_CONTRAST` if ink is not darker than the plate.
+    """
+    window = imaging.window
+    some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
+    levels = np.ascontiguousarray(window.levels[some])
+    outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
+    rays = np.ascontiguousarray(window.rays[:, some])
+    bare = look_at_plate(imaging, pose, rays, reach_m=outer_m - inner_m)
+    black, white = _plateaus(levels, bare.rho_m, bare.share, bare.off_edge_m, outer_m)
+    if not white - black >= 4.0 * window.levels_per_count:
+        raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
+    return light_of_levels(black, white, imaging.response)
+
+
+def _uneven(step: int, width: int) -> int:
+    """Return a step of about this size that does not stay in the same columns of a window."""
+    step = max(1, step)
+    while step > 1 and math.gcd(step, width) > 1:
+        step -= 1
+    return step
+
+
+@compiled
+def _plateaus(
+    levels: FloatArray,
+    rho_m: FloatArray,
+    share: FloatArray,
+    off_edge_m: FloatArray,
+    radius_m: float,
+) -> tuple[float, float]:
+    """Return the levels of ink and plate within a radius, as medians of what is clear of edges."""
+    seen, off, found = np.empty((2, len(levels))), np.empty((2, len(levels))), np.zeros(2, np.intp)
+    for i in range(len(levels)):
+        if rho_m[i] < radius_m:
+            kind = 0 if share[i] < 0.5 else 1
+            seen[kind, found[kind]], off[kind, found[kind]] = levels[i], off_edge_m[i]
+            found[kind] += 1
+    ink = _median_of_clearest(seen[0, : found[0]], off[0, : found[0]])
+    return ink, _median_of_clearest(seen[1, : found[1]], off[1, : found[1]])
+
+
+@compiled
+def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
+    """Return the median of the levels that are farthest from edges; NaN without any."""
+    if len(levels) == 0:
+        return np.nan
+    first = int(_BLURRED_SHARE * len(levels))
+    return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
+
+
+def reached_by_surroundings(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
+    """Tell which pixels (n,) of the window blur may mix with something that is not plate.
+
+    The pose may be off by `slack_px`.
+    """
+    imaging, blur, bare, scale = seen.imaging, seen.blur, seen.bare, seen.metres_per_px
+    black, white = plateau_levels(light, imaging.response)
+    foreign = np.empty(len(bare.rho_m), dtype=np.bool_)
+    if not _mark_foreign(
+        *(imaging.window.smooth, bare.points_m, bare.rho_m, seen.spread, black, white),
+        *(imaging.outer_radius_m, blur.largest_sd_px * scale, slack_px * scale),
+        foreign,
+    ):
+        return foreign
+    reach_px = _FOREIGN_SIGMAS * blur.largest_sd_px
+    half = math.ceil(reach_px)
+    kernel = np.empty((2 * half + 1, 2 * half + 1), dtype=np.uint8)
+    _fill_ellipse(*blur.total_covariance, _FOREIGN_SIGMAS, kernel)
+    inmost_m = (1.0 - 2.0 * reach_px / imaging.outer_radius_px) * imaging.outer_radius_m
+    return np.asarray(seen.dilated(foreign, kernel) & (bare.rho_m > inmost_m))
+
+
+@compiled
+def _mark_foreign(
+    smooth: FloatArray,
+    points_m: FloatArray,
+    rho_m: FloatArray,
+    spread: FloatArray,
+    black: float,
+    white: float,
+    radius_m: float,
+    sd_m: float,
+    slack_m: float,
+    foreign: BoolArray,
+) -> int:
+    """Mark what is not plate outside a ring; return how many pixels that are.
+
+    Where the ring is not felt, by a level that is not the plate's; nearer, where the end of the
+    plate may be within the blur of the ring, by one that is darker than the ring makes it.
+    """
+    count, level = 0, min(white, 1.0)
+    for i in range(len(smooth)):
+        beyond_m, foreign[i] = rho_m[i] - radius_m, False
+        if beyond_m > _CLEAR_SIGMAS * sd_m:
+            foreign[i] = abs(smooth[i] - level) > _FOREIGN_CONTRAST * (white - black)
+        elif beyond_m > slack_m:
+            x, y = points_m[0, i], points_m[1, i]
+            felt = spread[0] * x * x + 2.0 * spread[1] * x * y + spread[2] * y * y
+            sigmas = (beyond_m - slack_m) * rho_m[i] / (sd_m * math.sqrt(felt))
+            if sigmas > _BESIDE_RING_SIGMAS:
+                share = 1.0 - 0.5 * math.erfc(sigmas * math.sqrt(0.5)) - _FOREIGN_CONTRAST
+                foreign[i] = smooth[i] < min(black + (white - black) * share, 1.0)
+        count += foreign[i]
+    return count
+
+
+@compiled
+def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyArray) -> None:
+    """Fill in 1 within so many sigmas of a blur about the middle, 0 elsewhere."""
+    half, limit = kernel.shape[0] // 2, sigmas * sigmas * (xx * yy - xy * xy)
+    for row in range(-half, half + 1):
+        for column in range(-half, half + 1):
+            distance2 = yy * column * column - 2.0 * xy * column * row + xx * row * row
+            kernel[row + half, column + half] = 1 if distance2 <= limit else 0
+
+
+def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
+    """Tell which pixels (n,) of the window show something else than ink and plate.
+
+    By levels that are neither where it is flat, and by edges that are not there: grey values
+    just beside one that are like those beyond it. The pose may be off by `slack_px`.
+    """
+    imaging, sd_px, bare = seen.imaging, seen.blur.largest_sd_px, seen.bare
+    other = np.zeros(len(bare.rho_m), dtype=np.bool_)
+    if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
+        return other
+    black, white = plateau_levels(light, imaging.response)
+    contrast, scale = min(white, 1.0) - black, seen.metres_per_px
+    found, tested = _mark_other(
+        *(imaging.window.smooth, bare.share, bare.off_edge_m, bare.rho_m, black, contrast),
+        *(imaging.outer_radius_m, slack_px * scale, sd_px * scale),
+        other,
+    )
+    if found:
+        other = _without_dots(seen, other)
+        found = int(np.count_nonzero(other))
+    if not found or found > _MAX_HIDDEN * tested:
+        return np.zeros_like(other)
+    half = math.ceil(_HIDDEN_SIGMAS * sd_px + slack_px)
+    size = (2 * half + 1, 2 * half + 1)
+    return seen.dilated(other, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size).astype(np.uint8))
+
+
+def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
+    """Leave out what may be a dot too many or too few: it lies in the ring, and is no larger.
+
+    That speaks of another code, and must not be overlooked.
+    """
+    radii_m, rho_m, window = seen.imaging.circles.radii_m, seen.bare.rho_m, seen.imaging.window
+    mask = other.reshape(window.height, window.width).view(np.uint8)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
+    beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
+    dot_px = 2.0 * radii_m[2] / seen.metres_per_px
+    hides = np.bincount(labels.ravel(), weights=beside) > 0
+    hides |= boxes[:, cv2.CC_STAT_AREA] > _DOT_AREAS * 0.25 * math.pi * dot_px**2
+    hides |= boxes[:, cv2.CC_STAT_WIDTH : cv2.CC_STAT_HEIGHT + 1].max(axis=1) > _DOTS * dot_px + 1.0
+    hides[0] = False
+    return np.asarray(hides[labels.ravel()])
+
+
+@compiled
+def _mark_other(
+    smooth: FloatArray,
+    share: FloatArray,
+    off_edge_m: FloatArray,
+    rho_m: FloatArray,
+    black: float,
+    contrast: float,
+    outer_radius_m: float,
+    slack_m: float,
+    sd_m: float,
+    other: BoolArray,
+) -> tuple[int, int]:
+    """Mark the pixels that are not what they should be; return their number, and of all tested."""
+    found = tested = 0
+    for i in range(len(smooth)):
+        off_m, beyond_m = off_edge_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m
+        is_clear = off_m > _CLEAR_SIGMAS * sd_m and beyond_m < 0.0
+        is_near = off_m > _NO_EDGE_SIGMAS * sd_m and beyond_m < _NO_EDGE_OUTSIDE_SIGMAS * sd_m
+        tested += is_clear or is_near
+        off_level = abs(smooth[i] - (black + contrast * share[i]))
+        other[i] = (is_clear and off_level > _HIDDEN_CONTRAST * contrast) or (
+            is_near and off_level > _NO_EDGE_CONTRAST * contrast
+        )
+        found += other[i]
+    return found, tested

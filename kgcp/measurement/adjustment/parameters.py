@@ -1,0 +1,88 @@
+"""Everything that the adjustment estimates, and how a step moves it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.photometry import Light, Param
+
+_NO_POSE = (0.0,) * 6
+_MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
+_MAX_ANISOTROPY = 0.95
+_MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(Param.BLUR_XY)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """A pose, a blur and a light, as the numbers that the adjustment works with.
+
+    Attributes
+    ----------
+    matrix : (3, 4) array
+        Of the pose: rotation and translation [m], target → camera.
+    vector : (19,) array
+        All others in the order of `Param`, with zeros for the pose.
+    """
+
+    matrix: FloatArray
+    vector: FloatArray
+
+    @staticmethod
+    def of(pose: Pose, blur: Blur, light: Light) -> Parameters:
+        """Collect the numbers."""
+        mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
+        of_blur = (mean, difference, blur.xy, blur.streak_x, blur.streak_y)
+        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values)))
+
+    @cached_property
+    def pose(self) -> Pose:
+        """The pose."""
+        return Pose(self.matrix[:, :3].copy(), self.matrix[:, 3].copy())
+
+    @cached_property
+    def blur(self) -> Blur:
+        """The blur."""
+        mean, difference, xy, *streak = self.vector[Param.BLUR_MEAN : Param.BLACK].tolist()
+        return Blur(mean + difference, mean - difference, xy, *streak)
+
+    @cached_property
+    def light(self) -> Light:
+        """The light."""
+        return Light(*self.vector[Param.BLACK :].tolist())
+
+    def at(self, pose: Pose) -> Parameters:
+        """Return the same blur and light at another pose."""
+        return Parameters(pose.matrix, self.vector)
+
+    def moved(self, step: FloatArray) -> Parameters:
+        """Return the parameters after a step (19,) in the order of `Param`.
+
+        That of the pose is a translation [m] and a left rotation vector [rad].
+        """
+        matrix = rotation_about(step[3:6]) @ self.matrix
+        matrix[:, 3] = self.matrix[:, 3] + step[:3]
+        return Parameters(matrix, _moved_others(self.vector, step))
+
+
+@compiled
+def _moved_others(vector: FloatArray, step: FloatArray) -> FloatArray:
+    """Return blur and light after a step, the blur such that it can be."""
+    moved = vector.copy()
+    moved[_MEAN:] += step[_MEAN:]
+    if step[_MEAN] < 0.0:  # what steps promise of narrower blur is too much
+        moved[_MEAN] = vector[_MEAN] ** 2 / (vector[_MEAN] - step[_MEAN])
+    moved[_MEAN] = max(moved[_MEAN], _MIN_VARIANCE_PX2)
+    elongation = math.sqrt(moved[_DIFFERENCE] ** 2 + moved[_XY] ** 2)
+    excess = elongation / (_MAX_ANISOTROPY * moved[_MEAN])
+    if excess > 1.0:  # the covariance must stay positive definite
+        moved[_DIFFERENCE] /= excess
+        moved[_XY] /= excess
+    return moved

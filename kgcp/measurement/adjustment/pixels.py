@@ -1,0 +1,245 @@
+"""The pixels that take part in the adjustment."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.masks import (
+    SeenPlate,
+    hidden_pixels,
+    reached_by_surroundings,
+    see_plate,
+)
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur, EdgePairs, pair_edges, reach_px
+from kgcp.measurement.image_model.blurred_plate import white_level
+from kgcp.measurement.image_model.noise import Censoring
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Imager, Light, plateau_levels
+from kgcp.measurement.image_model.sharpening import unsharp_mask
+
+_BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
+_BORDER_RADII = 0.2  # … and how far it is looked for at most
+_NEAR_SIGMAS, _NEAR_PX = 2.0, 0.3  # half width of the band around an edge that is used
+_PLATEAU_PIXELS = 400  # enough for the levels and their noise
+_SMALL_PX = 40.0  # radius below which sharpening feels the far tails of edges
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """The pixels that take part, chosen for an approximate pose and blur.
+
+    Attributes
+    ----------
+    imaging : Imaging
+    index : (n,) array of int
+        The pixels, in the flattened window.
+    is_thinned : bool
+        There would be more.
+    levels : (n,) array
+    rays : (6, n) array
+        As in `Window`.
+    imager : Imager
+    censoring : Censoring
+    pairs : EdgePairs
+    """
+
+    imaging: Imaging
+    index: IndexArray
+    is_thinned: bool
+    levels: FloatArray
+    rays: FloatArray
+    imager: Imager
+    censoring: Censoring
+    pairs: EdgePairs
+
+    @property
+    def clipped(self) -> FloatArray | BoolArray:
+        """Share of clipped pixels (n,) in each."""
+        bins = self.imaging.window.clipped
+        if bins is None:
+            return self.censoring.at_high | self.censoring.at_low
+        return bins[self.index]
+
+
+def choose_sample(
+    imaging: Imaging,
+    pose: Pose,
+    blur: Blur,
+    light: Light | None,
+    *,
+    most: int | None = None,
+    slack_px: float = 0.0,
+) -> Sample:
+    """Choose the pixels near edges, and a share of the plateaus; `most` of them, where given.
+
+    Pixels that blur may mix with what is foreign are not used: surroundings of the plate,
+    and what hides a part of the target. It is seen from the levels, once they are known (`light`),
+    by a pose that may be off by `slack_px`.
+
+    Pixels in the far tails of an edge say little about it but cost as much as any other, and they
+    feel first what the model does not know; they are left out.
+
+    Raises
+    ------
+    Rejection
+        `EDGES_LOST` if too little of the target is within the frame.
+    """
+    seen = see_plate(imaging, pose, blur, slack_px)
+    unused = np.zeros(len(seen.bare.rho_m), dtype=np.bool_)
+    if light is not None:
+        unused = reached_by_surroundings(seen, light, slack_px)
+        unused |= hidden_pixels(seen, light, slack_px)
+    if imaging.visible is not None:
+        unused |= ~imaging.visible[_steps_about(seen.bare.points_m, len(imaging.visible))]
+    index = _useful_pixels(seen, unused)
+    is_thinned = most is not None and len(index) > most
+    if most is not None and is_thinned:
+        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
+    if len(index) < 4 * PARAM_COUNT:
+        raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
+    return _sample(seen, pose, light, index, is_thinned=is_thinned)
+
+
+def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sample:
+    """Return all pixels of the ring and its border, hidden ones too: to be looked at.
+
+    Those that blur mixes with what surrounds the plate are left out, but for what shows only if the
+    pose is right.
+    """
+    seen = see_plate(imaging, pose, blur)
+    reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
+    unused = reached_by_surroundings(seen, light, slack_px=math.inf)
+    index = np.flatnonzero((seen.bare.rho_m < reach_m) & ~unused)
+    return _sample(seen, pose, light, index, is_thinned=False)
+
+
+def _sample(
+    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, *, is_thinned: bool
+) -> Sample:
+    imaging = seen.imaging
+    window, clip = imaging.window, imaging.censoring
+    rays = np.take(window.rays, index, axis=1)
+    return Sample(
+        imaging=imaging,
+        index=index,
+        is_thinned=is_thinned,
+        levels=window.levels[index],
+        rays=rays,
+        imager=_imager(seen, pose, light, index),
+        censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
+        pairs=_pairs(seen, pose, rays, index),
+    )
+
+
+def _steps_about(points_m: FloatArray, count: int) -> IndexArray:
+    """Return in which of so many steps about the plate's normal points (2, n) are."""
+    turns = np.arctan2(points_m[1], points_m[0]) / (2.0 * math.pi)
+    return np.asarray(np.rint(turns * count).astype(np.intp) % count)
+
+
+def _useful_pixels(seen: SeenPlate, unused: BoolArray) -> IndexArray:
+    """Return the pixels near edges, and those of the plateaus, thinned; of the used ones.
+
+    Within circles that are not measured none is used.
+    """
+    imaging, sd_px, scale = seen.imaging, seen.blur.largest_sd_px, seen.metres_per_px
+    tail_m = REACH_SIGMAS * sd_px * scale
+    border_px = _BORDER_SIGMAS * sd_px + _BORDER_PX
+    limit = 1.0 + min(_BORDER_RADII, border_px / imaging.outer_radius_px)
+    index = np.empty(len(unused), dtype=np.intp)
+    count = _choose(
+        *(seen.bare.rho_m, seen.bare.off_measured_m, unused),
+        *((_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale, tail_m),
+        *(_unmeasured_m(seen), limit * imaging.outer_radius_m),
+        index,
+    )
+    return index[:count]
+
+
+def _unmeasured_m(seen: SeenPlate) -> float:
+    """Return how far from the target's centre the edges of what is not measured are felt."""
+    imaging = seen.imaging
+    radii_m = imaging.circles.radii_m[imaging.measured_count :]
+    reach_m = reach_px(seen.blur) * seen.metres_per_px
+    return float(radii_m.max()) + reach_m if len(radii_m) else 0.0
+
+
+@compiled
+def _choose(
+    rho_m: FloatArray,
+    off_edge_m: FloatArray,
+    unused: BoolArray,
+    near_m: float,
+    tail_m: float,
+    unmeasured_m: float,
+    limit_m: float,
+    index: IndexArray,
+) -> int:
+    """Fill in all pixels near edges, and a share of those clear of all edges; return how many."""
+    flat = 0
+    for i in range(len(rho_m)):
+        is_flat = off_edge_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
+        flat += is_flat and not unused[i]
+    step, number, count = max(1, flat // _PLATEAU_PIXELS), 0, 0
+    for i in range(len(rho_m)):
+        if unused[i] or rho_m[i] >= limit_m:
+            continue
+        is_used = off_edge_m[i] < near_m
+        if off_edge_m[i] >= tail_m and rho_m[i] >= unmeasured_m:
+            is_used = number % step == 0
+            number += 1
+        if is_used:
+            index[count] = i
+            count += 1
+    return count
+
+
+def _imager(seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray) -> Imager:
+    imaging, window = seen.imaging, seen.imaging.window
+    offsets = (window.pixels(index) - imaging.centre_px[:, None]) / imaging.outer_radius_px
+    if imaging.sharpening_px == 0.0 or light is None:
+        return Imager(offsets, imaging.response, None)
+    is_small = imaging.outer_radius_px < _SMALL_PX
+    shown = _shown(seen, pose, light, index) if is_small else seen.bare.share
+    mask = unsharp_mask((window.height, window.width), index, shown, imaging.sharpening_px)
+    return Imager(offsets, imaging.response, mask)
+
+
+def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
+    """Return where between ink and plate the levels of all pixels are but those of `index`.
+
+    Under this pose, blur and light, for what sharpening takes from them.
+    """
+    imaging, scale, shown = seen.imaging, seen.metres_per_px, seen.bare.share.copy()
+    is_other = seen.bare.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
+    is_other[index] = False
+    others = np.flatnonzero(is_other)
+    rays, points_m = (np.take(a, others, axis=1) for a in (imaging.window.rays, seen.bare.points_m))
+    pairs = pair_edges(points_m, scale, imaging.circles, seen.blur, seen.spread)
+    share = white_level(pose.matrix, rays, seen.blur.vector, pairs).value
+    even = Imager(np.zeros((2, len(others))), imaging.response, None)
+    black, white = plateau_levels(light, imaging.response)
+    shown[others] = (even.levels(share, light) - black) / (white - black)
+    return shown
+
+
+def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> EdgePairs:
+    """Pair the pixels with the measured circles; the others are as they are for this pose."""
+    imaging, blur, scale = seen.imaging, seen.blur, seen.metres_per_px
+    points_m = np.take(seen.bare.points_m, index, axis=1)
+    measured = imaging.circles.part(slice(0, imaging.measured_count))
+    pairs = pair_edges(points_m, scale, measured, blur, seen.spread)
+    if seen.bare.rho_m[index].min() > _unmeasured_m(seen):
+        return pairs
+    others = imaging.circles.part(slice(imaging.measured_count, None))
+    replicas = pair_edges(points_m, scale, others, blur, seen.spread)
+    added = white_level(pose.matrix, rays, blur.vector, replicas).value - 1.0
+    return replace(pairs, background=pairs.background + added)

@@ -1,0 +1,73 @@
+"""What is known of the imaging, and of the plate, before the adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.camera import Response
+from kgcp.measurement.image_model.noise import Censoring
+from kgcp.measurement.image_model.plate import Circles
+from kgcp.measurement.image_model.window import Window
+
+_CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
+_FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imaging:
+    """A window with a target in it, and what it is seen with.
+
+    Attributes
+    ----------
+    window : Window
+    circles : Circles
+        All circles of the plate.
+    measured_count : int
+        The first so many of them are measured; of the others only what they add there is modelled.
+    outer_radius_m, outer_radius_px : float
+        Of the ring that is measured.
+    centre_px : (2,) array
+        Approximate, raw image.
+    focal_px : float
+        Mean principal distance.
+    censoring : Censoring
+        Of the whole window.
+    response : Response
+    sharpening_px : float
+        σ of the unsharp mask to be modelled [px]; 0: none.
+    visible : (m,) array of bool, or None
+        Where the target is seen, in equal steps about its normal from its +x axis on; None:
+        everywhere, as far as the search knows.
+    """
+
+    window: Window
+    circles: Circles
+    measured_count: int
+    outer_radius_m: float
+    outer_radius_px: float
+    centre_px: FloatArray
+    focal_px: float
+    censoring: Censoring
+    response: Response
+    sharpening_px: float
+    visible: BoolArray | None = None
+
+    @property
+    def few_pixels(self) -> int | None:
+        """How many pixels a first approach needs; None: all, for an unsharp mask needs them."""
+        return None if self.sharpening_px else _FEW_PIXELS
+
+
+def apparent_response(response: Response, window: Window) -> Response:
+    """Return how the grey values of a window follow light.
+
+    In means of grey values, tone curves, sharpening and clipping leave of an edge within a bin how
+    far they displace it; the parameters of an unknown response take that.
+    """
+    if window.clipped is None:
+        return response
+    is_clipped = float(np.mean(window.clipped)) > _CLIPPED
+    return Response.LINEAR if response is Response.LINEAR and not is_clipped else Response.UNKNOWN

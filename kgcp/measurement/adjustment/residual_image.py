@@ -1,0 +1,99 @@
+"""What a measured pose leaves of the image: the model's grey values less the frame's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.acceptance import edge_noise
+from kgcp.measurement.adjustment.fit_target import imaging_of
+from kgcp.measurement.adjustment.masks import first_levels
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import whole_plate
+from kgcp.measurement.adjustment.solver import predict
+from kgcp.measurement.adjustment.unknowns import adjust_with_streak
+from kgcp.measurement.image_model.blur import Blur, variance_in_bins
+from kgcp.measurement.image_model.photometry import plateau_levels
+from kgcp.measurement.image_model.plate import circles_of
+from kgcp.targets.layout import Target
+
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 97)
+_UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
+_USUAL_BLUR_PX = 0.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Residuals around one target, in shares of the contrast between plate and ink.
+
+    Attributes
+    ----------
+    x0, y0 : int
+        The first pixel's place in the frame [px].
+    share : (height, width) array
+        Model less grey value; NaN off the ring and its border, as far as that is plate.
+    edge_noise : float
+        Their median size near edges, without what lies hidden.
+    """
+
+    x0: int
+    y0: int
+    share: FloatArray
+    edge_noise: float
+
+
+def residuals_of(
+    grey: GreyArray, camera: Camera, target: Target, pose: Pose, blur_px: float | None
+) -> Residuals:
+    """Return what the image of a target at this pose leaves of the grey values.
+
+    Blur and light are adjusted, the pose is not, whoever measured it.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame.
+    camera : Camera
+    target : Target
+    pose : Pose
+        Target → camera.
+    blur_px : float or None
+        Approximate edge spread σ [px]; None: not known.
+
+    Raises
+    ------
+    Rejection
+        As `kgcp.measurement.adjustment.fit_target.measure_by_model`.
+    """
+    imaging = imaging_of(grey, camera, target, pose)
+    binning = imaging.window.binning
+    variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
+    start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
+    fit = adjust_with_streak(imaging, start, moves=False)
+    light = fit.parameters.light
+    sample = whole_plate(imaging, pose, fit.parameters.blur, light)
+    black, white = plateau_levels(light, imaging.response)
+    limits = imaging.censoring
+    levels = np.clip(predict(sample, fit.parameters).levels, limits.low, limits.high)
+    window = imaging.window
+    share = np.full(window.width * window.height, np.nan)
+    share[sample.index] = (levels - np.clip(sample.levels, limits.low, limits.high)) / (
+        min(white, limits.high) - black
+    )
+    shape = (window.height, window.width)
+    of_pixels = np.kron(share.reshape(shape), np.ones((binning, binning)))
+    return Residuals(binning * window.x0, binning * window.y0, of_pixels, edge_noise(fit))
+
+
+def contours_px(camera: Camera, target: Target, pose: Pose) -> FloatArray:
+    """Return the images (c, 97, 2) of all circles of a target as closed curves [px]."""
+    circles = circles_of(target.rings)
+    on_plate = (
+        circles.centres_m.T[:, None, :] + circles.radii_m[:, None, None] * _UNIT_CIRCLE[None, :, :]
+    )
+    points = pose.transform(on_plate.reshape(-1, 2))
+    return camera.project(points).reshape(on_plate.shape)

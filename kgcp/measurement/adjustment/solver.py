@@ -1,0 +1,252 @@
+"""The adjustment: pose, blur and light from the grey values around all circles of a target."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.normal_equations import (
+    Unknowns,
+    normal_matrix,
+    propose,
+    scaled_rows,
+)
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import Sample, choose_sample
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.image_model.blurred_plate import white_level, white_share
+from kgcp.measurement.image_model.noise import Misfit, Noise, estimate_noise, misfit
+
+_MAX_ROUNDS = 4
+_EARLY_STEPS, _STEPS = 4, 8
+_EARLY_GAIN, _LAST_GAIN = 2.0, 0.05  # of log-likelihood; the error left is its square, about
+_SETTLED_NOISE, _SETTLED_PX = 0.15, 0.4
+_SETTLED_BLUR, _SETTLED_STREAK = 0.15, 0.01
+_NOISE_ROUNDS = 3
+_SLACK_PX = 0.4  # by which an approximate pose may be off
+_LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
+_NEGLIGIBLE = 1e-6
+_AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
+_DAMPING, _DAMPED = 1e-7, 1e-3
+_MAX_DAMPING = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """A sample under given parameters.
+
+    Attributes
+    ----------
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
+    share : (n,) array
+        White share.
+    levels : (n,) array
+        Grey values before clipping.
+    """
+
+    points_m: FloatArray
+    share: FloatArray
+    levels: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The state of an adjustment.
+
+    Attributes
+    ----------
+    sample : Sample
+    parameters : Parameters
+    prediction : Prediction
+    jacobian : (19, n) array
+    sd : (n,) array
+        Noise of every pixel, as level.
+    misfit : Misfit
+        Without the priors.
+    unknowns : Unknowns
+    """
+
+    sample: Sample
+    parameters: Parameters
+    prediction: Prediction
+    jacobian: FloatArray
+    sd: FloatArray
+    misfit: Misfit
+    unknowns: Unknowns
+
+    @property
+    def scaled_jacobian(self) -> FloatArray:
+        """Jacobian of the free parameters (p, n), in units of the noise."""
+        return scaled_rows(self.jacobian, self.unknowns.free, self.sd)
+
+    @property
+    def total(self) -> float:
+        """Negative log-likelihood with the priors."""
+        return self.misfit.total + self.unknowns.penalty(self.parameters)
+
+
+def predict(sample: Sample, parameters: Parameters) -> Prediction:
+    """Model the grey values of a sample."""
+    share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
+    levels = sample.imager.levels(share.value, parameters.light)
+    return Prediction(share.points_m, share.value, levels)
+
+
+def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
+    """Model the grey values of a sample, and return their Jacobian (19, n) with them."""
+    share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
+    levels, jacobian = sample.imager.linearised(share, parameters.light)
+    return Prediction(share.points_m, share.value, levels), jacobian
+
+
+def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:
+    """Come near the minimum from a rough start, on pixels chosen for that start."""
+    return _fit_with_noise(
+        sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN, is_near=False
+    )
+
+
+def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | None = None) -> Fit:
+    """Estimate the unknowns, in rounds: pixels, noise and outliers are settled anew in each.
+
+    With at most so many pixels, where `most` is given; where there are more, only roughly.
+
+    Raises
+    ------
+    Rejection
+        As `choose_sample`; `POOR_FIT` if the steps diverge.
+    """
+    parameters = start
+    for _ in range(_MAX_ROUNDS):
+        pose, blur, light = parameters.pose, parameters.blur, parameters.light
+        sample = choose_sample(imaging, pose, blur, light, most=most, slack_px=_SLACK_PX)
+        enough = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
+        fit = _fit_with_noise(
+            sample, parameters, unknowns, steps=_STEPS, enough=enough, is_near=True
+        )
+        if _is_settled(parameters, fit):
+            break
+        parameters = fit.parameters
+    return fit
+
+
+def _fit_with_noise(
+    sample: Sample,
+    parameters: Parameters,
+    unknowns: Unknowns,
+    *,
+    steps: int,
+    enough: float,
+    is_near: bool,
+) -> Fit:
+    """Minimise until the noise that the residuals show is the one that they were weighed by.
+
+    A start that is near need not be followed to the minimum for the noise to show; one that is not
+    might then be drawn to a wrong one.
+    """
+    linear = linearise(sample, parameters)
+    sd = noise_of(sample, linear[0]).sd
+    for number in range(_NOISE_ROUNDS):
+        fit = minimise(
+            sample,
+            parameters,
+            sd,
+            unknowns,
+            steps=steps,
+            enough=enough,
+            linear=linear,
+            pauses=is_near and number == 0,
+        )
+        parameters, linear = fit.parameters, (fit.prediction, fit.jacobian)
+        before, sd = sd, noise_of(sample, fit.prediction).sd
+        if abs(float(sd.sum() / before.sum()) - 1.0) < _SETTLED_NOISE:
+            break
+    return fit
+
+
+def _is_settled(before: Parameters, fit: Fit) -> bool:
+    """Tell whether the pixels of a round are right for what it found.
+
+    They follow blur, direction and size: off the axis, too, a move along the ray is growth alone.
+    """
+    imaging, after = fit.sample.imaging, fit.parameters
+    blur = after.blur.largest_sd_px / before.blur.largest_sd_px
+    (x, y, depth), (x0, y0, depth0) = after.matrix[:, 3].tolist(), before.matrix[:, 3].tolist()
+    across_px = math.hypot(x / depth - x0 / depth0, y / depth - y0 / depth0) * imaging.focal_px
+    growth_px = abs(depth / depth0 - 1.0) * imaging.outer_radius_px
+    enough = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
+    return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
+
+
+def noise_of(sample: Sample, prediction: Prediction) -> Noise:
+    """Return the noise of every pixel of a sample, from its residuals.
+
+    Of pixels that are clipped, or should be, there are none: a white that is not bounded would make
+    its own noise.
+    """
+    limits, levels = sample.censoring, prediction.levels
+    usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
+    return estimate_noise(
+        sample.levels - prediction.levels,
+        prediction.share,
+        usable,
+        sample.imaging.window.levels_per_count,
+    )
+
+
+def minimise(
+    sample: Sample,
+    parameters: Parameters,
+    sd: FloatArray,
+    unknowns: Unknowns,
+    *,
+    steps: int,
+    enough: float,
+    linear: tuple[Prediction, FloatArray] | None = None,
+    pauses: bool = False,
+) -> Fit:
+    """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
+
+    At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
+    anew only while steps are large, and the normal matrix with it: near the minimum they hardly
+    change, and cost most. With `pauses`, one that is made anew ends it.
+    """
+    damping, light = _DAMPING, parameters.light
+    contrast = max(light.white - light.black, sample.imaging.window.levels_per_count)
+    relative_sd = float(sd.mean()) / contrast
+    prediction, jacobian = linearise(sample, parameters) if linear is None else linear
+    scaled = scaled_rows(jacobian, unknowns.free, sd)
+    current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
+    total = current.total + unknowns.penalty(parameters)
+    normal = normal_matrix(scaled, current, unknowns)
+    for number in range(steps):
+        while True:
+            step, promised = propose(scaled, normal, current, parameters, unknowns, damping)
+            candidate = parameters.moved(step)
+            change = relative_sd * math.sqrt(2.0 * promised / len(sd))
+            if change > _LARGE_CHANGE and number < steps - 1:
+                attempt, attempt_jacobian = linearise(sample, candidate)
+            else:
+                attempt, attempt_jacobian = predict(sample, candidate), jacobian
+            trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
+            trial_total = trial.total + unknowns.penalty(candidate)
+            is_better = trial_total <= total + _NEGLIGIBLE
+            if is_better or promised < enough or damping > _MAX_DAMPING:
+                break
+            damping = max(10.0 * damping, _DAMPED)
+        if not is_better:
+            break
+        gain, total = total - trial_total, trial_total
+        parameters, prediction, current = candidate, attempt, trial
+        if attempt_jacobian is not jacobian:
+            jacobian = attempt_jacobian
+            scaled = scaled_rows(jacobian, unknowns.free, sd)
+            if pauses:
+                break
+            normal = normal_matrix(scaled, current, unknowns)
+        damping = max(0.1 * damping, 1e-9)
+        if gain < enough or abs(gain - promised) < _AS_PROMISED:
+            break
+    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)

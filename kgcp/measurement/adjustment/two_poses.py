@@ -1,0 +1,174 @@
+"""The two poses that explain a circle's image, adjusted one after the other.
+
+A start comes first near the minimum on few pixels; its mirror image about the viewing ray does the
+same, and the better one of both is adjusted on all pixels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass, replace
+
+from kgcp.errors import Rejection
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.acceptance import edge_noise
+from kgcp.measurement.adjustment.covariance import PoseCovariance, pose_covariance
+from kgcp.measurement.adjustment.masks import first_levels
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import choose_sample
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import Fit, adjust, approach, minimise, predict
+from kgcp.measurement.adjustment.unknowns import adjust_with_streak, unknowns_of
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.noise import misfit
+from kgcp.measurement.normal_prior import NormalPrior
+
+_START_SLACK_PX = 1.5
+_HALF_SHARPENED, _NARROWED = 0.25, 1.12  # strength, and blur as a share of what seems to be
+_DOUBTFUL_EDGE_NOISE = 0.12  # of the contrast: more than a true pose leaves in most frames
+_SPILT_PX = (0.7, 1.4, -0.7)  # by which edges may be displaced beyond what the start says
+_SLIGHT_TILT_PX, _TRIED_TILT_PX, _ACROSS_STEPS = 0.06, 0.2, 6  # of the minor axis, half
+_MIRRORED_STEPS, _MIRRORED_GAIN = (1, 5), 0.5
+_HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose is fitted no better
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoPoses:
+    """The two poses of a circle, adjusted.
+
+    Attributes
+    ----------
+    best, other : Fit
+        The better and the worse one, on the same pixels with the same noise.
+    """
+
+    best: Fit
+    other: Fit
+
+
+def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
+    """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
+    rough = _off_the_saddle(_rough_fit(imaging, pose, blur))
+    other = _mirrored_fit(rough, _UNLIKELY)
+    near, far = (other, rough) if other.total < rough.total else (rough, other)
+    best = adjust_with_streak(imaging, _with_sharpening(imaging, near.parameters))
+    other = _fit_at(best, far.parameters.pose)
+    if other.total < best.total:
+        best = adjust(imaging, other.parameters, best.unknowns)
+        other = _mirrored_fit(best)
+    return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
+
+
+def _off_the_saddle(rough: Fit) -> Fit:
+    """Try a tilt across the one that was found, if that is slight.
+
+    A start that is tilted the wrong way comes near the tilt of 0, where nothing pulls it across.
+    """
+    parameters, radius_px = rough.parameters, rough.sample.imaging.outer_radius_px
+    pose = parameters.pose
+    if radius_px * (1.0 - pose.normal @ pose.translation_m / pose.distance_m) > _SLIGHT_TILT_PX:
+        return rough
+    turned = pose.tilted_across(math.acos(max(0.0, 1.0 - _TRIED_TILT_PX / radius_px)))
+    other = minimise(
+        rough.sample,
+        parameters.at(turned),
+        rough.sd,
+        rough.unknowns,
+        steps=_ACROSS_STEPS,
+        enough=_MIRRORED_GAIN,
+    )
+    return other if other.total < rough.total else rough
+
+
+def _with_sharpening(imaging: Imaging, parameters: Parameters) -> Parameters:
+    """Go half the way to what usual sharpening does, if there may be any: it was left out."""
+    if not imaging.sharpening_px:
+        return parameters
+    light = replace(parameters.light, sharpening=_HALF_SHARPENED)
+    return Parameters.of(parameters.pose, parameters.blur.scaled(_NARROWED), light)
+
+
+def _rough_fit(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
+    """Come near the minimum; from other distances if there is none near the start pose.
+
+    Where the plate is burnt white its light spills over the edges, and the start may be far off.
+    """
+    rough = _approach(imaging, pose, blur)
+    for shift_px in _SPILT_PX:
+        if edge_noise(rough) <= _DOUBTFUL_EDGE_NOISE:
+            break
+        closer = imaging.outer_radius_px / (imaging.outer_radius_px + shift_px)
+        with contextlib.suppress(Rejection):
+            other = _approach(imaging, Pose(pose.rotation, closer * pose.translation_m), blur)
+            rough = min(rough, other, key=edge_noise)
+    return rough
+
+
+def _approach(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
+    """Fit few pixels, without an unsharp mask: that would need all, and displaces little."""
+    light = first_levels(imaging, pose)
+    plain = replace(imaging, sharpening_px=0.0)
+    few = plain.few_pixels
+    sample = choose_sample(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
+    unknowns = unknowns_of(imaging, has_streak=False)
+    return approach(sample, Parameters.of(pose, blur, light), unknowns)
+
+
+def choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
+    """Let the poses change places where the prior outweighs the image; adjust the new best one."""
+    if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
+        return poses
+    best = adjust(imaging, poses.other.parameters, poses.best.unknowns)
+    turned = TwoPoses(best, _mirrored_fit(best))
+    is_better = advantage(turned, pose_covariance(best), prior) >= 0.0
+    return turned if is_better else poses
+
+
+def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | None) -> float:
+    """Return the Δχ² by which the other pose is worse: of the image, and of the prior.
+
+    That of the image counts as much as its residuals are independent; both normals are known
+    about equally well.
+    """
+    best, other = poses.best, poses.other
+    of_image = 2.0 * (other.total - best.total) / covariance.inflation
+    if prior is None:
+        return of_image
+    rotation_cov = covariance.pose_cov[3:, 3:]
+    worse, better = (prior.chi2(fit.parameters.pose, rotation_cov) for fit in (other, best))
+    return of_image + worse - better
+
+
+def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
+    parameters = fit.parameters
+    mirrored = parameters.at(parameters.pose.mirrored())
+    linear = None
+    for steps in _MIRRORED_STEPS:
+        other = minimise(
+            fit.sample,
+            mirrored,
+            fit.sd,
+            fit.unknowns,
+            steps=steps,
+            enough=_MIRRORED_GAIN,
+            linear=linear,
+        )
+        if other.total - fit.total > hopeless:
+            break
+        mirrored, linear = other.parameters, (other.prediction, other.jacobian)
+    return other
+
+
+def _fit_at(fit: Fit, pose: Pose) -> Fit:
+    """Fit another pose to the pixels of a fit, unless it is hopeless."""
+    parameters = fit.parameters.at(pose)
+    prediction = predict(fit.sample, parameters)
+    current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
+    there = replace(fit, parameters=parameters, prediction=prediction, misfit=current)
+    if there.total - fit.total > _HOPELESS:
+        return there
+    steps = _MIRRORED_STEPS[-1]
+    return minimise(
+        fit.sample, parameters, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
+    )

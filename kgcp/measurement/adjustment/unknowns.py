@@ -1,0 +1,94 @@
+"""What is estimated besides the pose, and how: light by the response, blur round or as a streak."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+
+from kgcp.geometry.camera import Response
+from kgcp.measurement.adjustment.normal_equations import Unknowns
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import Fit, adjust
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param
+
+_MANY_PIXELS_RADIUS_PX = 40.0  # from there on, few pixels first save more than to choose them costs
+_SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
+_TOO_LONG, _TOO_LONG_FROM2 = 0.095, 15.0  # what a Gaussian fitted to a streak's edges shows of it
+
+_PRIOR_SD = {
+    Param.BLUR_DIFFERENCE: 0.5,
+    Param.BLUR_XY: 0.5,
+    Param.SLOPE_X: 0.05,
+    Param.SLOPE_Y: 0.05,
+    Param.TONE_1: 0.7,
+    Param.TONE_2: 0.5,
+    Param.TONE_3: 0.5,
+    Param.SHARPENING: 0.7,
+}
+_WHITE, _WHITE_SD = 1.0, 0.4  # burnt plates of unknown tone: lest white and tone drift together
+_ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
+_GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
+_STREAK = [Param.STREAK_X, Param.STREAK_Y]
+_OF_RESPONSE = {
+    Response.LINEAR: [],
+    Response.SRGB: [Param.SHARPENING],
+    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
+}
+_OF_BINS = [Param.TONE_1]  # how far edges are displaced; their shape is that of the bins
+
+
+def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
+    """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
+    streak = _streak_of(start.blur)
+    if streak is None:
+        best = adjust(imaging, start, unknowns_of(imaging, has_streak=False, moves=moves))
+        streak, start = _streak_of(best.parameters.blur), best.parameters
+        if streak is None:
+            return best
+    unknowns = unknowns_of(imaging, has_streak=True, moves=moves)
+    streaked = Parameters.of(start.pose, streak, start.light)
+    is_large = imaging.outer_radius_px > _MANY_PIXELS_RADIUS_PX
+    near = adjust(imaging, streaked, unknowns, imaging.few_pixels if is_large else None)
+    return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
+
+
+def unknowns_of(imaging: Imaging, *, has_streak: bool, moves: bool = True) -> Unknowns:
+    """Return which parameters are free, with weak priors on what one frame hardly tells."""
+    is_binned = imaging.window.binning > 1
+    return _unknowns(imaging.response, is_binned=is_binned, has_streak=has_streak, moves=moves)
+
+
+@cache
+def _unknowns(response: Response, *, is_binned: bool, has_streak: bool, moves: bool) -> Unknowns:
+    of_response = _OF_RESPONSE[response]
+    if is_binned and of_response:
+        of_response = _OF_BINS
+    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *of_response]
+    mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
+    for param, sd in _PRIOR_SD.items():
+        precision[param] = sd**-2 if param in free else 0.0
+    if response is Response.UNKNOWN:
+        mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
+    estimated = np.array(sorted(free)[0 if moves else 6 :])
+    return Unknowns(estimated, mean, precision, precision[estimated])
+
+
+def _streak_of(blur: Blur) -> Blur | None:
+    """Read an elongated Gaussian as a streak of uniform motion; None if it is too short.
+
+    One fitted to edges, by least squares, has more variance than the streak: by up to a tenth of
+    the length, as far as that is long against the blur across it.
+    """
+    difference, mean = 0.5 * (blur.xx - blur.yy), 0.5 * (blur.xx + blur.yy)
+    half_range = math.hypot(difference, blur.xy)
+    length = math.sqrt(24.0 * half_range)
+    if length < _SHORTEST_STREAK_PX:
+        return None
+    direction = 0.5 * math.atan2(blur.xy, difference)
+    across = mean - half_range
+    length *= 1.0 - _TOO_LONG * length**2 / (length**2 + _TOO_LONG_FROM2 * across)
+    return Blur(across, across, 0.0, length * math.cos(direction), length * math.sin(direction))

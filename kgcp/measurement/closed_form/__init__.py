@@ -1,0 +1,1 @@
+"""The closed-form method of Cucci (2016)."""

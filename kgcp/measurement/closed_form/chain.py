@@ -1,0 +1,256 @@
+"""From a matched cluster to a pose by closed forms: §2.4, §4 and §3 of Cucci (2016), in turn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle import (
+    CirclePlane,
+    circle_planes,
+    conic_of_circle,
+    conic_on_plate,
+    kim_centre,
+    minimise_dispersion,
+    pose_on_plane,
+)
+from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.closed_form.edges import EdgeFit, Patch, fit_edge, patch_around
+from kgcp.measurement.records import Alternative, Appearance, Observation
+from kgcp.measurement.search.code_signal import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
+from kgcp.measurement.search.sampling import sample_grey
+from kgcp.targets.layout import Ring, Target
+
+_MAX_EDGE_SHIFT_PX = 1.2
+_MAX_EDGE_SHIFT_SHARE = 0.02  # of the outer radius
+_MAX_CENTRE_MISFIT_PX = 0.6
+_MAX_CENTRE_MISFIT_SHARE = 0.04  # of the outer radius
+_MAX_TILT_DEG = 75.0
+_MAX_DETOUR_PX = 0.05
+_SAME_POSE_RAD = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingEdges:
+    """Both edges of one ring: all that is measured in the image (end of §2.4)."""
+
+    outer: EdgeFit
+    inner: EdgeFit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedRing:
+    """One of the two poses that explain the outer circle, with what the rest says of it.
+
+    Attributes
+    ----------
+    pose : Pose
+        Target → camera.
+    score : float
+        Normalised cross-correlation of the code seen with this pose.
+    centre_misfit_px : float
+        Distance of the inner ellipse's centre from where this pose puts it [px].
+    """
+
+    pose: Pose
+    score: float
+    centre_misfit_px: float
+
+
+def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> Observation:
+    """Measure one matched ring by the paper's chain; instance 0.
+
+    Raises
+    ------
+    Rejection
+        Where the chain breaks: NO_INNER_CIRCLE, EDGES_LOST, POOR_ELLIPSE, CODE_MISMATCH or
+        IMPOSSIBLE_GEOMETRY.
+    """
+    edges = measure_edges(grey, camera, match)
+    nearest, mirrored = solve_poses(grey, camera, match, edges)
+    shift_px = edge_shift_px(nearest.pose, match.ring, edges)
+    _check_geometry(nearest, edges.outer, shift_px)
+    turn = nearest.pose.rotation.T @ mirrored.pose.rotation
+    alternative = Alternative(mirrored.pose, mirrored.centre_misfit_px - nearest.centre_misfit_px)
+    distinct = np.linalg.norm(turn - np.eye(3)) > _SAME_POSE_RAD
+    return Observation(
+        target=target.name,
+        ring=match.ring.name,
+        instance=0,
+        score=nearest.score,
+        pose=nearest.pose,
+        centre_px=camera.project(nearest.pose.translation_m),
+        heading_deg=image_heading_deg(camera, nearest.pose),
+        appearance=_appearance(grey, target, match, edges.outer.ellipse, shift_px),
+        alternative=alternative if distinct else None,
+        uncertainty=None,
+    )
+
+
+def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdges:
+    """Fit the outer ellipse, then the inner one (§2.4).
+
+    Blur and overexposure can join the dots to the disc so that no contour follows the inner
+    circle. The poses of the outer circle say where to look for its edge points.
+    """
+    ring = match.ring
+    patch = patch_around(grey, match.outer)
+    outer = fit_edge(
+        patch,
+        camera,
+        match.outer,
+        ring=ring,
+        edge_diameter_m=ring.outer_diameter_m,
+        lag_deg=match.lag_deg,
+    )
+    fits: list[EdgeFit] = []
+    rejection = Rejection(Reason.NO_INNER_CIRCLE)
+    for start in _inner_circles(camera, outer, ring):
+        try:
+            fits.append(_fit_inner(patch, camera, match, start))
+        except Rejection as failure:
+            rejection = Rejection(Reason.NO_INNER_CIRCLE, failure.detail)
+    if not fits:
+        raise rejection
+    return RingEdges(outer, max(fits, key=lambda fit: len(fit.points_px)))
+
+
+def _inner_circles(camera: Camera, outer: EdgeFit, ring: Ring) -> list[Ellipse]:
+    """Return where either pose of the outer circle puts the inner one [px]."""
+    towards = camera.undistort(outer.ellipse.points(np.zeros(1)))[0]
+    angles = CODE_ANGLES_RAD[::10]
+    circle_m = 0.5 * ring.inner_diameter_m * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    poses = (
+        pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards)
+        for plane in circle_planes(outer.conic)
+    )
+    return [
+        ellipse_from_conic(fit_ellipse(camera.project(pose.transform(circle_m)))) for pose in poses
+    ]
+
+
+def _fit_inner(patch: Patch, camera: Camera, match: CodeMatch, start: Ellipse) -> EdgeFit:
+    return fit_edge(
+        patch,
+        camera,
+        start,
+        ring=match.ring,
+        edge_diameter_m=match.ring.inner_diameter_m,
+        lag_deg=match.lag_deg,
+    )
+
+
+def solve_poses(
+    grey: GreyArray, camera: Camera, match: CodeMatch, edges: RingEdges
+) -> tuple[PosedRing, PosedRing]:
+    """Solve for the projected centre and the poses (§4, §3); the better one comes first.
+
+    Kim's centre of the two ellipses starts the minimisation of D (eq. 14). Both minima are known
+    in closed form: the minimisation must end at one of them, which makes sure of the geometry,
+    and the inner ellipse, by its centre, decides which of the two is taken.
+    """
+    outer = edges.outer.conic
+    first, second = circle_planes(outer)
+    centre = minimise_dispersion(outer, kim_centre(outer, edges.inner.conic))
+    _check_minimum(centre, first, second, camera.mean_focal_px)
+    one, other = (_posed(grey, camera, match, edges, plane) for plane in (first, second))
+    return (one, other) if one.centre_misfit_px <= other.centre_misfit_px else (other, one)
+
+
+def _check_minimum(
+    centre: FloatArray, first: CirclePlane, second: CirclePlane, focal_px: float
+) -> None:
+    """Refuse a minimum of D that is neither of the two that exist, nor in the valley between."""
+    apart = float(np.linalg.norm(first.image_centre - second.image_centre))
+    detour = sum(float(np.linalg.norm(centre - p.image_centre)) for p in (first, second)) - apart
+    if not focal_px * detour < _MAX_DETOUR_PX:
+        raise Rejection(
+            Reason.IMPOSSIBLE_GEOMETRY, f"D is least {focal_px * detour:.2f} px off its minima"
+        )
+
+
+def _posed(
+    grey: GreyArray, camera: Camera, match: CodeMatch, edges: RingEdges, plane: CirclePlane
+) -> PosedRing:
+    ring = match.ring
+    towards_x = edges.outer.ellipse.points(np.radians(match.lag_deg))
+    rough = pose_on_plane(plane, 0.5 * ring.outer_diameter_m, camera.undistort(towards_x))
+    signal = sample_grey(grey, points_of_code(camera, rough, ring)[None])
+    scores, lags_deg = match_code(signal, ring)
+    pose = rough.turned(float(lags_deg[0]))
+    inner = ellipse_from_conic(conic_of_circle(pose, 0.5 * ring.inner_diameter_m)).centre
+    measured = ellipse_from_conic(edges.inner.conic).centre
+    misfit_px = camera.mean_focal_px * float(np.linalg.norm(inner - measured))
+    return PosedRing(pose, float(scores[0]), misfit_px)
+
+
+def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
+    """Return raw pixels (360, 2) of a ring's code circle where a pose puts it, one per degree."""
+    radius_m = np.array([0.5 * ring.code_diameter_m])
+    circles = camera.project_circles(pose.rotation, pose.translation_m, radius_m, CODE_CIRCLE)
+    return circles.reshape(-1, 2)
+
+
+def edge_shift_px(pose: Pose, ring: Ring, edges: RingEdges) -> float:
+    """Return δ [px], the displacement of both edges towards the dark ring.
+
+    With r_o = R - δ and r_i = kR + δ: δ = (r_i - k r_o) / (1 + k), the inner radius taken on the
+    plate so that the perspective of a tilted ring does not count.
+    """
+    inner_m = ellipse_from_conic(conic_on_plate(pose, edges.inner.conic)).mean_radius
+    k, outer_m = ring.inner_ratio, 0.5 * ring.outer_diameter_m
+    px_per_m = edges.outer.ellipse.a / outer_m
+    return px_per_m * (inner_m - k * outer_m) / (1.0 + k)
+
+
+def _check_geometry(posed: PosedRing, outer: EdgeFit, shift_px: float) -> None:
+    """Refuse ellipses that cannot be one target's circles."""
+    radius_px = outer.ellipse.a
+    limit_px = max(_MAX_EDGE_SHIFT_PX, _MAX_EDGE_SHIFT_SHARE * radius_px)
+    if abs(shift_px) > limit_px:
+        raise Rejection(
+            Reason.IMPOSSIBLE_GEOMETRY,
+            f"the radii disagree by an edge shift of {shift_px:.2f} px, limit {limit_px:.2f} px",
+        )
+    limit_px = max(_MAX_CENTRE_MISFIT_PX, _MAX_CENTRE_MISFIT_SHARE * radius_px)
+    if posed.centre_misfit_px > limit_px:
+        raise Rejection(
+            Reason.IMPOSSIBLE_GEOMETRY,
+            f"the inner circle is {posed.centre_misfit_px:.2f} px off, limit {limit_px:.2f} px",
+        )
+    ray = posed.pose.translation_m / posed.pose.distance_m
+    tilt_deg = math.degrees(math.acos(min(1.0, float(ray @ posed.pose.normal))))
+    if tilt_deg > _MAX_TILT_DEG:
+        raise Rejection(Reason.IMPOSSIBLE_GEOMETRY, f"the plate is tilted by {tilt_deg:.0f} deg")
+
+
+def _appearance(
+    grey: GreyArray, target: Target, match: CodeMatch, outer: Ellipse, shift_px: float
+) -> Appearance:
+    full_range = float(np.iinfo(grey.dtype).max)
+    return Appearance(
+        radius_px=outer.a * target.ring.outer_diameter_m / match.ring.outer_diameter_m,
+        black=match.black / full_range,
+        white=match.white / full_range,
+        saturated=_saturated_share(grey, outer),
+        edge_shift_px=shift_px,
+    )
+
+
+def _saturated_share(grey: GreyArray, outer: Ellipse) -> float:
+    """Share of the pixels within an ellipse that are at the top of the grey values' range."""
+    rows = np.arange(max(0, int(outer.y - outer.a)), min(grey.shape[0], int(outer.y + outer.a) + 2))
+    columns = np.arange(
+        max(0, int(outer.x - outer.a)), min(grey.shape[1], int(outer.x + outer.a) + 2)
+    )
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    unit = (pixels - outer.centre) @ np.linalg.inv(outer.stretch)
+    inside = np.einsum("...i,...i->...", unit, unit) <= 1.0
+    values = grey[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1][inside]
+    return float(np.mean(values == np.iinfo(grey.dtype).max)) if values.size else 0.0

@@ -1,0 +1,135 @@
+"""Edges and their contours in one frame, broken ones closed: §2.1 of Cucci (2016)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.settings import DetectSettings
+
+_SMOOTHING_PX = 0.8  # as wide as a lens: noise and texture stop making edges, rings do not
+_BRIGHTEST_QUANTILE = 0.999
+
+_RIM = (0.9, 1.1)  # of the half widths of a contour's box: between them is its rim
+_SECTORS = 16
+_MIN_SECTORS = 10  # four dots leave this much of the rim at any blur
+_MAX_BOX_RATIO = 1.3
+_MAX_HULL_DEVIATION = 0.07  # of a hull's mean radius: squares are out
+_MIN_CORNERS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contours:
+    """All contours of a frame, end to end.
+
+    Attributes
+    ----------
+    points : (n, 2) array
+        Pixels of the contours in order, x and y [px].
+    starts : (m + 1,) array
+        Contour i is `points[starts[i]:starts[i + 1]]`.
+    """
+
+    points: FloatArray
+    starts: IndexArray
+
+    def __len__(self) -> int:
+        """Count the contours."""
+        return len(self.starts) - 1
+
+    def contour(self, index: int) -> FloatArray:
+        """Points (k, 2) of one contour [px]."""
+        return self.points[self.starts[index] : self.starts[index + 1]]
+
+    def chosen(self, indices: IndexArray) -> Contours:
+        """Contours of the given indices (k,) alone."""
+        return joined([self.contour(int(index)) for index in indices])
+
+
+def joined(contours: Sequence[npt.NDArray[Any]]) -> Contours:
+    """Put contours, each (k, 2), end to end."""
+    starts = np.zeros(len(contours) + 1, dtype=np.intp)
+    np.cumsum([len(contour) for contour in contours], out=starts[1:])
+    points = np.concatenate(contours) if contours else np.zeros((0, 2))
+    return Contours(points=points.astype(np.float64), starts=starts)
+
+
+def eight_bit(grey: GreyArray) -> GreyArray:
+    """Return an 8-bit frame for the edge detector.
+
+    A 16-bit frame often holds 10 or 12 bits: its range is stretched to its brightest pixels.
+    """
+    if grey.dtype == np.uint8:
+        return grey
+    white = max(float(np.quantile(grey[::4, ::4], _BRIGHTEST_QUANTILE)), 1.0)
+    return cv2.convertScaleAbs(grey, alpha=255.0 / white)
+
+
+def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
+    """Detect edges with Canny and follow them to contours (Suzuki & Abe 1985).
+
+    A thin closed edge gives two contours, one along each of its sides.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame, uint8 or uint16.
+    settings : DetectSettings
+        Hysteresis thresholds; contours too short for `min_radius_px` are left out.
+    """
+    smooth = cv2.GaussianBlur(eight_bit(grey), (0, 0), _SMOOTHING_PX)
+    edges = cv2.Canny(smooth, settings.canny_low, settings.canny_high)
+    found, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    # A digital circle has at least 4 √2 pixels per pixel of radius.
+    shortest = max(6, int(4.0 * np.sqrt(2.0) * settings.min_radius_px))
+    return joined([contour[:, 0] for contour in found if len(contour) >= shortest])
+
+
+def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatArray]:
+    """Return the corners (k, 2) of the convex hulls that pass the circle test [px]."""
+    if len(contours) == 0:
+        return []
+    hulls = (_hull(contours.contour(int(i))) for i in np.flatnonzero(_goes_round(contours)))
+    return [hull for hull in hulls if _is_circular(hull, settings)]
+
+
+def _goes_round(contours: Contours) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Tell for each contour (m,) whether most sectors of its box's rim have a part of it."""
+    starts, counts = contours.starts[:-1], np.diff(contours.starts)
+    low = np.minimum.reduceat(contours.points, starts)
+    high = np.maximum.reduceat(contours.points, starts)
+    half = np.maximum(0.5 * (high - low), 0.5)
+    unit = contours.points - np.repeat(0.5 * (low + high), counts, axis=0)
+    unit /= np.repeat(half, counts, axis=0)
+    radii = np.hypot(unit[:, 0], unit[:, 1])
+    sectors = np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / np.pi + 1.0) * (0.5 * _SECTORS))
+    seen = np.left_shift(1, sectors.astype(np.intp) % _SECTORS)
+    seen[(radii < _RIM[0]) | (radii > _RIM[1])] = 0
+    sectors_seen = _count_bits(np.bitwise_or.reduceat(seen, starts))
+    round_box = half.max(axis=1) < _MAX_BOX_RATIO * half.min(axis=1)
+    return np.asarray(round_box & (sectors_seen >= _MIN_SECTORS))
+
+
+def _count_bits(masks: IndexArray) -> IndexArray:
+    return np.asarray((masks[:, None] >> np.arange(_SECTORS) & 1).sum(axis=1))
+
+
+def _hull(points: FloatArray) -> FloatArray:
+    return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
+
+
+def _is_circular(hull: FloatArray, settings: DetectSettings) -> bool:
+    """§2.2 on the corners of a hull, about the middle of its box: corners are unevenly spread."""
+    offsets = hull - 0.5 * (hull.min(axis=0) + hull.max(axis=0))
+    radii = np.hypot(offsets[:, 0], offsets[:, 1])
+    return bool(
+        len(hull) >= _MIN_CORNERS
+        and radii.mean() > settings.min_radius_px
+        and radii.std() < _MAX_HULL_DEVIATION * radii.mean()
+    )

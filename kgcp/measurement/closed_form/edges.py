@@ -1,0 +1,213 @@
+"""Sub-pixel edge points and the ellipses through them: §2.4 of Cucci (2016)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
+from kgcp.targets.layout import Ring
+
+_OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])
+_CUBIC_FROM_SAMPLES = np.linalg.inv(np.vander(_OFFSETS_PX, 4, increasing=True))
+_SEARCH_PX = np.arange(-2.5, 2.75, 0.25)
+_MAX_SHIFT_PX = 1.5
+FAINTEST = 0.25  # grey values per pixel: less is rounding
+_MIN_SLOPE = 0.3  # of the median slope along the contour
+_PASSES = 3
+_DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
+_MIN_CLEAR = 0.55  # of the edge
+_MARGIN_PX = 8
+_MIN_POINTS = 8
+_MIN_SHARE = 0.25  # of the contour's length
+_OUTLIER = 3.0  # of the residuals' standard deviation
+_MIN_OUTLIER_PX = 0.1
+_MAX_RMS_PX = 0.35
+_MAX_RMS_SHARE = 0.005  # of the radius: the raw image of a large circle is not quite an ellipse
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeFit:
+    """One circle's edge, measured.
+
+    Attributes
+    ----------
+    points_px : (n, 2) array
+        Sub-pixel edge points in the raw frame [px].
+    ellipse : Ellipse
+        Through them, in the raw frame [px].
+    conic : (3, 3) array
+        Through them in normalised coordinates, free of distortion.
+    rms_px : float
+        Of the points' distances from `ellipse` [px].
+    """
+
+    points_px: FloatArray
+    ellipse: Ellipse
+    conic: FloatArray
+    rms_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """A part of the frame as a cubic spline, in the frame's pixel coordinates."""
+
+    spline: FloatArray
+    left: int
+    top: int
+
+    def sample(self, points: FloatArray) -> FloatArray:
+        """Interpolate grey values (…) at points (…, 2) of the frame [px]; NaN outside."""
+        rows, columns = points[..., 1] - self.top, points[..., 0] - self.left
+        return np.asarray(
+            ndimage.map_coordinates(
+                self.spline, [rows, columns], order=3, prefilter=False, cval=np.nan
+            )
+        )
+
+
+def patch_around(grey: GreyArray, ellipse: Ellipse) -> Patch:
+    """Cut out what the edge points of `ellipse`, and of any smaller one inside, can need."""
+    reach = ellipse.a + _MARGIN_PX
+    left, top = max(0, int(ellipse.x - reach)), max(0, int(ellipse.y - reach))
+    right, bottom = int(ellipse.x + reach) + 2, int(ellipse.y + reach) + 2
+    part = grey[top:bottom, left:right].astype(np.float64)
+    if min(part.shape) < 4:
+        raise Rejection(Reason.EDGES_LOST, "the ring is outside the frame")
+    return Patch(ndimage.spline_filter(part, order=3, mode="mirror"), left, top)
+
+
+def clear_of_dots(
+    angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
+) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
+
+    On a small ring with many dots none may be: then the places farthest from dots are taken.
+    """
+    dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
+    gap_m = np.empty(len(angles_rad))
+    _measure_gaps(angles_rad, 0.5 * edge_diameter_m, dots_rad, 0.5 * ring.code_diameter_m, gap_m)
+    gap_m -= 0.5 * ring.dot_diameter_m
+    fewest = math.ceil((1.0 - _MIN_CLEAR) * (len(gap_m) - 1))
+    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.partition(gap_m, fewest)[fewest]))
+    return np.asarray(gap_m >= reach_m)
+
+
+@compiled
+def _measure_gaps(
+    angles_rad: FloatArray,
+    radius: float,
+    others_rad: FloatArray,
+    other_radius: float,
+    gaps: FloatArray,
+) -> None:
+    """Fill in how far points of one circle are from the nearest of some points of another."""
+    for i in range(len(angles_rad)):
+        nearest = -1.0
+        for other_rad in others_rad:
+            nearest = max(nearest, math.cos(angles_rad[i] - other_rad))
+        square = radius**2 + other_radius**2 - 2.0 * radius * other_radius * nearest
+        gaps[i] = math.sqrt(max(square, 0.0))
+
+
+def steepest_ellipse(
+    patch: Patch, start: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
+) -> Ellipse:
+    """Return `start` made larger or smaller by up to two pixels to where the edge is steepest.
+
+    Four samples reach an edge less than a pixel away; overexposure can move it farther. The
+    median over the contour is what the edge is judged by.
+    """
+    factors = 1.0 + _SEARCH_PX / start.mean_radius
+    points = start.points(angles_rad) - start.centre
+    samples = patch.sample(start.centre + factors[:, None, None] * points)
+    slopes = np.median(samples[2:] - samples[:-2], axis=1) * (1.0 if dark_inside else -1.0)
+    if not np.isfinite(slopes).any():
+        return start
+    return start.scaled(float(factors[1 + int(np.nanargmax(slopes))]))
+
+
+def edge_points(
+    patch: Patch, ellipse: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
+) -> FloatArray:
+    """Return the sub-pixel edge points (k, 2) [px] near points of an ellipse, k ≤ n.
+
+    At each point the frame is sampled at four places across the ellipse, one pixel apart; the
+    edge is at the inflection of the cubic through them. Points without an inflection of the right
+    sense within reach, or much fainter than the rest, are left out.
+    """
+    normals = np.stack((np.cos(angles_rad), np.sin(angles_rad)), axis=-1) @ np.linalg.inv(
+        ellipse.stretch
+    )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    base = ellipse.points(angles_rad)
+    samples = patch.sample(base[:, None] + _OFFSETS_PX[:, None] * normals[:, None])
+    rising = samples if dark_inside else -samples
+    _, linear, quadratic, cubic = (rising @ _CUBIC_FROM_SAMPLES.T).T
+    with np.errstate(divide="ignore", invalid="ignore"):  # no cubic term: no inflection, left out
+        shift = -quadratic / (3.0 * cubic)
+        slope = linear + shift * quadratic
+    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST)
+    if plausible.any():
+        plausible &= slope >= _MIN_SLOPE * np.median(slope[plausible])
+    return np.asarray((base + shift[:, None] * normals)[plausible])
+
+
+def fit_edge(
+    patch: Patch,
+    camera: Camera,
+    start: Ellipse,
+    *,
+    ring: Ring,
+    edge_diameter_m: float,
+    lag_deg: float,
+) -> EdgeFit:
+    """Measure one edge of a ring from a preliminary ellipse.
+
+    ⌈4√(a² + b²)⌉ places on the ellipse, those near dots left out, give edge points, and they a
+    better ellipse; after the last pass the points are corrected for distortion and the ellipse is
+    fitted once more, in normalised coordinates.
+
+    Raises
+    ------
+    Rejection
+        EDGES_LOST if too few points are left, POOR_ELLIPSE if they do not lie on an ellipse.
+    """
+    ellipse, dark_inside = start, edge_diameter_m > ring.inner_diameter_m
+    for step in range(_PASSES + 1):
+        count = math.ceil(4.0 * math.hypot(ellipse.a, ellipse.b))
+        angles = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False)
+        px_per_m = 2.0 * ellipse.mean_radius / edge_diameter_m
+        clear = clear_of_dots(angles, ring, edge_diameter_m, lag_deg, px_per_m)
+        if step == 0:
+            ellipse = steepest_ellipse(patch, ellipse, angles[clear], dark_inside=dark_inside)
+            continue
+        points = edge_points(patch, ellipse, angles[clear], dark_inside=dark_inside)
+        if len(points) < max(_MIN_POINTS, _MIN_SHARE * count):
+            raise Rejection(Reason.EDGES_LOST, f"{len(points)} of {count} edge points are left")
+        points, conic = _robust_fit(points)
+        ellipse = ellipse_from_conic(conic)
+    rms = float(np.sqrt(np.mean(sampson_distance(conic, points) ** 2)))
+    if rms > max(_MAX_RMS_PX, _MAX_RMS_SHARE * ellipse.a):
+        raise Rejection(Reason.POOR_ELLIPSE, f"edge points scatter by {rms:.2f} px")
+    return EdgeFit(points, ellipse, fit_ellipse(camera.undistort(points)), rms)
+
+
+def _robust_fit(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit an ellipse and drop points far from it; return the points kept and the conic."""
+    conic = fit_ellipse(points)
+    for _ in range(_PASSES):
+        distance = np.abs(sampson_distance(conic, points))
+        limit = max(_MIN_OUTLIER_PX, _OUTLIER * 1.4826 * float(np.median(distance)))
+        if (distance <= limit).all():
+            break
+        points = points[distance <= limit]
+        conic = fit_ellipse(points)
+    return points, conic

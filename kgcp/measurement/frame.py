@@ -1,0 +1,241 @@
+"""All targets of one frame: outlines of rings, codes and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import BoolArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.closed_form.chain import points_of_code
+from kgcp.measurement.closed_form.circles import paper_outlines
+from kgcp.measurement.diagnosis import explain
+from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.records import Considered, Miss, Observation, Outcome
+from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
+from kgcp.measurement.search.code_signal import fixed_lag_score
+from kgcp.measurement.search.false_alarm import check_chance
+from kgcp.measurement.search.initial_pose import start_pose
+from kgcp.measurement.search.template_match import judge_at
+from kgcp.settings import DetectSettings, Method
+from kgcp.targets.layout import Ring, Target
+
+_MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
+_MIN_MAIN_SCORE = 0.75
+_MOST_TURNED_DEG = 8.0  # the main ring's heading against the replica's
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What one frame says about all targets.
+
+    Attributes
+    ----------
+    outcomes : tuple of Outcome
+        In the order of the targets; of each either its plates as observations, instance 0, 1, …
+        in order of score, or one Miss with the reason of its best candidate.
+    considered : tuple of Considered
+        All rings that were compared with a target's.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    considered: tuple[Considered, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """What became of one target, before the others are known."""
+
+    target: Target
+    found: tuple[Observation, ...]
+    considered: tuple[Considered, ...]
+
+
+def measure_frame(
+    grey: GreyArray,
+    camera: Camera,
+    targets: tuple[Target, ...],
+    settings: DetectSettings,
+    prior: NormalPrior | None = None,
+) -> tuple[Outcome, ...]:
+    """Return the outcomes of `examine`."""
+    return examine(grey, camera, targets, settings, prior).outcomes
+
+
+def examine(
+    grey: GreyArray,
+    camera: Camera,
+    targets: tuple[Target, ...],
+    settings: DetectSettings,
+    prior: NormalPrior | None = None,
+    known: Sequence[Observation] = (),
+) -> Examination:
+    """Look for every target in a frame and measure what is found.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame, uint8 or uint16, of the camera's size.
+    camera : Camera
+        Interior orientation.
+    targets : tuple of Target
+        All that may be seen.
+    settings : DetectSettings
+        Of the search.
+    prior : NormalPrior, optional
+        Of the normal of the plate on the vehicle: of all targets without a position of their own.
+    known : sequence of Observation
+        Other targets that are in this frame.
+    """
+    search = paper_outlines if settings.method is Method.PAPER else find_rings
+    rings = (ring for target in targets for ring in target.rings)
+    candidates = find_dotted(grey, search(grey, settings), rings)
+    trials = [
+        _try_target(
+            grey, camera, candidates, target, settings, prior if target.position_m is None else None
+        )
+        for target in targets
+    ]
+    outcomes: list[Outcome] = []
+    considered: list[Considered] = []
+    for trial in trials:
+        others = (other for other in trials if other is not trial)
+        rivals = [*known, *(seen for other in others for seen in other.found)]
+        own = _undisputed(trial.found, rivals)
+        free = [
+            one
+            for one in trial.considered
+            if not any(rival.covers(one.outline) for rival in rivals)
+        ]
+        outcomes += own or (miss_of(grey, trial.target, free, settings),)
+        considered += trial.considered
+    return Examination(tuple(outcomes), tuple(considered))
+
+
+def _undisputed(
+    found: tuple[Observation, ...], rivals: list[Observation]
+) -> tuple[Observation, ...]:
+    """Leave out plates that look more like another target's; number the others by score."""
+    kept = [
+        seen
+        for seen in found
+        if not any(rival.score > seen.score and _share_a_plate(rival, seen) for rival in rivals)
+    ]
+    kept.sort(key=lambda seen: -seen.score)
+    return tuple(replace(seen, instance=i) for i, seen in enumerate(kept))
+
+
+def _share_a_plate(one: Observation, other: Observation) -> bool:
+    radius_px = max(one.appearance.radius_px, other.appearance.radius_px)
+    return bool(np.linalg.norm(one.centre_px - other.centre_px) < radius_px)
+
+
+def _try_target(
+    grey: GreyArray,
+    camera: Camera,
+    candidates: dict[Ring, tuple[Candidate, ...]],
+    target: Target,
+    settings: DetectSettings,
+    prior: NormalPrior | None,
+) -> _Trial:
+    """Measure all plates of one target; its replicas serve where the main ring cannot."""
+    found: list[Observation] = []
+    considered: list[Considered] = []
+    for ring in target.rings:
+        free = (
+            one for one in candidates[ring] if not any(seen.covers(one.outline) for seen in found)
+        )
+        matches, refused = find_code(free, ring, settings)
+        considered += [
+            Considered(
+                *(target.name, ring.name, one.outline, one.score),
+                is_match=False,
+                reason=one.rejection.reason,
+                detail=one.rejection.detail,
+            )
+            for one in refused
+        ]
+        for match in matches:
+            candidate = Considered(target.name, ring.name, match.outer, match.score, is_match=True)
+            if any(seen.covers(match.outer) for seen in found):
+                continue
+            try:
+                start = start_pose(grey, camera, target, match, settings.method)
+                found.append(confirm(grey, camera, target, start, settings, prior))
+            except Rejection as rejection:
+                candidate = replace(candidate, reason=rejection.reason, detail=rejection.detail)
+            considered.append(candidate)
+    return _Trial(target, tuple(found), tuple(considered))
+
+
+def confirm(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    start: Observation,
+    settings: DetectSettings,
+    prior: NormalPrior | None,
+) -> Observation:
+    """Measure what a start has found, and make sure that it is the target.
+
+    Raises
+    ------
+    Rejection
+        With the reason of the first test that is not passed.
+    """
+    ring = next(ring for ring in target.rings if ring.name == start.ring)
+    verdict = judge_at(grey, camera, start.pose, ring)
+    verdict.check(settings.min_score)
+    visible = verdict.visible
+    if ring is not target.ring:
+        visible = _check_main_ring(grey, camera, target.ring, start, settings)
+    if settings.method is Method.PAPER:
+        return start
+    observation = measure_by_model(grey, camera, target, start, prior, visible)
+    check_chance(observation, target, ring, settings.false_alarm)
+    return observation
+
+
+def miss_of(
+    grey: GreyArray, target: Target, considered: Sequence[Considered], settings: DetectSettings
+) -> Miss:
+    """Give the reason of the best candidate, of those that got as far as any."""
+    if not considered:
+        return Miss(target.name, Reason.NO_CANDIDATE)
+    best = max(considered, key=lambda one: (one.is_match, one.score))
+    ring = next(ring for ring in target.rings if ring.name == best.ring)
+    best = explain(grey, ring, best, settings.min_radius_px)
+    outlines = {one.outline for one in considered}
+    reason = best.reason or Reason.CODE_MISMATCH
+    return Miss(target.name, reason, best.detail, best.score, len(outlines), best.outline)
+
+
+def _check_main_ring(
+    grey: GreyArray, camera: Camera, main: Ring, start: Observation, settings: DetectSettings
+) -> BoolArray | None:
+    """Refuse a replica that sits on a plate with another main code; return where that is seen.
+
+    Plates of several targets may carry the same small ring. Where enough of the main ring is in
+    the frame it must show its code at the heading of the replica.
+    """
+    points = points_of_code(camera, start.pose, main)
+    height, width = grey.shape
+    within = np.all((points >= 0.0) & (points <= (width - 1.0, height - 1.0)), axis=1)
+    if within.mean() < _MIN_VISIBLE:
+        return None
+    score = fixed_lag_score(grey, points, within, main)
+    if score >= _MIN_MAIN_SCORE:
+        return None
+    verdict = judge_at(grey, camera, start.pose, main)  # a part of it may be hidden
+    turn_deg = abs((verdict.lag_deg + 180.0) % 360.0 - 180.0)
+    if verdict.visible is None or turn_deg > _MOST_TURNED_DEG:
+        raise Rejection(
+            Reason.CODE_MISMATCH,
+            f"the ring around the replica {start.ring} is not {main.name}: {score:.2f}",
+        )
+    verdict.check(settings.min_score)
+    return verdict.visible

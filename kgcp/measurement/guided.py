@@ -1,0 +1,180 @@
+"""A second look: at a small part of a frame, for a target that must be there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
+from kgcp.measurement.frame import confirm
+from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.records import Considered, Observation
+from kgcp.measurement.search.candidates import find_rings_at
+from kgcp.measurement.search.code_signal import CodeMatch
+from kgcp.measurement.search.initial_pose import start_pose
+from kgcp.measurement.search.template_match import judge, polar_patch
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Target
+
+_SIGMAS = 4.0
+_SMALLEST_PX = 3.0  # radius of a ring that is looked for
+_FARTHEST = 8.0  # radii that a target may be off: more is hardly known
+_LARGEST_RATIO = 2.0  # of the radius to the expected one
+_SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are followed from
+_LOWER_SCORE = 0.06
+_WORTH_A_TRY = 0.5  # score of the whole ring
+_TRIES = 4  # per ring: the best ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """Where a target must be in a frame, and how large.
+
+    Attributes
+    ----------
+    centre_px : (2,) array
+        Projected centre [px].
+    sd_px : float
+        Standard deviation of either coordinate [px].
+    radius_px : float
+        Of the main ring [px].
+    sd_log_radius : float
+        Standard deviation of its logarithm.
+    source : str
+        What it was made of, in a word.
+    """
+
+    centre_px: FloatArray
+    sd_px: float
+    radius_px: float
+    sd_log_radius: float
+    source: str
+
+    def __str__(self) -> str:
+        """Tell it in the detail of a row."""
+        x, y = self.centre_px
+        return (
+            f"expected by {self.source} at ({x:.0f}, {y:.0f}) ± {self.sd_px:.1f} px, radius"
+            f" {self.radius_px:.1f} px ± {self.sd_log_radius:.0%}"
+        )
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it says enough to look there, and only there."""
+        return (
+            _SIGMAS * self.sd_px <= _FARTHEST * self.radius_px
+            and _SIGMAS * self.sd_log_radius <= math.log(_LARGEST_RATIO)
+        )
+
+    def is_visible(self, camera: Camera) -> bool:
+        """Tell whether the centre must be in the frame, and the ring large enough to be seen."""
+        x, y = self.centre_px
+        return bool(
+            0.0 <= x <= camera.width - 1.0
+            and 0.0 <= y <= camera.height - 1.0
+            and self.radius_px >= _SMALLEST_PX
+        )
+
+    def check(self, observation: Observation) -> None:
+        """Raise `Rejection` (`POOR_FIT`) unless an observation agrees, in place and in radius."""
+        off_px = float(np.linalg.norm(observation.centre_px - self.centre_px))
+        ratio = observation.appearance.radius_px / self.radius_px
+        if off_px > _SIGMAS * self.sd_px or abs(math.log(ratio)) > _SIGMAS * self.sd_log_radius:
+            raise Rejection(Reason.POOR_FIT, f"{off_px:.1f} px and {ratio - 1.0:+.0%} off; {self}")
+
+
+def look_again(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    expectation: Expectation,
+    settings: DetectSettings,
+    prior: NormalPrior | None,
+    rivals: Sequence[Observation],
+) -> tuple[Observation | None, tuple[Considered, ...]]:
+    """Look for one target where it must be, however faint its ring is.
+
+    The search lets pass what it would not in a whole frame. What is found must agree with the
+    expectation and pass all tests of the measurement, with a slightly lower score of the ring.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    camera : Camera
+    target : Target
+    expectation : Expectation
+    settings : DetectSettings
+    prior : NormalPrior or None
+        As for the first look.
+    rivals : sequence of Observation
+        Other targets in this frame.
+
+    Returns
+    -------
+    observation : Observation or None
+        The first that passes, the main ring's candidates tried before the replicas'.
+    considered : tuple of Considered
+    """
+    lowered = replace(settings, min_score=max(settings.min_score - _LOWER_SCORE, 0.01))
+    considered = []
+    for match in _candidates(grey, target, expectation):
+        candidate = Considered(
+            target.name, match.ring.name, match.outer, match.score, is_match=True
+        )
+        if any(rival.covers(candidate.outline) for rival in rivals):
+            continue
+        try:
+            start = start_pose(grey, camera, target, match, settings.method)
+            observation = confirm(grey, camera, target, start, lowered, prior)
+            expectation.check(observation)
+        except Rejection as rejection:
+            considered.append(replace(candidate, reason=rejection.reason, detail=rejection.detail))
+            continue
+        return replace(observation, is_guided=True), (*considered, candidate)
+    return None, tuple(considered)
+
+
+def _candidates(grey: GreyArray, target: Target, expectation: Expectation) -> Iterator[CodeMatch]:
+    """Yield the rings most like the target's, ring by ring, best first."""
+    for ring in target.rings:
+        scale = ring.outer_diameter_m / target.ring.outer_diameter_m
+        if scale * expectation.radius_px < _SMALLEST_PX:
+            continue
+        matches = [
+            CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)
+            for outline in _outlines(grey, expectation, scale)
+            for verdict in (judge(polar_patch(grey, outline), ring),)
+            if verdict.score > _WORTH_A_TRY
+        ]
+        matches.sort(key=lambda match: -match.score)
+        yield from matches[:_TRIES]
+
+
+def _outlines(grey: GreyArray, expectation: Expectation, scale: float) -> list[Ellipse]:
+    """Follow rings from all places and radii that the expectation allows."""
+    radius = scale * expectation.radius_px
+    reach = _SIGMAS * expectation.sd_px
+    steps = math.ceil(reach / (_SPACING * radius))
+    line = np.linspace(-reach, reach, 2 * steps + 1)
+    offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    offsets = offsets[np.hypot(*offsets.T) <= reach + 1e-9]
+    widest = _SIGMAS * expectation.sd_log_radius
+    sizes = math.ceil(widest / math.log(_RATIO))
+    radii = radius * np.exp(np.linspace(-widest, widest, 2 * sizes + 1))
+    found = find_rings_at(
+        grey,
+        np.repeat(expectation.centre_px + offsets, len(radii), axis=0),
+        np.tile(radii, len(offsets)),
+    )
+    return [
+        outline
+        for outline in found
+        if np.linalg.norm(outline.centre - expectation.centre_px) <= reach + _SPACING * radius
+        and abs(math.log(outline.a / radius)) <= widest + math.log(_RATIO)
+    ]

@@ -1,0 +1,1 @@
+"""What a plate looks like: blur, exposure, tone curve, sharpening, noise."""

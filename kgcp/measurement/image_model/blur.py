@@ -1,0 +1,176 @@
+"""Blur, and which pixels it lets feel which circle's edge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.measurement.image_model.plate import Circles
+from kgcp.measurement.image_model.quadrature import quadrature_for
+
+REACH_SIGMAS = 3.7  # beyond, a blurred edge is flat to 1e-4 of the contrast
+_LEAST_SPREAD = 1e-4  # of the largest variance: of a plate that is all but edge-on
+_SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blur:
+    """How an image point spreads.
+
+    Attributes
+    ----------
+    xx, yy, xy : float
+        Covariance of the Gaussian part, pixel integration included [px²].
+    streak_x, streak_y : float
+        Motion during exposure [px].
+    """
+
+    xx: float
+    yy: float
+    xy: float
+    streak_x: float = 0.0
+    streak_y: float = 0.0
+
+    @property
+    def has_streak(self) -> bool:
+        """Tell whether there is motion."""
+        return bool(self.streak_x or self.streak_y)
+
+    def scaled(self, factor: float) -> Blur:
+        """Return a blur that is so many times as wide."""
+        square = factor * factor
+        streak = (factor * self.streak_x, factor * self.streak_y)
+        return Blur(square * self.xx, square * self.yy, square * self.xy, *streak)
+
+    @property
+    def vector(self) -> FloatArray:
+        """All five, in the order of the attributes."""
+        return np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
+
+    @property
+    def total_covariance(self) -> tuple[float, float, float]:
+        """Covariance of Gaussian and streak together: xx, yy, xy [px²]."""
+        return (
+            self.xx + self.streak_x**2 / 12.0,
+            self.yy + self.streak_y**2 / 12.0,
+            self.xy + self.streak_x * self.streak_y / 12.0,
+        )
+
+    @property
+    def largest_sd_px(self) -> float:
+        """Standard deviation along the direction of the strongest blur [px]."""
+        xx, yy, xy = self.total_covariance
+        return float(np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)))
+
+    @property
+    def mean_sd_px(self) -> float:
+        """Standard deviation averaged over directions [px]."""
+        xx, yy, _ = self.total_covariance
+        return float(np.sqrt(0.5 * (xx + yy)))
+
+
+def variance_in_bins(variance_px2: float, count: int) -> float:
+    """Return a blur's variance in bins of `count` by `count` pixels, their integration included."""
+    return (variance_px2 + (count * count - 1) / 12.0) / (count * count)
+
+
+def variance_in_pixels(variance: float, count: int) -> float:
+    """Return what `variance_in_bins` took [px²]; that of a pixel at least."""
+    return max(1.0 / 12.0, count * count * variance - (count * count - 1) / 12.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgePairs:
+    """Which of n pixels feel the edge of which of c circles.
+
+    Attributes
+    ----------
+    circles : (c, 5) array
+        Centre x, y, radius [m], sign and rule of integration.
+    starts : (c + 1,) array of int, members : (m,) array of int
+        The pixels that feel circle i are members[starts[i]:starts[i + 1]].
+    background : (n,) array
+        White share of every pixel from the circles whose edge it does not feel.
+    """
+
+    circles: FloatArray
+    starts: IndexArray
+    members: IndexArray
+    background: FloatArray
+
+
+def pair_edges(
+    points_m: FloatArray,
+    metres_per_px: float,
+    circles: Circles,
+    blur: Blur,
+    spread: FloatArray,
+) -> EdgePairs:
+    """Find the pairs of pixels and circles whose edges are within reach of the blur.
+
+    Parameters
+    ----------
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
+    metres_per_px : float
+        Largest length on the plate that a pixel spans.
+    circles : Circles
+    blur : Blur
+    spread : (3,) array
+        By `blur_on_plate`.
+    """
+    sd_m = blur.largest_sd_px * metres_per_px
+    half_range = math.hypot(0.5 * (spread[0] - spread[2]), spread[1])
+    least = max(0.5 * (spread[0] + spread[2]) - half_range, _LEAST_SPREAD)
+    sharpest_m = sd_m * math.sqrt(least)
+    table = np.empty((len(circles.radii_m), 5))
+    table[:, 0], table[:, 1] = circles.centres_m
+    table[:, 2], table[:, 3] = circles.radii_m, circles.signs
+    table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
+    slack_m = _SLACK_PX * metres_per_px
+    return EdgePairs(table, *_pair(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
+
+
+def reach_px(blur: Blur) -> float:
+    """Return how far from an edge pixels feel it, wherever a circle may move [px]."""
+    return REACH_SIGMAS * blur.largest_sd_px + _SLACK_PX
+
+
+@compiled
+def _pair(
+    points_m: FloatArray,
+    circles: FloatArray,
+    reach_m: float,
+    slack_m: float,
+    spread: FloatArray,
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Return starts, members and background.
+
+    What is beyond the reach in its own direction from the circle's centre is so in all others.
+    """
+    count, found, most_m = points_m.shape[1], 0, reach_m + slack_m
+    starts, background = np.zeros(len(circles) + 1, np.intp), np.ones(count)
+    members = np.empty(2 * count, np.intp)
+    for c in range(len(circles)):
+        if found + count > len(members):
+            members = np.concatenate((members, np.empty_like(members)))
+        within_m, beyond_m = max(circles[c, 2] - most_m, 0.0), circles[c, 2] + most_m
+        for i in range(count):
+            dx, dy = points_m[0, i] - circles[c, 0], points_m[1, i] - circles[c, 1]
+            square = dx * dx + dy * dy
+            if square < within_m * within_m:
+                background[i] += circles[c, 3]
+            elif square <= beyond_m * beyond_m:
+                out_m = math.sqrt(square)
+                felt = spread[0] * dx * dx + 2.0 * spread[1] * dx * dy + spread[2] * dy * dy
+                beyond = out_m - circles[c, 2] - slack_m
+                if beyond > 0.0 and beyond * out_m > reach_m * math.sqrt(felt):
+                    continue
+                members[found] = i
+                found += 1
+        starts[c + 1] = found
+    return starts, members[:found], background

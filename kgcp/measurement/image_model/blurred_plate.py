@@ -1,0 +1,85 @@
+"""The plate under blur: white share of every pixel, with derivatives for the adjustment.
+
+The plate is a sum of discs, white minus black: blur is linear, so every circle is blurred on its
+own and the results are added. Blur lives in the image; within its reach the map from image to plate
+is taken as affine, pixel by pixel, so that a disc stays an exact circle on the plate and the blur
+becomes an anisotropic Gaussian there. `kgcp.measurement.image_model.blurred_discs` does it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.image_model.blur import EdgePairs
+from kgcp.measurement.image_model.blurred_discs import render
+from kgcp.measurement.image_model.ray_plate import (
+    PLATE_ROWS,
+    SLOPE_ROWS,
+    VIEW_ROWS,
+    carry_slopes,
+    meet_plate,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteShare:
+    """White share of n pixels and its derivatives.
+
+    Attributes
+    ----------
+    points_m : (2, n) array
+        Where the pixels' rays meet the plate.
+    value : (n,) array
+        0: ink, 1: plate.
+    jacobian : (11, n) array
+        With respect to translation [m], rotation vector [rad] (left perturbation in the camera
+        frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) where only the
+        levels were asked for.
+    """
+
+    points_m: FloatArray
+    value: FloatArray
+    jacobian: FloatArray
+
+
+def white_share(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+) -> WhiteShare:
+    """Return the white share of every pixel, with derivatives.
+
+    Parameters
+    ----------
+    pose : (3, 4) array
+        `Pose.matrix`.
+    rays : (6, n) array
+        As of a window.
+    blur : (5,) array
+        `Blur.vector`.
+    pairs : EdgePairs
+    """
+    views, on_plate = _rendered(pose, rays, blur, pairs, PLATE_ROWS)
+    slopes = np.empty((SLOPE_ROWS, rays.shape[1]))
+    carry_slopes(pose, views, on_plate, slopes)
+    return WhiteShare(views[:2], on_plate[0], slopes)
+
+
+def white_level(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+) -> WhiteShare:
+    """Return the white share of every pixel alone, at less than half the cost."""
+    views, on_plate = _rendered(pose, rays, blur, pairs, 1)
+    return WhiteShare(views[:2], on_plate[0], np.empty((0, rays.shape[1])))
+
+
+def _rendered(
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs, rows: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return views (15, n) and what is seen (rows, n)."""
+    views, on_plate = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((rows, rays.shape[1]))
+    meet_plate(pose, rays, views)
+    on_plate[0] = pairs.background
+    render(views, blur, pairs.circles, pairs.starts, pairs.members, on_plate)
+    return views, on_plate

@@ -1,0 +1,292 @@
+"""The likelihood of grey values: noise that follows the level, clipped and outlying pixels.
+
+Noise is estimated from the plateaus of ink and plate, in between it grows linearly with the level
+(shot noise); near edges it is inflated to what the residuals there show (jagged prints, JPEG).
+Clipped pixels are censored observations (Tobin): they only say "at least white". Outliers (dirt,
+a finger of shadow, a hidden part) are weighted down as by a heavy-tailed distribution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+
+_OUTLIER_SIGMAS = 3.5
+_FARTHEST_CLIPPED = (
+    3.23249  # sigmas short of the limit: there the pull is as strong as an outlier's
+)
+_MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
+_TRIM = 0.9
+_TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
+_MIN_SAMPLES = 8
+_PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
+_MOST_SMEARED = 6  # grey values below the top in which more pixels than in the next ones …
+_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # … are so many of those at the top; how far that is felt
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Censoring:
+    """Which pixels are clipped.
+
+    Attributes
+    ----------
+    high, low : float
+        Levels at and beyond which a value only says "at least" and "at most".
+    at_high, at_low : (n,) arrays
+        The pixels concerned.
+    """
+
+    high: float
+    low: float
+    at_high: BoolArray
+    at_low: BoolArray
+
+    @property
+    def share(self) -> float:
+        """Share of clipped pixels."""
+        return float(np.mean(self.at_high | self.at_low))
+
+
+def find_censoring(levels: FloatArray, count: float) -> Censoring:
+    """Find where a window is clipped: at the ends of the range, or where values pile up.
+
+    Compression smears what is clipped over some grey values below; they say no more than it does.
+
+    Parameters
+    ----------
+    levels : (n,) array
+        Grey values, 0…1 of the data type's range.
+    count : float
+        One grey value's step.
+    """
+    high, low = 1.0 - 0.5 * count, 0.5 * count
+    top, near_top, near_bottom = float(levels.max()), *_numbers_at_ends(levels, count)
+    # a sensor of fewer bits than its files saturates below the end of the range
+    if top < high:
+        at_top = float(np.mean(levels == top))
+        if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
+            high = top - 0.5 * count
+    else:
+        high -= _smeared_over(near_top, len(levels)) * count
+    low += _smeared_over(near_bottom, len(levels)) * count
+    return Censoring(high, low, levels >= high, levels <= low)
+
+
+@compiled
+def _numbers_at_ends(levels: FloatArray, count: float) -> IndexArray:
+    """Return how many pixels (2, 13) are so many grey values from the top, and from the bottom."""
+    number = np.zeros((2, 2 * _MOST_SMEARED + 1), np.intp)
+    for level in levels:
+        from_top, from_bottom = (1.0 - level) / count, level / count
+        if from_top < number.shape[1] - 0.5:
+            number[0, int(np.rint(from_top))] += 1
+        if from_bottom < number.shape[1] - 0.5:
+            number[1, int(np.rint(from_bottom))] += 1
+    return number
+
+
+def _smeared_over(number: IndexArray, pixels: int) -> int:
+    """Return over how many grey values what is clipped is smeared; 0 if it is not.
+
+    Parameters
+    ----------
+    number : (13,) array of int
+        Pixels by grey values from the end of the range.
+    pixels : int
+        All there are.
+    """
+    if number[0] <= max(_MIN_SAMPLES, _PILED_UP * pixels):
+        return 0
+    steps = np.arange(1, _MOST_SMEARED + 1)
+    excess = np.maximum(number[steps] - number[_MOST_SMEARED + 1 :].mean(), 0.0)
+    if excess.sum() < _SMEARED * number[0]:
+        return 0
+    return math.ceil(_SMEAR_SIGMAS * math.sqrt(float(excess @ steps**2 / excess.sum())))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Noise of n pixels.
+
+    Attributes
+    ----------
+    sd : (n,) array
+        As level.
+    plateau_sd : (n,) array
+        Without what only edges have.
+    """
+
+    sd: FloatArray
+    plateau_sd: FloatArray
+
+
+def estimate_noise(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    count: float,
+) -> Noise:
+    """Return the noise of every pixel from the residuals of a fit.
+
+    Parameters
+    ----------
+    residuals : (n,) array
+        Observed − modelled levels.
+    share : (n,) array
+        White share.
+    usable : (n,) array of bool
+        Not clipped.
+    count : float
+        One grey value's step.
+    """
+    sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
+    _estimate(residuals, share, usable, (_MIN_NOISE_COUNTS * count) ** 2, sd, plateau_sd)
+    return Noise(sd, plateau_sd)
+
+
+@compiled
+def _estimate(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    floor: float,
+    sd: FloatArray,
+    plateau_sd: FloatArray,
+) -> None:
+    ink, white = _plateau_variances(residuals, share, usable, floor)
+    edge, of_edge = np.empty(len(share)), 0
+    for i in range(len(share)):
+        within = min(max(share[i], 0.0), 1.0)
+        variance = max(ink + (white - ink) * within, floor)
+        plateau_sd[i] = math.sqrt(variance)
+        if usable[i] and 0.2 < within < 0.8:
+            edge[of_edge] = residuals[i] * residuals[i] / variance
+            of_edge += 1
+    standardised = _trimmed_variance(edge[:of_edge])
+    excess = 0.0 if math.isnan(standardised) else max(0.0, standardised - 1.0)
+    for i in range(len(share)):
+        within = min(max(share[i], 0.0), 1.0)
+        sd[i] = plateau_sd[i] * math.sqrt(1.0 + excess * 4.0 * within * (1.0 - within))
+
+
+@compiled
+def _plateau_variances(
+    residuals: FloatArray, share: FloatArray, usable: BoolArray, floor: float
+) -> tuple[float, float]:
+    """Return the variances of ink and plate; one for both, where there is too little of either."""
+    dark, bright, both = np.empty((3, len(share)))
+    of_dark = of_bright = of_both = 0
+    for i in range(len(share)):
+        if not usable[i]:
+            continue
+        both[of_both] = square = residuals[i] * residuals[i]
+        of_both += 1
+        if share[i] < 0.15:
+            dark[of_dark] = square
+            of_dark += 1
+        elif share[i] > 0.85:
+            bright[of_bright] = square
+            of_bright += 1
+    ink, white = _trimmed_variance(dark[:of_dark]), _trimmed_variance(bright[:of_bright])
+    if not math.isnan(ink + white):
+        return ink, white
+    for one in (ink, white, _trimmed_variance(both[:of_both])):
+        if not math.isnan(one):
+            return one, one
+    return floor, floor
+
+
+@compiled
+def median_at_edges(
+    values: FloatArray, share: FloatArray, ink: float, plate: float, otherwise: float
+) -> float:
+    """Return the median of values (n,) where the white share (n,) is between two limits."""
+    there, count = np.empty(len(values)), 0
+    for i in range(len(values)):
+        if ink < share[i] < plate:
+            there[count] = values[i]
+            count += 1
+    return float(np.median(there[:count])) if count else otherwise
+
+
+@compiled
+def _trimmed_variance(squares: FloatArray) -> float:
+    """Return the variance of the central part, scaled to the whole; NaN if there are too few."""
+    if len(squares) < _MIN_SAMPLES:
+        return math.nan
+    count = max(1, int(_TRIM * len(squares)))
+    total = 0.0
+    for square in np.partition(squares, count - 1)[:count]:
+        total += square
+    return total / (count * _TRIMMED_VARIANCE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Misfit:
+    """Negative log-likelihood of a window, and what Newton's method needs of it.
+
+    Attributes
+    ----------
+    total : float
+        Up to a constant.
+    score : (n,) array
+        Its derivative with respect to the standardised model, times −1.
+    weight : (n,) array
+        Its second derivative, made positive.
+    """
+
+    total: float
+    score: FloatArray
+    weight: FloatArray
+
+
+def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Censoring) -> Misfit:
+    """Compare observed and modelled levels (n,) under noise of standard deviation `sd` (n,).
+
+    Far from the model the density of a seen pixel falls like a power of the distance, so that its
+    loss grows as the logarithm; that of a clipped pixel falls exponentially, its loss grows
+    linearly.
+    """
+    clips = (censoring.at_low, censoring.at_high)
+    return Misfit(*_misfit(levels, model, sd, *clips, censoring.low, censoring.high))
+
+
+@compiled
+def _misfit(
+    levels: FloatArray,
+    model: FloatArray,
+    sd: FloatArray,
+    at_low: BoolArray,
+    at_high: BoolArray,
+    low: float,
+    high: float,
+) -> tuple[float, FloatArray, FloatArray]:
+    score, weight = np.empty_like(levels), np.empty_like(levels)
+    total = 0.0
+    for i in range(len(levels)):
+        if at_low[i] or at_high[i]:
+            sign, limit = (-1.0, low) if at_low[i] else (1.0, high)
+            missing = sign * (limit - model[i]) / sd[i]
+            near = min(missing, _FARTHEST_CLIPPED)
+            tail = 0.5 * math.erfc(near * math.sqrt(0.5))
+            hazard = math.exp(-0.5 * near * near) / (math.sqrt(2.0 * math.pi) * tail)
+            total += hazard * (missing - near) - math.log(tail)
+            score[i] = sign * hazard
+            curvature = hazard * (hazard - near) if missing == near else hazard / missing
+            weight[i] = max(curvature, 1e-9)
+            continue
+        z = (levels[i] - model[i]) / sd[i]
+        square = z * z / (_OUTLIER_SIGMAS * _OUTLIER_SIGMAS)
+        if square <= 1.0:
+            total += 0.5 * z * z
+            weight[i] = 1.0
+        else:
+            total += 0.5 * _OUTLIER_SIGMAS * _OUTLIER_SIGMAS * (1.0 + math.log(square))
+            weight[i] = 1.0 / square
+        score[i] = z * weight[i]
+    return total, score, weight

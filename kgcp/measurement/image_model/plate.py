@@ -1,0 +1,148 @@
+"""The plate and the rays: circles in metres, and where the pixels of a window meet them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.pose import Pose
+from kgcp.targets.layout import Ring
+
+_SAME_PLACE = 1e-6  # of a radius
+EVEN = np.array([1.0, 0.0, 1.0])  # a blur that is spread evenly
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circles:
+    """Circles on the plate, as arrays.
+
+    Attributes
+    ----------
+    centres_m : (2, c) array
+    radii_m : (c,) array
+    signs : (c,) array
+        +1: white within; −1: black within.
+    """
+
+    centres_m: FloatArray
+    radii_m: FloatArray
+    signs: FloatArray
+
+    def part(self, which: slice) -> Circles:
+        """Return some of the circles."""
+        return Circles(self.centres_m[:, which], self.radii_m[which], self.signs[which])
+
+
+@cache
+def circles_of(rings: tuple[Ring, ...]) -> Circles:
+    """Return all circles of concentric rings: edges and dots."""
+    centres: list[FloatArray] = []
+    radii: list[float] = []
+    signs: list[float] = []
+    for ring in rings:
+        dots = ring.dot_centres_m()
+        centres += [np.zeros((2, 2)), dots]
+        radii += [0.5 * ring.outer_diameter_m, 0.5 * ring.inner_diameter_m]
+        radii += [0.5 * ring.dot_diameter_m] * len(dots)
+        signs += [-1.0, 1.0] + [1.0] * len(dots)
+    return Circles(np.vstack(centres).T.copy(), np.array(radii), np.array(signs))
+
+
+def plate_points(pose: Pose, rays: FloatArray) -> FloatArray:
+    """Return where the rays (6, n) of n pixels meet the plate (2, n) [m]."""
+    points = np.empty((2, rays.shape[1]))
+    _meet(pose.rotation, pose.translation_m, rays, points)
+    return points
+
+
+@compiled
+def _meet(axes: FloatArray, offset: FloatArray, rays: FloatArray, points: FloatArray) -> None:
+    height, along = 0.0, np.zeros(2)
+    for k in range(3):
+        height += axes[k, 2] * offset[k]
+        for j in range(2):
+            along[j] += axes[k, j] * offset[k]
+    for i in range(rays.shape[1]):
+        x, y = rays[0, i], rays[1, i]
+        depth = height / (axes[0, 2] * x + axes[1, 2] * y + axes[2, 2])
+        for j in range(2):
+            points[j, i] = depth * (axes[0, j] * x + axes[1, j] * y + axes[2, j]) - along[j]
+
+
+def largest_metres_per_px(pose: Pose, rays: FloatArray) -> float:
+    """Return the largest length on the plate that a pixel with these rays (6, n) spans [m]."""
+    return math.sqrt(_largest_square(pose.rotation, pose.translation_m, rays))
+
+
+@compiled
+def _largest_square(axes: FloatArray, offset: FloatArray, rays: FloatArray) -> float:
+    """Return the largest square of the length on the plate along x or y of a raw pixel [m²]."""
+    largest = 0.0
+    for i in range(rays.shape[1]):
+        xx, xy, yx, yy = _scales(axes, offset, rays[:, i])
+        largest = max(largest, xx * xx + yx * yx, xy * xy + yy * yy)
+    return largest
+
+
+@compiled
+def _scales(
+    axes: FloatArray, offset: FloatArray, ray: FloatArray
+) -> tuple[float, float, float, float]:
+    """Return the metres on the plate along its x and y per raw pixel along x, y: xx, xy, yx, yy."""
+    facing = axes[0, 2] * ray[0] + axes[1, 2] * ray[1] + axes[2, 2]
+    height = axes[0, 2] * offset[0] + axes[1, 2] * offset[1] + axes[2, 2] * offset[2]
+    depth, scales = height / facing, np.empty((2, 2))
+    for j in range(2):
+        share = (axes[0, j] * ray[0] + axes[1, j] * ray[1] + axes[2, j]) / facing
+        slide_x, slide_y = axes[0, j] - share * axes[0, 2], axes[1, j] - share * axes[1, 2]
+        for k in range(2):
+            scales[j, k] = depth * (slide_x * ray[2 + k] + slide_y * ray[4 + k])
+    return scales[0, 0], scales[0, 1], scales[1, 0], scales[1, 1]
+
+
+def blur_on_plate(
+    pose: Pose, ray: FloatArray, covariance: tuple[float, float, float], sd_m: float
+) -> FloatArray:
+    """Return how an image's blur is spread over the plate's directions.
+
+    Parameters
+    ----------
+    pose : Pose
+    ray : (6,) array
+        Of a pixel on the plate, as in `Window`.
+    covariance : (3,) tuple
+        Of the blur: xx, yy, xy [px²].
+    sd_m : float
+        Largest standard deviation that it may have on the plate.
+
+    Returns
+    -------
+    (3,) array
+        Its covariance there, xx, xy, yy, in units of sd_m².
+    """
+    a, b, c, d = _scales(pose.rotation, pose.translation_m, ray)
+    xx, yy, xy = covariance
+    along_x, along_y = xx * a + xy * b, xy * a + yy * b
+    mixed, across = along_x * c + along_y * d, (xx * c + 2.0 * xy * d) * c + yy * d * d
+    return np.array((along_x * a + along_y * b, mixed, across)) / (sd_m * sd_m)
+
+
+@compiled
+def find_skips(centres_m: FloatArray, radii_m: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Return how far circles (c,) are out, and the next that may be in reach where one is not.
+
+    Dots of one ring are all as far from the target's centre.
+    """
+    count = len(radii_m)
+    out_m, beyond = np.sqrt(centres_m[0] ** 2 + centres_m[1] ** 2), np.empty(count, np.intp)
+    for c in range(count - 1, -1, -1):
+        beyond[c] = c + 1
+        is_like_next = c + 1 < count and radii_m[c] == radii_m[c + 1]
+        if is_like_next and abs(out_m[c] - out_m[c + 1]) < _SAME_PLACE * radii_m[c]:
+            beyond[c] = beyond[c + 1]
+    return out_m, beyond

@@ -1,0 +1,1 @@
+"""Where the rings of a frame are, and whose code they carry."""

@@ -1,0 +1,174 @@
+"""Which of the rings in a frame carry a target's code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.errors import Rejection
+from kgcp.geometry._jit import compiled, inlined
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.conic import Ellipse
+from kgcp.measurement.search.code_signal import CodeMatch
+from kgcp.measurement.search.outlines import Seeds, find_outlines, find_seeds
+from kgcp.measurement.search.pyramid import build_pyramid
+from kgcp.measurement.search.sampling import sample_ellipses
+from kgcp.measurement.search.template_match import judge
+from kgcp.measurement.search.templates import ANGLES, CIRCLE, SAMPLED_RADII
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Ring
+
+_MIN_CONTRAST = 0.02  # of the grey values' range
+_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
+_UNEVEN = 0.5  # grey values of ink, disc and plate, of the contrast
+_DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
+_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
+_SEED_REACH = 2.0  # around places that are pointed out, of their radii
+_SMALLEST_WINDOW_PX = 12
+_DIGITS = 6  # of proportions that are the same
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A dark ring with brighter places, between a bright disc and a bright plate.
+
+    Attributes
+    ----------
+    outline : Ellipse
+        Of its outer circle [px].
+    patch : (radii, angles) array
+        Grey values around it, for `kgcp.measurement.search.template_match.judge`.
+    """
+
+    outline: Ellipse
+    patch: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A ring in the frame that is not the one looked for.
+
+    Attributes
+    ----------
+    outline : Ellipse
+        Of its outer circle [px].
+    score : float
+        Normalised cross-correlation of the whole ring, -1…1.
+    rejection : Rejection
+        What speaks against it.
+    """
+
+    outline: Ellipse
+    score: float
+    rejection: Rejection
+
+
+def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
+    """Return the outlines of all dark rings in a frame that may be a target's."""
+    pyramid = build_pyramid(grey)
+    return find_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
+
+
+def find_rings_at(
+    grey: GreyArray, centres_px: FloatArray, radii_px: FloatArray
+) -> tuple[Ellipse, ...]:
+    """Return the outlines of rings at places (n, 2) of about some radii (n,), however faint.
+
+    Nothing but the part of the frame around them is looked at.
+    """
+    reach = _SEED_REACH * radii_px[:, None] + 1.0
+    low = np.maximum(np.floor((centres_px - reach).min(axis=0)).astype(int), 0)
+    x1, y1 = np.ceil((centres_px + reach).max(axis=0)).astype(int) + 1
+    window = grey[low[1] : max(y1, 0), low[0] : max(x1, 0)]
+    if min(window.shape) < _SMALLEST_WINDOW_PX:
+        return ()
+    seeds = Seeds(centres_px - low, radii_px, np.ones(len(radii_px)))
+    return tuple(
+        replace(outline, x=outline.x + float(low[0]), y=outline.y + float(low[1]))
+        for outline in find_outlines(build_pyramid(window), seeds)
+    )
+
+
+def find_dotted(
+    grey: GreyArray, outlines: tuple[Ellipse, ...], rings: Iterable[Ring]
+) -> dict[Ring, tuple[Candidate, ...]]:
+    """Return for each ring the outlines that look like it but for their code.
+
+    They have a dark ring between bright disc and plate, brighter in places. Rings of the same
+    proportions, such as replicas, share their candidates.
+    """
+    found: dict[tuple[float, float], tuple[Candidate, ...]] = {}
+    by_ring: dict[Ring, tuple[Candidate, ...]] = {}
+    for ring in rings:
+        ratios = ring.inner_ratio, ring.code_diameter_m / ring.outer_diameter_m
+        shape = round(ratios[0], _DIGITS), round(ratios[1], _DIGITS)
+        if shape not in found:
+            found[shape] = _dotted(grey, outlines, *ratios)
+        by_ring[ring] = found[shape]
+    return by_ring
+
+
+def find_code(
+    candidates: Iterable[Candidate], ring: Ring, settings: DetectSettings
+) -> tuple[tuple[CodeMatch, ...], tuple[Refusal, ...]]:
+    """Look for a ring's code in all candidates.
+
+    Returns
+    -------
+    matches : tuple of CodeMatch
+        Best first.
+    refused : tuple of Refusal
+        The others.
+    """
+    matches: list[CodeMatch] = []
+    refused: list[Refusal] = []
+    for candidate in candidates:
+        outline, verdict = candidate.outline, judge(candidate.patch, ring)
+        try:
+            verdict.check(settings.min_score - _CIRCLE_LOSS)
+        except Rejection as rejection:
+            refused.append(Refusal(outline, verdict.score, rejection))
+            continue
+        matches.append(
+            CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)
+        )
+    return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
+
+
+def _dotted(
+    grey: GreyArray, outlines: tuple[Ellipse, ...], inner: float, code: float
+) -> tuple[Candidate, ...]:
+    """Return the candidates for rings with such circles, of their outer radius."""
+    radii = np.array((_DISC_SHARE * inner, code, _PLATE))
+    values = np.sort(sample_ellipses(grey, outlines, radii, CIRCLE), axis=2)
+    dotted = np.empty(len(outlines), dtype=bool)
+    _tell(values, _MIN_CONTRAST * float(np.iinfo(grey.dtype).max), dotted)
+    kept = tuple(outlines[i] for i in np.flatnonzero(dotted))
+    return tuple(map(Candidate, kept, sample_ellipses(grey, kept, SAMPLED_RADII, CIRCLE)))
+
+
+@compiled
+def _tell(values: FloatArray, least: float, dotted: npt.NDArray[np.bool_]) -> None:
+    """Tell of which outlines disc, code circle and plate (n, 3, angles), sorted, are a ring's."""
+    for i in range(len(values)):
+        disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
+        black = code[_rank(0.25)]
+        contrast = min(disc[_rank(0.5)], plate[_rank(0.5)]) - black
+        uneven = max(
+            code[_rank(0.35)] - code[_rank(0.05)],
+            disc[_rank(0.7)] - disc[_rank(0.3)],
+            plate[_rank(0.8)] - plate[_rank(0.4)],
+        )
+        dotted[i] = (
+            contrast > least
+            and code[_rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
+            and uneven < _UNEVEN * contrast
+        )
+
+
+@inlined
+def _rank(share: float) -> int:
+    return round(share * (ANGLES - 1))

@@ -1,0 +1,154 @@
+"""The code on the black ring: identity and heading of a plate, §2.3 of Cucci (2016)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.conic import Ellipse
+from kgcp.measurement.search.sampling import sample_grey
+from kgcp.targets.layout import Ring
+
+_SAMPLES = 360
+CODE_ANGLES_RAD = np.linspace(0.0, 2.0 * math.pi, _SAMPLES, endpoint=False)
+CODE_CIRCLE = np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=-1)
+_BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # edge spreads that the code is tried with
+_HEADING_SLACK = 6  # degrees that a replica's heading may be off
+
+
+@dataclass(frozen=True, slots=True)
+class CodeMatch:
+    """A ring in the frame that carries the code of a target's.
+
+    Attributes
+    ----------
+    ring : Ring
+        Whose code it is.
+    outer : Ellipse
+        Preliminary outer ellipse [px].
+    score : float
+        Normalised cross-correlation of the code, -1…1.
+    lag_deg : float
+        Heading of the plate's +x axis as an angle of `Ellipse.points` [deg].
+    black, white : float
+        Grey levels of ring and plate, in grey values.
+    """
+
+    ring: Ring
+    outer: Ellipse
+    score: float
+    lag_deg: float
+    black: float
+    white: float
+
+
+@lru_cache(maxsize=64)
+def reference_signals(ring: Ring) -> FloatArray:
+    """Return a ring's code (4, 360) at heading 0: 1 in dots, 0 between, four degrees of blur."""
+    degrees = np.degrees(CODE_ANGLES_RAD)
+    offset = np.abs((degrees[:, None] - np.array(ring.code_deg) + 180.0) % 360.0 - 180.0)
+    sharp = np.clip(ring.dot_half_angle_deg + 0.5 - offset.min(axis=1), 0.0, 1.0)
+    frequency = np.arange(_SAMPLES // 2 + 1)
+    damping = np.exp(-0.5 * (frequency * _BLURS_RAD[:, None]) ** 2)
+    return np.fft.irfft(np.fft.rfft(sharp) * damping, _SAMPLES)
+
+
+def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]:
+    """Return the best normalised cross-correlation over all lags, and the lag (§2.3).
+
+    Parameters
+    ----------
+    signals : (m, 360) array
+        Grey values along code circles, one per degree.
+    ring : Ring
+        Whose code is looked for.
+
+    Returns
+    -------
+    scores, lags_deg : (m,) arrays
+        The lag is refined between samples by a parabola.
+    """
+    by_blur = np.fft.irfft(np.fft.rfft(signals)[:, None] * _wanted_spectra(ring), _SAMPLES)
+    scores, lags_deg = np.empty(len(signals)), np.empty(len(signals))
+    _find_peaks(signals, by_blur, scores, lags_deg)
+    return scores, lags_deg
+
+
+@lru_cache(maxsize=64)
+def _wanted_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
+    return np.conj(np.fft.rfft(_standardised(reference_signals(ring))))
+
+
+@compiled
+def _find_peaks(
+    signals: FloatArray, by_blur: FloatArray, scores: FloatArray, lags_deg: FloatArray
+) -> None:
+    """Fill in the largest value by blur and lag of each signal, and its lag between samples."""
+    for i in range(len(signals)):
+        correlation, peak = by_blur[i, 0], 0
+        for candidate in by_blur[i]:
+            best = candidate.argmax()
+            if candidate[best] > correlation[peak]:
+                correlation, peak = candidate, best
+        before, after = correlation[peak - 1], correlation[(peak + 1) % _SAMPLES]
+        bend = min(before - 2.0 * correlation[peak] + after, -1e-12)
+        shift = min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+        lags_deg[i] = (peak + shift) * (360.0 / _SAMPLES) % 360.0
+        norm = np.sqrt(np.sum((signals[i] - signals[i].mean()) ** 2))
+        scores[i] = correlation[peak] / norm if norm > 0.0 else 0.0
+
+
+def fixed_lag_score(
+    grey: GreyArray,
+    points: FloatArray,
+    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    ring: Ring,
+) -> float:
+    """Return the correlation of a code where its heading is known, to a few degrees.
+
+    Parameters
+    ----------
+    points : (360, 2) array
+        The code circle in the frame, from the plate's +x axis on [px].
+    visible : (360,) array
+        Which of them count.
+    """
+    return _best_near(sample_grey(grey, points[None])[0], visible, reference_signals(ring))
+
+
+@compiled
+def _best_near(
+    signal: FloatArray,
+    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    references: FloatArray,
+) -> float:
+    """Return the best correlation with references (m, 360), turned by little, where visible."""
+    best = -1.0
+    for reference in references:
+        for lag in range(-_HEADING_SLACK, _HEADING_SLACK + 1):
+            count = wanted = found = wanted_power = found_power = product = 0.0
+            for a in range(_SAMPLES):
+                if visible[a]:
+                    one, other = reference[(a - lag) % _SAMPLES], signal[a]
+                    count, wanted, found = count + 1.0, wanted + one, found + other
+                    wanted_power, found_power = (
+                        wanted_power + one * one,
+                        found_power + other * other,
+                    )
+                    product += one * other
+            variances = (wanted_power - wanted**2 / count) * (found_power - found**2 / count)
+            covariance = product - wanted * found / count
+            best = max(best, covariance / math.sqrt(max(variances, 1e-12)))
+    return best
+
+
+def _standardised(signals: FloatArray) -> FloatArray:
+    centred = signals - signals.mean(axis=-1, keepdims=True)
+    norm = np.linalg.norm(centred, axis=-1, keepdims=True)
+    return np.asarray(centred / np.where(norm > 0.0, norm, 1.0))

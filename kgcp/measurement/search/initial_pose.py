@@ -1,0 +1,183 @@
+"""From a ring with the right code to the pose that the measurement starts from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle import circle_planes, pose_on_plane
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.ellipse_fit import fit_ellipses
+from kgcp.geometry.pose import image_heading_deg
+from kgcp.measurement.closed_form.chain import measure_ring, points_of_code
+from kgcp.measurement.closed_form.edges import FAINTEST, clear_of_dots
+from kgcp.measurement.records import Appearance, Observation
+from kgcp.measurement.search.code_signal import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
+from kgcp.measurement.search.sampling import sample_ellipses, sample_grey
+from kgcp.settings import Method
+from kgcp.targets.layout import Target
+
+_REACH_PX, _STEP_PX = 3.0, 0.2
+_OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # of an ellipse enough points give its undistorted image
+_EVERYWHERE = np.ones((1, len(_OUTLINE_RAD)), dtype=bool)
+_EDGE_RAD, _EDGE = CODE_ANGLES_RAD[::4], CODE_CIRCLE[::4]
+_MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
+_AXIS_ERROR_PX = 0.3  # of an outline
+
+
+def start_pose(
+    grey: GreyArray, camera: Camera, target: Target, match: CodeMatch, method: Method
+) -> Observation:
+    """Start by the method's own means: the paper's chain, or the outline of the search.
+
+    The outline is good to some tenths of a pixel, and the image model needs no more.
+
+    Raises
+    ------
+    Rejection
+        With the method `paper`, where its chain breaks.
+    """
+    if method is Method.PAPER:
+        return measure_ring(grey, camera, target, match)
+    return _pose_of_outline(grey, camera, target, match)
+
+
+def _pose_of_outline(
+    grey: GreyArray, camera: Camera, target: Target, match: CodeMatch
+) -> Observation:
+    """Take the better one of the two poses that an outline has."""
+    ring = match.ring
+    towards = camera.undistort(match.outer.points(math.radians(match.lag_deg) + _OUTLINE_RAD))
+    poses = [
+        pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards[0])
+        for plane in circle_planes(_ellipse_through(towards).conic)
+    ]
+    seen = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
+    scores, lags_deg = match_code(seen, ring)
+    best = int(scores.argmax())
+    turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
+    pose = poses[best]
+    if abs(turn_deg) < _MAX_TURN_DEG:  # else something hides the code, which the search knows
+        pose = pose.turned(turn_deg)
+    # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
+    pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
+    return Observation(
+        target=target.name,
+        ring=ring.name,
+        instance=0,
+        score=float(scores[best]),
+        pose=pose,
+        centre_px=camera.project(pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, pose),
+        appearance=_appearance(grey, target, match),
+        alternative=None,
+        uncertainty=None,
+    )
+
+
+def _ellipse_through(points: FloatArray) -> Ellipse:
+    """Fit an ellipse to points (n, 2) all around, which are nearly on one."""
+    lengths, directions = np.empty((1, len(points))), np.empty_like(points)
+    x, y, unit = _measure_spokes(points, lengths[0], directions)
+    found, possible = np.empty((1, 5)), np.empty(1)
+    fit_ellipses(lengths, _EVERYWHERE, directions, math.inf, found, possible)
+    if not possible[0]:
+        raise Rejection(Reason.POOR_ELLIPSE, "the outline is beyond the lens model's reach")
+    right, down, a, b, angle_rad = found[0].tolist()
+    return Ellipse(x + unit * right, y + unit * down, unit * a, unit * b, angle_rad)
+
+
+@compiled
+def _measure_spokes(
+    points: FloatArray, lengths: FloatArray, directions: FloatArray
+) -> tuple[float, float, float]:
+    """Fill in how far and in which direction points are from their mean, which is returned.
+
+    The unit of the lengths is their mean, which is returned, too.
+    """
+    x, y, unit, count = 0.0, 0.0, 0.0, len(points)
+    for i in range(count):
+        x, y = x + points[i, 0] / count, y + points[i, 1] / count
+    for i in range(count):
+        lengths[i] = math.hypot(points[i, 0] - x, points[i, 1] - y)
+        directions[i, 0] = (points[i, 0] - x) / lengths[i]
+        directions[i, 1] = (points[i, 1] - y) / lengths[i]
+        unit += lengths[i] / count
+    for i in range(count):
+        lengths[i] /= unit
+    return x, y, unit
+
+
+@dataclass(frozen=True, slots=True)
+class _Profile:
+    """One of a ring's edges, from the mean grey values along its radii.
+
+    Attributes
+    ----------
+    radius_px : float
+        Where they change most.
+    slope_per_px : float
+        By how much there, in grey values.
+    """
+
+    radius_px: float
+    slope_per_px: float
+
+
+def _appearance(grey: GreyArray, target: Target, match: CodeMatch) -> Appearance:
+    """Return size, levels, blur and δ as the mean profile along radii shows them.
+
+    Where the plate is burnt white its light spills over the edges, and the outline is too small.
+    """
+    ring, full_range = match.ring, float(np.iinfo(grey.dtype).max)
+    outer, inner = (
+        _profile(grey, match, diameter_m)
+        for diameter_m in (ring.outer_diameter_m, ring.inner_diameter_m)
+    )
+    contrast = match.white - match.black
+    return Appearance(
+        radius_px=match.outer.a * target.ring.outer_diameter_m / ring.outer_diameter_m,
+        black=match.black / full_range,
+        white=match.white / full_range,
+        saturated=0.0,
+        edge_shift_px=(inner.radius_px - ring.inner_ratio * outer.radius_px)
+        / (1.0 + ring.inner_ratio),
+        blur_px=contrast / (math.sqrt(2.0 * math.pi) * max(outer.slope_per_px, FAINTEST)),
+    )
+
+
+def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Profile:
+    ring, outline = match.ring, match.outer
+    share = edge_diameter_m / ring.outer_diameter_m
+    reach_px = min(_REACH_PX, 0.5 * (1.0 - ring.inner_ratio) * outline.mean_radius)
+    radii_px = share * outline.mean_radius + np.arange(-reach_px, reach_px, _STEP_PX)
+    px_per_m = 2.0 * outline.mean_radius / ring.outer_diameter_m
+    clear = clear_of_dots(_EDGE_RAD, ring, edge_diameter_m, match.lag_deg, px_per_m)
+    factors = radii_px / outline.mean_radius
+    seen = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
+    sign = 1.0 if edge_diameter_m > ring.inner_diameter_m else -1.0
+    steepest, rise = _steepest(seen, sign)
+    return _Profile(float(radii_px[steepest]), rise / _STEP_PX)
+
+
+@compiled
+def _steepest(seen: FloatArray, sign: float) -> tuple[int, float]:
+    """Return where the means of some rows rise most, or fall with −1, and by how much per row."""
+    rows, angles = seen.shape
+    means = np.zeros(rows)
+    for r in range(rows):
+        for a in range(angles):
+            means[r] += sign * seen[r, a] / angles
+    best, most = 0, means[1] - means[0]
+    for r in range(1, rows):
+        after = means[min(r + 1, rows - 1)]
+        rise = (after - means[r - 1]) / (min(r + 1, rows - 1) + 1 - r)
+        if rise > most:
+            best, most = r, rise
+    return best, most

@@ -1,0 +1,150 @@
+"""From places that may be a ring's to the ellipses of outer edges, one for each ring."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.ellipse_fit import fit_ellipses
+from kgcp.measurement.search.edge_tracking import RAYS, RAYS_RAD, follow
+from kgcp.measurement.search.pyramid import Pyramid, factor_of
+from kgcp.measurement.search.ring_check import look_around
+from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
+
+_SMALLEST_RATIO = 0.93  # of rings looked for in a level, to that radius
+# Of one ring are seeds, or outlines, by distance of centres, of its radius, and ratio of radii.
+_NEAR_SEEDS, _ALIKE_SEEDS = 0.3, 0.25
+
+_DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
+_MAX_AXIS_RATIO = 2.0
+_NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
+
+
+def distinct(
+    centres: FloatArray, radii: FloatArray, clearness: FloatArray, near: float, alike: float
+) -> IndexArray:
+    """Return the indices of circles without those that are like a clearer one, clearest first.
+
+    Parameters
+    ----------
+    centres : (n, 2) array
+    radii, clearness : (n,) array
+    near : float
+        Distance up to which two circles may be the same, of the clearer one's radius.
+    alike : float
+        Difference of the logarithms of their radii up to which they may be.
+    """
+    order, by_row = np.argsort(-clearness, kind="stable"), np.argsort(centres[:, 1], kind="stable")
+    return order[_is_first(centres, radii, order, by_row, near, alike)[order]]
+
+
+@compiled
+def _is_first(
+    centres: FloatArray,
+    radii: FloatArray,
+    order: IndexArray,
+    by_row: IndexArray,
+    near: float,
+    alike: float,
+) -> BoolArray:
+    """Tell which circles (n,) are like no clearer one, from their orders by clearness and row."""
+    first = np.ones(len(radii), np.bool_)
+    position, rank = np.empty(len(radii), np.intp), np.empty(len(radii), np.intp)
+    for i in range(len(radii)):
+        position[by_row[i]], rank[order[i]] = i, i
+    for one in order:
+        if not first[one]:
+            continue
+        reach = near * radii[one]
+        for step in (-1, 1):
+            place = position[one] + step
+            while 0 <= place < len(by_row):
+                other = by_row[place]
+                y = centres[other, 1] - centres[one, 1]
+                if abs(y) > reach:
+                    break
+                x = centres[other, 0] - centres[one, 0]
+                if x * x + y * y <= reach * reach and rank[other] > rank[one]:
+                    first[other] &= abs(math.log(radii[other] / radii[one])) > alike
+                place += step
+    return first
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeds:
+    """Places that may be a ring's.
+
+    Attributes
+    ----------
+    centres_px : (n, 2) array
+        In the frame.
+    radii_px : (n,) array
+        Of the outer circle, to a fifth.
+    contrasts : (n,) array
+        Grey values by which core and surround are brighter than the ring.
+    """
+
+    centres_px: FloatArray
+    radii_px: FloatArray
+    contrasts: FloatArray
+
+    def __len__(self) -> int:
+        """Count the places."""
+        return len(self.radii_px)
+
+    def chosen(self, which: IndexArray) -> Seeds:
+        """Return some of the seeds."""
+        return Seeds(self.centres_px[which], self.radii_px[which], self.contrasts[which])
+
+
+def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
+    """Look for rings in all levels that `min_radius_px` needs, and keep the clearest of each."""
+    first, last = 0, len(pyramid.levels)
+    while first < last and factor_of(first) * PEAK_RADIUS_PX < _SMALLEST_RATIO * min_radius_px:
+        first += 1
+    peaks, ends = find_peaks(pyramid.reduced, pyramid.levels[first:])
+    rings = look_around(pyramid, peaks, ends)
+    centres, radii, contrasts = np.ascontiguousarray(rings[:, :2]), *rings[:, 2:].T.copy()
+    kept = distinct(centres, radii, contrasts, _NEAR_SEEDS, _ALIKE_SEEDS)
+    return Seeds(centres, radii, contrasts).chosen(kept)
+
+
+def find_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
+    """Follow the outer edge of every seed's ring and fit an ellipse to it.
+
+    Twice: the centre of a large ring is known to some pixels at first.
+    """
+    ellipses = np.empty((0, 5))
+    for _ in range(2):
+        if not len(seeds):
+            return ()
+        ellipses = _follow(pyramid, seeds)
+        centres, axes = np.ascontiguousarray(ellipses[:, :2]), ellipses[:, 2:4]
+        seeds = Seeds(centres, np.sqrt(axes.prod(axis=1)), np.ones(len(ellipses)))
+    return tuple(Ellipse(*row) for row in ellipses.tolist())
+
+
+def _follow(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
+    """Return centre, semi-axes [px] and direction [rad] of the seeds' outlines, clearest first.
+
+    Those that agree with a clearer one are dropped. The unit of the edges is the seed's radius, the
+    origin its centre.
+    """
+    edges, inlying = np.empty((len(seeds), RAYS)), np.empty((len(seeds), RAYS), dtype=np.bool_)
+    places = seeds.centres_px, seeds.radii_px
+    follow(pyramid.frame, pyramid.reduced, pyramid.levels, *places, edges, inlying)
+    ellipses, shares = np.empty((len(seeds), 5)), np.empty(len(seeds))
+    fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, ellipses, shares)
+    good = np.flatnonzero(shares)
+    ellipses, seeds, shares = ellipses[good], seeds.chosen(good), shares[good]
+    ellipses[:, :4] *= seeds.radii_px[:, None]
+    ellipses[:, :2] += seeds.centres_px
+    radii, centres = np.sqrt(ellipses[:, 2:4].prod(axis=1)), np.ascontiguousarray(ellipses[:, :2])
+    return ellipses[
+        distinct(centres, radii, shares * seeds.contrasts, _NEAR_OUTLINES, _ALIKE_OUTLINES)
+    ]

@@ -1,0 +1,257 @@
+"""Where box filters answer to a ring: a first glance at every pixel, which must be cheap.
+
+The filters go through an image row by row, in strips: every loop is over one row of small integers,
+of which the processor takes some tens at once, and all that is between two loops stays in its
+cache.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry._jit import compiled, inlined
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+
+PEAK_RADIUS_PX = 2.8
+"""Radius of the rings that the filters answer to most; a quarter more or less is as good."""
+_REACH = 4  # rows and columns that the filters look around a pixel, neighbours included
+_STRIP = 1024 - 2 * _REACH  # columns
+_VECTOR = 32  # columns that the processor may take at once
+_ROWS = 8  # rows of grey values that are kept, of which the filters look at seven
+_KEPT = 3  # rows of their answers that are kept
+_UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
+_MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
+_MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around
+
+_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
+
+_Rows = npt.NDArray[np.generic]
+
+
+@compiled
+def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, IndexArray]:
+    """Return where the filters answer clearly, image by image.
+
+    The score is core - disc + surround - disc, of the means of 3 x 3, 5 x 5 and, less at its
+    corners, 7 x 7 pixels. It must be a maximum, of some grey values, and at least a fifth of the
+    range of grey values in 5 x 5 pixels. Of very many, those with the largest share are kept.
+
+    Parameters
+    ----------
+    reduced : (n,) array of uint8
+        Images one behind the other.
+    levels : (m, 4) array of int
+        Of each of them: begin and end in `reduced`, height, width.
+
+    Returns
+    -------
+    peaks : (n, 4) array
+        Column and row in the image [px], interpolated; the grey value between those of core and
+        ring; the score's share of the range of grey values.
+    ends : (m,) array of int
+        Where the peaks of each image end.
+    """
+    most, kept = 0, 0
+    for i in range(len(levels)):
+        # Maxima have no neighbours.
+        at_most = ((levels[i, 2] + 1) // 2) * ((levels[i, 3] + 1) // 2)
+        most, kept = max(most, at_most), kept + min(at_most, _limit(levels[i]))
+    found, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
+    count = 0
+    for i in range(len(levels)):
+        at, end, share = levels[i], count, _MIN_SHARE
+        image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+        for first in range(0, image.shape[1], _STRIP):
+            end += _scan(image, first, share, found[end:])
+            if end - count > _limit(at):
+                end = count + _keep_best(found[count:end], _limit(at))
+                share = np.int16(found[count:end, 3].min())  # what is less will not be kept
+        count = end
+        ends[i] = count
+    return found[:count], ends
+
+
+@compiled
+def _limit(level: IndexArray) -> int:
+    """Return how many peaks of an image are kept."""
+    return max(int(_MAX_PEAK_SHARE * (level[1] - level[0])), _MAX_PEAKS)
+
+
+@compiled
+def _keep_best(found: FloatArray, limit: int) -> int:
+    """Move the peaks with the largest shares, so many, to the begin; return their number."""
+    least = np.partition(found[:, 3].copy(), len(found) - limit)[len(found) - limit]
+    count, alike = 0, limit - np.sum(found[:, 3] > least)
+    for i in range(len(found)):
+        if found[i, 3] > least or (found[i, 3] == least and alike > 0):
+            alike -= found[i, 3] == least
+            found[count] = found[i]
+            count += 1
+    return count
+
+
+@compiled
+def _scan(image: GreyArray, first: int, share: np.int16, found: FloatArray) -> int:
+    """Fill in columns and rows of peaks, grey values between core and ring, shares; count them.
+
+    It is a strip from the first column on that is scanned, for peaks of at least some share. Entry
+    0 of what is kept of a row is left of that column: by 4 columns in `grey` and `sums`, by 3 in
+    `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`. Rows are kept at their numbers
+    modulo 8 (`grey`) or 3.
+    """
+    count = 0
+    columns = min(image.shape[1] - first, _STRIP)
+    width = -(-(columns + 2 * _REACH) // _VECTOR) * _VECTOR
+    longer = width + 2 * _REACH
+    grey, sums = np.zeros((_ROWS, longer), np.uint8), np.zeros((2, longer), np.uint16)
+    core, disc = np.zeros((_KEPT, longer), np.uint16), np.zeros((_KEPT, longer), np.uint16)
+    wide, extent = np.zeros((1, longer), np.uint16), np.zeros((_KEPT, longer), np.uint8)
+    score = np.zeros((_KEPT, longer), np.int16)
+    words, places = np.zeros(width // 8, np.uint64), np.empty(width + 8, np.int64)
+    is_peak = words.view(np.uint8)
+    for row in range(-_REACH, 2):
+        _take(image, row, first - _REACH, grey)
+    for row in range(-2, image.shape[0] + 2):
+        _take(image, row + 2, first - _REACH, grey)
+        _sum_columns(grey, row, sums, width)
+        _sum_rows(sums, (row + _KEPT) % _KEPT, core, disc, width)
+        if row < 0:
+            continue
+        last = (row - 1 + _KEPT) % _KEPT
+        _score(core, disc, last, wide, score, width)
+        if row < 2:
+            continue
+        _extents(grey, row - 2, extent, width)
+        _mark(score, row - 2, extent, share, is_peak)
+        some = places[: _list(words, is_peak, columns, places)]
+        if len(some) > 0:
+            count += _describe(some, first, row - 2, score, core, disc, extent, found[count:])
+    return count
+
+
+@inlined
+def _take(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
+    """Keep a row from some column on; beyond its border the image repeats its last pixels."""
+    height, width = image.shape
+    line, out = image[min(max(row, 0), height - 1)], grey[row % _ROWS]
+    left, right = max(-first, 0), min(len(out), width - first)
+    seen, copy = line[first + left : first + right], out[left:right]
+    for x in range(len(copy)):
+        copy[x] = seen[x]
+    out[:left] = line[0]
+    out[right:] = line[width - 1]
+
+
+@inlined
+def _sum_columns(grey: _Rows, row: int, sums: _Rows, width: int) -> None:
+    """Add up three rows and five."""
+    a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
+    d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
+    for x in range(width):
+        sums[0, x] = grey[b, x] + grey[c, x] + grey[d, x]
+    for x in range(width):
+        sums[1, x] = sums[0, x] + grey[a, x] + grey[e, x]
+
+
+@inlined
+def _sum_rows(sums: _Rows, slot: int, core: _Rows, disc: _Rows, width: int) -> None:
+    """Add up three columns of the sums of three rows, five of those of five."""
+    for x in range(width):
+        core[slot, x] = sums[0, x] + sums[0, x + 1] + sums[0, x + 2]
+    for x in range(width):
+        three = sums[1, x] + sums[1, x + 1] + sums[1, x + 2]
+        disc[slot, x] = three + sums[1, x + 3] + sums[1, x + 4]
+
+
+@inlined
+def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width: int) -> None:
+    """Combine sums over 9, 25 and 225 pixels, so that nothing exceeds 16 bits."""
+    for x in range(width):
+        wide[0, x] = disc[0, x] + disc[1, x] + disc[2, x]
+    for x in range(width):
+        surround = np.int16(np.uint16(wide[0, x] + wide[0, x + 1] + wide[0, x + 2]) >> 2)
+        inner = np.int16(np.uint16(25 * core[slot, x + 2]) >> 2)
+        ring = np.int16(np.uint16(9 * disc[slot, x + 1]) >> 2)
+        score[slot, x] = inner - ring + surround - ring
+
+
+@inlined
+def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
+    """Return the range of grey values in 5 x 5 pixels; rows 1 and 2 are for its use."""
+    a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
+    d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
+    high, low = 1, 2
+    for x in range(width):
+        out[high, x] = max(grey[a, x], grey[b, x], grey[c, x], grey[d, x], grey[e, x])
+    for x in range(width):
+        out[low, x] = min(grey[a, x], grey[b, x], grey[c, x], grey[d, x], grey[e, x])
+    for x in range(width):
+        out[0, x] = max(
+            out[high, x], out[high, x + 1], out[high, x + 2], out[high, x + 3], out[high, x + 4]
+        ) - min(out[low, x], out[low, x + 1], out[low, x + 2], out[low, x + 3], out[low, x + 4])
+
+
+@inlined
+def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows) -> None:
+    """Tell where peaks may be: pixels above four neighbours; of equal ones the first."""
+    before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
+    for x in range(len(is_peak)):
+        value = score[at, x + 1]
+        is_peak[x] = (
+            (value > score[before, x + 1])
+            & (value > score[at, x])
+            & (value >= score[at, x + 2])
+            & (value >= score[after, x + 1])
+            & (value >= _MIN_SCORE)
+            & (value >= np.int16(share * extent[0, x + 2]))
+        )
+
+
+@inlined
+def _list(words: _Rows, is_peak: _Rows, columns: int, places: IndexArray) -> int:
+    """Fill in where the peaks of a row are, of which eight are one word; return how many."""
+    count = 0
+    for word in range(-(-columns // 8)):
+        if words[word]:
+            for x in range(8 * word, 8 * word + 8):
+                places[count] = x
+                count += is_peak[x] & (x < columns)
+    return count
+
+
+@compiled
+def _describe(
+    places: IndexArray,
+    first: int,
+    row: int,
+    score: _Rows,
+    core: _Rows,
+    disc: _Rows,
+    extent: _Rows,
+    found: FloatArray,
+) -> int:
+    """Fill in column and row of a row's peaks, grey values between core and ring, and shares.
+
+    Count those that are also above their other four neighbours.
+    """
+    before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
+    count = 0
+    for x in places:
+        up, top, down = score[before, x + 1], score[at, x + 1], score[after, x + 1]
+        if max(score[before, x], score[before, x + 2]) >= top:
+            continue
+        if max(score[after, x], score[after, x + 2]) > top:
+            continue
+        found[count, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
+        found[count, 1] = row + _beside(up, top, down)
+        found[count, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
+        found[count, 3] = top / max(extent[0, x + 2], 1)
+        count += 1
+    return count
+
+
+@compiled
+def _beside(before: int, top: int, after: int) -> float:
+    """Return how far beside a maximum the parabola through the scores has its own: up to ±0.5."""
+    return 0.5 * (before - after) / min(before - 2 * top + after, -1)

@@ -1,0 +1,72 @@
+"""Grey values of a frame between its pixels: at points, and on ellipses about rings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.conic import Ellipse
+
+
+def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray:
+    """Sample a frame bilinearly at points (m, n, 2) [px]; beyond its border it repeats itself."""
+    maps = points.astype(np.float32, copy=False)
+    values = cv2.remap(  # type: ignore[call-overload]  # stubs know no map of both x and y
+        grey, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(values, dtype=np.float64)
+
+
+def sample_ellipses(
+    grey: GreyArray, outlines: Sequence[Ellipse], factors: FloatArray, circle: FloatArray
+) -> FloatArray:
+    """Sample a frame on ellipses that are so many times as large as outlines, as `sample_grey`.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    outlines : sequence of n Ellipse
+        [px].
+    factors : (m,) array
+    circle : (k, 2) array
+        Points of the unit circle, of which `Ellipse.points` makes those of the ellipse.
+
+    Returns
+    -------
+    (n, m, k) array
+    """
+    shape = len(outlines), len(factors), len(circle)
+    if not outlines:
+        return np.empty(shape)
+    points = np.empty((*shape, 2), dtype=np.float32)
+    for one, around in zip(outlines, points, strict=True):
+        _place(one.x, one.y, one.a, one.b, one.angle_rad, factors, circle, around)
+    return sample_grey(grey, points.reshape(len(outlines), -1, 2)).reshape(shape)
+
+
+@compiled
+def _place(
+    x: float,
+    y: float,
+    a: float,
+    b: float,
+    angle_rad: float,
+    factors: FloatArray,
+    circle: FloatArray,
+    points: npt.NDArray[np.float32],
+) -> None:
+    """Fill in points (m, k, 2) on ellipses about one centre."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    for m in range(len(factors)):
+        xx = factors[m] * (a * cosine * cosine + b * sine * sine)
+        xy = factors[m] * (a - b) * cosine * sine
+        yy = factors[m] * (a * sine * sine + b * cosine * cosine)
+        for k in range(len(circle)):
+            points[m, k, 0] = x + xx * circle[k, 0] + xy * circle[k, 1]
+            points[m, k, 1] = y + xy * circle[k, 0] + yy * circle[k, 1]

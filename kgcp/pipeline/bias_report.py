@@ -1,0 +1,208 @@
+"""The report's files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError, Rejection
+from kgcp.io.files.atomic import write_bytes
+from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import read_grey
+from kgcp.io.images.remote import StoredFolder, at_hand
+from kgcp.io.tables.columns import BIAS_COLUMNS
+from kgcp.io.tables.gcps import bias_row
+from kgcp.io.tables.parquet import write_table
+from kgcp.io.tables.provenance import provenance
+from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.quality.bias_study import BiasStudy
+from kgcp.report.bias.closeups import SPREAD, Closeup, closeup, evenly, largest
+from kgcp.report.bias.figures import (
+    change_by_reexposure,
+    detection_rate,
+    error_against_distance,
+    error_against_exposure,
+    error_in_time,
+    error_over_image,
+    flight_map,
+    one_edge_against_two,
+    standardised_histogram,
+)
+from kgcp.report.bias.numbers import BiasNumbers, bias_numbers
+from kgcp.report.bias.page import Content, deviations_of, frames_of, render_page
+from kgcp.report.bias.reexposure import Reexposed, measure_again
+from kgcp.report.bias.summary import Json, finite, summary_of
+from kgcp.report.bias.verdict import Verdict, judge
+from kgcp.report.style import Picture
+from kgcp.settings import DetectSettings
+
+FIGURE_FILES = {
+    "error": "bias_error.png",
+    "rate": "bias_detection_rate.png",
+    "exposure": "bias_exposure.png",
+    "edges": "bias_edges.png",
+    "reexposure": "bias_reexposure.png",
+    "standardised": "bias_standardised.png",
+    "time": "bias_time.png",
+    "image": "bias_image.png",
+    "map": "bias_map.png",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """What was written, and what it says."""
+
+    numbers: Json
+    verdict: Verdict
+    files: tuple[Path, ...]
+
+    def summary(self) -> Json:
+        """Return all numbers for machines, and the paths of the files."""
+        return {**self.numbers, "files": [str(path) for path in self.files]}
+
+
+@single_threaded()
+def write_report(
+    study: BiasStudy,
+    flight: Flight,
+    settings: DetectSettings,
+    folder: Path,
+    reexpose: int,
+    stored_frames: StoredFolder | None = None,
+) -> Report:
+    """Write bias.parquet, bias_summary.json, the figures and bias_report.html into a folder.
+
+    Parameters
+    ----------
+    study : BiasStudy
+    flight : Flight
+        Its frames, where they are, give the close-ups.
+    settings : DetectSettings
+        Of the detections, to measure frames again.
+    folder : Path
+    reexpose : int
+        How many frames to measure again, with darker and brighter grey values.
+    stored_frames : StoredFolder, optional
+        Where the frames are, if not in the flight's folder.
+
+    Raises
+    ------
+    KgcpError
+        If no measurement can be compared, or a file cannot be written.
+    """
+    if not study.trusted:
+        raise KgcpError(
+            f"none of {len(study.measured)} measurements lies where a reference pose and the"
+            " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
+        )
+    table = folder / "bias.parquet"
+    rows = (bias_row(one, study.method) for one in study.measured)
+    write_table(table, BIAS_COLUMNS, rows, provenance(flight))
+    frames = stored_frames or flight.frames_folder
+    content = _content(study, flight, settings, frames, reexpose)
+    files = {FIGURE_FILES[name]: one.png for name, one in content.pictures.items()}
+    text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
+    files["bias_summary.json"] = f"{text}\n".encode()
+    files["bias_report.html"] = render_page(content).encode()
+    for name, data in files.items():
+        write_bytes(folder / name, data)
+    for name in set(FIGURE_FILES.values()) - files.keys():
+        (folder / name).unlink(missing_ok=True)  # of an earlier run: not of these numbers
+    paths = (table, *(folder / name for name in files))
+    return Report(content.summary, content.verdict, paths)
+
+
+def _content(
+    study: BiasStudy,
+    flight: Flight,
+    settings: DetectSettings,
+    frames: Path | StoredFolder,
+    reexpose: int,
+) -> Content:
+    numbers = bias_numbers(study)
+    deviations = deviations_of(numbers)
+    spread, worst = evenly(numbers.data.distance_m, SPREAD), largest(deviations)
+    again = evenly(numbers.data.distance_m, reexpose)
+    closeups, reexposed = _look(numbers, flight, frames, settings, [*spread, *worst], again)
+    verdict = judge(numbers, reexposed)
+    return Content(
+        name=flight.name,
+        numbers=numbers,
+        verdict=verdict,
+        pictures=_pictures(numbers, flight, reexposed),
+        rows=[bias_row(one, study.method) for one in numbers.compared],
+        closeups=closeups,
+        worst=worst,
+        deviations=deviations,
+        reexposed=reexposed,
+        summary=summary_of(numbers, verdict, reexposed, frames_of(numbers.compared)),
+    )
+
+
+def _look(
+    numbers: BiasNumbers,
+    flight: Flight,
+    frames: Path | StoredFolder,
+    settings: DetectSettings,
+    shown: list[int],
+    again: list[int],
+) -> tuple[list[Closeup], list[Reexposed]]:
+    """Make close-ups of some rows and measure some again, as far as their frames are there."""
+    closeups: list[Closeup] = []
+    reexposed: list[Reexposed] = []
+    targets = {target.name: target for target in flight.targets}
+    for row in dict.fromkeys([*shown, *again]):
+        one = numbers.compared[row]
+        seen = one.attempt.sighting
+        if seen is None:
+            continue
+        try:
+            with at_hand(frames, seen.frame) as path:
+                grey = read_grey(path, flight.camera)
+        except (Rejection, KgcpError):
+            continue  # the page says of which frames there is no close-up
+        target, radius = targets[seen.target], float(numbers.data.radius_px[row])
+        if row in shown and (picture := closeup(grey, flight.camera, target, seen, row)):
+            closeups.append(picture)
+        if row in again:
+            with stops_held():
+                reexposed += measure_again(
+                    grey, flight.camera, target, settings, seen.centre_px, radius, row
+                )
+    return closeups, reexposed
+
+
+def _pictures(
+    numbers: BiasNumbers, flight: Flight, reexposed: list[Reexposed]
+) -> Mapping[str, Picture]:
+    pictures = {"error": error_against_distance(numbers)}
+    if numbers.chances:
+        pictures["rate"] = detection_rate(numbers)
+    if numbers.influences:
+        pictures["exposure"] = error_against_exposure(numbers)
+    if numbers.edges is not None and numbers.is_displaced:
+        pictures["edges"] = one_edge_against_two(numbers, numbers.edges)
+    if reexposed:
+        pictures["reexposure"] = change_by_reexposure(reexposed)
+    if numbers.standardised is not None:
+        pictures["standardised"] = standardised_histogram(numbers)
+    pictures["time"] = _in_time(numbers)
+    centre = np.array(
+        [one.attempt.sighting.centre_px for one in numbers.compared if one.attempt.sighting]
+    )
+    pictures["image"] = error_over_image(numbers, centre, flight.camera)
+    pictures["map"] = flight_map(numbers)
+    return pictures
+
+
+def _in_time(numbers: BiasNumbers) -> Picture:
+    times = np.array([one.attempt.time_s for one in numbers.compared], dtype=np.float64)
+    if not np.isfinite(times).all():
+        return error_in_time(numbers, np.arange(float(len(times))), "frame, in order")
+    return error_in_time(numbers, (times - times[0]) / 60.0, "time since the first [min]")

@@ -1,0 +1,236 @@
+"""Many frames, many processes, one ordered table, however often the work is interrupted."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from kgcp import __version__
+from kgcp.errors import KgcpError
+from kgcp.io.files.lock import locked
+from kgcp.io.files.safe_read import is_file
+from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import read_times
+from kgcp.io.formats.orientations import read_flight_poses
+from kgcp.io.images.remote import StoredFolder, frames_below
+from kgcp.io.tables.columns import DETECTION_COLUMNS, SCHEMA_VERSION, Row
+from kgcp.io.tables.detections import detection_rows
+from kgcp.io.tables.parquet import write_table
+from kgcp.io.tables.provenance import versions, write_run_record
+from kgcp.measurement.guided import Expectation
+from kgcp.measurement.normal_prior import NormalPrior, normal_priors
+from kgcp.pipeline.detection_run import Looks, Watcher
+from kgcp.pipeline.execution.executor import Crew, hired
+from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.frame_task import Debug, FrameNote, FrameTask
+from kgcp.pipeline.guidance import expectations, with_expectations
+from kgcp.pipeline.overlay import draw_overlay
+from kgcp.pipeline.run_summary import Stopwatch, SurveySummary, Tally
+from kgcp.report.contact_sheet import ContactSheet
+from kgcp.settings import DetectSettings
+
+FRAME_TIMEOUT_S = 300.0  # hundreds of times what a large frame takes
+
+
+class Nobody:
+    """A watcher who does not care."""
+
+    def note(self, text: str) -> None:
+        """Do nothing."""
+
+    def progress(self, done: int, total: int, found: int) -> None:
+        """Do nothing."""
+
+
+@single_threaded()
+def detect_flight(
+    flight: Flight,
+    settings: DetectSettings,
+    out: Path,
+    *,
+    jobs: int | None,
+    watcher: Watcher | None = None,
+    debug: Debug | None = None,
+    overlay: Path | None = None,
+    is_restart: bool = False,
+    frame_timeout_s: float = FRAME_TIMEOUT_S,
+    is_profiled: bool = False,
+    scheduler: str | None = None,
+    stored_frames: StoredFolder | None = None,
+) -> SurveySummary:
+    """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
+
+    Frames without a target are looked at again where the others say that it must be. However the
+    work is interrupted, what was done is kept in a journal, and the same call goes on from there.
+
+    Parameters
+    ----------
+    flight : Flight
+    settings : DetectSettings
+    out : Path
+        Folder of the results.
+    jobs : int or None
+        Worker processes; 0 works in this one, without a limit of time; None: as many as there are
+        cores, or as the scheduler has threads. The table does not depend on it.
+    watcher : Watcher, optional
+        Who is told how the work goes.
+    debug : Debug, optional
+        Pictures to draw.
+    overlay : Path, optional
+        Folder of a contact sheet of all rings, to be made after the table.
+    is_restart : bool
+        Whether to begin anew, whatever an interrupted run has left.
+    frame_timeout_s : float
+        Time for one look at one frame [s].
+    is_profiled : bool
+        Whether to measure what the workers spend their time on, at the price of some.
+    scheduler : str, optional
+        Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
+        frames, and the folder of pictures, where they are seen here.
+    stored_frames : StoredFolder, optional
+        Where the frames are, if not in the flight's folder.
+
+    Raises
+    ------
+    KgcpError
+        If there are no frames, the times file or that of the reference poses is bad, `out` cannot
+        be written or is another process's, the scheduler is of no use, or the frames vanish.
+    """
+    stopwatch = Stopwatch()
+    if scheduler is not None:
+        flight, debug = _seen_from_elsewhere(flight, debug)
+    with stopwatch.stage("preparation"):
+        frames = frames_below(stored_frames or flight.frames_folder)
+        times = {}
+        if flight.times_file is not None:
+            times = read_times(flight.times_file, frames, flight.times_format)
+        notes = _take_notes(flight, frames, times)
+        sheet = None if overlay is None else _sheet(flight, overlay)
+    task = FrameTask(
+        stored_frames or flight.frames_folder,
+        flight.camera,
+        flight.calibration_covariance,
+        flight.targets,
+        settings,
+        debug,
+    )
+    with (
+        locked(out / ".detections.lock"),
+        Journal(out / ".detections.journal", _making(task), is_new=is_restart) as journal,
+        hired(
+            *(jobs, frame_timeout_s, scheduler, task.frames_folder), is_profiled=is_profiled
+        ) as crew,
+    ):
+        looks = Looks(task, notes, journal, crew, watcher or Nobody())
+        with stopwatch.stage("first look"):
+            looks.look()
+        expected: Mapping[int, Mapping[str, Expectation]] = {}
+        guide_problem = None
+        if settings.is_guided:
+            with stopwatch.stage("second look"):
+                expected, guide_problem = expectations(flight, looks.sightings)
+                looks.look_again(expected)
+        tally = Tally(times)
+        if sheet is not None:
+            sheet.clear()
+        with stopwatch.stage("table"):
+            write_table(
+                out / "detections.parquet",
+                DETECTION_COLUMNS,
+                _rows(looks, expected, tally),
+                _provenance(flight, settings),
+            )
+        not_drawn = 0
+        if sheet is not None:
+            with stopwatch.stage("overlay"):
+                not_drawn = draw_overlay(sheet, flight.name, looks, task)
+        is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
+        summary = tally.summary(
+            kept=looks.kept,
+            frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
+            not_drawn=not_drawn,
+            guide_problem=guide_problem,
+            stages_s=_stages_s(stopwatch, journal, crew),
+        )
+        record = {**asdict(summary), "jobs": crew.jobs, "settings": asdict(settings)}
+        write_run_record(out / "run.json", record)
+        journal.remove()
+    return summary
+
+
+def _sheet(flight: Flight, folder: Path) -> ContactSheet:
+    if folder.resolve().is_relative_to(flight.frames_folder.resolve()):
+        raise KgcpError(
+            f"{folder}: is among the frames, where pictures would be taken for frames;"
+            " choose another --overlay"
+        )
+    return ContactSheet(folder)
+
+
+def _seen_from_elsewhere(flight: Flight, debug: Debug | None) -> tuple[Flight, Debug | None]:
+    """Name folders as they are called in whatever folder another process works."""
+    flight = replace(flight, frames_folder=flight.frames_folder.absolute())
+    return flight, None if debug is None else replace(debug, folder=debug.folder.absolute())
+
+
+def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, float]:
+    workers = (crew.stages_s or Counter()).most_common()
+    return {
+        **stopwatch.stages_s,
+        "journal, within these": journal.seconds,
+        **{f"workers: {stage}": seconds for stage, seconds in workers},
+    }
+
+
+def _take_notes(
+    flight: Flight, frames: Sequence[str], times: Mapping[str, float]
+) -> list[FrameNote]:
+    """Return what is known of each frame before it is read.
+
+    Reference poses are mostly made after the detections: a file that is not there yet is no error.
+    """
+    priors: Sequence[NormalPrior | None] = [None] * len(frames)
+    if flight.vehicle is not None and flight.vehicle.level_sd_deg is not None:
+        path = flight.reference_file
+        priors = normal_priors(
+            frames,
+            read_flight_poses(flight, frames) if path is not None and is_file(path) else None,
+            level_sd_deg=flight.vehicle.level_sd_deg,
+            plumb_sd_deg=flight.plumb_sd_deg,
+        )
+    return [
+        FrameNote(frame, times.get(frame), prior)
+        for frame, prior in zip(frames, priors, strict=True)
+    ]
+
+
+def _making(task: FrameTask) -> dict[str, str]:
+    """Return what the results of all frames depend on, so that a change can be named."""
+    return {
+        "the version of kgcp or of a library": to_text(versions()),
+        "the settings": to_text(task.settings),
+        "the camera": fingerprint(task.camera, task.calibration_covariance),
+        "the targets": fingerprint(task.targets),
+        "what is drawn": to_text(task.debug),
+    }
+
+
+def _rows(
+    looks: Looks, expected: Mapping[int, Mapping[str, Expectation]], tally: Tally
+) -> Iterator[Row]:
+    for row, result in enumerate(looks.results()):
+        tally.add(result)
+        yield from detection_rows(with_expectations(result, expected.get(row, {})))
+
+
+def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "version": __version__,
+        "settings": json.dumps(asdict(settings), sort_keys=True),
+        "flight_toml": flight.toml_text,
+    }

@@ -1,0 +1,1 @@
+"""Running one function on many frames: processes, Dask, journal, signals."""

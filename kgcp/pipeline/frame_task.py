@@ -1,0 +1,224 @@
+"""One frame: read, measured, looked at again; and what it is when that ends its process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from kgcp.errors import KgcpError, Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.geometry.camera import Camera, TimeReference
+from kgcp.io.images.exif import Exif
+from kgcp.io.images.frames import read_exif, read_grey
+from kgcp.io.images.remote import StoredFolder, at_hand
+from kgcp.io.tables.detections import FrameResult
+from kgcp.measurement.frame import Examination, examine, miss_of
+from kgcp.measurement.guided import Expectation, look_again
+from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.records import Considered, Miss, Observation, Outcome, is_unreadable
+from kgcp.measurement.search.template_match import CODE_LIKE
+from kgcp.measurement.systematic_errors import common_uncertainty
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.report.debug_picture import write_debug_picture
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Target
+
+
+@dataclass(frozen=True, slots=True)
+class Debug:
+    """Which frames to draw pictures of.
+
+    Attributes
+    ----------
+    folder : Path
+        Where the pictures go.
+    pattern : str
+        With `*` and `?`, of the frames' names.
+    """
+
+    folder: Path
+    pattern: str
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTask:
+    """What a worker needs to know to examine any frame of a flight."""
+
+    frames_folder: Path | StoredFolder
+    camera: Camera
+    calibration_covariance: CalibrationCovariance | None
+    targets: tuple[Target, ...]
+    settings: DetectSettings
+    debug: Debug | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameNote:
+    """What a worker needs to know about one frame.
+
+    Attributes
+    ----------
+    frame : str
+        Path relative to the frames folder.
+    time_s : float or None
+        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: EXIF decides.
+    prior : NormalPrior or None
+        Of the normal of the plate on the vehicle; None: nothing is known of it.
+    """
+
+    frame: str
+    time_s: float | None
+    prior: NormalPrior | None
+
+
+@dataclass(frozen=True, slots=True)
+class SecondLook:
+    """A frame that is to be looked at again.
+
+    Attributes
+    ----------
+    note : FrameNote
+    first : FrameResult
+        Of the first look.
+    expected : mapping of str to Expectation
+        By the name of the target, which must be visible; those that are looked for.
+    """
+
+    note: FrameNote
+    first: FrameResult
+    expected: Mapping[str, Expectation]
+
+
+@single_threaded()
+def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
+    """Read and measure one frame; whatever a frame can do wrong becomes its result."""
+    place = task.frames_folder / note.frame
+    exif = Exif()
+    outcomes: tuple[Outcome, ...]
+    try:
+        with at_hand(task.frames_folder, note.frame) as path:
+            exif = read_exif(path)
+            grey = read_grey(path, task.camera)
+        examination = examine(grey, task.camera, task.targets, task.settings, note.prior)
+        outcomes = tuple(_with_common_uncertainty(task, one) for one in examination.outcomes)
+        _draw(task, note.frame, grey, examination)
+    except Rejection as rejection:
+        outcomes = tuple(
+            Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
+        )
+    time_s = exif.time_s if note.time_s is None else note.time_s
+    reference = task.camera.time_reference
+    if time_s is not None and reference is not TimeReference.MIDDLE:
+        is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
+        time_s = _mid_exposure_s(time_s, exif, reference, place) if is_readable else None
+    return FrameResult(note.frame, time_s, exif, outcomes)
+
+
+@single_threaded()
+def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
+    """Look once more for what was not found in a frame, where it must be."""
+    try:
+        with at_hand(task.frames_folder, look.note.frame) as path:
+            grey = read_grey(path, task.camera)
+    except Rejection as rejection:
+        raise KgcpError(
+            f"{task.frames_folder / look.note.frame}: could be read, and cannot any more"
+            f" ({rejection.detail}); put it back, and the same command goes on"
+        ) from rejection
+    found = {
+        outcome.target: outcome
+        for outcome in look.first.outcomes
+        if isinstance(outcome, Observation) and outcome.instance == 0
+    }
+    considered: list[Considered] = []
+    for target in task.targets:
+        if target.name in look.expected:
+            seen, more = look_again(
+                *(grey, task.camera, target, look.expected[target.name], task.settings),
+                look.note.prior if target.position_m is None else None,
+                tuple(found.values()),
+            )
+            considered += more
+            if seen is not None:
+                found[target.name] = seen
+    outcomes = _merged(task, look, grey, found, considered)
+    _draw(task, look.note.frame, grey, Examination(outcomes, tuple(considered)), look.expected)
+    return replace(look.first, outcomes=outcomes)
+
+
+def lost_frame(task: FrameTask, note: FrameNote, reason: Reason) -> FrameResult:
+    """Return the result of a frame that cannot be examined without the end of the process."""
+    outcomes = tuple(Miss(target.name, reason) for target in task.targets)
+    is_known = task.camera.time_reference is TimeReference.MIDDLE
+    return FrameResult(note.frame, note.time_s if is_known else None, Exif(), outcomes)
+
+
+def kept_frame(look: SecondLook, reason: Reason) -> FrameResult:
+    """Return the result of the first look, where the second one ended its process."""
+    outcomes = tuple(
+        replace(one, detail="; ".join(filter(None, (one.detail, f"second look: {reason}"))))
+        if isinstance(one, Miss)
+        else one
+        for one in look.first.outcomes
+    )
+    return replace(look.first, outcomes=outcomes)
+
+
+def _merged(
+    task: FrameTask,
+    look: SecondLook,
+    grey: GreyArray,
+    found: Mapping[str, Observation],
+    considered: Sequence[Considered],
+) -> tuple[Outcome, ...]:
+    """Put what was found in the place of misses, and explain the others by what is known now."""
+    first = {one.target: one for one in look.first.outcomes if isinstance(one, Miss)}
+    missed = tuple(target for target in task.targets if target.name not in found)
+    if first.keys() & found.keys():  # rings on those plates explain no other's miss any more
+        others = tuple(found.values())
+        again = examine(grey, task.camera, missed, task.settings, look.note.prior, others)
+        first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
+    instead: dict[str, Outcome] = {}
+    for target in missed:
+        there = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
+        known = miss_of(grey, target, there, task.settings) if there else first[target.name]
+        instead[target.name] = known
+    for name in first.keys() & found.keys():
+        instead[name] = _with_common_uncertainty(task, found[name])
+    return tuple(
+        instead[one.target] if isinstance(one, Miss) else one for one in look.first.outcomes
+    )
+
+
+def _draw(
+    task: FrameTask,
+    frame: str,
+    grey: GreyArray,
+    examination: Examination,
+    expected: Mapping[str, Expectation] | None = None,
+) -> None:
+    if task.debug is not None and fnmatchcase(frame, task.debug.pattern):
+        write_debug_picture(task.debug.folder, frame, grey, examination, expected)
+
+
+def _mid_exposure_s(
+    time_s: float, exif: Exif, reference: TimeReference, place: Path | StoredFolder
+) -> float:
+    if exif.exposure_time_s is None:
+        raise KgcpError(
+            f"{place}: has no exposure time in EXIF, which [camera] time_reference ="
+            f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
+            " of mid-exposure and delete time_reference"
+        )
+    return time_s + reference.to_middle_s(exif.exposure_time_s)
+
+
+def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
+    if isinstance(outcome, Miss):
+        return outcome
+    ring = next(target.ring for target in task.targets if target.name == outcome.target)
+    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
+    return replace(outcome, common=common)

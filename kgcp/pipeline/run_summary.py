@@ -1,0 +1,140 @@
+"""What is counted and timed over all frames."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from kgcp.errors import Reason, Status
+from kgcp.io.tables.detections import FrameResult
+from kgcp.measurement.records import Miss
+
+
+@dataclass(frozen=True, slots=True)
+class SurveySummary:
+    """Counts over a flight.
+
+    Attributes
+    ----------
+    frames : int
+        Frames examined.
+    status : dict of int
+        Rows per status.
+    reasons : dict of int
+        Rows per reason, most frequent first.
+    frames_without_time : int
+        Frames that neither the times file nor EXIF gives a time.
+    times_without_frame : int
+        Entries of the times file that name no frame.
+    exif_times_in_whole_seconds : int
+        Frames whose time is EXIF's, if all of these times are whole seconds; else 0.
+    frames_without_attitude : int
+        Frames whose camera attitude is not known, so that a level plate tells nothing about them;
+        0 where the plate is not said to be level.
+    kept : int
+        Frames that a run before, which did not end, had examined.
+    guided : int
+        Rows measured by a second look only.
+    not_drawn : int
+        Rings that are not in the contact sheet, since their frame could not be read again.
+    guide_problem : str or None
+        Why reference poses and trajectory could not say where to look again, if they could not.
+    stages_s : dict of float
+        Time that each stage of the work took [s].
+    """
+
+    frames: int
+    status: Mapping[str, int]
+    reasons: Mapping[str, int]
+    frames_without_time: int
+    times_without_frame: int
+    exif_times_in_whole_seconds: int
+    frames_without_attitude: int
+    kept: int
+    guided: int
+    not_drawn: int
+    guide_problem: str | None
+    stages_s: Mapping[str, float]
+
+
+class Stopwatch:
+    """How long the stages of the work take.
+
+    Attributes
+    ----------
+    stages_s : dict of float
+        Seconds by the stage's name.
+    """
+
+    def __init__(self) -> None:
+        self.stages_s: dict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time of the block, however it ends."""
+        start_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages_s[name] += time.perf_counter() - start_s
+
+
+class Tally:
+    """Counts of rows and frames, one frame after the other.
+
+    Parameters
+    ----------
+    times : mapping of str to float
+        What the times file says, by frame.
+    """
+
+    def __init__(self, times: Mapping[str, float]) -> None:
+        self._times = times
+        self._frames = self._timed = self._without_time = self._guided = 0
+        self._status: Counter[Status] = Counter()
+        self._reasons: Counter[Reason] = Counter()
+        self._from_exif: Counter[bool] = Counter()  # by whether the time has no fraction
+
+    def add(self, result: FrameResult) -> None:
+        """Count a frame."""
+        self._frames += 1
+        self._without_time += result.time_s is None
+        if result.frame in self._times:
+            self._timed += 1
+        elif result.exif.time_s is not None:
+            self._from_exif[result.exif.time_s.is_integer()] += 1
+        for outcome in result.outcomes:
+            if isinstance(outcome, Miss):
+                self._reasons[outcome.reason] += 1
+                self._status[outcome.reason.status] += 1
+            else:
+                self._status[Status.MEASURED] += 1
+                self._guided += outcome.is_guided
+
+    def summary(
+        self,
+        *,
+        kept: int,
+        frames_without_attitude: int,
+        not_drawn: int,
+        guide_problem: str | None,
+        stages_s: Mapping[str, float],
+    ) -> SurveySummary:
+        """Return the counts, with what else there is to say."""
+        return SurveySummary(
+            frames=self._frames,
+            status={kind.value: self._status[kind] for kind in Status},
+            reasons={reason.value: count for reason, count in self._reasons.most_common()},
+            frames_without_time=self._without_time,
+            times_without_frame=len(self._times) - self._timed,
+            exif_times_in_whole_seconds=0 if self._from_exif[False] else self._from_exif[True],
+            frames_without_attitude=frames_without_attitude,
+            kept=kept,
+            guided=self._guided,
+            not_drawn=not_drawn,
+            guide_problem=guide_problem,
+            stages_s=dict(stages_s),
+        )

@@ -1,0 +1,309 @@
+"""A simulated flight as a flight folder, with its truth beside it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from PIL.TiffImagePlugin import IFDRational
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.time_text import format_time
+from kgcp.io.flight.target_table import target_lines
+from kgcp.pipeline.execution.resilient_map import ordered_map
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.settings import VehicleSettings
+from kgcp.simulation.flight import (
+    CRS,
+    TARGET_PLATE,
+    FlightPlan,
+    FramePlan,
+    frame_name,
+    grow_ground,
+    render_frame,
+)
+from kgcp.simulation.ground import Ground
+
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+_PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
+_EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
+_ISO = 100
+_F_NUMBER = Fraction(28, 5)
+
+_TRUTH_COLUMNS = (
+    *("frame", "present", "decoy", "distance", "x", "y"),
+    *(f"r{row}{column}" for row in range(3) for column in range(3)),
+    *("cx", "cy", "cz", "gain", "psf", "radius_px", "X", "Y", "Z"),
+    *("streak_x", "streak_y", "black", "white"),
+)
+
+
+def flight_toml(plan: FlightPlan) -> str:
+    """Return flight.toml by docs/conventions.md."""
+    lines = [
+        f"name = {json.dumps(plan.settings.name)}",
+        f"crs = {json.dumps(CRS)}  # x, y: easting, northing [m]; z: ellipsoidal height [m]",
+        "\n[frames]",
+        'folder = "frames"',
+        'times = "frames.csv"',
+        *_camera_lines(plan.settings.camera),
+        *target_lines(TARGET_PLATE.target),
+        *_vehicle_lines(plan.vehicle),
+        "\n[reference]",
+        'poses = "reference.csv"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _camera_lines(camera: Camera) -> Iterator[str]:
+    yield "\n[camera]"
+    yield f"width = {camera.width}"
+    yield f"height = {camera.height}"
+    for key in ("fx", "fy", "cx", "cy"):
+        yield f"{key} = {getattr(camera, key)!r}"
+    for key in _DISTORTION:
+        if value := getattr(camera, key):
+            yield f"{key} = {value!r}"
+    yield f"response = {json.dumps(camera.response.value)}"
+
+
+def _vehicle_lines(vehicle: VehicleSettings) -> Iterator[str]:
+    yield "\n[vehicle]"
+    yield 'trajectory = "vehicle.csv"'
+    yield f"lever_arm_m = {list(vehicle.lever_arm_m)}"
+    yield f"sd_lever_arm_m = {list(vehicle.sd_lever_arm_m)}"
+    yield f"sd_time_s = {vehicle.sd_time_s!r}"
+
+
+def readme(plan: FlightPlan) -> str:
+    """Return a page that says what the folder is and how it was made."""
+    settings = plan.settings
+    present = sum(frame.present for frame in plan.frames)
+    decoys = sum(bool(frame.decoys) for frame in plan.frames)
+    survey = "" if settings.sd_position_m[0] else " --no-survey-errors"
+    command = (
+        f"kgcp simulate OUT --preset {settings.name} --frames {settings.frames}"
+        f" --seed {plan.seed}{survey}"
+    )
+    return f"""# A simulated flight: {settings.name}
+
+{settings.frames} frames, {present} with the target, {decoys} with a decoy of another code.
+Nothing here was photographed: it was rendered by
+
+    {command}
+
+and the same version of kgcp writes the same bytes again. (In the sources of kgcp,
+`make sample-flight` remakes `sample_flight/` in this way.)
+
+| file | content |
+|---|---|
+| `flight.toml` | camera, target, vehicle: what the images cannot tell |
+| `frames/` | the images, with exposure and time in their EXIF |
+| `frames.csv` | time of each frame |
+| `vehicle.csv` | trajectory of the vehicle that carries the target |
+| `reference.csv` | poses of the camera as an aerial triangulation would give them |
+| `truth.csv` | what kgcp should find |
+
+Columns of `truth.csv`: `present` 1: the whole ring is in the frame, 0: nothing of the plate is;
+`decoy` 1: a plate with another code is in the frame; `distance` [m] from the camera to the
+target's centre; `x`, `y` its projection [px]; `r00` … `r22` rotation target → camera, row by row;
+`cx`, `cy`, `cz` the centre in the camera frame [m]; `gain` exposure, 1 where white of radiance 1
+fills the well; `psf` σ of the point spread [px]; `radius_px` fx · outer radius / distance [px];
+`X`, `Y`, `Z` the centre in the flight's CRS [m]; `streak_x`, `streak_y` motion during the exposure
+[px]; `black`, `white` levels of ink and plate, 0…1.
+"""
+
+
+@single_threaded()
+def write_simulated_flight(
+    plan: FlightPlan, out: Path, *, jobs: int, on_frame: Callable[[], object]
+) -> None:
+    """Render a flight and write its folder: all of it or nothing.
+
+    Parameters
+    ----------
+    plan : FlightPlan
+    out : Path
+        The folder to be; it must not exist, or be empty.
+    jobs : int
+        Worker processes; 1 works in this one. The files do not depend on it.
+    on_frame : callable
+        Called after each frame.
+
+    Raises
+    ------
+    KgcpError
+        If `out` holds something already or cannot be written.
+    """
+    out = out.resolve()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise KgcpError(f"{out}: holds something already; choose a new folder or empty it first")
+    partial = out.with_name(f".{out.name}.part")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+        (partial / "frames").mkdir(parents=True)
+        for _ in _write_frames(plan, partial / "frames", jobs):
+            on_frame()
+        write_texts(plan, partial)
+        if out.exists():
+            out.rmdir()
+        partial.replace(out)
+    except OSError as error:
+        raise KgcpError(f"{out}: cannot be written ({error}); choose another folder") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def encode_frame(plan: FlightPlan, index: int, grey: GreyArray) -> bytes:
+    """Return a frame as a PNG or JPEG file, with exposure and time in its EXIF."""
+    quality = plan.settings.jpeg_quality
+    exif = _exif(plan, index)
+    buffer = io.BytesIO()
+    image = Image.fromarray(grey)
+    if quality is None:
+        image.save(buffer, "PNG", compress_level=_PNG_COMPRESSION, exif=exif)
+    else:
+        image.save(buffer, "JPEG", quality=quality, exif=exif)
+    return buffer.getvalue()
+
+
+def _exif(plan: FlightPlan, index: int) -> bytes:
+    moment = datetime.fromtimestamp(float(plan.recorded_times_s[index]), UTC)
+    gain = Fraction(plan.frames[index].gain).limit_denominator(1000)
+    exposure = _EXPOSURE_AT_GAIN_1_S * gain
+    exif = Image.Exif()
+    tags = exif.get_ifd(IFD.Exif)
+    tags[Base.ExposureTime] = IFDRational(exposure.numerator, exposure.denominator)
+    tags[Base.FNumber] = IFDRational(_F_NUMBER.numerator, _F_NUMBER.denominator)
+    tags[Base.ISOSpeedRatings] = _ISO
+    tags[Base.DateTimeOriginal] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    tags[Base.SubsecTimeOriginal] = f"{moment.microsecond:06d}"
+    tags[Base.OffsetTimeOriginal] = "+00:00"
+    return exif.tobytes()
+
+
+def _write_frames(plan: FlightPlan, folder: Path, jobs: int) -> Iterator[None]:
+    """Render and write every frame, yielding after each."""
+    return ordered_map(
+        _write_frame_in_worker,
+        range(len(plan.frames)),
+        jobs=jobs,
+        start=_start_worker,
+        start_arguments=(plan, folder),
+    )
+
+
+_worker: tuple[FlightPlan, Path, Ground] | None = None  # once per process: the ground is large
+
+
+def _start_worker(plan: FlightPlan, folder: Path) -> None:
+    global _worker  # noqa: PLW0603 - the only state a pool's initializer can leave behind
+    _worker = plan, folder, grow_ground(plan.seed)
+
+
+def _write_frame_in_worker(index: int) -> None:
+    if _worker is None:
+        raise RuntimeError("worker used before it was started")
+    plan, folder, ground = _worker
+    encoded = encode_frame(plan, index, render_frame(plan, ground, index))
+    (folder / frame_name(plan.settings, index)).write_bytes(encoded)
+
+
+def write_texts(plan: FlightPlan, folder: Path) -> None:
+    """Write everything but the frames into an existing folder."""
+    (folder / "flight.toml").write_text(flight_toml(plan), encoding="utf-8", newline="\n")
+    (folder / "README.md").write_text(readme(plan), encoding="utf-8", newline="\n")
+    names = [frame_name(plan.settings, frame.index) for frame in plan.frames]
+    times = [format_time(float(time_s)) for time_s in plan.recorded_times_s]
+    _write_csv(folder / "frames.csv", ("frame", "time"), zip(names, times, strict=True))
+    _write_csv(folder / "vehicle.csv", _vehicle_columns(), _vehicle_rows(plan))
+    _write_csv(folder / "reference.csv", _reference_columns(), _reference_rows(plan))
+    _write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(plan))
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _vehicle_columns() -> tuple[str, ...]:
+    state = ("x", "y", "z", "roll_deg", "pitch_deg", "heading_deg")
+    return ("time", *state, *(f"sd_{name}" for name in state))
+
+
+def _vehicle_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
+    trajectory = plan.trajectory
+    deviations = [
+        f"{deviation:g}"
+        for deviation in (*plan.settings.sd_position_m, *plan.settings.sd_attitude_deg)
+    ]
+    for time_s, position, attitude in zip(
+        trajectory.time_s, trajectory.position_map, trajectory.attitude_deg, strict=True
+    ):
+        yield (
+            format_time(float(time_s)),
+            *(f"{value:.5f}" for value in position),
+            *(f"{value:.6f}" for value in attitude),
+            *deviations,
+        )
+
+
+def _reference_columns() -> tuple[str, ...]:
+    position, angles = ("x", "y", "z"), ("omega_deg", "phi_deg", "kappa_deg")
+    return ("frame", *position, *angles, "sd_x", "sd_y", "sd_z", "sd_angle_deg")
+
+
+def _reference_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
+    settings, poses = plan.settings, plan.reference
+    deviations = [f"{settings.sd_reference_m:g}"] * 3 + [f"{settings.sd_reference_deg:g}"]
+    for frame, position, angles in zip(
+        poses.frames, poses.position_map, poses.opk_deg, strict=True
+    ):
+        yield (
+            frame,
+            *(f"{value:.5f}" for value in position),
+            *(f"{value:.7f}" for value in angles),
+            *deviations,
+        )
+
+
+def _truth_rows(plan: FlightPlan) -> Iterator[Sequence[object]]:
+    for frame, target_map in zip(plan.frames, plan.target_map, strict=True):
+        name = frame_name(plan.settings, frame.index)
+        numbers = _truth_numbers(plan, frame, target_map)
+        present, decoy = int(frame.present), int(bool(frame.decoys))
+        # Nine decimals: enough for a nanometre, and the same on every processor.
+        yield (name, present, decoy, *(f"{round(number, 9) + 0.0:.9f}" for number in numbers))
+
+
+def _truth_numbers(plan: FlightPlan, frame: FramePlan, target_map: FloatArray) -> FloatArray:
+    """Return the numbers of a row of truth.csv, from `distance` on."""
+    camera, pose = plan.settings.camera, frame.target
+    outer_radius_m = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
+    light = np.minimum(frame.gain * np.array([TARGET_PLATE.black, TARGET_PLATE.white]), 1.0)
+    return np.concatenate(
+        (
+            [pose.distance_m],
+            camera.project(pose.translation_m[None])[0],
+            pose.rotation.ravel(),
+            pose.translation_m,
+            [frame.gain, frame.optics.psf_px, camera.fx * outer_radius_m / pose.distance_m],
+            target_map,
+            frame.optics.streak_px,
+            plan.settings.sensor.tone.apply(light),  # far from edges sharpening changes nothing
+        )
+    )

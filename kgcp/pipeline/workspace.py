@@ -1,0 +1,199 @@
+"""Where a command works: in the flight's folder, or beside an object store that has it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from kgcp.errors import KgcpError
+from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import FRAME_SUFFIXES
+from kgcp.io.images.remote import StoredFolder
+
+NAME = "kgcp"
+"""Of the results' folder in that of the flight."""
+
+DETECTIONS = "detections.parquet"
+"""What `kgcp detect` makes, and the other commands need."""
+
+
+def results_folder(flight: Path) -> Path:
+    """Return the results' folder of a flight for which no other is named.
+
+    A flight's folder may come from anybody. A link in the place of its results, or of a folder
+    among them, would have files written wherever it leads.
+
+    Raises
+    ------
+    KgcpError
+        If there is such a link.
+    """
+    folder = flight / NAME
+    if folder.is_symlink():
+        raise KgcpError(f"{folder}: is a link; delete it, or name where it leads with --out")
+    for parent, folders, _ in os.walk(folder):
+        for name in folders:
+            path = Path(parent) / name
+            if path.is_symlink():
+                raise KgcpError(
+                    f"{path}: is a link to a folder; delete it, or choose another --out"
+                )
+    return folder
+
+
+@dataclass(frozen=True, slots=True)
+class Workplace:
+    """Folders of this machine, and what they stand for.
+
+    Attributes
+    ----------
+    flight : Path
+        Has flight.toml and what that names, but for the frames of a stored flight.
+    out : Path
+        Takes the results.
+    stored_flight, stored_out : StoredFolder or None
+        What `flight` and `out` stand for; None: they are what the user named.
+    """
+
+    flight: Path
+    out: Path
+    stored_flight: StoredFolder | None
+    stored_out: StoredFolder | None
+
+    def frames_of(self, flight: Flight) -> StoredFolder | None:
+        """Return where the frames are; None: in the flight's folder of frames."""
+        if self.stored_flight is None:
+            return None
+        return self.stored_flight / flight.frames_folder.relative_to(self.flight).as_posix()
+
+    def named(self, text: object) -> str:
+        """Return a path, or a text with paths, by the names that the user knows."""
+        shown = str(text)
+        for folder, stored in ((self.out, self.stored_out), (self.flight, self.stored_flight)):
+            if stored is not None:
+                shown = shown.replace(str(folder), str(stored))
+        return shown
+
+
+@contextmanager
+def workplace(
+    flight: Path | StoredFolder, out: Path | StoredFolder | None, needs: Sequence[str] = ()
+) -> Iterator[Workplace]:
+    """Have a place to work at until the block ends, and put the results where they belong.
+
+    Parameters
+    ----------
+    flight : Path or StoredFolder
+    out : Path, StoredFolder or None
+        None: the folder `kgcp` in the flight's.
+    needs : sequence of str
+        Results of other commands, that must be at hand in `out` if they are there.
+
+    Raises
+    ------
+    KgcpError
+        If a store cannot be read or written. Those of the block name what the user knows.
+    """
+    with ExitStack() as stack:
+        stored_flight = None
+        if isinstance(flight, StoredFolder):
+            temporary = stack.enter_context(tempfile.TemporaryDirectory(prefix="kgcp-"))
+            where, stored_flight = _copied(flight, Path(temporary) / flight.name), flight
+        else:
+            where = flight
+        results = out or _results_of(flight)
+        stored_out = results if isinstance(results, StoredFolder) else None
+        place = Workplace(
+            where,
+            results if isinstance(results, Path) else _cache_of(results),
+            stored_flight,
+            stored_out,
+        )
+        fetched = [] if stored_out is None else _fetched(stored_out, place.out, needs)
+        try:
+            yield place
+        except KgcpError as error:
+            raise KgcpError(place.named(error)) from error
+        if stored_out is not None:
+            _deliver(place.out, stored_out, fetched)
+
+
+def _results_of(flight: Path | StoredFolder) -> Path | StoredFolder:
+    return flight / NAME if isinstance(flight, StoredFolder) else results_folder(flight)
+
+
+def _copied(flight: StoredFolder, folder: Path) -> Path:
+    """Copy a flight without its frames, and make their folder."""
+    folder.mkdir()
+    (folder / "flight.toml").write_bytes((flight / "flight.toml").read())
+    frames = _frames_folder(folder / "flight.toml")
+    if frames is not None:
+        (folder / frames).mkdir(parents=True, exist_ok=True)
+    for name in flight.tree([NAME] if frames is None else [NAME, str(frames)]):
+        if PurePosixPath(name).suffix.lower() not in FRAME_SUFFIXES:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes((flight / name).read())
+    return folder
+
+
+def _frames_folder(path: Path) -> PurePosixPath | None:
+    """Return the folder of the frames, if it is one below the flight's; who reads it all says."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig")).get("frames", {})
+        name = PurePosixPath(table.get("folder", "frames"))
+    except (ValueError, RecursionError, AttributeError, TypeError):
+        return None
+    return None if name.is_absolute() or ".." in name.parts else name
+
+
+def _cache_of(out: StoredFolder) -> Path:
+    """Return the folder of this machine in which results of a store are made.
+
+    It is the same for every run, so that the journal of one that was interrupted is found again.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "kgcp" / hashlib.sha256(str(out).encode()).hexdigest()[:16]
+
+
+def _fetched(out: StoredFolder, folder: Path, needs: Sequence[str]) -> list[Path]:
+    """Have the named results of other commands at hand, where there are any."""
+    out.require_writable()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = [name for name in needs if out.has(name)]
+        for name in found:
+            (folder / name).write_bytes((out / name).read())
+    except OSError as error:
+        raise KgcpError(
+            f"{folder}: cannot be written ({error.strerror}); set XDG_CACHE_HOME to a folder with"
+            " space for the results"
+        ) from error
+    return [folder / name for name in found]
+
+
+def _deliver(folder: Path, out: StoredFolder, fetched: Sequence[Path]) -> None:
+    """Put all results into a store, in the order in which they were made, and delete them here."""
+    results = [
+        path
+        for path in folder.rglob("*")
+        if path.is_file()
+        and path not in fetched
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
+    try:
+        for path in sorted(results, key=lambda path: (path.stat().st_mtime_ns, path)):
+            (out / path.relative_to(folder).as_posix()).write(path)
+    except KgcpError as error:
+        raise KgcpError(f"{error} (the results are in {folder}: copy them by hand)") from error
+    for path in (*results, *fetched):
+        path.unlink()
+    folders = [path for path in folder.rglob("*") if path.is_dir() and path.name[0] != "."]
+    for path in (*sorted(folders, reverse=True), folder):
+        with suppress(OSError):  # it has the journal of a run that was interrupted
+            path.rmdir()

@@ -1,1 +1,0 @@
-"""What a flight will give before it is flown."""

@@ -1,0 +1,89 @@
+"""What to change in flight.toml where vehicle and camera disagree, in words."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kgcp.quality.consistency import Consistency
+from kgcp.quality.corrections import Correction
+
+_TANGLED_CHI2 = 3.0  # of χ² over its degrees of freedom: disagreement without a single culprit
+_FARTHEST_M = 100.0  # what a second and some metres of lever arm make of a vehicle's place
+_AXES = {"forward": 0, "right": 1, "down": 2}
+
+
+def advice(found: Consistency) -> tuple[str, ...]:
+    """Return one line per correction that is due; none where all is well.
+
+    It is due where it is more than chance, and more than what flight.toml itself calls uncertain.
+    Where maps or clocks do not belong together, none of them means anything.
+    """
+    distance_m = math.hypot(*rms_m(found))
+    strange = [
+        one for one in found.estimate.corrections if one.is_significant and not one.is_credible
+    ]
+    if strange or distance_m > _FARTHEST_M:
+        return (_mismatch(distance_m),)
+    lines = [
+        _line(correction)
+        for correction in found.estimate.corrections
+        if correction.is_significant
+        and abs(correction.value or 0.0) > found.stated_sd.get(correction.name, 0.0)
+    ]
+    factor = found.estimate.variance_factor
+    if factor > _TANGLED_CHI2:
+        lines.append(
+            f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their deviations"
+            " say, whatever is corrected: look at consistency.parquet for when, and check sd_x …"
+            " of trajectory and reference poses"
+        )
+    return tuple(lines)
+
+
+def rms_m(found: Consistency) -> tuple[float, float, float]:
+    """Return the RMS of the offsets along, across and up, outliers left out [m]."""
+    kept = np.array([one.offset_m for one in found.discrepancies if not one.is_outlier])
+    along, across, up = np.sqrt(np.mean(kept**2, axis=0)).tolist()
+    return along, across, up
+
+
+def _mismatch(distance_m: float) -> str:
+    return (
+        f"vehicle and camera put the target {distance_m:.0f} m apart, which no correction explains:"
+        " check in flight.toml that [vehicle] crs and [reference] crs are those of the files, and"
+        " that all times are of one clock (GPS time is 18 s ahead of UTC: [vehicle] time_system)"
+    )
+
+
+def _line(correction: Correction) -> str:
+    text = _remedy(correction)
+    if correction.tangled_with:
+        others = " and ".join(correction.tangled_with)
+        text += f"; only if {others} is right: this flight cannot tell them apart"
+    return text
+
+
+def _remedy(correction: Correction) -> str:
+    quantity, _, unit = correction.name.rpartition("_")
+    amount = _amount(correction, unit)
+    if quantity == "time_offset":
+        return f"add {amount} to [vehicle] time_offset_s in flight.toml"
+    if quantity == "readout":
+        return f"add {amount} to [camera] readout_s in flight.toml"
+    if quantity.startswith("lever_arm_"):
+        axis = quantity.removeprefix("lever_arm_")
+        return f"add {amount} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
+    axis = quantity.removeprefix("boresight_")
+    return (
+        f"the images are turned by {amount} about the camera's {axis} axis against the reference"
+        " poses: check that [reference] poses and [camera] are of the same adjustment"
+    )
+
+
+def _amount(correction: Correction, unit: str) -> str:
+    """Return value ± deviation, both to the deviation's second digit."""
+    value, sd = correction.value or 0.0, correction.sd or 0.0
+    decimals = max(0, 1 - math.floor(math.log10(sd))) if sd > 0.0 else 6
+    return f"{value:.{decimals}f} ± {sd:.{decimals}f} {unit}"

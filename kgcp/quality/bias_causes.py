@@ -1,0 +1,256 @@
+"""What residuals of distances are made of: a scale, an offset, and what exposure does to edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtrc, stdtr
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.quality.exposure_effects import QUANTITIES, Residuals, varies
+from kgcp.quality.robust_gls import Fit, fit
+
+SIGNIFICANT = 0.01
+"""Largest probability, corrected for the number of terms, of what is called significant."""
+
+MIN_COUNT = 6
+_PER_TERM = 4  # observations that every term of exposure must have
+_KNOWN_SHARE = 0.9  # of the frames that must have a quantity
+_MAX_INFLATION = 25.0  # of a term's variance by the others: a deviation five times larger
+_DISTANCE_LIKE = 1000.0  # the same of what grows with distance alone, and is always looked for
+_CURVED = "edge_curvature_px2"
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One cause, as far as residuals show it.
+
+    Attributes
+    ----------
+    name : str
+        `scale`, `offset_m`, `edge_curvature_px2`, or a column of the exposure.
+    value, sd : float
+        Estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of
+        `edge_curvature_px2` displacement of the edge times its radius [px²], of the others
+        displacement of the edge in pixels per unit.
+    probability : float
+        Of a value as large by chance (Student's t, both sides), by Holm's correction for the
+        number of terms.
+    """
+
+    name: str
+    value: float
+    sd: float
+    probability: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is more than chance."""
+        return self.probability < SIGNIFICANT
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regression:
+    """Residual = scale · distance + offset + what displaced edges do.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        `scale` first.
+    tangled : tuple of str
+        Quantities that vary, but so much like others that they cannot be told from them.
+    count : int
+        Residuals that had a part.
+    used, outlier : (n,) array of bool
+        Which had, and which fit nothing.
+    scatter : float
+        Of what is left, over its deviations as they were stated; 1 where these are true.
+    correlation_s : float
+        As in `Fit`.
+    exposure_share : float
+        Of the variance that scale and offset leave, what the terms of exposure explain,
+        corrected for their number; 0 without any.
+    exposure_probability : float or None
+        Of as large a share by chance (F test); None without such terms.
+    systematic_m : (n,) array
+        What all terms but those of exposure make [m].
+    """
+
+    terms: tuple[Term, ...]
+    tangled: tuple[str, ...]
+    count: int
+    used: BoolArray
+    outlier: BoolArray
+    scatter: float
+    correlation_s: float
+    exposure_share: float
+    exposure_probability: float | None
+    systematic_m: FloatArray
+
+    def term(self, name: str) -> Term | None:
+        """Return the term of a name."""
+        return next((term for term in self.terms if term.name == name), None)
+
+    @property
+    def exposure_terms(self) -> tuple[Term, ...]:
+        """The terms of exposure."""
+        names = {quantity.name for quantity in QUANTITIES}
+        return tuple(term for term in self.terms if term.name in names)
+
+    @property
+    def is_exposure_significant(self) -> bool:
+        """Whether any effect of exposure is more than chance."""
+        return any(term.is_significant for term in self.exposure_terms)
+
+
+def regress(data: Residuals) -> Regression | None:
+    """Separate the causes of residuals; None for too few, or for distances that do not vary.
+
+    Edges displaced by ε px change a distance by D ε / R, R being the ring's radius in px: which
+    with R ∝ 1/D grows with the square of the distance. So each exposure quantity x has the column
+    (x − mean) D / R, and δ, which is a displacement itself, δ D / R. Blur displaces curved edges
+    by σ² / 2R, so that D / R² is looked for last, and kept where it is significant.
+    """
+    if len(data.residual_m) < MIN_COUNT or not varies(data.residual_m):
+        return None
+    columns, used = _columns(data)
+    weight = 1.0 / np.sqrt(data.noise.white + data.noise.lasting)
+    names, tangled = _separable(columns, used, weight, int(np.count_nonzero(used)) // _PER_TERM)
+    if "offset_m" not in names:
+        return None
+    found = _fit(data, columns, names, used)
+    curved = {**columns, _CURVED: data.distance_m / data.radius_px**2}
+    more, _ = _separable(curved, used, weight, len(used))
+    if set(more) >= {*names, _CURVED} and used.sum() > _PER_TERM * (len(names) + 1):
+        other = _fit(data, curved, [*names, _CURVED], used)
+        if _terms([*names, _CURVED], other)[-1].is_significant:
+            names, columns, found = [*names, _CURVED], curved, other
+    return _regression(data, columns, names, tangled, used, found)
+
+
+def _columns(data: Residuals) -> tuple[dict[str, FloatArray], BoolArray]:
+    """Return the columns of all terms that vary, and the rows that have all of them."""
+    per_px = data.distance_m / data.radius_px
+    columns = {"scale": data.distance_m, "offset_m": np.ones_like(data.distance_m)}
+    used = np.ones(len(data.distance_m), dtype=bool)
+    for quantity in QUANTITIES:
+        values = quantity.measure(data.exposure[quantity.name])
+        known = np.isfinite(values)
+        if known.mean() < _KNOWN_SHARE or not varies(values[known]):
+            continue
+        used &= known
+        zero = 0.0 if quantity.is_absolute else float(np.mean(values[known]))
+        columns[quantity.name] = (values - zero) * per_px
+    return columns, used
+
+
+def _separable(
+    columns: dict[str, FloatArray], used: BoolArray, weight: FloatArray, most: int
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the terms that can be told apart, at most so many, and those that cannot."""
+    names: list[str] = []
+    tangled = []
+    for name, column in columns.items():
+        rows = np.column_stack([columns[other] for other in (*names, name)])[used]
+        rows = rows * weight[used, None]
+        limit = _DISTANCE_LIKE if name in {"offset_m", _CURVED} else _MAX_INFLATION
+        if len(names) >= max(2, most) or _inflation(rows) > limit or not column[used].any():
+            tangled.append(name)
+        else:
+            names.append(name)
+    return names, tuple(tangled)
+
+
+def _inflation(rows: FloatArray) -> float:
+    """Return by how much the other columns inflate the variance of the last (n, p) one."""
+    if rows.shape[1] == 1:
+        return 1.0
+    size = np.linalg.norm(rows, axis=0)
+    if not size.all():
+        return math.inf
+    unit = rows / size
+    rest = unit[:, -1] - unit[:, :-1] @ np.linalg.lstsq(unit[:, :-1], unit[:, -1], rcond=None)[0]
+    return 1.0 / max(float(rest @ rest), 1e-12)
+
+
+def _fit(
+    data: Residuals, columns: dict[str, FloatArray], names: Sequence[str], used: BoolArray
+) -> Fit:
+    design = np.column_stack([columns[name] for name in names])[used]
+    return fit(design, data.residual_m[used], data.noise.kept(used))
+
+
+def _terms(names: Sequence[str], found: Fit) -> tuple[Term, ...]:
+    chances = [
+        two_sided(float(value / sd), found.freedom)
+        for value, sd in zip(found.values, found.sds, strict=True)
+    ]
+    return tuple(
+        Term(name, float(value), float(sd), chance)
+        for name, value, sd, chance in zip(
+            names, found.values, found.sds, holm(chances), strict=True
+        )
+    )
+
+
+def two_sided(t: float, freedom: int) -> float:
+    """Return the probability of a Student's t beyond ± t by chance."""
+    return float(2.0 * stdtr(freedom, -abs(t)))
+
+
+def holm(probabilities: Sequence[float]) -> list[float]:
+    """Correct the probabilities of several tests (Holm 1979, Scand. J. Statist. 6, 65–70)."""
+    corrected = [0.0] * len(probabilities)
+    largest = 0.0
+    ranked = sorted(range(len(probabilities)), key=lambda index: probabilities[index])
+    for rank, index in enumerate(ranked):
+        largest = max(largest, min(1.0, (len(probabilities) - rank) * probabilities[index]))
+        corrected[index] = largest
+    return corrected
+
+
+def _regression(
+    data: Residuals,
+    columns: dict[str, FloatArray],
+    names: list[str],
+    tangled: tuple[str, ...],
+    used: BoolArray,
+    found: Fit,
+) -> Regression:
+    outlier = np.zeros(len(used), dtype=bool)
+    outlier[used] = found.outlier
+    basic = _without_exposure(names)
+    design = np.column_stack([columns[name] for name in names])
+    share, probability = _share_of_exposure(names, found)
+    left = data.residual_m - design @ found.values
+    unit = left / np.sqrt(data.noise.white + data.noise.lasting)
+    return Regression(
+        terms=_terms(names, found),
+        tangled=tangled,
+        count=int(np.count_nonzero(used & ~outlier)),
+        used=used,
+        outlier=outlier,
+        scatter=float(np.sqrt(np.sum(unit[used & ~outlier] ** 2) / found.freedom)),
+        correlation_s=found.correlation_s,
+        exposure_share=share,
+        exposure_probability=probability,
+        systematic_m=design[:, basic] @ found.values[basic],
+    )
+
+
+def _without_exposure(names: Sequence[str]) -> list[int]:
+    return [index for index, name in enumerate(names) if index < 2 or name == _CURVED]
+
+
+def _share_of_exposure(names: Sequence[str], found: Fit) -> tuple[float, float | None]:
+    others = _without_exposure(names)
+    extra = len(names) - len(others)
+    if not extra:
+        return 0.0, None
+    without = found.chi2_of(others)
+    share = 1.0 - (found.chi2 / found.freedom) / (without / (found.freedom + extra))
+    ratio = (without - found.chi2) / extra / (found.chi2 / found.freedom)
+    return max(0.0, share), float(fdtrc(extra, found.freedom, max(0.0, ratio)))

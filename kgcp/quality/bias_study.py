@@ -1,0 +1,364 @@
+"""How well measured distances agree with reference poses, and how often the target is found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import Views, visible_pixels
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Absence, Place, Whereabouts
+from kgcp.settings import Method
+from kgcp.targets.layout import Target
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSds:
+    """Standard deviations of a reference distance, by where they come from.
+
+    Attributes
+    ----------
+    pose_m : float
+        Of the camera's reference position, taken as independent from frame to frame [m].
+    place_m : float
+        Of the trajectory, attitude included: an error that lasts for a while [m].
+    common_m : float
+        Of lever arm and synchronisation, or of a static target's position: one error in all
+        frames [m].
+    """
+
+    pose_m: float
+    place_m: float
+    common_m: float
+
+    @property
+    def total_m(self) -> float:
+        """All three together [m]."""
+        return math.hypot(self.pose_m, self.place_m, self.common_m)
+
+    @classmethod
+    def along(cls, direction: FloatArray, place: Place, views: Views, row: int) -> Self | None:
+        """Return the deviations along a line of sight: a unit vector (3,) in the ENU frame.
+
+        Parameters
+        ----------
+        direction : (3,) array
+        place : Place
+            Of the target.
+        views : Views
+            Reference poses.
+        row : int
+            That of the frame.
+
+        Returns
+        -------
+        ReferenceSds or None
+            None where trajectory or poses have no deviations.
+        """
+        if place.cov_m2 is None or views.cov_m2 is None:
+            return None
+        pose = float(direction @ views.cov_m2[row] @ direction)
+        whole = float(direction @ place.cov_m2 @ direction)
+        common = whole  # of a target that stands still
+        if place.common_m is not None:
+            common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
+        return cls(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What may move the edges: the columns of these names in the detections; None is null."""
+
+    radius_px: float | None
+    blur_px: float | None
+    edge_shift_px: float | None
+    black: float | None
+    white: float | None
+    saturated: float | None
+    exposure_time_s: float | None
+    iso: float | None
+    f_number: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One target looked for in one readable frame.
+
+    Attributes
+    ----------
+    frame, target : str
+        As in the detections.
+    time_s : float or None
+        Mid-exposure, Unix UTC [s].
+    sighting : Sighting or None
+        None where the target was not measured.
+    exposure : Exposure
+    """
+
+    frame: str
+    target: str
+    time_s: float | None
+    sighting: Sighting | None
+    exposure: Exposure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """One attempt against the reference.
+
+    Attributes
+    ----------
+    attempt : Attempt
+    camera_m, place_m : (3,) array
+        Reference projection centre, and the target's place at that time, in the ENU frame [m].
+    sds : ReferenceSds or None
+        Of the distance between the two; None where trajectory or poses have none.
+    expected_px : (2,) array
+        Where the reference pose puts the centre in the raw image [px]; NaN behind the camera.
+    expected_radius_px : float
+        Outer radius that the main ring has there [px].
+    """
+
+    attempt: Attempt
+    camera_m: FloatArray
+    place_m: FloatArray
+    sds: ReferenceSds | None
+    expected_px: FloatArray
+    expected_radius_px: float
+
+    @property
+    def reference_distance_m(self) -> float:
+        """Between reference projection centre and target [m]."""
+        return math.dist(self.camera_m, self.place_m)
+
+    @property
+    def residual_m(self) -> float | None:
+        """Measured minus reference distance [m]; None where nothing was measured."""
+        seen = self.attempt.sighting
+        return None if seen is None else seen.distance_m - self.reference_distance_m
+
+    @property
+    def residual_percent(self) -> float | None:
+        """The residual in percent of the reference distance."""
+        residual = self.residual_m
+        return None if residual is None else 100.0 * residual / self.reference_distance_m
+
+    @property
+    def is_astray(self) -> bool:
+        """Whether something was measured that is not where the target must be.
+
+        The limit is one radius of the ring.
+        """
+        seen = self.attempt.sighting
+        if seen is None:
+            return False
+        return not math.dist(seen.centre_px, self.expected_px) <= self.expected_radius_px
+
+    def is_whole_in(self, camera: Camera) -> bool:
+        """Whether the reference puts the whole ring into the frame."""
+        margin = self.expected_radius_px
+        limit = np.array([camera.width, camera.height]) - 1.0 - margin
+        return bool(np.all((self.expected_px >= margin) & (self.expected_px <= limit)))
+
+
+@dataclass(frozen=True, slots=True)
+class BiasStudy:
+    """All that could be compared.
+
+    Attributes
+    ----------
+    method : Method
+        How the distances were measured.
+    measured : tuple of Comparison
+        With a residual, in the frames' order.
+    chances : tuple of Comparison
+        Frames in which the target must be wholly visible, measured or not.
+    attitudes_agree : bool
+        Whether most measured centres lie where the reference attitudes put them. If not, nothing
+        is called astray, and every frame with a pose counts as a chance.
+    frames_without_pose : tuple of str
+        Frames that the reference does not name.
+    absences : tuple of Absence
+        Of the frames whose target cannot be placed.
+    """
+
+    method: Method
+    measured: tuple[Comparison, ...]
+    chances: tuple[Comparison, ...]
+    attitudes_agree: bool
+    frames_without_pose: tuple[str, ...]
+    absences: tuple[Absence, ...]
+
+    def trusts(self, one: Comparison) -> bool:
+        """Whether a comparison holds a measurement, and one of this target."""
+        return one.attempt.sighting is not None and not (self.attitudes_agree and one.is_astray)
+
+    @property
+    def trusted(self) -> tuple[Comparison, ...]:
+        """Measurements that statistics are made of."""
+        return tuple(one for one in self.measured if self.trusts(one))
+
+
+def study_bias(
+    attempts: Sequence[Attempt],
+    poses: ReferencePoses,
+    whereabouts: Whereabouts,
+    camera: Camera,
+    targets: Sequence[Target],
+    method: Method,
+) -> BiasStudy:
+    """Compare every attempt with the reference.
+
+    Parameters
+    ----------
+    attempts : sequence of Attempt
+        One per frame and target; targets never measured are left out.
+    poses : ReferencePoses
+        Of the camera.
+    whereabouts : Whereabouts
+        Of the targets.
+    camera : Camera
+        To know whether the target was in the frame.
+    targets : sequence of Target
+        Of the flight.
+    method : Method
+        Of the measurement.
+
+    Raises
+    ------
+    KgcpError
+        If nothing was measured, no measured frame has a pose, or as `Whereabouts.places`.
+    """
+    ours = _with_measured_target(attempts)
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    posed = [attempt for attempt in ours if attempt.frame in rows]
+    if not any(attempt.sighting for attempt in posed):
+        raise KgcpError(_no_pose(ours, poses))
+    times = [
+        attempt.sighting.row_time_s(camera) if attempt.sighting else attempt.time_s
+        for attempt in posed
+    ]
+    places = whereabouts.places([attempt.target for attempt in posed], times)
+    views = Views.of(poses, whereabouts.frame)
+    diameters = {target.name: target.ring.outer_diameter_m for target in targets}
+    placed = [
+        (attempt, place, rows[attempt.frame])
+        for attempt, place in zip(posed, places, strict=True)
+        if isinstance(place, Place)
+    ]
+    in_camera = [
+        (place.position_m - views.centre_m[row]) @ views.enu_from_camera[row]
+        for _, place, row in placed
+    ]
+    pixels = visible_pixels(camera, np.reshape(in_camera, (-1, 3)))
+    compared = [
+        _compare(
+            attempt,
+            place,
+            views,
+            row,
+            pixel,
+            0.5 * diameters[attempt.target] * camera.mean_focal_px,
+        )
+        for (attempt, place, row), pixel in zip(placed, pixels, strict=True)
+    ]
+    measured = tuple(one for one in compared if one.attempt.sighting is not None)
+    agree = 2 * sum(one.is_astray for one in measured) < len(measured)
+    return BiasStudy(
+        method=method,
+        measured=measured,
+        chances=tuple(one for one in compared if not agree or one.is_whole_in(camera)),
+        attitudes_agree=agree,
+        frames_without_pose=tuple(sorted({one.frame for one in ours} - rows.keys())),
+        absences=tuple(place for place in places if isinstance(place, Absence)),
+    )
+
+
+def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:
+    measured = {attempt.target for attempt in attempts if attempt.sighting is not None}
+    if not measured:
+        raise KgcpError(
+            f"no target was measured in any of {len(attempts)} attempts; there is nothing to"
+            " compare, see the reasons that 'kgcp detect' gives"
+        )
+    return [
+        attempt
+        for attempt in attempts
+        if attempt.target in measured
+        and (attempt.sighting is None or not attempt.sighting.instance)
+    ]
+
+
+def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
+    ours = next(attempt.frame for attempt in attempts if attempt.sighting is not None)
+    theirs = f"'{poses.frames[0]}'" if poses.frames else "no frame at all"
+    return (
+        f"no measured frame has a reference pose: measured is for example '{ours}', the file of"
+        f" [reference] poses names {theirs}; its names must be relative to the frames folder"
+    )
+
+
+def _compare(
+    attempt: Attempt,
+    place: Place,
+    views: Views,
+    row: int,
+    expected_px: FloatArray,
+    radius_px_m: float,
+) -> Comparison:
+    """Compare one attempt with the pose in `row`."""
+    sight = place.position_m - views.centre_m[row]
+    distance = float(np.linalg.norm(sight))
+    return Comparison(
+        attempt=attempt,
+        camera_m=views.centre_m[row],
+        place_m=place.position_m,
+        sds=ReferenceSds.along(sight / distance, place, views, row),
+        expected_px=expected_px,
+        expected_radius_px=radius_px_m / distance,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeDistances:
+    """Distances of one target by its edges.
+
+    Attributes
+    ----------
+    one_m : float
+        As the outer edge alone gives it, displaced by exposure as it is [m].
+    two_m : float
+        With both edges, whose common displacement drops out [m].
+    one_px : float
+        Radius of the displaced outer edge [px].
+    """
+
+    one_m: float
+    two_m: float
+    one_px: float
+
+
+def edge_distances(one: Comparison, method: Method) -> EdgeDistances | None:
+    """Return both distances of a comparison; None where it has no measurement, or no δ.
+
+    Exposure displaces the outer edge by δ towards the dark ring, from the radius R to R − δ, and
+    a distance is inversely proportional to the radius. The paper's chain takes the pose from the
+    outer edge; the image model has displaced edges among its unknowns.
+    """
+    seen, look = one.attempt.sighting, one.attempt.exposure
+    if seen is None or look.edge_shift_px is None or look.radius_px is None:
+        return None
+    if method is Method.PAPER:  # there the radius is that of the displaced edge
+        share = look.edge_shift_px / look.radius_px
+        return EdgeDistances(seen.distance_m, seen.distance_m / (1.0 + share), look.radius_px)
+    displaced_px = look.radius_px - look.edge_shift_px
+    one_m = seen.distance_m * look.radius_px / displaced_px
+    return EdgeDistances(one_m, seen.distance_m, displaced_px)

@@ -1,0 +1,201 @@
+"""The target's places by its vehicle against those by the camera's reference poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import Views
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Place, Whereabouts
+from kgcp.quality.consistency_equations import Meeting, System
+from kgcp.quality.corrections import Estimate, estimate, find_outliers
+from kgcp.quality.robust_gls import whiten
+from kgcp.settings import VehicleSettings
+
+MIN_POINTS = 10
+_CORRELATIONS_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discrepancy:
+    """Between the two places of a target in one frame.
+
+    Attributes
+    ----------
+    frame, target : str
+        As in the sighting.
+    time_s : float
+        When the target's row was exposed, by the trajectory's clock, Unix UTC [s].
+    offset_m : (3,) array
+        By the vehicle minus by the camera: along the track, across it to the right, up [m].
+    cov_m2 : (3, 3) array
+        Covariance by all stated deviations but those that all frames share [m²].
+    residual_m : (3,) array
+        What the corrections leave of the offset [m].
+    is_outlier : bool
+        Whether it fits no correction and had no part in them.
+    """
+
+    frame: str
+    target: str
+    time_s: float
+    offset_m: FloatArray
+    cov_m2: FloatArray
+    residual_m: FloatArray
+    is_outlier: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consistency:
+    """How well vehicle and camera agree.
+
+    Attributes
+    ----------
+    discrepancies : tuple of Discrepancy
+        Ascending in time.
+    estimate : Estimate
+        Corrections that explain them.
+    correlation_s : float
+        Over which the trajectory's errors seem to fade: the likeliest of a few times [s].
+    stated_sd : mapping of str to float
+        How well flight.toml says that unknowns are known, by their names and in their units.
+    """
+
+    discrepancies: tuple[Discrepancy, ...]
+    estimate: Estimate
+    correlation_s: float
+    stated_sd: Mapping[str, float]
+
+
+def study_consistency(
+    sightings: Sequence[Sighting],
+    whereabouts: Whereabouts,
+    poses: ReferencePoses,
+    camera: Camera,
+) -> Consistency | None:
+    """Compare the places of the target on the vehicle with those that the camera gives it.
+
+    By the vehicle: trajectory and lever arm. By the camera: reference pose and measured pose of
+    the target, P = C + R(ENU ← camera) t, where a rolling shutter's camera has moved on, too.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        Without a pose or a reference pose they are passed over, and so are static targets.
+    whereabouts : Whereabouts
+        Of the flight's targets.
+    poses : ReferencePoses
+    camera : Camera
+        For the rolling shutter.
+
+    Returns
+    -------
+    Consistency or None
+        None with fewer than ten frames to compare, or that fit any correction.
+
+    Raises
+    ------
+    KgcpError
+        As `Whereabouts.places`.
+    """
+    meetings = _meet(sightings, whereabouts, poses, camera)
+    if len(meetings) < MIN_POINTS or whereabouts.carrier is None:
+        return None
+    views = Views.of(poses, whereabouts.frame)
+    system = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
+    outlier = find_outliers(system.design, system.offset, system.fading + system.white)
+    if np.count_nonzero(~outlier) < MIN_POINTS:
+        return None
+    found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), system, ~outlier)
+    settings = whereabouts.carrier.settings
+    return Consistency(
+        _discrepancies(meetings, system, outlier, found, settings.time_offset_s),
+        found,
+        correlation_s,
+        _stated_sd(settings),
+    )
+
+
+def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
+    names = (f"lever_arm_{axis}_m" for axis in ("forward", "right", "down"))
+    of_arm = dict(zip(names, settings.sd_lever_arm_m, strict=True))
+    return {"time_offset_s": settings.sd_time_s, **of_arm}
+
+
+def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estimate, float]:
+    """Return the corrections by the points that are kept, and the likeliest correlation time.
+
+    A time that is believed but wrong would weigh neighbouring frames against each other as if
+    their trajectory were far better, or worse, than it is.
+    """
+    columns = np.concatenate(
+        (system.design, system.offset[:, :, None], system.common[:, :, None]), axis=2
+    )[kept]
+    every = whiten(
+        time_s[kept], system.fading[kept], system.white[kept], np.array(_CORRELATIONS_S), columns
+    )
+    trials = []
+    for correlation_s, whitened, log_det in zip(_CORRELATIONS_S, *every, strict=True):
+        rows = whitened.reshape(-1, columns.shape[2])
+        found = estimate(rows, has_deviations=system.has_deviations)
+        misfit = found.chi2_after
+        if not system.has_deviations:  # the likeliest scale is part of the likelihood
+            misfit = len(rows) * float(np.log(misfit))
+        trials.append((misfit + log_det, correlation_s, found))
+    _, correlation_s, found = min(trials, key=lambda trial: trial[0])
+    return found, correlation_s
+
+
+def _meet(
+    sightings: Sequence[Sighting],
+    whereabouts: Whereabouts,
+    poses: ReferencePoses,
+    camera: Camera,
+) -> list[Meeting]:
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    moving = [
+        seen
+        for seen in sightings
+        if not seen.instance and seen.target not in whereabouts.static and seen.frame in rows
+    ]
+    if not moving:
+        return []
+    times = [seen.row_time_s(camera) for seen in moving]
+    places = whereabouts.places([seen.target for seen in moving], times)
+    meetings = [
+        Meeting(seen, seen.pose, time_s, place, place.ride, rows[seen.frame])
+        for seen, time_s, place in zip(moving, times, places, strict=True)
+        if isinstance(place, Place) and place.ride and seen.pose and time_s is not None
+    ]
+    return sorted(meetings, key=lambda one: (one.time_s, one.seen.frame))
+
+
+def _discrepancies(
+    meetings: Sequence[Meeting],
+    system: System,
+    outlier: BoolArray,
+    found: Estimate,
+    time_offset_s: float,
+) -> tuple[Discrepancy, ...]:
+    residual = system.offset + system.design @ found.values
+    cov = system.track @ (system.fading + system.white) @ np.swapaxes(system.track, 1, 2)
+    offset_m = np.einsum("nij,nj->ni", system.track, system.offset)
+    residual_m = np.einsum("nij,nj->ni", system.track, residual)
+    return tuple(
+        Discrepancy(
+            one.seen.frame,
+            one.seen.target,
+            one.time_s + time_offset_s,
+            offset_m[index],
+            cov[index],
+            residual_m[index],
+            bool(outlier[index]),
+        )
+        for index, one in enumerate(meetings)
+    )

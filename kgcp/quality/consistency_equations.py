@@ -1,0 +1,170 @@
+"""The equations of the comparison: discrepancies, what moves them, and how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.georef.exterior_orientation import Views
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Place, Ride
+
+_MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
+_UNSTATED_SD_M = 0.01  # of what has no deviations; the residuals set the scale then
+_STANDING_M_S = 0.2  # below, the track is where the vehicle points
+_NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """One frame in which the target's place is known twice.
+
+    Attributes
+    ----------
+    seen : Sighting
+    pose : Pose
+        Its, target → camera.
+    time_s : float
+        When the target's row was exposed, by the frames' clock, Unix UTC [s].
+    place : Place
+        By the vehicle.
+    ride : Ride
+        Its.
+    row : int
+        Of the reference pose.
+    """
+
+    seen: Sighting
+    pose: Pose
+    time_s: float
+    place: Place
+    ride: Ride
+    row: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class System:
+    """Discrepancies of n meetings in ENU axes, and everything that they are made of.
+
+    Attributes
+    ----------
+    offset : (n, 3) array
+        Place by the vehicle minus place by the camera [m].
+    design : (n, 3, 8) array
+        What one unit of each of the `UNKNOWNS`, as a correction, adds to it.
+    fading, white : (n, 3, 3) array
+        Covariance by the trajectory, and by all that is independent from frame to frame [m²].
+    common : (n, 3) array
+        What one deviation of calibration and diameter, by way of the distance, adds to it [m].
+    has_deviations : bool
+        Whether trajectory and reference poses have deviations.
+    track : (n, 3, 3) array
+        Along the track, across it to the right and up, as rows.
+    """
+
+    offset: FloatArray
+    design: FloatArray
+    fading: FloatArray
+    white: FloatArray
+    common: FloatArray
+    has_deviations: bool
+    track: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        meetings: Sequence[Meeting],
+        views: Views,
+        poses: ReferencePoses,
+        camera: Camera,
+        sd_time_s: float,
+    ) -> Self:
+        """Set up the system of meetings, in their order in time."""
+        rows = [one.row for one in meetings]
+        attitude = views.enu_from_camera[rows]
+        in_camera = np.array([one.pose.translation_m for one in meetings])
+        sight = np.einsum("nij,nj->ni", attitude, in_camera)
+        velocity = np.array([one.ride.velocity_m_s for one in meetings])
+        body = np.array([one.ride.frame_from_body for one in meetings])
+        since_middle = np.array([one.seen.rows_since_middle(camera) for one in meetings])[:, None]
+        moved = _camera_velocity(meetings, views.centre_m[rows], velocity)
+        centre = views.centre_m[rows] + moved * since_middle * camera.readout_s
+        offset = np.array([one.place.position_m for one in meetings]) - centre - sight
+        columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
+        design = np.concatenate((*columns, attitude @ _cross(in_camera)), axis=2)
+        fading = np.array([_fading_m2(one.place) for one in meetings])
+        white = _white_m2(meetings, views, poses, sight)
+        shift = sd_time_s * velocity
+        white = white + shift[:, :, None] * shift[:, None, :]
+        common_m = np.array([one.seen.sd_common_distance_m or 0.0 for one in meetings])
+        unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+        stated = all(one.place.cov_m2 is not None for one in meetings) and views.cov_m2 is not None
+        return cls(
+            offset, design, fading, white, unit * common_m[:, None], stated, _track(velocity, body)
+        )
+
+
+def _fading_m2(place: Place) -> FloatArray:
+    if place.cov_m2 is None or place.common_m is None:
+        return _UNSTATED_SD_M**2 * np.eye(3)
+    return place.cov_m2 - place.common_m @ place.common_m.T
+
+
+def _white_m2(
+    meetings: Sequence[Meeting], views: Views, poses: ReferencePoses, sight: FloatArray
+) -> FloatArray:
+    """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
+    rows = [one.row for one in meetings]
+    attitude = views.enu_from_camera[rows]
+    total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
+    measured = [one.seen.pose_cov for one in meetings]
+    of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
+    total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
+    unstated = _UNSTATED_SD_M**2 * np.eye(3)
+    total = total + (unstated if views.cov_m2 is None else views.cov_m2[rows])
+    if poses.sd_angle_deg is not None:
+        effect = _cross(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
+        total = total + effect @ np.swapaxes(effect, 1, 2)
+    return np.asarray(total)
+
+
+def _camera_velocity(
+    meetings: Sequence[Meeting], centre: FloatArray, otherwise: FloatArray
+) -> FloatArray:
+    """Return the camera's velocity (n, 3) by splines through its positions, not across gaps.
+
+    Where there is nothing to interpolate it is taken to follow the vehicle.
+    """
+    time_s = np.array([one.time_s for one in meetings])
+    velocity = otherwise.copy()
+    breaks = np.flatnonzero(np.diff(time_s) > _NEIGHBOUR_S) + 1
+    for run in np.split(np.arange(len(time_s)), breaks):
+        if len(run) > 1 and np.all(np.diff(time_s[run]) > 0.0):
+            velocity[run] = CubicSpline(time_s[run], centre[run])(time_s[run], 1)
+    return velocity
+
+
+def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:
+    """Return along track, across to the right and up (n, 3, 3), as rows in ENU axes."""
+    ahead = np.where(
+        np.linalg.norm(velocity[:, :2], axis=1, keepdims=True) > _STANDING_M_S,
+        velocity,
+        body[:, :, 0],
+    )
+    east, north = (ahead[:, :2] / np.linalg.norm(ahead[:, :2], axis=1, keepdims=True)).T
+    none, one = np.zeros_like(east), np.ones_like(east)
+    rows = ((east, north, none), (north, -east, none), (none, none, one))
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _cross(vectors: FloatArray) -> FloatArray:
+    """Return the matrices [v]× (n, 3, 3) of vectors (n, 3)."""
+    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None], axis=2).swapaxes(1, 2))

@@ -1,0 +1,159 @@
+"""Residuals of a flight's distances as arrays, with what may explain them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.quality.bias_study import Comparison
+from kgcp.quality.robust_gls import Noise
+
+ROUNDING = 1e-9  # a quantity that varies by less does not vary
+# Of what has no stated deviations: the scatter sets the scale then, these only the proportions.
+_UNSTATED_EDGE_PX = 0.05
+_UNSTATED_WHITE_M, _UNSTATED_LASTING_M = 0.005, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One thing that an exposure may act by.
+
+    Attributes
+    ----------
+    name : str
+        Of the column.
+    label : str
+        What it is, with its unit.
+    per : str
+        Of what one unit is called in the regression.
+    is_log : bool
+        Whether factors count, not differences: then the unit is a factor of two.
+    is_absolute : bool
+        Whether 0 means that nothing is displaced; of others only changes can be told.
+    """
+
+    name: str
+    label: str
+    per: str
+    is_log: bool = False
+    is_absolute: bool = False
+
+    def measure(self, values: FloatArray) -> FloatArray:
+        """Return values (n,) in the regression's unit; NaN where there is none."""
+        if not self.is_log:
+            return values
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.log2(values)
+        return np.where(np.isfinite(logs), logs, np.nan)
+
+
+QUANTITIES = (
+    Quantity("edge_shift_px", "edge shift δ [px]", "px of δ", is_absolute=True),
+    Quantity("exposure_time_s", "exposure time [s]", "doubling", is_log=True),
+    Quantity("iso", "ISO", "doubling", is_log=True),
+    Quantity("white", "level of white", "full range"),
+    Quantity("saturated", "share of clipped pixels", "share of 1"),
+    Quantity("blur_px", "edge spread σ [px]", "px of σ"),
+    Quantity("black", "level of black", "full range"),
+    Quantity("f_number", "f-number", "doubling", is_log=True),
+)
+"""In the order in which they are believed: of those that look alike the last is given up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Residuals of n distances, with all that may explain them, in the order of time.
+
+    Attributes
+    ----------
+    distance_m, radius_px : (n,) array
+        Reference distance, and the radius in the image that gave the measured one.
+    residual_m : (n,) array
+        Measured minus reference distance.
+    noise : Noise
+        Of the residuals [m²].
+    exposure : mapping of str to (n,) array
+        The columns of `QUANTITIES` by name; NaN where a frame has none.
+    """
+
+    distance_m: FloatArray
+    radius_px: FloatArray
+    residual_m: FloatArray
+    noise: Noise
+    exposure: dict[str, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        compared: Sequence[Comparison],
+        measured_m: FloatArray,
+        radius_px: FloatArray | None = None,
+    ) -> Self:
+        """Collect comparisons with a measurement, `in_time`.
+
+        Parameters
+        ----------
+        compared : sequence of n Comparison
+        measured_m : (n,) array
+            Measured distances [m].
+        radius_px : (n,) array, optional
+            Radii that gave them; those of the detections if not given.
+        """
+        distance = np.array([one.reference_distance_m for one in compared])
+        radius = radius_px
+        if radius is None:
+            radius = np.array(
+                [one.attempt.exposure.radius_px or one.expected_radius_px for one in compared]
+            )
+        return cls(
+            distance_m=distance,
+            radius_px=radius,
+            residual_m=measured_m - distance,
+            noise=_noise(compared, _UNSTATED_EDGE_PX * distance / radius),
+            exposure={
+                quantity.name: np.array(
+                    [getattr(one.attempt.exposure, quantity.name) for one in compared],
+                    dtype=np.float64,
+                )
+                for quantity in QUANTITIES
+            },
+        )
+
+
+def in_time(compared: Sequence[Comparison]) -> list[Comparison]:
+    """Sort comparisons by time, those without one by their frames' names behind the others."""
+    return sorted(
+        compared,
+        key=lambda one: (
+            one.attempt.time_s is None,
+            one.attempt.time_s or 0.0,
+            one.attempt.frame,
+            one.attempt.target,
+        ),
+    )
+
+
+def varies(values: FloatArray) -> bool:
+    """Tell whether values (n,) differ by more than rounding."""
+    return len(values) > 1 and float(np.ptp(values)) > ROUNDING
+
+
+def _noise(compared: Sequence[Comparison], unstated_m: FloatArray) -> Noise:
+    seen = [one.attempt.sighting for one in compared]
+    measured = np.array(
+        [
+            otherwise if one is None or one.sd_distance_m is None else one.sd_distance_m
+            for one, otherwise in zip(seen, unstated_m, strict=True)
+        ]
+    )
+    pose = np.array([one.sds.pose_m if one.sds else _UNSTATED_WHITE_M for one in compared])
+    place = np.array([one.sds.place_m if one.sds else _UNSTATED_LASTING_M for one in compared])
+    times = np.array([one.attempt.time_s for one in compared], dtype=np.float64)
+    if not np.isfinite(times).all():  # nobody knows which are neighbours
+        times = np.arange(float(len(pose)))
+        return Noise(measured**2 + pose**2 + place**2, np.zeros_like(pose), times)
+    return Noise(measured**2 + pose**2, place**2, times)

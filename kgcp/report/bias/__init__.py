@@ -1,0 +1,1 @@
+"""The bias report: its page, its figures and its numbers."""

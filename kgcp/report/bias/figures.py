@@ -1,0 +1,323 @@
+"""Figures of the bias report: residuals, detection rates, and what exposure does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.quality.statistics import Slope, moving_statistics
+from kgcp.report.bias.numbers import BiasNumbers, EdgeNumbers, Influence
+from kgcp.report.bias.ranges import DetectionRate
+from kgcp.report.bias.reexposure import Reexposed
+from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, Points, picture, scatter, sheet
+
+WINDOW_M = 10.0  # of the paper's Figure 9
+_SIGNED = "PuOr"  # orange and violet: told apart whatever one's colour vision
+_BINS = [0.5 * step - 5.25 for step in range(22)]
+
+_CONFIDENCE = 1.96  # deviations: 95 %
+
+
+def error_against_distance(numbers: BiasNumbers) -> Picture:
+    """Draw the paper's Figure 9: errors with moving mean and deviation, in metres and percent."""
+    distance = numbers.data.distance_m
+    with sheet(7.0, 7.2) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        metres = _errors(
+            upper, numbers, numbers.data.residual_m, numbers.sd_m, _systematic_m(numbers)
+        )
+        sd_percent = 100.0 * numbers.sd_m / distance
+        percent = _errors(
+            lower, numbers, numbers.residual_percent, sd_percent, numbers.explained_percent
+        )
+        upper.set_ylabel("error [m]")
+        lower.set_ylabel("error [% of distance]")
+        lower.set_xlabel("reference distance [m]")
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=5)
+        return picture(figure, [metres, percent])
+
+
+def _errors(
+    axes: Axes, numbers: BiasNumbers, error: FloatArray, sd: FloatArray, fitted: FloatArray
+) -> Points:
+    distance = numbers.data.distance_m
+    moving = moving_statistics(distance, error, WINDOW_M)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.fill_between(
+        moving.centre,
+        moving.mean - moving.sd,
+        moving.mean + moving.sd,
+        color=VERMILION,
+        alpha=0.18,
+        linewidth=0.0,
+        label="± 1 sd",
+    )
+    axes.plot(moving.centre, moving.mean, color=VERMILION, linewidth=2.0, label="mean, 10 m")
+    known = np.isfinite(sd)
+    if known.any():
+        reported = moving_statistics(distance[known], sd[known], WINDOW_M)
+        for sign, label in ((1.0, "reported ± 1 sd"), (-1.0, None)):
+            axes.plot(
+                reported.centre, sign * reported.mean, "--", color=GREY, linewidth=1.4, label=label
+            )
+    points = scatter(axes, np.arange(len(error)), distance, error, "frame")
+    if numbers.regression is not None:
+        order = np.argsort(distance)
+        axes.plot(distance[order], fitted[order], color=GREEN, linewidth=1.6, label="fitted")
+    return points
+
+
+def detection_rate(numbers: BiasNumbers) -> Picture:
+    """Draw the paper's Figure 8: detection rate, with 95 % intervals."""
+    with sheet(7.0, 6.4) as figure:
+        upper, lower = figure.subplots(2, 1)
+        _rates(upper, numbers.rates, [0.5 * (rate.low + rate.high) for rate in numbers.rates])
+        upper.set_xlabel("reference distance [m]  (small numbers: frames)")
+        radii = [float(np.sqrt(rate.low * rate.high)) for rate in numbers.radius_rates]
+        _rates(lower, numbers.radius_rates, radii)
+        lower.set_xscale("log", base=2)
+        lower.set_xticks(radii, [f"{radius:.0f}" for radius in radii])
+        lower.minorticks_off()
+        lower.set_xlabel("radius of the ring by the reference [px]")
+        return picture(figure)
+
+
+def _rates(axes: Axes, rates: Sequence[DetectionRate], centre: Sequence[float]) -> None:
+    value = np.array([rate.rate for rate in rates])
+    below = value - [rate.confidence_low for rate in rates]
+    above = [rate.confidence_high for rate in rates] - value
+    axes.errorbar(
+        centre,
+        100.0 * value,
+        yerr=100.0 * np.maximum(np.vstack((below, above)), 0.0),
+        fmt="o",
+        color=BLUE,
+        ecolor=GREY,
+        elinewidth=1.5,
+        capsize=4,
+        markersize=7,
+    )
+    for rate, x in zip(rates, centre, strict=True):
+        axes.annotate(
+            f"{rate.frames}",
+            (x, 0.0),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+            color=GREY,
+        )
+    axes.set_ylim(0.0, 105.0)
+    axes.set_ylabel("detected [%]")
+
+
+def standardised_histogram(numbers: BiasNumbers) -> Picture:
+    """Draw residuals over their reported deviations against the normal distribution."""
+    raw = numbers.standardised_residuals
+    left = (numbers.data.residual_m - _systematic_m(numbers)) / numbers.sd_m
+    with sheet(7.0, 4.0) as figure:
+        axes = figure.subplots()
+        for values, colour, filled, label in (
+            (raw, BLUE, True, "error / reported sd"),
+            (left, VERMILION, False, "without scale and offset"),
+        ):
+            known = np.clip(values[np.isfinite(values)], _BINS[0], _BINS[-1])
+            share = np.full(len(known), 1.0 / (len(known) * 0.5))
+            axes.hist(
+                known,
+                bins=_BINS,
+                weights=share,
+                histtype="stepfilled" if filled else "step",
+                color=colour,
+                alpha=0.35 if filled else 1.0,
+                linewidth=2.0,
+                label=label,
+            )
+        x = np.linspace(-5.0, 5.0, 201)
+        normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+        axes.plot(x, normal, "--", color="black", linewidth=1.5, label="normal, sd 1")
+        axes.set_xlabel("error / reported standard deviation  (ends: and beyond)")
+        axes.set_ylabel("density")
+        axes.legend(loc="upper right")
+        return picture(figure)
+
+
+def _systematic_m(numbers: BiasNumbers) -> FloatArray:
+    return 0.01 * numbers.explained_percent * numbers.data.distance_m
+
+
+def error_in_time(numbers: BiasNumbers, minutes: FloatArray, label: str) -> Picture:
+    """Draw errors in metres in the order of time (n,)."""
+    with sheet(7.0, 3.6) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        points = scatter(axes, np.arange(len(minutes)), minutes, numbers.data.residual_m)
+        axes.set_xlabel(label)
+        axes.set_ylabel("error [m]")
+        return picture(figure, [points])
+
+
+def error_over_image(numbers: BiasNumbers, centre_px: FloatArray, camera: Camera) -> Picture:
+    """Draw errors in percent where in the image (n, 2) they were measured."""
+    with sheet(7.0, 0.8 + 5.1 * min(1.4, camera.height / camera.width)) as figure:
+        axes = figure.subplots()
+        axes.set_aspect("equal")
+        points = _coloured(figure, axes, centre_px, numbers.residual_percent, "error [%]")
+        axes.set_xlim(-0.5, camera.width - 0.5)
+        axes.set_ylim(camera.height - 0.5, -0.5)
+        axes.set_xlabel("x [px]")
+        axes.set_ylabel("y [px]")
+        return picture(figure, [points])
+
+
+def flight_map(numbers: BiasNumbers) -> Picture:
+    """Draw where the cameras were, and where the target was, coloured by the error."""
+    places = np.array([one.place_m for one in numbers.compared])
+    cameras = np.array([one.camera_m for one in numbers.compared])
+    with sheet(7.0, 6.0) as figure:
+        axes = figure.subplots()
+        axes.set_aspect("equal", adjustable="datalim")
+        sights = np.stack((cameras, places, np.full_like(places, np.nan)), axis=1).reshape(-1, 3)
+        axes.plot(*sights[:, :2].T, color="#cccccc", linewidth=0.5)
+        axes.plot(*cameras[:, :2].T, "+", color=GREY, markersize=5, label="camera")
+        points = _coloured(figure, axes, places, numbers.data.residual_m, "error [m]")
+        axes.set_xlabel("east [m]")
+        axes.set_ylabel("north [m]")
+        axes.legend(loc="best")
+        return picture(figure, [points])
+
+
+def _coloured(
+    figure: Figure, axes: Axes, places: FloatArray, error: FloatArray, label: str
+) -> Points:
+    largest = float(np.quantile(np.abs(error), 0.98)) or 1.0
+    drawn = axes.scatter(
+        places[:, 0],
+        places[:, 1],
+        c=np.clip(error, -largest, largest),
+        s=np.clip(14.0 + 40.0 * np.abs(error) / largest, 14.0, 54.0),
+        cmap=_SIGNED,
+        norm=TwoSlopeNorm(0.0, -largest, largest),
+        edgecolors=GREY,
+        linewidths=0.5,
+    )
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.85)
+    return Points(axes, np.arange(len(error)), places[:, 0], places[:, 1])
+
+
+def error_against_exposure(numbers: BiasNumbers) -> Picture:
+    """Draw residual and δ against every exposure quantity that varies, with fitted slopes."""
+    left = numbers.residual_percent - numbers.explained_percent
+    shift = numbers.data.exposure["edge_shift_px"]
+    displaced = [
+        one
+        for one in numbers.influences
+        if numbers.is_displaced and one.quantity.name != "edge_shift_px"
+    ]
+    count = -(-(len(numbers.influences) + len(displaced)) // 2)
+    with sheet(7.0, 2.7 * count) as figure:
+        panels = iter(figure.subplots(count, 2, squeeze=False).ravel())
+        points = []
+        # pairs side by side, and δ, which has no partner, behind them
+        for influence in (*displaced, *(one for one in numbers.influences if one not in displaced)):
+            axes = next(panels)
+            axes.axhline(0.0, color="black", linewidth=0.8)
+            points.append(scatter(axes, influence.rows, influence.values, left[influence.rows]))
+            _line(axes, influence, influence.residual)
+            axes.set_ylabel("error [%]", fontsize=11)
+            if influence not in displaced:
+                continue
+            axes = next(panels)
+            known = np.isfinite(shift[influence.rows])
+            rows, x = influence.rows[known], influence.values[known]
+            points.append(scatter(axes, rows, x, shift[rows], None, GREEN))
+            _line(axes, influence, influence.edge_shift)
+            axes.set_ylabel("δ [px]", fontsize=11)
+        for axes in panels:
+            axes.set_visible(False)
+        return picture(figure, points)
+
+
+def _line(axes: Axes, influence: Influence, slope: Slope | None) -> None:
+    """Draw a fitted line with its confidence, and name the abscissa."""
+    axes.set_xlabel(influence.quantity.label, fontsize=11)
+    axes.tick_params(labelsize=10)
+    axes.locator_params(nbins=5)
+    if slope is None:
+        return
+    x = np.linspace(influence.values.min(), influence.values.max(), 60)
+    y, sd = slope.line(influence.quantity.measure(x))
+    low, high = axes.get_ylim()
+    axes.plot(x, y, color=VERMILION, linewidth=1.8)
+    axes.fill_between(
+        x,
+        y - _CONFIDENCE * sd,
+        y + _CONFIDENCE * sd,
+        color=VERMILION,
+        alpha=0.18,
+        linewidth=0.0,
+    )
+    axes.set_ylim(low, high)
+
+
+def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
+    """Draw errors of the distances by one edge and by two, and their difference against δ."""
+    rows = edges.rows
+    distance = numbers.data.distance_m[rows]
+    with sheet(7.0, 6.4) as figure:
+        upper, lower = figure.subplots(2, 1)
+        upper.axhline(0.0, color="black", linewidth=0.8)
+        one, two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
+        both = np.concatenate((one, two))
+        points = [
+            scatter(upper, rows, distance, one, "one edge", VERMILION, "x", both),
+            scatter(upper, rows, distance, two, "both edges", among=both),
+        ]
+        upper.set_xlabel("reference distance [m]")
+        upper.set_ylabel("error [%]")
+        upper.legend(loc="best", ncols=2)
+        shift = numbers.data.exposure["edge_shift_px"][rows]
+        points.append(scatter(lower, rows, shift, one - two, None, GREEN))
+        lower.set_xlabel("edge shift δ [px]")
+        lower.set_ylabel("one edge − both [%]")
+        return picture(figure, points)
+
+
+def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
+    """Draw the paper's Figure 10: how distances move when grey values are multiplied."""
+    gains = sorted({result.gain for result in results})
+    colours = dict(zip(gains, (BLUE, VERMILION, GREEN, GREY), strict=False))
+    with sheet(7.0, 4.2) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        points: list[Points] = []
+        for gain in gains:
+            kept = [one for one in results if one.gain == gain and one.change_percent is not None]
+            lost = [one for one in results if one.gain == gain and one.change_percent is None]
+            label = f"grey × {gain:g}"
+            points.append(_changes(axes, kept, colours[gain], label))
+            if lost:
+                x = np.array([one.radius_px for one in lost])
+                axes.plot(x, np.zeros(len(x)), "x", color=colours[gain], label=f"{label}: lost")
+        axes.set_xscale("log", base=2)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
+        axes.set_xlabel("radius of the ring [px]")
+        axes.set_ylabel("change of distance [%]")
+        axes.legend(loc="best")
+        return picture(figure, [panel for panel in points if panel.rows.size])
+
+
+def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, label: str) -> Points:
+    x = np.array([one.radius_px for one in kept])
+    y = np.array([one.change_percent for one in kept], dtype=np.float64)
+    sd = np.array([one.sd_percent or 0.0 for one in kept])
+    axes.errorbar(
+        x, y, yerr=sd, fmt="o", color=colour, ecolor=colour, elinewidth=1.0, capsize=3, label=label
+    )
+    return Points(axes, np.array([one.row for one in kept], dtype=np.intp), x, y)

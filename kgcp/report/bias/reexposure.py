@@ -1,0 +1,108 @@
+"""Frames measured again with other grey values: the experiment of Figure 10 of Cucci (2016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.measurement.guided import Expectation, look_again
+from kgcp.measurement.records import Observation
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Target
+
+GAINS = (0.6, 1.6)
+_SD_PX, _SD_LOG_RADIUS = 0.5, 0.02  # how sure it is that the target is where it was
+_REACH = 4.0  # of the ring's radius: what is changed of the frame around it
+_LEAST_REACH_PX = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reexposed:
+    """One target measured again.
+
+    Attributes
+    ----------
+    row : int
+        Of the measurement, by its place in time.
+    gain : float
+        What the grey values were multiplied by.
+    radius_px : float
+        Of the ring.
+    change_percent : float or None
+        Of the distance; None: the target was not measured again.
+    sd_percent : float or None
+        Standard deviation of the distance then.
+    saturated : float or None
+        Share of clipped pixels then.
+    """
+
+    row: int
+    gain: float
+    radius_px: float
+    change_percent: float | None
+    sd_percent: float | None
+    saturated: float | None
+
+
+def reexposed(grey: GreyArray, gain: float) -> GreyArray:
+    """Return a frame with its grey values times `gain`, clipped and rounded."""
+    limit = np.iinfo(grey.dtype).max
+    return np.rint(np.minimum(grey * gain, limit)).astype(grey.dtype)
+
+
+def measure_again(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    settings: DetectSettings,
+    centre_px: FloatArray,
+    radius_px: float,
+    row: int,
+) -> list[Reexposed]:
+    """Measure one target with its grey values as they are, and times each of `GAINS`.
+
+    It is looked for only where it is, whatever the size of the frame. Empty if it is not found
+    there unchanged.
+    """
+    expected = Expectation(centre_px, _SD_PX, radius_px, _SD_LOG_RADIUS, "the unchanged frame")
+
+    def measured(gain: float) -> Observation | None:
+        changed = _reexposed_around(grey, gain, centre_px, radius_px)
+        return look_again(changed, camera, target, expected, settings, None, ())[0]
+
+    before = measured(1.0)
+    if before is None:
+        return []
+    return [_compare(before, measured(gain), gain, radius_px, row) for gain in GAINS]
+
+
+def _compare(
+    before: Observation, after: Observation | None, gain: float, radius_px: float, row: int
+) -> Reexposed:
+    if after is None:
+        return Reexposed(row, gain, radius_px, None, None, None)
+    distance = after.pose.distance_m
+    spread = after.uncertainty
+    return Reexposed(
+        row,
+        gain,
+        radius_px,
+        100.0 * (distance / before.pose.distance_m - 1.0),
+        None if spread is None else 100.0 * spread.sd_distance_m / distance,
+        after.appearance.saturated,
+    )
+
+
+def _reexposed_around(
+    grey: GreyArray, gain: float, centre_px: FloatArray, radius_px: float
+) -> GreyArray:
+    """Return a frame that is changed as far as the measurement looks."""
+    reach = max(_LEAST_REACH_PX, _REACH * radius_px)
+    left, top = np.maximum(np.floor(centre_px - reach), 0).astype(int)
+    right, bottom = np.ceil(centre_px + reach).astype(int)
+    changed = grey.copy()
+    changed[top:bottom, left:right] = reexposed(grey[top:bottom, left:right], gain)
+    return changed

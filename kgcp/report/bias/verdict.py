@@ -1,0 +1,281 @@
+"""The verdict of the bias report: one word, the reasons for it, and what else is to be said."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from kgcp.report.bias.numbers import BiasNumbers
+from kgcp.report.bias.ranges import RangeRow
+from kgcp.report.bias.reexposure import GAINS, Reexposed
+from kgcp.report.bias.wording import amount, exposure_sentence, label_of, meaning_of, value_of
+
+
+class Grade(IntEnum):
+    """How good a flight is; the worst of all findings counts."""
+
+    GOOD = 0
+    LOOK = 1
+    UNUSABLE = 2
+
+    @property
+    def words(self) -> str:
+        """The grade in print."""
+        return ("Good", "Look at what is marked below", "Not usable as it is")[self]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """From where on something is a finding.
+
+    Attributes
+    ----------
+    min_frames : int
+        Compared frames, below which there is no verdict "good".
+    unusable_rms_percent : float
+        RMS of the residuals [%]; the paper has 1 % up to 100 m.
+    mean_percent : float
+        Size of a mean error that neither noise nor the reference explains [%].
+    scale_percent, offset_m : float
+        Size of a significant scale [%] and offset [m].
+    exposure_share : float
+        Of the variance, explained by exposure of which a term is significant.
+    reexposure_percent : float
+        RMS change of distances that are measured again darker and brighter [%].
+    standardised_low, standardised_high : float
+        Spread of the residuals, without scale and offset, over their reported deviations.
+    lost_share, unusable_lost_share : float
+        Of measurements that are astray or outliers.
+    detection_rate : float
+        Of frames with the target fully in view.
+    """
+
+    min_frames: int = 10
+    unusable_rms_percent: float = 1.0
+    mean_percent: float = 0.02
+    scale_percent: float = 0.02
+    offset_m: float = 0.01
+    exposure_share: float = 0.1
+    reexposure_percent: float = 0.1
+    standardised_low: float = 0.5
+    standardised_high: float = 1.5
+    lost_share: float = 0.05
+    unusable_lost_share: float = 0.3
+    detection_rate: float = 0.8
+
+
+LIMITS = Limits()
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One sentence of the verdict.
+
+    Attributes
+    ----------
+    grade : Grade
+        What it makes of the flight; `GOOD` where it only informs.
+    text : str
+    section : str
+        Where the page shows it: the id of a section.
+    """
+
+    grade: Grade
+    text: str
+    section: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """All that is to be said, what matters most first."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def grade(self) -> Grade:
+        """The worst grade of the findings."""
+        return max(finding.grade for finding in self.findings)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict as text, line by line."""
+        return (f"{self.grade.words}.", *(finding.text for finding in self.findings))
+
+
+def judge(
+    numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), limits: Limits = LIMITS
+) -> Verdict:
+    """Judge a flight by its numbers, and by what measuring some frames again has changed."""
+    findings = [
+        _accuracy(numbers, limits),
+        _bias(numbers, limits),
+        *_causes(numbers, limits),
+        *_deviations(numbers, limits),
+        *_losses(numbers, limits),
+        *_reexposure(reexposed, limits),
+        *_detection(numbers, limits),
+        *_reservations(numbers),
+    ]
+    return Verdict(tuple(sorted(findings, key=lambda finding: -finding.grade)))
+
+
+def _accuracy(numbers: BiasNumbers, limits: Limits) -> Finding:
+    count = numbers.total.percent.count
+    parts = [f"{_rms(row)} {row.label} ({row.percent.count})" for row in numbers.halves]
+    frames = "frame" if count == 1 else "frames"
+    text = f"Distance error (RMS) over {count} {frames}: {'; '.join(parts)}."
+    if numbers.total.percent.rms > limits.unusable_rms_percent:
+        return Finding(
+            Grade.UNUSABLE,
+            f"{text} That is above {limits.unusable_rms_percent:g} %: something is wrong with"
+            " target, camera, times, reference or exposure.",
+            "error",
+        )
+    if count < limits.min_frames:
+        return Finding(
+            Grade.LOOK, f"{text} Fewer than {limits.min_frames} frames say little.", "error"
+        )
+    return Finding(Grade.GOOD, text, "error")
+
+
+def _rms(row: RangeRow) -> str:
+    return f"{row.percent.rms:.3f} % ({1000.0 * row.metres.rms:.0f} mm)"
+
+
+def _bias(numbers: BiasNumbers, limits: Limits) -> Finding:
+    if numbers.total.percent.count == 1:
+        return Finding(Grade.LOOK, "One frame says nothing about bias.", "error")
+    if not numbers.biased:
+        known = numbers.total.sd_reference_percent is not None
+        beyond = "noise and the reference's own errors" if known else "noise"
+        text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
+        return Finding(Grade.GOOD, text, "error")
+    sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
+    parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
+    material = any(abs(row.percent.mean) >= limits.mean_percent for row in numbers.biased)
+    text = f"Biased: distances are measured {'; '.join(parts)}."
+    return Finding(Grade.LOOK if material else Grade.GOOD, text, "error")
+
+
+def _mean(row: RangeRow) -> str:
+    return amount(row.percent.mean, row.percent.sd_mean, "%")
+
+
+def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+    found = numbers.regression
+    if found is None:
+        text = "Scale and offset cannot be told apart: too few frames, or distances too alike."
+        yield Finding(Grade.LOOK, text, "causes")
+        return
+    basic = [term for term in found.terms if term.name in {"scale", "offset_m"}]
+    if not any(term.is_significant for term in basic):
+        values = " and ".join(f"{label_of(term.name)} {value_of(term)}" for term in basic)
+        yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
+    large = {"scale": 0.01 * limits.scale_percent, "offset_m": limits.offset_m}
+    for term in found.terms:
+        if term.name in large and term.is_significant:
+            material = abs(term.value) >= large[term.name]
+            yield Finding(Grade.LOOK if material else Grade.GOOD, meaning_of(term), "causes")
+        elif term.name == "edge_curvature_px2":
+            yield Finding(Grade.LOOK, meaning_of(term), "causes")
+    material = found.is_exposure_significant and found.exposure_share >= limits.exposure_share
+    yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(found), "exposure")
+
+
+def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Finding]:
+    changes = [one.change_percent for one in reexposed if one.change_percent is not None]
+    if not changes:
+        return
+    rms = math.hypot(*changes) / math.sqrt(len(changes))
+    lost = len(reexposed) - len(changes)
+    text = (
+        f"Measured again with grey values × {' and × '.join(f'{gain:g}' for gain in GAINS)},"
+        f" distances change by {rms:.3f} % (RMS of {len(changes)}; {lost} lost)."
+    )
+    grade = Grade.LOOK if rms > limits.reexposure_percent else Grade.GOOD
+    yield Finding(grade, text, "reexposure")
+
+
+def _deviations(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+    """Say whether the reported deviations are true; what scale and offset explain left out."""
+    found = numbers.regression
+    if found is None or numbers.standardised is None or numbers.sd_reference_m is None:
+        return
+    spread = found.scatter
+    if spread > limits.standardised_high:
+        yield Finding(
+            Grade.LOOK,
+            f"Residuals scatter {spread:.1f} times as much as their reported deviations say: those"
+            " of trajectory and reference poses may be too small.",
+            "standardised",
+        )
+    elif spread < limits.standardised_low:
+        yield Finding(
+            Grade.GOOD,
+            f"Residuals scatter only {spread:.2f} times as much as their reported deviations say:"
+            " those of trajectory and reference poses may be too large.",
+            "standardised",
+        )
+
+
+def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+    found = numbers.regression
+    outliers = 0 if found is None else int(found.outlier.sum())
+    astray = len(numbers.astray)
+    if not outliers + astray:
+        return
+    share = (outliers + astray) / (numbers.total.percent.count + astray)
+    grade = Grade.GOOD
+    if share > limits.unusable_lost_share:
+        grade = Grade.UNUSABLE
+    elif share > limits.lost_share:
+        grade = Grade.LOOK
+    parts = []
+    if astray:
+        parts.append(
+            f"{astray} {_plural('measurement', astray)} not where the target must be, left out of"
+            " the statistics"
+        )
+    if outliers:
+        parts.append(
+            f"{outliers} {_plural('outlier', outliers)}, more than five deviations off the"
+            " regression and left out of it"
+        )
+    yield Finding(grade, f"{'; '.join(parts)}.", "worst")
+
+
+def _plural(word: str, count: int) -> str:
+    return word if count == 1 else f"{word}s"
+
+
+def _detection(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+    if not numbers.chances:
+        return
+    share = numbers.detected / numbers.chances
+    kind = "the target fully in view" if numbers.attitudes_agree else "a reference pose"
+    yield Finding(
+        Grade.GOOD if share >= limits.detection_rate else Grade.LOOK,
+        f"Detected in {numbers.detected} of {numbers.chances} frames with {kind}"
+        f" ({100.0 * share:.1f} %).",
+        "rate",
+    )
+
+
+def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
+    """Say what speaks against taking the numbers at face value."""
+    if numbers.sd_reference_m is not None:
+        yield Finding(
+            Grade.GOOD,
+            f"The reference distance itself is known to {1000.0 * numbers.sd_reference_m:.0f} mm"
+            " (median sd).",
+            "error",
+        )
+    if not numbers.attitudes_agree:
+        yield Finding(
+            Grade.LOOK,
+            "The reference attitudes do not lead to the measured points: check omega, phi, kappa;"
+            " distances do not depend on them.",
+            "left-out",
+        )

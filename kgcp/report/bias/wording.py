@@ -1,0 +1,108 @@
+"""What the numbers of the bias report mean, in sentences."""
+
+from __future__ import annotations
+
+import math
+
+from kgcp.quality.bias_causes import Regression, Term
+from kgcp.quality.exposure_effects import QUANTITIES
+
+_LABELS = {
+    "scale": "scale",
+    "offset_m": "constant offset",
+    "edge_curvature_px2": "curved edges",
+} | {quantity.name: quantity.label for quantity in QUANTITIES}
+_PER = {quantity.name: quantity.per for quantity in QUANTITIES}
+
+
+def amount(value: float, sd: float | None, unit: str, factor: float = 1.0) -> str:
+    """Return value ± deviation, both to the deviation's second digit."""
+    value *= factor
+    if sd is None or not sd > 0.0:
+        return f"{minus(f'{value:+.3g}')} {unit}"
+    sd *= factor
+    decimals = min(6, max(0, 1 - math.floor(math.log10(sd))))
+    return f"{minus(f'{value:+.{decimals}f}')} ± {sd:.{decimals}f} {unit}"
+
+
+def minus(number: str) -> str:
+    """Return a number in print: with a true minus, and no sign where it is zero."""
+    return number.replace("-", "−") if float(number) else number.lstrip("+-")
+
+
+def label_of(name: str) -> str:
+    """Return what a term of the regression is called."""
+    return _LABELS[name]
+
+
+def value_of(term: Term) -> str:
+    """Return a term's estimate with deviation and unit."""
+    if term.name == "scale":
+        return amount(term.value, term.sd, "%", 100.0)
+    if term.name == "offset_m":
+        return amount(term.value, term.sd, "mm", 1000.0)
+    if term.name == "edge_curvature_px2":
+        return amount(term.value, term.sd, "px²")
+    return amount(term.value, term.sd, f"px per {_PER[term.name]}")
+
+
+def meaning_of(term: Term) -> str:
+    """Return one sentence on a term."""
+    if not term.is_significant:
+        return f"No {_nothing(term)} beyond chance."
+    side = "long" if term.value > 0.0 else "short"
+    if term.name == "scale":
+        return (
+            f"Distances are too {side} in proportion, by {value_of(term)}: focal length (fx, fy) or"
+            f" target diameters in flight.toml are too {'large' if side == 'long' else 'small'} by"
+            " as much."
+        )
+    if term.name == "offset_m":
+        return (
+            f"Distances are too {side} by the same length everywhere, {value_of(term)}: lever arm,"
+            " height of the trajectory or datum of the reference poses; from above, the target"
+            f" lies {'lower' if side == 'long' else 'higher'} than they say."
+        )
+    if term.name == "edge_curvature_px2":
+        way = "into" if side == "long" else "out of"
+        return (
+            f"Edges are displaced {way} the dark ring the more the smaller it is, by"
+            f" {value_of(term)} over its radius: blur of curved edges, which only"
+            " --method model takes into account, or sharpening."
+        )
+    if term.name == "edge_shift_px":
+        return (
+            f"Displaced edges are in the distances: {amount(term.value, term.sd, 'px')} of each"
+            " pixel of δ (1: all of it, as with one edge; 0: none)."
+        )
+    return f"Distances follow {_LABELS[term.name]}: the outer edge moves by {value_of(term)}."
+
+
+def _nothing(term: Term) -> str:
+    nothing = {
+        "scale": "error of scale",
+        "offset_m": "constant offset",
+        "edge_shift_px": "part of δ in the distances",
+    }
+    return nothing.get(term.name, f"effect of {_LABELS[term.name]}")
+
+
+def chance(term: Term) -> str:
+    """Return a term's probability."""
+    return probability_text(term.probability)
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability in print."""
+    return "< 0.0001" if probability < 1e-4 else f"{probability:.2g}"
+
+
+def exposure_sentence(found: Regression) -> str:
+    """Return what exposure has to do with the residuals."""
+    if found.exposure_probability is None:
+        return "No exposure quantity varies enough in this flight to be examined."
+    share = f"{100.0 * found.exposure_share:.0f} % of the variance that scale and offset leave"
+    if not found.is_exposure_significant:
+        return f"No exposure term is significant; together they explain {share}."
+    clear = [_LABELS[term.name] for term in found.exposure_terms if term.is_significant]
+    return f"The error follows the exposure ({', '.join(clear)}), which explains {share}."

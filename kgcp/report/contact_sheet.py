@@ -1,0 +1,149 @@
+"""The contact sheet: a folder with a page, and a picture and its thumbnail for every ring."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp import __version__
+from kgcp.errors import KgcpError, Status
+from kgcp.io.files.atomic import whole_file
+from kgcp.report.ring_picture import FULL_SCALE, THUMBNAIL_PX, Pictures
+
+PAGE = "index.html"
+_PICTURES, _THUMBNAILS = "pictures", "thumbnails"
+_OWN_NAME = re.compile(r"\d{6,}-\d+\.jpg")
+_MARK = '<meta name="generator" content="kgcp'
+_HEAD = 2000  # characters of a page, in which the mark must be
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """What the page says of one row of the table.
+
+    Attributes
+    ----------
+    frame, target, status, reason : str
+        As in the table.
+    instance : int
+    headline, text : str
+        The main value, and the others.
+    distance_m, sd_percent, radius_px, residual_percent : float or None
+        What the page can sort by.
+    stem : str or None
+        Of the picture's files; None: there is none.
+    """
+
+    frame: str
+    target: str
+    instance: int
+    status: str
+    reason: str
+    headline: str
+    text: str
+    distance_m: float | None = None
+    sd_percent: float | None = None
+    radius_px: float | None = None
+    residual_percent: float | None = None
+    stem: str | None = None
+
+
+class ContactSheet:
+    """A folder that becomes a contact sheet; its page appears last, when all pictures are there.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if need be.
+
+    Raises
+    ------
+    KgcpError
+        Here and by all methods, if it cannot be written; here, if it holds another page.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._kept: set[str] = set()
+        self.page = folder / PAGE
+        try:
+            for name in (_PICTURES, _THUMBNAILS):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+            if self.page.is_file() and not _is_own(self.page):
+                raise KgcpError(
+                    f"{self.page}: is a page of something else; choose another --overlay"
+                )
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def clear(self) -> None:
+        """Delete the page of another run: what follows is not what it shows."""
+        try:
+            self.page.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def add(self, stem: str, pictures: Pictures) -> None:
+        """Write a picture and its thumbnail."""
+        name = f"{stem}.jpg"
+        self._kept.add(name)
+        for folder, content in (
+            (_PICTURES, pictures.picture),
+            (_THUMBNAILS, pictures.thumbnail),
+        ):
+            self._write(self._folder / folder / name, content)
+
+    def finish(self, flight_name: str, cards: Sequence[Card]) -> None:
+        """Delete what is left of other runs, and write the page."""
+        for folder in (_PICTURES, _THUMBNAILS):
+            for path in (self._folder / folder).iterdir():
+                if _OWN_NAME.fullmatch(path.name) and path.name not in self._kept:
+                    with suppress(OSError):  # it only takes room
+                        path.unlink()
+        self._write(self.page, _render(flight_name, cards).encode("utf-8"))
+
+    def _write(self, path: Path, content: bytes) -> None:
+        try:
+            with whole_file(path) as temporary:
+                temporary.write_bytes(content)
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> KgcpError:
+        return KgcpError(
+            f"{self._folder}: cannot be written ({error.strerror}); choose another --overlay"
+        )
+
+
+def _is_own(page: Path) -> bool:
+    with page.open(encoding="utf-8", errors="replace") as stream:
+        return _MARK in stream.read(_HEAD)
+
+
+def _render(flight_name: str, cards: Sequence[Card]) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # workers need it not
+
+    environment = Environment(
+        loader=PackageLoader("kgcp.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    statuses = Counter(card.status for card in cards)
+    reasons = Counter(card.reason for card in cards if card.reason)
+    return environment.get_template("contact_sheet.html").render(
+        name=flight_name,
+        version=__version__,
+        cards=cards,
+        frames=len({card.frame for card in cards}),
+        statuses=[(kind.value, statuses[kind.value]) for kind in Status if statuses[kind.value]],
+        reasons=sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])),
+        targets=sorted({card.target for card in cards}),
+        thumbnail_px=THUMBNAIL_PX,
+        full_percent=100.0 * FULL_SCALE,
+    )

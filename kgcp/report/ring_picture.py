@@ -1,0 +1,154 @@
+"""Pictures of one ring: as the frame shows it, with what was fitted to it, and what that leaves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.measurement.adjustment.residual_image import Residuals
+
+FULL_SCALE = 0.1
+"""Residuals, in shares of the contrast, that have the full colour."""
+PICTURE_PX, THUMBNAIL_PX = 400, 160
+"""Width of either half of a picture, which is as high."""
+
+_REACH, _LEAST_REACH_PX = 1.4, 6.0  # of the outer radius
+_QUALITY = 80
+_MAGNIFIED = 2.0  # from here on pixels are shown as squares
+_PARTS = 4  # bits of a pixel that lines are drawn to
+# Told apart whatever one's colour vision, on ink and on plate; in OpenCV's order blue, green, red.
+_FITTED, _DROPPED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
+_DARKER, _BRIGHTER = np.array([178.0, 114.0, 0.0]), np.array([0.0, 94.0, 213.0])
+_NOTHING = (226, 226, 226)
+
+_Picture = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What is to be shown of one ring in a frame.
+
+    Attributes
+    ----------
+    centre_px : (2,) array
+        Its centre in the raw frame [px].
+    radius_px : float
+        Of its outer edge [px].
+    curves : sequence of (m, 2) array
+        Fitted contours [px].
+    residuals : Residuals or None
+        What the fit leaves; None: there is no fit.
+    """
+
+    centre_px: FloatArray
+    radius_px: float
+    curves: Sequence[FloatArray]
+    residuals: Residuals | None
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """One scene as JPEG, twice as wide as high: contours on the left, residuals on the right."""
+
+    picture: bytes
+    thumbnail: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """A square of the frame; x0 and y0 may lie outside."""
+
+    x0: int
+    y0: int
+    side: int
+
+    def of(self, layer: npt.NDArray[np.generic], fill: float) -> FloatArray:
+        """Cut it out of a layer (height, width) of the frame; beyond that there is `fill`."""
+        height, width = layer.shape
+        cut = np.full((self.side, self.side), fill)
+        top, left = max(self.y0, 0), max(self.x0, 0)
+        part = layer[top : max(self.y0 + self.side, 0), left : max(self.x0 + self.side, 0)]
+        if top < height and left < width:
+            down, right = top - self.y0, left - self.x0
+            cut[down : down + part.shape[0], right : right + part.shape[1]] = part
+        return cut
+
+
+def draw_scene(grey: GreyArray, scene: Scene) -> Pictures:
+    """Draw the surroundings of a ring: with its contours, and beside it the residuals.
+
+    The residuals are blue where the frame is brighter than the model, orange where it is darker,
+    and grey where there is no model. Where nothing was fitted, the ring is there without contours.
+    """
+    reach = math.ceil(max(_REACH * scene.radius_px, _LEAST_REACH_PX))
+    x, y = np.rint(scene.centre_px).astype(int).tolist()
+    cut = _Cut(x - reach, y - reach, 2 * reach + 1)
+    plain = _stretched(cut.of(grey, math.nan))
+    beside = plain if scene.residuals is None else _coloured(scene.residuals, cut)
+    picture, thumbnail = (
+        _encoded(np.hstack((_with_contours(_sized(plain, size), cut, scene), _sized(beside, size))))
+        for size in (PICTURE_PX, THUMBNAIL_PX)
+    )
+    return Pictures(picture, thumbnail)
+
+
+def _stretched(cut: FloatArray) -> _Picture:
+    """Spread grey values from the darkest to the brightest; in colours, as all that follows."""
+    inside = np.isfinite(cut)
+    low, high = (cut[inside].min(), cut[inside].max()) if inside.any() else (0.0, 1.0)
+    level = np.nan_to_num(255.0 * (cut - low) / max(high - low, 1e-9), nan=0.0)
+    picture = np.repeat(np.rint(level).astype(np.uint8)[:, :, None], 3, axis=2)
+    picture[~inside] = _NOTHING
+    return picture
+
+
+def _coloured(residuals: Residuals, cut: _Cut) -> _Picture:
+    moved = _Cut(cut.x0 - residuals.x0, cut.y0 - residuals.y0, cut.side)
+    share = moved.of(residuals.share, math.nan)
+    strength = np.nan_to_num(np.minimum(np.abs(share) / FULL_SCALE, 1.0))[:, :, None]
+    ink = np.where(share[:, :, None] > 0.0, _BRIGHTER, _DARKER)
+    picture = np.rint(255.0 + strength * (ink - 255.0)).astype(np.uint8)
+    picture[np.isnan(share)] = _NOTHING
+    return picture
+
+
+def _sized(picture: _Picture, size: int) -> _Picture:
+    """Scale a square to a size [px]."""
+    is_magnified = size >= _MAGNIFIED * len(picture)
+    way = cv2.INTER_NEAREST_EXACT if is_magnified else cv2.INTER_AREA
+    if len(picture) < size < _MAGNIFIED * len(picture):
+        way = cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(picture, (size, size), interpolation=way), dtype=np.uint8)
+
+
+def _with_contours(picture: _Picture, cut: _Cut, scene: Scene) -> _Picture:
+    scale = len(picture) / cut.side
+    corner = np.array([cut.x0, cut.y0]) - 0.5
+
+    def place(points: FloatArray) -> npt.NDArray[np.int32]:
+        on_picture = scale * (points - corner) - 0.5
+        return np.asarray(np.rint(on_picture * 2**_PARTS), dtype=np.int32)
+
+    colour = _DROPPED if scene.residuals is None else _FITTED
+    for curve in scene.curves:
+        cv2.polylines(picture, [place(curve)], isClosed=False, color=colour, thickness=1,
+                      lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
+    x, y = (float(c) for c in scene.centre_px)
+    arm = 0.03 * cut.side
+    for tip in ((arm, 0.0), (0.0, arm)):
+        ends = place(np.array([[x - tip[0], y - tip[1]], [x + tip[0], y + tip[1]]]))
+        cv2.polylines(picture, [ends], isClosed=False, color=_CENTRE, thickness=1,
+                      lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
+    return picture
+
+
+def _encoded(picture: _Picture) -> bytes:
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    sharp_colours = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    return cv2.imencode(".jpg", picture, quality + sharp_colours)[1].tobytes()

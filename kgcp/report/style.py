@@ -1,0 +1,140 @@
+"""What all figures share: style, PNG bytes, and where in a figure its points lie."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+
+# Okabe and Ito's palette, told apart by colour-blind readers and in grey print
+BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+MARK_STEPS = 10_000  # of a picture's width and height
+_DPI = 150
+_FEW = 400  # points, up to which they are drawn large
+_FAR = 8.0  # robust deviations, beyond which points are drawn at the rim
+_STYLE = {
+    "font.size": 12.0,
+    "font.family": "DejaVu Sans",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 10.0,
+    "savefig.dpi": _DPI,
+}
+
+
+def load_matplotlib() -> None:
+    """Import it without the settings of the current folder, before anything else imports it.
+
+    It reads a file matplotlibrc there, and commands are mostly run in a flight's folder, which may
+    come from anybody.
+    """
+    with chdir("/"):
+        import_module("matplotlib")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Measurements drawn in one panel.
+
+    Attributes
+    ----------
+    axes : Axes
+    rows : (m,) array of int
+        Which measurements, by their place in time.
+    x, y : (m,) array
+        Where, in the panel's coordinates.
+    """
+
+    axes: Axes
+    rows: IndexArray
+    x: FloatArray
+    y: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A figure as a file, with the places of its points.
+
+    Attributes
+    ----------
+    png : bytes
+    rows : (m,) array of int
+        Measurements that are drawn; one may be in several panels.
+    places : (m, 2) array of int
+        Theirs, from the picture's left and top, in `MARK_STEPS` of its width and height.
+    """
+
+    png: bytes
+    rows: IndexArray
+    places: IndexArray
+
+
+@contextmanager
+def sheet(width_in: float, height_in: float) -> Iterator[Figure]:
+    """Yield an empty figure in the report's style, whatever the user's matplotlibrc says."""
+    with style.context(["default", _STYLE]):
+        yield Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+
+
+def picture(figure: Figure, points: Sequence[Points] = ()) -> Picture:
+    """Draw a figure: byte for byte the same for the same numbers."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    size = np.array([figure.bbox.width, figure.bbox.height])
+    rows = [np.zeros(0, dtype=np.intp)]
+    places = [np.zeros((0, 2))]
+    for panel in points:
+        shown = panel.axes.transData.transform(np.column_stack((panel.x, panel.y))) / size
+        rows.append(panel.rows)
+        places.append(np.column_stack((shown[:, 0], 1.0 - shown[:, 1])))
+    steps = np.rint(MARK_STEPS * np.concatenate(places)).astype(np.intp)
+    return Picture(stream.getvalue(), np.concatenate(rows), steps)
+
+
+def scatter(
+    axes: Axes,
+    rows: IndexArray,
+    x: FloatArray,
+    y: FloatArray,
+    label: str | None = None,
+    colour: str = BLUE,
+    marker: str = "o",
+    among: FloatArray | None = None,
+) -> Points:
+    """Draw measurements; those far off all others stand at the rim, as triangles.
+
+    All others are these alone, or `among` (m,) if several kinds share a panel.
+    """
+    low, high = _limits(y if among is None else among)
+    shown = np.clip(y, low, high)
+    size = 4.0 if len(y) <= _FEW else 2.0
+    inside = shown == y
+    axes.plot(x[inside], y[inside], marker, color=colour, markersize=size, alpha=0.7, label=label)
+    for beyond, triangle in ((y > high, "^"), (y < low, "v")):
+        axes.plot(x[beyond], shown[beyond], triangle, color=colour, markersize=6.0)
+    return Points(axes, rows, x, shown)
+
+
+def _limits(values: FloatArray) -> tuple[float, float]:
+    middle = float(np.median(values))
+    spread = float(np.median(np.abs(values - middle))) / 0.6745
+    if spread == 0.0:
+        return float(values.min()), float(values.max())
+    near = values[np.abs(values - middle) <= _FAR * spread]
+    margin = 0.15 * float(np.ptp(near))
+    low, high = float(values.min()), float(values.max())
+    return max(low, near.min() - margin), min(high, near.max() + margin)

@@ -1,0 +1,1 @@
+"""Rendered truth, seeded and deterministic, and the accuracy to expect; no files."""

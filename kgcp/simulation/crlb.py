@@ -1,0 +1,256 @@
+"""Cramér-Rao bound of one view: the least scatter any unbiased measurement of it can have.
+
+The image model is the simulator's own (`kgcp.simulation`): exact coverage, spread by point spread
+and streak, integrated over pixels; shot and read noise, clipping, rounding. benchmarks/README.md
+says what is taken as unknown and what is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import log_ndtr, ndtr
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.plate import Plate
+from kgcp.simulation.shapes import Disc
+
+_STEP_PX = 0.02  # of the central differences, as the largest movement of an edge
+_OPAQUE = 0.999  # share of the plate in a pixel from which the plate's outline does not matter
+_WHITE_LEVEL = 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Least standard deviations of one view.
+
+    Attributes
+    ----------
+    distance_percent : float
+        Of the distance [%].
+    centre_px : float
+        Of the projected centre: root of the summed variances of x and y [px].
+    normal_deg : float
+        Of the plate's normal: root of the summed variances of its two angles [deg].
+    """
+
+    distance_percent: float
+    centre_px: float
+    normal_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """What there is to see of one plate, and by what.
+
+    Attributes
+    ----------
+    camera : Camera
+    plate : Plate
+        With the radiances of plate and ink.
+    pose : Pose
+        Target → camera.
+    optics : Optics
+    sensor : Sensor
+    gain : float
+        Exposure relative to the one at which radiance 1 fills the well.
+    has_unknown_streak : bool
+        Whether a measurement has to find out how the image moved.
+    sub_pixels : int
+        Across the ring's window: 150 are good for 1 %, 600 for a per mille of the bound.
+    """
+
+    camera: Camera
+    plate: Plate
+    pose: Pose
+    optics: Optics
+    sensor: Sensor
+    gain: float
+    has_unknown_streak: bool
+    sub_pixels: int = 600
+
+
+def bound_of(shot: Shot) -> Bound:
+    """Return the bound of a view of the whole main ring.
+
+    Unknown besides the six of the pose: the radiances of ink and plate and the point spread; the
+    streak, where the shot says so; two parameters of the tone curve's bend, where the camera's
+    response is unknown.
+    """
+    view = _View(shot, _ring_window(shot))
+    white = view.white(shot.pose)
+    share = view.seen(white, shot.optics)
+    weight = np.sqrt(_information(view, share))
+    nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view, white, share)])
+    pose = weight[:, None] * _pose_derivatives(view)
+    return _in_words(shot.camera, shot.pose, pose_covariance(pose, nuisances))
+
+
+def pose_covariance(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
+    """Return the inverse (6, 6) of the information about the pose that the nuisances leave.
+
+    Parameters
+    ----------
+    pose, nuisances : (n, 6) and (n, m) arrays
+        Derivatives of n observations of unit variance. A nuisance without effect is left out.
+    """
+    sizes = np.linalg.norm(nuisances, axis=0)
+    nuisances = nuisances[:, sizes > 0.0] / sizes[sizes > 0.0]
+    scale = np.linalg.norm(pose, axis=0)
+    _, triangle = np.linalg.qr(np.column_stack((nuisances, pose / scale)))
+    count = nuisances.shape[1]
+    inverse = np.linalg.inv(triangle[count:, count:]) / scale[:, None]
+    covariance: FloatArray = inverse @ inverse.T
+    return covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A window on the plate: how much white every pixel sees, 0 (ink) … 1."""
+
+    shot: Shot
+    window: Window
+
+    def white(self, pose: Pose) -> FloatArray:
+        """Return the share of white in the sub-pixels, on a plate without end."""
+        patch = Patch.of(self.shot.camera, pose, self.window, self._oversampling)
+        white = np.ones_like(patch.x_m)
+        for shape, radiance in replace(self.shot.plate, black=0.0, white=1.0).print_layers():
+            patch.paint(white, shape, radiance)
+        return white
+
+    def seen(self, white: FloatArray, optics: Optics) -> FloatArray:
+        """Return the share of white (height, width) that reaches the pixels."""
+        return optics.spread(white, self._oversampling)
+
+    def irradiance(self, share: FloatArray) -> FloatArray:
+        """Return the light of a share of white."""
+        plate = self.shot.plate
+        return plate.black + (plate.white - plate.black) * share
+
+    def opaque(self) -> npt.NDArray[np.bool_]:
+        """Return where (height, width) a pixel of the frame sees nothing but the plate."""
+        shot, window = self.shot, self.window
+        patch = Patch.of(shot.camera, shot.pose, window, self._oversampling)
+        plate = np.zeros_like(patch.x_m)
+        patch.paint(plate, shot.plate.outline, 1.0)
+        columns = window.column + np.arange(window.width)
+        rows = window.row + np.arange(window.height)
+        inside = ((rows >= 0) & (rows < shot.camera.height))[:, None] & (
+            (columns >= 0) & (columns < shot.camera.width)
+        )
+        return (shot.optics.spread(plate, self._oversampling) > _OPAQUE) & inside
+
+    @property
+    def _oversampling(self) -> int:
+        longest = max(self.window.width, self.window.height)
+        return int(np.clip(self.shot.sub_pixels // longest, 2, 8))
+
+
+def _ring_window(shot: Shot) -> Window:
+    """Return the window with everything that the edges of the main ring send light to."""
+    edge = Disc((0.0, 0.0), 0.5 * shot.plate.target.ring.outer_diameter_m)
+    corner, size = outline_box(shot.camera, shot.pose, edge)
+    margin = shot.optics.reach_px
+    column, row = np.floor(corner).astype(int) - margin
+    width, height = np.ceil(size).astype(int) + 2 * margin + 2
+    return Window(int(column), int(row), int(width), int(height))
+
+
+def _information(view: _View, share: FloatArray) -> FloatArray:
+    """Return what each pixel (n,) tells about its irradiance: 1 / variance, for one that is seen.
+
+    A pixel that may clip tells less, by the information of a censored normal variable; one that
+    is far above, nothing. Sharpening follows the noise and cannot add information: it is left
+    out, as JPEG is.
+    """
+    gain, sensor = view.shot.gain, view.shot.sensor
+    exposure = gain * view.irradiance(share).ravel()
+    slope = _WHITE_LEVEL * sensor.tone.slope(exposure)
+    electrons = sensor.full_well_e * exposure + sensor.read_noise_e**2
+    variance = electrons / sensor.full_well_e**2 + 1.0 / 12.0 / slope**2
+    seen = censored_information((1.0 - exposure) / np.sqrt(variance))
+    information: FloatArray = view.opaque().ravel() * seen * gain**2 / variance
+    return information
+
+
+def censored_information(margin: FloatArray) -> FloatArray:
+    """Return the Fisher information about the mean of a unit normal variable that is censored.
+
+    Parameters
+    ----------
+    margin : array
+        From the mean to the limit above which only the fact of being above is seen.
+    """
+    density = np.exp(-0.5 * margin * margin) / math.sqrt(2.0 * math.pi)
+    log_density = -0.5 * (margin * margin + math.log(2.0 * math.pi))
+    above = np.exp(2.0 * log_density - log_ndtr(-margin))  # φ² / (1 − Φ)
+    information: FloatArray = ndtr(margin) - margin * density + above
+    return information
+
+
+def _pose_derivatives(view: _View) -> FloatArray:
+    """Return the derivatives (n, 6) of the irradiance by tx ty tz [m] and left rotation vector.
+
+    Differences are taken along and across the viewing ray: a step along z would move a target
+    off the axis sideways by far more than it scales it.
+    """
+    plate, pose, optics = view.shot.plate, view.shot.pose, view.shot.optics
+    radius_m = 0.5 * plate.target.ring.outer_diameter_m
+    distance_m = pose.distance_m
+    across_m = _STEP_PX * distance_m / view.shot.camera.mean_focal_px
+    sizes = np.array(
+        [across_m * distance_m / radius_m, *[across_m] * 2, *[across_m / radius_m] * 3]
+    )
+    directions = np.eye(6)
+    directions[:3, :3] = np.linalg.qr(np.column_stack((pose.translation_m, np.eye(3)[:, :2])))[0]
+    columns = []
+    for size, direction in zip(sizes, directions.T, strict=True):
+        after = view.seen(view.white(pose.moved(size * direction)), optics)
+        before = view.seen(view.white(pose.moved(-size * direction)), optics)
+        columns.append((plate.white - plate.black) * (after - before).ravel() / (2.0 * size))
+    derivatives: FloatArray = np.column_stack(columns) @ directions.T
+    return derivatives
+
+
+def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:
+    """Yield the derivatives of the irradiance by everything unknown that is not the pose."""
+    shot = view.shot
+    yield share
+    yield 1.0 - share
+    psf_px, (streak_x, streak_y) = shot.optics.psf_px, shot.optics.streak_px
+    changes = [(_STEP_PX, 0.0, 0.0)]
+    if shot.has_unknown_streak:
+        changes += [(0.0, _STEP_PX, 0.0), (0.0, 0.0, _STEP_PX)]
+    for psf, x, y in changes:
+        after = Optics(psf_px + psf, (streak_x + x, streak_y + y))
+        before = Optics(psf_px - psf, (streak_x - x, streak_y - y))
+        yield view.seen(white, after) - view.seen(white, before)
+    if shot.camera.response is Response.UNKNOWN:
+        slope = shot.sensor.tone.slope(shot.gain * view.irradiance(share))
+        bend = share * (1.0 - share) / slope
+        yield bend
+        yield bend * (2.0 * share - 1.0)
+
+
+def _in_words(camera: Camera, pose: Pose, covariance: FloatArray) -> Bound:
+    """Propagate the covariance of the pose to distance, centre and normal."""
+    x, y, z = pose.translation_m
+    ray = pose.translation_m / pose.distance_m
+    projection = np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / z
+    centre = camera.distort_jacobian(np.array([x / z, y / z])) @ projection
+    across = np.eye(3) - np.outer(pose.normal, pose.normal)
+    position, rotation = covariance[:3, :3], covariance[3:, 3:]
+    return Bound(
+        distance_percent=100.0 * math.sqrt(ray @ position @ ray) / pose.distance_m,
+        centre_px=math.sqrt(np.trace(centre @ position @ centre.T)),
+        normal_deg=math.degrees(math.sqrt(np.trace(across @ rotation @ across))),
+    )

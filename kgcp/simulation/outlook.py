@@ -1,0 +1,297 @@
+"""What a camera will make of a target from some height: found or not, and how accurately.
+
+The image model is the simulator's: a tilted plate in the middle of the image, well exposed, with
+the full well and read noise of `Sensor`. Its Cramér-Rao bound times the scatter that kgcp has over
+it, as measured on simulated flights, is what to expect of one frame; calibration and print come on
+top of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from kgcp.errors import SettingError
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.systematic_errors import common_uncertainty
+from kgcp.settings import require_range
+from kgcp.simulation.crlb import Shot, bound_of
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import Plate
+from kgcp.simulation.shapes import regular_polygon
+from kgcp.targets.layout import Ring, Target
+
+TILT_DEG = 6.0
+"""Of the plate against the viewing ray; more hardly matters, frontal views are better."""
+GAIN = 0.85
+"""Exposure relative to the one at which a perfect white clips."""
+SCATTER = {True: (1.0, 1.1), False: (1.4, 1.2)}
+"""RMS error over bound, of distance and centre, by whether the camera's response is linear.
+
+`python -m benchmarks.accuracy.planning`: 0.98 and 1.08 of 55 targets in clean, exposure_sweep,
+blurred, oblique and far; 1.37 and 1.22 of 38 in consumer (tone curve, sharpening, JPEG), which are
+11 of seed 1 and 27 of `--flights 30 --seed 2`.
+"""
+FOUND = ((6.0, 52, 52), (7.0, 54, 54), (8.0, 44, 44), (9.0, 300, 300))
+"""Radius from which on [px], rings found, rings shown.
+
+`python -m benchmarks.accuracy.planning`, seed 1, 150 frames each of the sets small, middle and
+large.
+"""
+SURE_PX = 9.0
+"""Radius to plan for [px]: below, blur that is not foreseen leaves little of the dots."""
+LARGEST_SHARE = 0.46
+"""Largest radius that was tried, of the image's shorter side."""
+_RADII_PX = (6.0, 9.0, 20.0, 45.0)  # where the bound is computed
+_Z95 = 1.959964
+_SPAN = 50.0
+_ROUND = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+_WAYS_DEG = (35.0, 125.0)  # of tilt and streak: small rings feel where their dots are
+_OFF_PX = 0.3  # the centre is not a pixel's
+_SUB_PIXELS = 150
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the frames will be taken.
+
+    Attributes
+    ----------
+    blur_px : float
+        Motion of the image during the exposure, at most [px].
+    exposure_s : float
+    psf_px : float
+        σ of the point spread of lens and sensor [px].
+    accuracy_percent : float
+        Wanted standard deviation of one distance [% of it].
+    """
+
+    blur_px: float = 1.0
+    exposure_s: float = 0.001
+    psf_px: float = 0.7
+    accuracy_percent: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_range("blur", self.blur_px, 0.0, 30.0, unit="px")
+        require_range("exposure", self.exposure_s, 0.0, 60.0, unit="s", open_low=True)
+        require_range("psf", self.psf_px, 0.3, 10.0, unit="px")
+        require_range("accuracy", self.accuracy_percent, 0.0, 10.0, unit="%", open_low=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What to expect from one height.
+
+    Attributes
+    ----------
+    height_m : float
+        Camera above target.
+    ring : str or None
+        The largest ring that is wholly in the image; None: none is.
+    radius_px : float
+        Of that ring, or of the main one [px].
+    found, found_low, found_high : float
+        Probability that it is found, and Wilson's interval of 95 %.
+    sd_distance_m, sd_centre_px : float or None
+        Standard deviations of one frame, of the centre per axis; None where nothing is found.
+    sd_common_distance_m : float or None
+        Of calibration and print, in all frames alike; None: flight.toml does not say.
+    largest_speed_mps : float
+        Over ground, relative to the target, that blurs by no more than `blur_px`.
+    smallest_diameter_m : float
+        Of the main ring, for the wanted accuracy, and to be found for sure.
+    """
+
+    height_m: float
+    ring: str | None
+    radius_px: float
+    found: float
+    found_low: float
+    found_high: float
+    sd_distance_m: float | None
+    sd_centre_px: float | None
+    sd_common_distance_m: float | None
+    largest_speed_mps: float
+    smallest_diameter_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Accuracy:
+    """Standard deviations by radius: smooth in logarithms, and by their laws beyond.
+
+    Edges of a ring of radius R are seen by about R pixels. So the deviation of the radius, and of
+    the centre, falls with R^(-1/2) and that of the distance, relative, with R^(-3/2).
+    """
+
+    log_distance: PchipInterpolator
+    log_centre: PchipInterpolator
+
+    def relative_distance(self, radius_px: float) -> float:
+        """Return the standard deviation of the distance over the distance."""
+        return _at(self.log_distance, radius_px) / math.sqrt(radius_px) ** 3
+
+    def centre_px(self, radius_px: float) -> float:
+        """Return the standard deviation of the centre per axis [px]."""
+        return _at(self.log_centre, radius_px) / math.sqrt(radius_px)
+
+    def radius_for(self, relative_distance: float) -> float:
+        """Return the least radius at which the distance is so accurate [px]."""
+        low, high = math.log(1.0), math.log(1e5)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            if self.relative_distance(math.exp(middle)) > relative_distance:
+                low = middle
+            else:
+                high = middle
+        return math.exp(high)
+
+
+def _at(logarithm: PchipInterpolator, radius_px: float) -> float:
+    inside = min(max(radius_px, _RADII_PX[0]), _RADII_PX[-1])
+    return math.exp(float(logarithm(math.log(inside))))
+
+
+def usual_heights(camera: Camera, target: Target) -> tuple[float, ...]:
+    """Return round heights from which some ring of a target can be measured [m].
+
+    They span a factor of fifty at most: a replica may be measured from hands' distance, where
+    nobody flies.
+    """
+    px_m = [0.5 * ring.outer_diameter_m * camera.mean_focal_px for ring in target.rings]
+    farthest = max(px_m) / FOUND[0][0]
+    nearest = min(px_m) / (LARGEST_SHARE * min(camera.width, camera.height))
+    nearest = max(nearest, farthest / _SPAN)
+    decades = range(math.floor(math.log10(nearest)), math.ceil(math.log10(farthest)) + 1)
+    heights = (step * 10.0**decade for decade in decades for step in _ROUND)
+    return tuple(height for height in heights if nearest <= height <= farthest)
+
+
+def look_ahead(
+    camera: Camera,
+    calibration: CalibrationCovariance | None,
+    target: Target,
+    heights_m: Sequence[float],
+    conditions: Conditions,
+) -> tuple[Outlook, ...]:
+    """Return what to expect from each height.
+
+    Raises
+    ------
+    SettingError
+        If a height cannot be.
+    """
+    for height_m in heights_m:
+        require_range("height", height_m, 0.0, 1e5, unit="m", open_low=True)
+    if not heights_m:
+        raise SettingError("height", "is missing", "no usual one suits this camera and target")
+    accuracy = _accuracy(camera, _of_unit_size(target.ring), conditions.blur_px, conditions.psf_px)
+    wanted_px = max(accuracy.radius_for(0.01 * conditions.accuracy_percent), SURE_PX)
+    return tuple(
+        _outlook(camera, calibration, target, height_m, conditions, accuracy, wanted_px)
+        for height_m in heights_m
+    )
+
+
+def _outlook(
+    camera: Camera,
+    calibration: CalibrationCovariance | None,
+    target: Target,
+    height_m: float,
+    conditions: Conditions,
+    accuracy: _Accuracy,
+    wanted_px: float,
+) -> Outlook:
+    metre_px = camera.mean_focal_px / height_m
+    ring = _seen_ring(camera, target, metre_px)
+    radius_px = 0.5 * (ring or target.ring).outer_diameter_m * metre_px
+    found, low, high = chance_to_find(radius_px) if ring else (0.0, 0.0, 0.0)
+    common = common_uncertainty(camera, calibration, target.ring, _pose(camera, height_m))
+    return Outlook(
+        height_m=height_m,
+        ring=None if ring is None else ring.name,
+        radius_px=radius_px,
+        found=found,
+        found_low=low,
+        found_high=high,
+        sd_distance_m=height_m * accuracy.relative_distance(radius_px) if found else None,
+        sd_centre_px=accuracy.centre_px(radius_px) if found else None,
+        sd_common_distance_m=None if common is None else common.sd_distance_m,
+        largest_speed_mps=conditions.blur_px / metre_px / conditions.exposure_s,
+        smallest_diameter_m=2.0 * wanted_px / metre_px,
+    )
+
+
+def _seen_ring(camera: Camera, target: Target, metre_px: float) -> Ring | None:
+    """Return the largest ring that is wholly in the image."""
+    largest_px = LARGEST_SHARE * min(camera.width, camera.height)
+    fitting = (r for r in target.rings if 0.5 * r.outer_diameter_m * metre_px <= largest_px)
+    return next(fitting, None)
+
+
+def chance_to_find(radius_px: float) -> tuple[float, float, float]:
+    """Return the probability that a ring is found, and Wilson's interval of 95 %.
+
+    E. B. Wilson, JASA 22 (1927), 209–212.
+    """
+    bands = [(found, shown) for low_px, found, shown in FOUND if low_px <= radius_px]
+    if not bands:
+        return 0.0, 0.0, 0.0
+    found, shown = bands[-1]
+    share, spread = found / shown, _Z95**2 / shown
+    middle = share + 0.5 * spread
+    half = math.sqrt(share * (1.0 - share) * spread + 0.25 * spread**2)
+    low, high = (middle - half) / (1.0 + spread), (middle + half) / (1.0 + spread)
+    return share, low, 1.0 if found == shown else high  # which rounding would make less
+
+
+def _of_unit_size(ring: Ring) -> Ring:
+    """Return a ring of these proportions, 1 m across."""
+    size_m = ring.outer_diameter_m
+    return Ring(
+        *("", 1.0, round(ring.inner_diameter_m / size_m, 6)),
+        *(round(ring.code_diameter_m / size_m, 6), round(ring.dot_diameter_m / size_m, 6)),
+        ring.code_deg,
+    )
+
+
+@lru_cache(maxsize=8)
+def _accuracy(camera: Camera, ring: Ring, blur_px: float, psf_px: float) -> _Accuracy:
+    """Compute the bound at some radii, for plates tilted in several ways, times the scatter."""
+    # In the middle of the image there is no distortion; small images must not cut the ring.
+    spacious = Camera(1000, 1000, camera.fx, camera.fy, 499.5, 499.5, response=camera.response)
+    plate = Plate(Target(ring), regular_polygon(4, 0.7 * ring.outer_diameter_m))
+    by_distance, by_centre = SCATTER[camera.response is Response.LINEAR]
+    variances = np.zeros((2, len(_RADII_PX)))
+    for column, radius_px in enumerate(_RADII_PX):
+        distance_m = 0.5 * ring.outer_diameter_m * camera.mean_focal_px / radius_px
+        for way_deg in _WAYS_DEG:
+            way = math.radians(way_deg)
+            optics = Optics(psf_px, (blur_px * math.cos(way), blur_px * math.sin(way)))
+            pose = _pose(camera, distance_m, way)
+            shot = Shot(spacious, plate, pose, optics, Sensor(), GAIN, blur_px > 0.0, _SUB_PIXELS)
+            bound = bound_of(shot)
+            variances[:, column] += (0.01 * bound.distance_percent) ** 2, 0.5 * bound.centre_px**2
+    distance, centre = np.sqrt(variances / len(_WAYS_DEG))
+    radii_px = np.array(_RADII_PX)
+    return _Accuracy(
+        PchipInterpolator(np.log(radii_px), np.log(by_distance * distance * radii_px**1.5)),
+        PchipInterpolator(np.log(radii_px), np.log(by_centre * centre * radii_px**0.5)),
+    )
+
+
+def _pose(camera: Camera, distance_m: float, way: float = 0.0) -> Pose:
+    """Return a plate in the middle of the image, tilted one way [rad]."""
+    axis = math.radians(TILT_DEG) * np.array([-math.sin(way), math.cos(way), 0.0])
+    off = _OFF_PX / camera.mean_focal_px
+    ray = np.array([off, -off, 1.0])
+    return Pose(
+        Rotation.from_rotvec(axis).as_matrix(), distance_m * ray / float(np.linalg.norm(ray))
+    )

@@ -1,0 +1,163 @@
+"""What a simulated flight is like: frozen settings, and the presets by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from kgcp.errors import SettingError
+from kgcp.geometry.camera import Camera, Response
+from kgcp.settings import require_range
+from kgcp.simulation.imaging import Sensor, ToneCurve
+
+_CAMERA = Camera(
+    width=1600,
+    height=1200,
+    fx=2306.0,
+    fy=2302.0,
+    cx=792.6,
+    cy=603.9,
+    k1=-0.072,
+    k2=0.055,
+    p1=0.0004,
+    p2=-0.0003,
+    response=Response.LINEAR,
+)
+_SENSOR = Sensor()
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationSettings:
+    """Parameters of a simulated flight. Pairs are ranges.
+
+    Attributes
+    ----------
+    name : str
+        Name of the flight.
+    camera : Camera
+    sensor : Sensor
+    frames : int
+        Number of frames.
+    distance_m : tuple of float
+        Camera to target; the UAV climbs and descends between the two, uniform in the logarithm.
+    tilt_deg : tuple of float
+        Optical axis against the vertical, uniform [deg].
+    gain : tuple of float
+        Exposure relative to the one at which radiance 1 fills the well, uniform in the logarithm.
+    psf_px : tuple of float
+        σ of the point spread, uniform [px].
+    streak_px : tuple of float
+        Length of the motion streak, uniform, in any direction [px].
+    absent_share, decoy_share : float
+        Share of frames without the target, and with a plate of another code where there is room.
+    jpeg_quality : int or None
+        None: PNG.
+    sd_position_m, sd_attitude_deg : tuple of float
+        Errors of the trajectory: map x, y, z [m]; roll, pitch, heading [deg].
+    sd_lever_arm_m, sd_time_s : float
+        Errors of the lever arm, per axis and flight [m], and of the frames' times [s].
+    sd_reference_m, sd_reference_deg : float
+        Errors of the reference poses, per axis [m, deg].
+    """
+
+    name: str
+    camera: Camera = _CAMERA
+    sensor: Sensor = _SENSOR
+    frames: int = 60
+    distance_m: tuple[float, float] = (8.0, 110.0)
+    tilt_deg: tuple[float, float] = (0.0, 12.0)
+    gain: tuple[float, float] = (0.7, 1.0)
+    psf_px: tuple[float, float] = (0.55, 0.75)
+    streak_px: tuple[float, float] = (0.0, 0.0)
+    absent_share: float = 0.1
+    decoy_share: float = 0.2
+    jpeg_quality: int | None = None
+    sd_position_m: tuple[float, float, float] = (0.010, 0.010, 0.018)
+    sd_attitude_deg: tuple[float, float, float] = (0.02, 0.02, 0.05)
+    sd_lever_arm_m: float = 0.003
+    sd_time_s: float = 0.001
+    sd_reference_m: float = 0.004
+    sd_reference_deg: float = 0.003
+
+    def __post_init__(self) -> None:
+        require_range("frames", self.frames, 1, 100_000)
+        for key, low, high in (
+            ("distance_m", 2.0, 1000.0),
+            ("tilt_deg", 0.0, 50.0),
+            ("gain", 0.01, 100.0),
+            ("psf_px", 0.3, 10.0),
+            ("streak_px", 0.0, 30.0),
+        ):
+            first, last = getattr(self, key)
+            require_range(key, first, low, high)
+            require_range(key, last, first, high)
+        for key in ("absent_share", "decoy_share"):
+            require_range(key, getattr(self, key), 0.0, 1.0)
+        if self.jpeg_quality is not None:
+            require_range("jpeg_quality", self.jpeg_quality, 1, 100)
+
+    def without_survey_errors(self) -> SimulationSettings:
+        """Return the same flight with perfect trajectory, lever arm, times and reference."""
+        return replace(
+            self,
+            sd_position_m=(0.0, 0.0, 0.0),
+            sd_attitude_deg=(0.0, 0.0, 0.0),
+            sd_lever_arm_m=0.0,
+            sd_time_s=0.0,
+            sd_reference_m=0.0,
+            sd_reference_deg=0.0,
+        )
+
+
+_UNKNOWN_RESPONSE = replace(_CAMERA, response=Response.UNKNOWN)
+
+_PRESETS = (
+    SimulationSettings(name="clean", distance_m=(8.0, 129.0)),  # R from 130 down to 8 px
+    SimulationSettings(name="exposure_sweep", gain=(0.35, 2.5)),
+    SimulationSettings(
+        name="consumer",
+        camera=_UNKNOWN_RESPONSE,
+        sensor=Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1),
+        gain=(0.5, 1.3),
+        psf_px=(0.7, 1.3),
+        jpeg_quality=92,
+    ),
+    SimulationSettings(name="blurred", psf_px=(0.7, 1.4), streak_px=(0.0, 3.0)),
+    SimulationSettings(name="oblique", tilt_deg=(20.0, 45.0)),
+    SimulationSettings(name="far", distance_m=(80.0, 172.0)),  # R from 13 down to 6 px
+    SimulationSettings(
+        name="sample",
+        camera=Camera(
+            width=1200,
+            height=900,
+            fx=1903.0,
+            fy=1901.0,
+            cx=606.2,
+            cy=446.1,
+            k1=-0.081,
+            k2=0.064,
+            p1=0.0003,
+            p2=0.0005,
+            response=Response.LINEAR,
+        ),
+        frames=24,
+        distance_m=(9.0, 100.0),
+        absent_share=0.125,
+        gain=(0.6, 1.05),
+        jpeg_quality=94,
+    ),
+)
+
+PRESETS = {preset.name: preset for preset in _PRESETS}
+
+
+def preset(name: str) -> SimulationSettings:
+    """Return the settings of a preset.
+
+    Raises
+    ------
+    SettingError
+        For an unknown name.
+    """
+    if name not in PRESETS:
+        raise SettingError("preset", f"{name!r} is unknown", f"give one of {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,1 +1,0 @@
-"""A public, seeded, deterministic flight simulator: rendered truth, no files."""

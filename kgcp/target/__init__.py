@@ -1,1 +1,0 @@
-"""One grey array in, one observation (or a named rejection) out."""

@@ -1,0 +1,1 @@
+"""The coded target: geometry, validation, code design and artwork."""

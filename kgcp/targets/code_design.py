@@ -1,0 +1,367 @@
+"""Codes of targets: how far apart they are, which are the farthest, and which to print."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.settings import require_range
+from kgcp.targets.layout import Ring, Target
+from kgcp.targets.validation import check_targets, same_shape
+
+LEAST_DISTANCE = 2.0
+"""Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
+DOTS = (3, 6)  # fewer say too little; of more, too many overlap however they are laid
+_GRID_DEG = 5.0
+_ROOM = 1.5  # from dot to dot, of a dot's width: ink must be seen between them
+_STARTS, _STRIDE = 6, 8  # searches begin at so many of the best codes, so far down the list
+_MOST = 10_000  # candidates: those that are farthest from themselves
+_BETTER = 1e-4  # of a dot
+
+# The proportions of Cucci's target: inner and code circle and dots, of the outer diameter.
+_INNER, _CODE, _DOT = 1.0 / 2.0, 1.0 / 1.4, 1.0 / 7.0
+
+
+def dots_apart(first: Ring, second: Ring, *, mirrored: bool = False) -> float:
+    """Return the distance of two codes over all rotations, in dots.
+
+    Parameters
+    ----------
+    first, second : Ring
+        Of one shape.
+    mirrored : bool
+        Whether the second one is seen from behind.
+    """
+    here, there = np.array(first.code_deg), np.array(second.code_deg)
+    width_deg = 2.0 * max(first.dot_half_angle_deg, second.dot_half_angle_deg)
+    overlap = _overlap(here[None], -there if mirrored else there, width_deg)[0].max()
+    return len(here) + len(there) - 2.0 * float(overlap)
+
+
+def dots_apart_turned(ring: Ring) -> float:
+    """Return the distance of a code to itself, turned by a dot's width or more."""
+    code = np.array(ring.code_deg)
+    overlap = _turned_overlap(code[None], 2.0 * ring.dot_half_angle_deg)[0]
+    return 2.0 * (len(code) - float(overlap))
+
+
+def least_apart(rings: Sequence[Ring]) -> float:
+    """Return the least distance of any code to itself, turned, and to others of its shape."""
+    distances = [dots_apart_turned(ring) for ring in rings]
+    for first, second in itertools.combinations(rings, 2):
+        if same_shape(first, second):
+            distances += [dots_apart(first, second, mirrored=m) for m in (False, True)]
+    return min(distances)
+
+
+def check_new_codes(new: Sequence[Target], known: Sequence[Target]) -> None:
+    """Refuse new targets whose codes could be confused, with each other or with known ones.
+
+    Raises
+    ------
+    SettingError
+        If the targets cannot be told apart, as in flight.toml, or if a new code is nearer than
+        `LEAST_DISTANCE` dots to itself turned or to another code, turned or mirrored.
+    """
+    check_targets((*known, *new))
+    for target in new:
+        if (apart := dots_apart_turned(target.ring)) < LEAST_DISTANCE:
+            raise _confusable(target.ring, "itself, turned", apart)
+    pairs = (
+        *itertools.combinations(new, 2),
+        *((target, other) for target in new for other in known),
+    )
+    for (target, other), mirrored in itertools.product(pairs, (False, True)):
+        if not same_shape(target.ring, other.ring):
+            continue
+        apart = dots_apart(target.ring, other.ring, mirrored=mirrored)
+        if apart < LEAST_DISTANCE:
+            seen = f"that of {other.name!r}{', seen from behind' if mirrored else ''}"
+            raise _confusable(target.ring, seen, apart)
+
+
+def _confusable(ring: Ring, other: str, apart: float) -> SettingError:
+    return SettingError(
+        "code_deg",
+        f"the code of {ring.name!r} is only {apart:.1f} dots away from {other}",
+        f"give one that is at least {LEAST_DISTANCE:g} dots away, or let --new propose one",
+    )
+
+
+def propose_codes(
+    ring: Ring, count: int, dots: int, known: Sequence[Ring] = ()
+) -> tuple[tuple[float, ...], ...]:
+    """Return codes whose least distance, to themselves, each other and known ones, is large.
+
+    All codes on a grid of five degrees with ink between the dots are candidates. From the best
+    ones, the candidate that is farthest from all chosen is added; then each is exchanged for a
+    better one as long as there is one. The result is the best of several such searches; it need
+    not be the best of all.
+
+    Parameters
+    ----------
+    ring : Ring
+        Its proportions; its code does not matter.
+    count, dots : int
+        How many codes, of how many dots.
+    known : sequence of Ring
+        Rings of this shape that are in use already.
+
+    Raises
+    ------
+    SettingError
+        If there are not so many codes that cannot be confused.
+    """
+    require_range("dots", dots, *DOTS)
+    width_deg = 2.0 * ring.dot_half_angle_deg
+    candidates = _candidates(dots, width_deg)
+    if len(candidates) == 0:
+        raise SettingError(
+            "dots", f"{dots} of this size do not fit on the code circle", "ask for fewer"
+        )
+    own = 2.0 * (dots - _turned_overlap(candidates, width_deg))
+    for other in known:
+        own = np.minimum(own, _apart(candidates, np.array(other.code_deg), width_deg))
+    best = np.argsort(-own, kind="stable")[:_MOST]
+    candidates, field = candidates[best], _Candidates(candidates[best], own[best], width_deg, {})
+    starts = range(0, min(len(candidates), _STARTS * _STRIDE), _STRIDE)
+    found = [_search(field, start, count) for start in starts]
+    chosen, least = max(found, key=lambda result: result[1])
+    if len(set(chosen)) < count or least < LEAST_DISTANCE:
+        raise SettingError(
+            "new",
+            f"the best {count} codes of {dots} dots are only {least:.1f} dots apart",
+            "ask for fewer codes or more --dots",
+        )
+    return tuple(tuple(map(float, candidates[index])) for index in sorted(chosen))
+
+
+def _candidates(dots: int, width_deg: float) -> FloatArray:
+    """Return the codes (m, dots) on the grid, once per rotation, the first dot at 0 [deg]."""
+    steps = round(360.0 / _GRID_DEG)
+    least = math.ceil(_ROOM * width_deg / _GRID_DEG)
+    free = steps - dots * least  # to be shared out among the gaps
+    if free < 0:
+        return np.empty((0, dots))
+    bars = np.array(list(itertools.combinations(range(free + dots - 1), dots - 1)))
+    ends = np.hstack((np.full((len(bars), 1), -1), bars, np.full((len(bars), 1), free + dots - 1)))
+    gaps = least + np.diff(ends, axis=1) - 1
+    turned = np.stack([_as_number(np.roll(gaps, turn, axis=1)) for turn in range(dots)])
+    gaps = gaps[turned[0] == turned.min(axis=0)]
+    starts = np.cumsum(gaps, axis=1)[:, :-1]
+    codes: FloatArray = _GRID_DEG * np.hstack((np.zeros((len(gaps), 1)), starts))
+    return codes
+
+
+def _as_number(gaps: np.ndarray[tuple[int, ...], np.dtype[np.int_]]) -> FloatArray:
+    """Return each row of small integers (m, n) as one number that orders like the row."""
+    return np.asarray(gaps @ 360.0 ** np.arange(gaps.shape[1])[::-1])
+
+
+def _overlap(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray:
+    """Return how many dots of codes (m, n) lie on dots of another, for rotations (m, k).
+
+    The rotations are those that lay some dot exactly onto another: the overlap of discs seen as
+    arcs is a sum of triangles over the rotation, whose maxima are at their tops.
+    """
+    between = other[None, None, :] - codes[:, :, None]
+    turns = between.reshape(len(codes), 1, 1, -1)
+    overlap: FloatArray = _share(between[..., None] - turns, width_deg).sum(axis=(1, 2))
+    return overlap
+
+
+def _share(off_deg: FloatArray, width_deg: float) -> FloatArray:
+    """Return how much of a dot lies on another that is off by an angle along the circle."""
+    off_deg = np.abs((off_deg + 180.0) % 360.0 - 180.0)
+    return np.asarray(np.maximum(1.0 - off_deg / width_deg, 0.0))
+
+
+def _turned_overlap(codes: FloatArray, width_deg: float) -> FloatArray:
+    """Return the largest overlap (m,) of each code with itself, turned by a dot's width or more."""
+    first, second = np.nonzero(~np.eye(codes.shape[1], dtype=bool))
+    turns = codes[:, second] - codes[:, first]
+    overlap = np.zeros(turns.shape)
+    for here, there in itertools.product(range(codes.shape[1]), repeat=2):
+        overlap += _share((codes[:, there] - codes[:, here])[:, None] - turns, width_deg)
+    overlap[np.abs((turns + 180.0) % 360.0 - 180.0) < width_deg] = 0.0
+    return np.asarray(overlap.max(axis=1))
+
+
+def _apart(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray:
+    """Return the distances (m,) of codes to another, over all rotations and mirror images."""
+    overlap = np.maximum(
+        _overlap(codes, other, width_deg).max(axis=1),
+        _overlap(codes, -other, width_deg).max(axis=1),
+    )
+    return np.asarray(codes.shape[1] + len(other) - 2.0 * overlap)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidates:
+    """Codes on the grid, and their distances as far as they were needed.
+
+    Attributes
+    ----------
+    codes : (m, n) array
+        [deg]
+    own : (m,) array
+        Distances to themselves, turned, and to known codes.
+    width_deg : float
+        Of a dot.
+    rows : dict
+        Index of a candidate → distances (m,) of all to it.
+    """
+
+    codes: FloatArray
+    own: FloatArray
+    width_deg: float
+    rows: dict[int, FloatArray]
+
+    def apart(self, index: int) -> FloatArray:
+        """Return the distances (m,) of all candidates to one of them; as `_apart`, but quicker.
+
+        On the grid all rotations are tried by looking up how much of a dot at some place lies on
+        the other's dots.
+        """
+        if index not in self.rows:
+            grid_deg = _GRID_DEG * np.arange(round(360.0 / _GRID_DEG))
+            turned = grid_deg[:, None] + grid_deg
+            overlap = np.zeros(len(self.codes))
+            for other in (self.codes[index], -self.codes[index]):
+                covered = sum(_share(turned - dot, self.width_deg) for dot in other)
+                table = np.asarray(covered, dtype=np.float32)
+                steps = np.rint(self.codes / _GRID_DEG).astype(int)
+                by_turn = sum(table[column] for column in steps.T)
+                overlap = np.maximum(overlap, np.max(by_turn, axis=1))
+            self.rows[index] = 2.0 * (self.codes.shape[1] - overlap)
+        return self.rows[index]
+
+    def farthest(self, others: Sequence[int]) -> tuple[int, float]:
+        """Return the candidate that is farthest from others, and its distance."""
+        least = np.minimum.reduce([self.own, *(self.apart(index) for index in others)])
+        least[list(others)] = -1.0
+        best = int(least.argmax())
+        return best, float(least[best])
+
+    def least(self, chosen: Sequence[int]) -> float:
+        """Return the least distance among some candidates."""
+        between = [self.apart(i)[j] for i, j in itertools.combinations(chosen, 2)]
+        return float(min([self.own[list(chosen)].min(), *between]))
+
+
+def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], float]:
+    """Choose `count` candidates far apart, and return them with their least distance."""
+    chosen = [start]
+    while len(chosen) < count:
+        chosen.append(field.farthest(chosen)[0])
+    improved = True
+    while improved:
+        improved = False
+        for place, held in enumerate(chosen):
+            others = chosen[:place] + chosen[place + 1 :]
+            now = min([field.own[held], *(field.apart(index)[held] for index in others)])
+            best, least = field.farthest(others)
+            if least > now + _BETTER:
+                chosen[place], improved = best, True
+    return chosen, field.least(chosen)
+
+
+def chosen_targets(known: Sequence[Target], names: Sequence[str]) -> tuple[Target, ...]:
+    """Return the targets of these names, or all.
+
+    Raises
+    ------
+    SettingError
+        For a name that no target has.
+    """
+    listed = [target.name for target in known]
+    for name in names:
+        if name not in listed:
+            problem = f"{name!r} is not in flight.toml"
+            raise SettingError("target", problem, f"give one of {', '.join(listed)}")
+    return tuple(target for target in known if not names or target.name in names)
+
+
+def new_targets(
+    known: Sequence[Target],
+    diameter_m: float | None,
+    codes: Sequence[str],
+    count: int,
+    dots: int,
+) -> tuple[Target, ...]:
+    """Return new targets, first those with given codes, then those with proposed ones.
+
+    Parameters
+    ----------
+    known : sequence of Target
+        From which they must differ; they have the proportions of the first of them.
+    diameter_m : float or None
+        Outer diameter; None: that of the first known target.
+    codes : sequence of str
+        Directions of dots [deg], separated by commas.
+    count, dots : int
+        How many codes to propose, of how many dots.
+
+    Raises
+    ------
+    SettingError
+        If a code is none, or could be confused, or there is no diameter.
+    """
+    ring = _model(known, diameter_m)
+    names = _free_names({one.name for target in known for one in target.rings})
+    given = [Target(replace(ring, name=next(names), code_deg=_angles(code))) for code in codes]
+    check_new_codes(given, known)
+    if not count:
+        return tuple(given)
+    others = [target.ring for target in (*known, *given) if same_shape(target.ring, ring)]
+    proposed = [
+        Target(replace(ring, name=next(names), code_deg=code))
+        for code in propose_codes(ring, count, dots, others)
+    ]
+    check_new_codes([*given, *proposed], known)
+    return (*given, *proposed)
+
+
+def _model(known: Sequence[Target], diameter_m: float | None) -> Ring:
+    """Return a ring of the size and proportions that are wanted."""
+    if known:
+        first = known[0].ring
+        scale = 1.0 if diameter_m is None else diameter_m / first.outer_diameter_m
+    elif diameter_m is None:
+        raise SettingError("diameter", "is missing", "give it in metres, or a FLIGHT to take it of")
+    else:
+        first, scale = Ring("new", 1.0, _INNER, _CODE, _DOT, (0.0,)), diameter_m
+    return replace(
+        first,
+        outer_diameter_m=_rounded(scale * first.outer_diameter_m),
+        inner_diameter_m=_rounded(scale * first.inner_diameter_m),
+        code_diameter_m=_rounded(scale * first.code_diameter_m),
+        dot_diameter_m=_rounded(scale * first.dot_diameter_m),
+        sd_outer_diameter_m=0.0,
+    )
+
+
+def _rounded(length_m: float) -> float:
+    """Return a length to the micrometre: what is printed is what flight.toml says."""
+    return round(length_m, 6)
+
+
+def _free_names(taken: Collection[str]) -> Iterator[str]:
+    numbers = itertools.count(1)
+    return (name for name in (f"T{number}" for number in numbers) if name not in taken)
+
+
+def _angles(code: str) -> tuple[float, ...]:
+    try:
+        angles = tuple(float(word) for word in code.split(","))
+    except ValueError:
+        angles = (math.nan,)
+    if not all(map(math.isfinite, angles)):
+        raise SettingError("code", f"{code!r} is no list of angles", "give them as 0,43,78,180")
+    return angles

@@ -1,0 +1,71 @@
+"""The targets of one flight: they must fit into each other, and be told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from kgcp.errors import SettingError
+from kgcp.targets.layout import Ring, Target
+
+_SAME_SHAPE = 0.1  # relative; ellipses of small targets do not show finer differences
+
+
+def check_targets(targets: Sequence[Target]) -> None:
+    """Refuse targets that no image could tell apart, or that overlap on one plate.
+
+    Raises
+    ------
+    SettingError
+        If two rings share a name, two codes of rings of one shape are rotations of each other,
+        or the replicas of a plate do not nest.
+    """
+    rings = [ring for target in targets for ring in target.rings]
+    for first, second in combinations(rings, 2):
+        if first.name == second.name:
+            problem = f"{first.name!r} is the name of two targets"
+            raise SettingError("name", problem, "give each target and replica a name of its own")
+        if same_shape(first, second) and codes_coincide(first, second):
+            raise SettingError(
+                "code_deg",
+                f"the codes of {first.name!r} and {second.name!r} are rotations of each other",
+                "give one of them another code",
+            )
+    for target in targets:
+        _check_nesting(target)
+
+
+def same_shape(first: Ring, second: Ring) -> bool:
+    """Whether two rings look alike but for their size and code."""
+    pairs = zip(_proportions(first), _proportions(second), strict=True)
+    return all(abs(one - other) <= _SAME_SHAPE * other for one, other in pairs)
+
+
+def codes_coincide(first: Ring, second: Ring) -> bool:
+    """Whether some rotation lays every dot of one code at least half onto a dot of the other."""
+    if len(first.code_deg) != len(second.code_deg):
+        return False
+    tolerance_deg = min(first.dot_half_angle_deg, second.dot_half_angle_deg)
+    here, count = np.asarray(first.code_deg), len(first.code_deg)
+    there = np.asarray(second.code_deg)[np.add.outer(np.arange(count), np.arange(count)) % count]
+    offsets = there - here
+    offsets = np.mod(offsets - offsets[:, :1] + 180.0, 360.0) - 180.0  # about the first dot's
+    return bool(np.ptp(offsets, axis=1).min() <= 2.0 * tolerance_deg)
+
+
+def _proportions(ring: Ring) -> tuple[float, ...]:
+    inner = (ring.inner_diameter_m, ring.code_diameter_m, ring.dot_diameter_m)
+    return tuple(length / ring.outer_diameter_m for length in inner)
+
+
+def _check_nesting(target: Target) -> None:
+    for outer, inner in pairwise(target.rings):
+        if inner.outer_diameter_m > outer.inner_diameter_m:
+            raise SettingError(
+                "scale",
+                f"{inner.name!r} ({inner.outer_diameter_m:g} m) does not fit into {outer.name!r}"
+                f" ({outer.inner_diameter_m:g} m inside)",
+                "make the replica smaller",
+            )

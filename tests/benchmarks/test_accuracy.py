@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from benchmarks.accuracy import evaluate, presets, reexpose
+from benchmarks.accuracy.bands import join_truth, summarise, table_lines
+from benchmarks.accuracy.bound import frame_bound
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.report.bias.reexposure import reexposed
+from kgcp.settings import DetectSettings
+from kgcp.simulation.crlb import censored_information, pose_covariance
+from kgcp.simulation.flight import TARGET_PLATE, FramePlan, plan_flight
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.presets import SimulationSettings, preset
+
+SMALL = Camera(
+    width=480, height=360, fx=1800.0, fy=1797.0, cx=243.1, cy=176.2, k1=-0.05,
+    response=preset("clean").camera.response,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("margin", [-2.0, -0.5, 0.0, 1.0, 2.5])
+def test_censored_information_is_the_variance_of_the_score(margin: float) -> None:
+    draws = np.random.default_rng(3).standard_normal(400_000)
+    hazard = math.exp(-0.5 * margin**2) / math.sqrt(2.0 * math.pi) / np.mean(draws > margin)
+    score = np.where(draws > margin, hazard, draws)
+    assert censored_information(np.array([margin]))[0] == pytest.approx(score.var(), rel=0.02)
+
+
+def test_far_from_clipping_all_is_seen_and_far_beyond_nothing() -> None:
+    seen = censored_information(np.array([-40.0, -6.0, 6.0, 40.0]))
+    np.testing.assert_allclose(seen, [0.0, 0.0, 1.0, 1.0], atol=1e-6)
+
+
+def test_unknowns_of_no_interest_cost_what_the_whole_inverse_says() -> None:
+    rng = np.random.default_rng(4)
+    pose, nuisances = rng.standard_normal((200, 6)), rng.standard_normal((200, 3))
+    pose[:, 2] *= 1e-4
+    whole = np.column_stack((pose, nuisances))
+    expected = np.linalg.inv(whole.T @ whole)[:6, :6]
+    with_idle = np.column_stack((nuisances, np.zeros(200)))
+    np.testing.assert_allclose(pose_covariance(pose, with_idle), expected, rtol=1e-8)
+
+
+def frame_of_even_noise(distance_m: float) -> tuple[SimulationSettings, FramePlan]:
+    """Return a frame whose noise is 1 % of white everywhere."""
+    sensor = Sensor(full_well_e=1e6, read_noise_e=1e4)
+    settings = replace(preset("clean"), camera=SMALL, sensor=sensor, frames=2)
+    tilt = Rotation.from_euler("zxy", [40.0, 19.0, -16.0], degrees=True).as_matrix()
+    pose = Pose(tilt, distance_m * np.array([0.03, -0.02, 1.0]))
+    frame = plan_flight(settings, 1).frames[0]
+    return settings, replace(frame, target=pose, optics=Optics(0.7), gain=0.8, present=True)
+
+
+def circles_m() -> list[tuple[np.ndarray, float]]:
+    """Return centres and radii of all printed circles."""
+    circles = []
+    for ring in TARGET_PLATE.target.rings:
+        circles += [(np.zeros(2), 0.5 * d) for d in (ring.outer_diameter_m, ring.inner_diameter_m)]
+        circles += [(centre, 0.5 * ring.dot_diameter_m) for centre in ring.dot_centres_m()]
+    return circles
+
+
+def edge_information(frame: FramePlan, radius_px: float) -> np.ndarray:
+    """Return the information (6, 6) in all edges, levels and spread known.
+
+    An edge of contrast c, spread σ and noise s that moves along its normal tells
+    c² / (2 √π σ s²) per pixel of length. What is small against the spread tells nearly nothing.
+    """
+    spread_px, noise = math.sqrt(0.7**2 + 1.0 / 12.0), math.hypot(0.01, 12.0**-0.5 / 255.0)
+    contrast = frame.gain * (TARGET_PLATE.white - TARGET_PLATE.black)
+    density = contrast**2 / (2.0 * math.sqrt(math.pi) * spread_px * noise**2)
+    angles = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    information = np.zeros((6, 6))
+    for centre, radius_m in circles_m():
+        if radius_m / 0.45 * radius_px < 2.5 * spread_px:
+            continue
+        points = centre + radius_m * np.column_stack((np.cos(angles), np.sin(angles)))
+
+        def moved(step: np.ndarray, points: np.ndarray = points) -> np.ndarray:
+            return SMALL.project(frame.target.moved(1e-5 * step).transform(points))
+
+        pixels = moved(np.zeros(6))
+        along = 0.5 * (np.roll(pixels, -1, axis=0) - np.roll(pixels, 1, axis=0))
+        length = np.linalg.norm(along, axis=1)
+        normal = np.column_stack((along[:, 1], -along[:, 0])) / length[:, None]
+        slopes = [np.sum((moved(e) - moved(-e)) / 2e-5 * normal, axis=1) for e in np.eye(6)]
+        information += density * np.einsum("in,n,jn->ij", slopes, length, slopes)
+    return information
+
+
+@pytest.mark.parametrize("radius_px", [15.0, 40.0, 90.0])
+def test_bound_is_that_of_blurred_edges(radius_px: float) -> None:
+    distance_m = SMALL.fx * 0.45 / radius_px
+    settings, frame = frame_of_even_noise(distance_m)
+    ideal = np.linalg.inv(edge_information(frame, radius_px))
+    ray = frame.target.translation_m / frame.target.distance_m
+    bound = frame_bound(settings, frame)
+    centre = frame.target.translation_m
+    slopes = [(SMALL.project(centre + 1e-5 * e) - SMALL.project(centre)) / 1e-5 for e in np.eye(3)]
+    ideal_px = math.sqrt(np.einsum("ik,ij,jk->", slopes, ideal[:3, :3], slopes))
+    assert bound.centre_px == pytest.approx(ideal_px, rel=0.1)
+    across = np.eye(3) - np.outer(frame.target.normal, frame.target.normal)
+    ideal_deg = math.degrees(math.sqrt(np.trace(across @ ideal[3:, 3:] @ across)))
+    assert bound.normal_deg == pytest.approx(ideal_deg, rel=0.1)
+    ideal_percent = 100.0 * math.sqrt(ray @ ideal[:3, :3] @ ray) / frame.target.distance_m
+    assert 0.95 < bound.distance_percent / ideal_percent < 1.3  # levels and spread cost something
+
+
+def random_flight(count: int, covariance: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return truth and detections of poses that scatter with a covariance."""
+    rng = np.random.default_rng(5)
+    truths, rows = [], []
+    for i in range(count):
+        tilt = Rotation.from_rotvec([*rng.uniform(0.2, 0.4, 2), rng.uniform(-3, 3)]).as_matrix()
+        pose = Pose(tilt, np.array([*rng.uniform(-1.0, 1.0, 2), rng.uniform(10.0, 80.0)]))
+        seen = pose.moved(-rng.multivariate_normal(np.zeros(6), covariance))
+        x, y = SMALL.project(pose.translation_m)
+        x_px, y_px = SMALL.project(seen.translation_m)
+        truths.append(
+            {"frame": f"{i}", "present": 1, "x": x, "y": y, "distance": pose.distance_m}
+            | {f"r{j}{k}": pose.rotation[j, k] for j in range(3) for k in range(3)}
+            | dict(zip(("cx", "cy", "cz"), pose.translation_m, strict=True))
+            | {"radius_px": 810.0 / pose.distance_m}
+        )
+        ray = pose.translation_m / pose.distance_m
+        sd_px = SMALL.fx * math.sqrt(covariance[0, 0]) / pose.translation_m[2]
+        rows.append(
+            {"frame": f"{i}", "target": "A", "status": "measured", "x_px": x_px, "y_px": y_px}
+            | {"distance_m": seen.distance_m, "sd_x_px": sd_px, "sd_y_px": sd_px}
+            | {"sd_distance_m": math.sqrt(ray @ covariance[:3, :3] @ ray), "radius_px": 1.0}
+            | dict(zip(("tx_m", "ty_m", "tz_m"), seen.translation_m, strict=True))
+            | dict(zip(("qw", "qx", "qy", "qz"), seen.quaternion_wxyz, strict=True))
+            | {"pose_cov": covariance.ravel()}
+        )
+    return pd.DataFrame(truths), pd.DataFrame(rows)
+
+
+COVARIANCE = np.diag([1e-8, 1e-8, 4e-6, 1e-6, 1e-6, 1e-8])
+COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-8
+
+
+def test_true_sigmas_are_called_true() -> None:
+    truth, rows = random_flight(2000, COVARIANCE)
+    for band in summarise(join_truth(rows, truth)):
+        if band.present:
+            assert band.found == band.present
+            assert 0.9 < band.z_distance < 1.1
+            assert 0.9 < band.z_centre < 1.15
+            assert 2.0 < band.worst_z_distance < 6.0
+            assert 4.7 < band.mahalanobis2 < 6.0
+            assert band.right_side == 1.0
+            assert 0.05 < band.normal_median_deg < 0.09  # Rayleigh: 1.177 · 1e-3 rad
+            assert abs(band.mean_percent) < 2.0 * band.mean_2se_percent
+
+
+def test_mirrored_normals_are_on_the_wrong_side() -> None:
+    truth, rows = random_flight(50, COVARIANCE)
+    for i in range(0, 50, 2):
+        rotation = Rotation.from_quat(
+            rows.loc[i, ["qw", "qx", "qy", "qz"]].to_numpy(float), scalar_first=True
+        ).as_matrix()
+        ray = truth.loc[i, ["cx", "cy", "cz"]].to_numpy(float)
+        half_turn = Rotation.from_rotvec(np.pi * ray / np.linalg.norm(ray)).as_matrix()
+        mirrored = Pose(half_turn @ rotation, ray)
+        rows.loc[i, ["qw", "qx", "qy", "qz"]] = mirrored.quaternion_wxyz
+    table = join_truth(rows, truth)
+    np.testing.assert_array_equal(table["on_right_side"], np.arange(50) % 2)
+
+
+def test_wrong_and_missing_targets_are_counted_and_have_no_errors() -> None:
+    truth, rows = random_flight(10, COVARIANCE)
+    truth["radius_px"] = 30.0
+    truth.loc[0, "present"] = 0
+    rows["x_px"] += np.where(rows.index == 1, 16.0, 0.0)
+    rows.loc[2, "status"] = "not_found"
+    table = join_truth(rows, truth)
+    band = summarise(table)[0]
+    assert (band.present, band.found, band.wrong) == (9, 7, 2)
+    assert table["mahalanobis2"].count() == 7
+
+
+def test_methods_without_sigmas_leave_dashes() -> None:
+    truth, rows = random_flight(5, COVARIANCE)
+    rows[["sd_x_px", "sd_y_px", "sd_distance_m"]] = np.nan
+    rows["pose_cov"] = None
+    results = summarise(join_truth(rows, truth))
+    assert all(math.isnan(band.mahalanobis2) for band in results)
+    assert all("–" in line for line in list(table_lines(results))[1:])
+
+
+def test_reexposed_frames_clip_and_round() -> None:
+    grey = np.array([[0, 7, 100, 160, 255]], dtype=np.uint8)
+    np.testing.assert_array_equal(reexposed(grey, 1.6), [[0, 11, 160, 255, 255]])
+    np.testing.assert_array_equal(reexposed(grey, 0.6), [[0, 4, 60, 96, 153]])
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
+    settings = replace(
+        preset("clean"), camera=SMALL, frames=6, distance_m=(20.0, 45.0), absent_share=0.0
+    )
+    plan = plan_flight(settings, 3)
+    folder = presets.simulate(plan, tmp_path_factory.mktemp("flights"), 1)
+    return folder, presets.compare(plan, folder, DetectSettings(), 1)
+
+
+def test_clean_frames_are_measured_near_the_bound(flight: tuple[Path, pd.DataFrame]) -> None:
+    _, table = flight
+    everything = table.assign(radius_px_true=30.0)
+    band = summarise(everything)[0]
+    assert (band.present, band.found, band.wrong) == (6, 6, 0)
+    assert 0.3 < band.bound_distance < 2.0
+    assert 0.3 < band.bound_centre < 2.0
+    assert 0.1 < band.z_distance < 2.0
+    assert 0.3 < band.z_centre < 2.0
+    assert 1.0 < band.mahalanobis2 < 14.0
+
+
+def test_the_commands_print_their_tables(flight: tuple[Path, pd.DataFrame]) -> None:
+    folder, _ = flight
+    arguments = [str(folder), str(folder / "truth.csv"), "--method", "paper", "--jobs", "1"]
+    evaluated = CliRunner().invoke(evaluate.main, arguments, catch_exceptions=False)
+    assert "found/present" in evaluated.stdout
+    assert "wrong 0" in evaluated.stdout
+    moved = CliRunner().invoke(reexpose.main, arguments, catch_exceptions=False)
+    assert "× 0.6" in moved.stdout
+    assert "× 1.6" in moved.stdout
+    assert "CPU time" in moved.stdout

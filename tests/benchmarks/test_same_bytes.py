@@ -1,0 +1,51 @@
+"""The same bytes, whatever the number of threads and jobs, and whoever has loaded numpy before.
+
+`python -m benchmarks.reliability.same_bytes` has more circumstances: what is compiled when, and by
+whom.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reliability.same_bytes import Circumstances, make_flight, process, processor_flags
+
+
+def circumstances(core: str | None) -> Iterator[Circumstances]:
+    """Some of `one_machine`, for the kernels of one kind of processor."""
+    chosen = {} if core is None else {"OPENBLAS_CORETYPE": core}
+    one, four = (
+        {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, **chosen}
+        for threads in ("1", "4")
+    )
+    yield Circumstances("one thread", 0, one)
+    yield Circumstances(
+        "four threads, in a program that has used numpy", 0, four, is_library_call=True
+    )
+    if core is None:
+        yield Circumstances("four threads, two jobs", 2, four)
+        yield Circumstances("four threads, a cluster", 2, four, has_cluster=True)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("same_bytes") / "flight"
+    make_flight(folder, 6)
+    return folder
+
+
+@pytest.mark.parametrize("core", [None, "Haswell", "Nehalem", "SkylakeX"])
+def test_threads_and_jobs_change_no_byte(core: str | None, flight: Path, tmp_path: Path) -> None:
+    if core == "SkylakeX" and "avx512f" not in processor_flags():
+        pytest.skip("the processor has no AVX-512")
+    first, *others = circumstances(core)
+    is_other = core is not None
+    expected = process(flight, tmp_path / "first", first, only_detects=is_other)
+    wanted = {"detections.parquet"} if is_other else {"kgcps.parquet", "bias_report.html"}
+    assert wanted <= expected.keys()
+    for number, other in enumerate(others):
+        hashes = process(flight, tmp_path / str(number), other, only_detects=is_other)
+        assert hashes == expected, other.name

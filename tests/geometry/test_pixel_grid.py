@@ -1,0 +1,47 @@
+"""Grids through the lens at once, against single pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pixel_grid import normalised_grid, rays_of_window
+
+CAMERA = Camera(
+    *(1600, 1100, 2306.0, 2302.0, 792.6, 543.9, -0.11, 0.07, 8e-4, -6e-4, -0.01, 0.02, 0.01, 0.0)
+)
+
+
+def pixels_of(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    return np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px"),
+    [
+        (np.arange(0.0, 180.0), np.arange(0.0, 131.0)),  # where distortion is strongest
+        (np.arange(760.0, 800.0), np.arange(1060.0, 1100.0)),
+        (np.arange(1599.0, 1600.0), np.arange(500.0, 503.0)),  # one column
+    ],
+)
+def test_a_window_is_undistorted_like_its_pixels(x_px: FloatArray, y_px: FloatArray) -> None:
+    rays = rays_of_window(CAMERA, x_px, y_px)
+    normalised, from_px = rays[:2], rays[2:].reshape(2, 2, -1)
+    pixels = pixels_of(x_px, y_px)
+    exact = CAMERA.undistort(pixels)
+    np.testing.assert_allclose(normalised.T * CAMERA.fx, exact * CAMERA.fx, rtol=0.0, atol=1e-9)
+    step = 0.01
+    for axis in (0, 1):
+        shift = step * np.eye(2)[axis]
+        numeric = (CAMERA.undistort(pixels + shift) - CAMERA.undistort(pixels - shift)) / 2.0 / step
+        np.testing.assert_allclose(from_px[:, axis].T, numeric, rtol=0.0, atol=1e-9)
+
+
+def test_a_whole_frame_is_undistorted_like_its_pixels() -> None:
+    x_px, y_px = np.arange(-0.5, 1600.0, 40.0), np.arange(-0.5, 1100.0, 40.0)
+    x, y = normalised_grid(CAMERA, x_px, y_px)
+    assert x.shape == y.shape == (len(y_px), len(x_px))
+    exact = CAMERA.undistort(pixels_of(x_px, y_px))
+    np.testing.assert_allclose(np.column_stack((x.ravel(), y.ravel())), exact, rtol=0.0, atol=1e-9)

@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import json
+import math
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import MapChange, MapFrame, best_transformer, parse_crs
+from kgcp.georef.gcp import Kgcp, on_map
+
+_UTM31 = np.array([430606.1, 4583523.0, 120.0])
+_LONGITUDE, _LATITUDE = 2.1698408834, 41.4002533376  # of that point, by the series below
+_US_FOOT_M = 1200.0 / 3937.0  # by definition
+
+
+def _change(source: str, target: str, xyz: FloatArray) -> MapChange:
+    return MapChange.to(target, MapFrame.at(source, xyz), xyz)
+
+
+def _utm(longitude_deg: float, latitude_deg: float, meridian_deg: float) -> tuple[float, float]:
+    """Easting and northing on GRS80: Krüger (1912), series to n³, good to a millimetre."""
+    f = 1.0 / 298.257222101
+    n = f / (2.0 - f)
+    alpha = (
+        n / 2.0 - 2.0 / 3.0 * n**2 + 5.0 / 16.0 * n**3,
+        13.0 / 48.0 * n**2 - 3.0 / 5.0 * n**3,
+        61.0 / 240.0 * n**3,
+    )
+    radius = 6378137.0 / (1.0 + n) * (1.0 + n**2 / 4.0 + n**4 / 64.0)
+    phi, lam = math.radians(latitude_deg), math.radians(longitude_deg - meridian_deg)
+    e = 2.0 * math.sqrt(n) / (1.0 + n)
+    t = math.sinh(math.atanh(math.sin(phi)) - e * math.atanh(e * math.sin(phi)))
+    xi, eta = math.atan2(t, math.cos(lam)), math.asinh(math.sin(lam) / math.hypot(t, math.cos(lam)))
+    north, east = xi, eta
+    for j, a in enumerate(alpha, start=1):
+        north += a * math.sin(2 * j * xi) * math.cosh(2 * j * eta)
+        east += a * math.cos(2 * j * xi) * math.sinh(2 * j * eta)
+    return 500000.0 + 0.9996 * radius * east, 0.9996 * radius * north
+
+
+def test_longitude_comes_first_and_agrees_with_kruegers_series() -> None:
+    moved = _change("EPSG:25831", "EPSG:4326", _UTM31).positions(_UTM31[None])[0]
+    np.testing.assert_allclose(moved[:2], [_LONGITUDE, _LATITUDE], atol=1e-8)
+    np.testing.assert_allclose(_utm(moved[0], moved[1], 3.0), _UTM31[:2], atol=1e-3)
+    assert moved[2] == pytest.approx(120.0, abs=1e-6)
+    back = _change("EPSG:4326", "EPSG:25830", moved).positions(moved[None])[0]
+    np.testing.assert_allclose(back[:2], _utm(moved[0], moved[1], -3.0), atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("crs", "xyz"),
+    [
+        ("EPSG:31467", (3_513_000.0, 5_403_000.0, 300.0)),  # says northing first, in metres
+        ("EPSG:4326", (9.2, 48.8, 300.0)),  # says latitude first
+        ("EPSG:2263", (987_000.0, 200_000.0, 10.0)),  # easting first, in feet
+    ],
+)
+def test_x_points_east_whatever_the_authority_says(
+    crs: str, xyz: tuple[float, float, float]
+) -> None:
+    frame = MapFrame.at(crs, np.array(xyz))
+    east, north, up = frame.grid_rotation(np.zeros(3)).T
+    assert east[0] > 0.99
+    assert north[1] > 0.99
+    assert up[2] > 0.9999
+
+
+def test_axes_turn_by_the_difference_of_the_meridian_convergences() -> None:
+    change = _change("EPSG:25831", "EPSG:25830", _UTM31)
+    axes = change.axes(_UTM31)
+    sine = math.sin(math.radians(_LATITUDE))
+    gamma = [
+        math.degrees(math.atan(math.tan(math.radians(_LONGITUDE - meridian)) * sine))
+        for meridian in (3.0, -3.0)
+    ]
+    turned_deg = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
+    # true north lies γ west of grid north, seen in either grid (Snyder 1987, eq. 8-15, on a
+    # sphere; the ellipsoid adds thousandths of a degree)
+    assert abs(turned_deg) == pytest.approx(gamma[1] - gamma[0], abs=5e-3)
+    assert turned_deg > 0.0
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+
+
+def _point(cov_m2: FloatArray) -> Kgcp:
+    return Kgcp(
+        id="K0001",
+        frame="f.jpg",
+        target="A",
+        time_s=0.0,
+        position_map=_UTM31,
+        cov_m2=cov_m2,
+        centre_px=np.zeros(2),
+        centre_cov_px2=None,
+        distance_m=60.0,
+        sd_distance_m=None,
+        sd_common_distance_m=None,
+        common_m=np.array([[0.01, 0.0, 0.0, 0.02], [0.0, 0.01, 0.0, 0.01], [0.0, 0.0, 0.01, 0.0]]),
+    )
+
+
+def test_a_covariance_is_the_same_ellipsoid_on_either_map() -> None:
+    half = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [0.005, -0.01, 0.05]])
+    point = _point(half @ half.T)
+    for crs in ("EPSG:25830", "EPSG:4326"):
+        change = _change("EPSG:25831", crs, _UTM31)
+        (moved,) = on_map([point], change)
+        physical = []
+        for frame, one in ((change.source, point), (change.target, moved)):
+            assert one.cov_m2 is not None
+            assert one.common_m is not None
+            enu = frame.enu_from_map(one.position_map[None])
+            axes = frame.level_rotations(enu)[0].T @ frame.grid_rotation(enu[0])
+            physical.append((axes @ one.cov_m2 @ axes.T, axes @ one.common_m))
+        np.testing.assert_allclose(physical[0][0], physical[1][0], atol=1e-12)
+        np.testing.assert_allclose(physical[0][1], physical[1][1], atol=1e-12)
+        assert moved.cov_m2 is not None  # metres, also where the CRS counts degrees
+        assert np.trace(moved.cov_m2) == pytest.approx(np.trace(half @ half.T), rel=1e-9)
+    assert on_map([], change) == ()
+
+
+def test_feet_become_metres_by_the_legal_ratio_in_plan_and_height() -> None:
+    feet = np.array([987_000.0, 200_000.0, 1_000.0])
+    plan = _change("EPSG:6539", "EPSG:6538", feet).positions(feet[None])[0]
+    np.testing.assert_allclose(plan[:2], feet[:2] * _US_FOOT_M, atol=1e-6)
+    assert plan[2] == pytest.approx(1_000.0, abs=1e-6)  # ellipsoidal heights are metres already
+    above_sea = best_transformer(  # NAVD88 in feet to NAVD88 in metres needs no geoid
+        parse_crs("EPSG:6539+6360"), parse_crs("EPSG:6538+5703"), "the way"
+    )
+    np.testing.assert_allclose(above_sea.transform(*feet), feet * _US_FOOT_M, atol=1e-6)
+
+
+def test_no_way_is_better_than_a_second_best_one() -> None:
+    with pytest.raises(KgcpError) as caught:  # NAD83 and ETRS89 differ by more than a metre
+        _change("EPSG:25831", "EPSG:2263", _UTM31)
+    assert "--crs 'EPSG:2263'" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(KgcpError, match="no easting"):
+        _change("EPSG:25831", "EPSG:4978", _UTM31)
+    with pytest.raises(KgcpError, match="--crs 'nonsense'"):
+        _change("EPSG:25831", "nonsense", _UTM31)
+
+
+_WITHOUT_GRIDS = """
+import pyproj
+pyproj.network.set_network_enabled(False)
+pyproj.datadir.append_data_dir({folder!r})
+import json, numpy as np
+from kgcp.errors import KgcpError
+from kgcp.georef.crs import MapChange
+from kgcp.georef.crs import MapFrame
+xyz = np.array({xyz!r})
+def result(source, target):
+    try:
+        frame = MapFrame.at(source, xyz)
+        if target is None:
+            plain = MapFrame.at(source.partition("+")[0], xyz)
+            return float((frame.origin_ecef_m - plain.origin_ecef_m) @ plain.ecef_from_enu[:, 2])
+        return MapChange.to(target, frame, xyz).positions(xyz[None])[0].tolist()
+    except KgcpError as error:
+        return str(error)
+print(json.dumps([result(*pair) for pair in {pairs!r}]))
+"""
+
+
+def _elsewhere(folder: Path, xyz: list[float], pairs: list[tuple[str, str | None]]) -> list[Any]:
+    """What comes out in a process of its own, which finds the grids of a folder, and no others."""
+    code = _WITHOUT_GRIDS.format(folder=str(folder), xyz=xyz, pairs=pairs)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    results: list[Any] = json.loads(done.stdout)
+    return results
+
+
+def test_heights_above_a_geoid_use_its_grid_or_name_it(tmp_path: Path) -> None:
+    latitude, longitude = np.arange(41.0, 43.01, 0.25), np.arange(1.0, 4.01, 0.25)
+    # a plane, which bilinear interpolation reproduces, under the old name of the EGM96 grid
+    geoid = 49.0 + 2.0 * (longitude[None] - 2.0) + 0.5 * (latitude[:, None] - 41.0)
+    header = struct.pack(">4d2i", 41.0, 1.0, 0.25, 0.25, *geoid.shape)
+    (tmp_path / "egm96_15.gtx").write_bytes(header + geoid.astype(">f4").tobytes())
+    undulation = 49.0 + 2.0 * (_LONGITUDE - 2.0) + 0.5 * (_LATITUDE - 41.0)
+    pairs = [("EPSG:25831", "EPSG:25831+5773"), ("EPSG:25831+5773", None)]
+    moved, raised = _elsewhere(tmp_path, _UTM31.tolist(), pairs)
+    np.testing.assert_allclose(moved, [*_UTM31[:2], 120.0 - undulation], atol=1e-4)
+    assert raised == pytest.approx(undulation, abs=1e-4)
+
+
+def test_a_missing_grid_is_named_with_how_to_get_it(tmp_path: Path) -> None:
+    pairs = [("EPSG:25831", "EPSG:4326+5773"), ("EPSG:25831+5773", None)]
+    for message in _elsewhere(tmp_path, _UTM31.tolist(), pairs):
+        assert isinstance(message, str)
+        assert "pyproj sync --file us_nga_egm96_15.tif" in message
+        assert "\n" not in message
+    # the trap: with anything less strict this is 120.0, some 49 m too high, and no word of it
+    (message,) = _elsewhere(tmp_path, [2.17, 41.4, 120.0], [("EPSG:4979", "EPSG:4326+5773")])
+    assert "us_nga_egm96_15.tif" in str(message)

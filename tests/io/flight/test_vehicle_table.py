@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import tomllib
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.io.files.gps_time import TimeSystem
+from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.flight.vehicle_table import Vehicle, read_vehicle
+from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation
+from kgcp.io.formats.trajectories.records import Wander
+
+NEEDED = 'trajectory = "v.out"\nlever_arm_m = [1, 2, 3]\n'
+
+
+def read(folder: Path, lines: str) -> Vehicle | None:
+    values = tomllib.loads(f"[vehicle]\n{NEEDED}{lines}")
+    return read_vehicle(TomlTable("flight.toml:", values, ("vehicle",)), folder)
+
+
+def test_without_keys_the_file_speaks_for_itself(tmp_path: Path) -> None:
+    vehicle = read(tmp_path, "")
+    assert vehicle is not None
+    assert vehicle.trajectory_file == tmp_path / "v.out"
+    assert vehicle.notation == TrajectoryNotation()
+    assert read_vehicle(TomlTable("flight.toml:", {}, ("vehicle",)), tmp_path) is None
+
+
+@pytest.mark.parametrize("day", ['"2026-05-04"', "2026-05-04"])
+def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
+    vehicle = read(
+        tmp_path,
+        'format = "sbet"\ncrs = "EPSG:7912"\ntime_system = "gps"\naccuracies = "smrmsg.out"\n'
+        f'wander = "subtract"\nattitude = "course"\nsd_attitude_deg = [2, 1.5, 3]\ndate = {day}\n',
+    )
+    assert vehicle is not None
+    assert vehicle.notation == TrajectoryNotation(
+        format=TrajectoryFormat.SBET,
+        crs="EPSG:7912",
+        time_system=TimeSystem.GPS,
+        first_day=date(2026, 5, 4),
+        accuracies_file=tmp_path / "smrmsg.out",
+        wander=Wander.SUBTRACT,
+        course_sd_deg=(2.0, 1.5, 3.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('format = "SBET"', 'format: \'SBET\' is not known; give one of "csv", "sbet"'),
+        ('time_system = "local"', 'give one of "gps", "utc"'),
+        ('date = "4.5.2026"', "date: '4.5.2026' is no date; give it as 2026-05-04"),
+        ("date = 2026-05-04T09:30:00Z", "is no date"),
+        ("date = 20260504", "is no date"),
+        ('attitude = "course"', "sd_attitude_deg: is missing"),
+        ("sd_attitude_deg = [2, 2, 3]", "attitude: is missing"),
+        ('attitude = "level"\nsd_attitude_deg = [2, 2, 3]', "attitude: 'level' is not known"),
+        ('attitude = "course"\nsd_attitude_deg = [2, -2, 3]', "is out of range"),
+        ('trajectorie = "x"', "nearest known key is 'trajectory'"),
+    ],
+)
+def test_what_is_wrong_is_named_by_its_key(tmp_path: Path, lines: str, words: str) -> None:
+    with pytest.raises(KgcpError) as caught:
+        read(tmp_path, lines)
+    message = str(caught.value)
+    assert message.startswith("flight.toml: [vehicle] ")
+    assert words in message
+    assert "\n" not in message

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from kgcp.errors import KgcpError, Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.io.images.frames import list_frames, read_frame_times, read_grey
+
+WIDTH, HEIGHT = 320, 200
+CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=400.0, fy=401.0, cx=160.0, cy=99.0)
+
+
+def textured(dtype: type[np.unsignedinteger[Any]] = np.uint8, channels: int = 1) -> GreyArray:
+    rng = np.random.default_rng(5)
+    shape = (HEIGHT, WIDTH) if channels == 1 else (HEIGHT, WIDTH, channels)
+    noise = cv2.GaussianBlur(rng.uniform(0.0, 1.0, shape), (0, 0), 1.5)
+    return np.asarray(noise * np.iinfo(dtype).max).astype(dtype)
+
+
+def encoded(image: GreyArray, suffix: str, *options: int) -> bytes:
+    done, data = cv2.imencode(suffix, image, list(options))
+    assert done
+    return data.tobytes()
+
+
+def rejection(path: Path) -> Rejection:
+    with pytest.raises(Rejection) as caught:
+        read_grey(path, CAMERA)
+    return caught.value
+
+
+class TestListFrames:
+    def test_walks_folders_and_sorts_by_relative_name(self, tmp_path: Path) -> None:
+        names = ["b/2.PNG", "b/1.tiff", "a.JPG", "c.jpeg", "b/deep/er/3.Bmp", "z.TIF"]
+        for name in [*names, "notes.txt", ".hidden.jpg", ".trash/x.jpg", "b/._2.png", "jpg"]:
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        assert list_frames(tmp_path) == sorted(names)
+
+    def test_an_empty_folder_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(KgcpError, match=r"holds no images; .*\[frames\] folder"):
+            list_frames(tmp_path)
+
+    def test_a_missing_folder_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(KgcpError, match=r"nowhere: is not a folder; .*\[frames\] folder"):
+            list_frames(tmp_path / "nowhere")
+
+    def test_a_name_that_no_table_can_hold_is_an_error(self, tmp_path: Path) -> None:
+        Path(os.fsdecode(bytes(tmp_path) + b"/\xff.jpg")).touch()
+        with pytest.raises(KgcpError, match=r"not UTF-8; rename") as caught:
+            list_frames(tmp_path)
+        assert str(caught.value).encode()
+
+
+class TestReadGrey:
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".pgm"])
+    def test_eight_bits_are_kept(self, tmp_path: Path, suffix: str) -> None:
+        image = textured()
+        path = tmp_path / f"frame{suffix}"
+        path.write_bytes(encoded(image, suffix))
+        grey = read_grey(path, CAMERA)
+        assert grey.dtype == np.uint8
+        np.testing.assert_array_equal(grey, image)
+
+    @pytest.mark.parametrize("suffix", [".png", ".tif"])
+    def test_sixteen_bits_are_kept(self, tmp_path: Path, suffix: str) -> None:
+        image = textured(np.uint16)
+        path = tmp_path / f"frame{suffix}"
+        path.write_bytes(encoded(image, suffix))
+        grey = read_grey(path, CAMERA)
+        assert grey.dtype == np.uint16
+        np.testing.assert_array_equal(grey, image)
+
+    @pytest.mark.parametrize("channels", [3, 4])
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+    def test_colour_and_alpha_become_luma(
+        self, tmp_path: Path, dtype: type[np.unsignedinteger[Any]], channels: int
+    ) -> None:
+        image = textured(dtype, channels)
+        path = tmp_path / "frame.png"
+        path.write_bytes(encoded(image, ".png"))
+        grey = read_grey(path, CAMERA)
+        luma = image[..., :3] @ np.array([0.114, 0.587, 0.299])  # BGR, ITU-R BT.601
+        assert grey.dtype == dtype
+        np.testing.assert_allclose(grey, luma, atol=2e-4 * np.iinfo(dtype).max + 1.0)
+
+    @pytest.mark.parametrize("is_big", [False, True])
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_nor_is_that_of_a_tiff(self, tmp_path: Path, orientation: int, *, is_big: bool) -> None:
+        image = textured()
+        path = tmp_path / "frame.tif"
+        Image.fromarray(image).save(path, tiffinfo={274: orientation}, big_tiff=is_big)
+        np.testing.assert_array_equal(read_grey(path, CAMERA), image)
+
+    def test_the_orientation_tag_is_not_applied(self, tmp_path: Path) -> None:
+        image = textured()
+        path = tmp_path / "turned.png"
+        exif = Image.Exif()
+        exif[0x0112] = 6  # "rotate by 90 degrees to show"
+        Image.fromarray(image).save(path, exif=exif)
+        np.testing.assert_array_equal(read_grey(path, CAMERA), image)
+
+    @pytest.mark.parametrize("progressive", [0, 1])
+    def test_a_whole_jpeg_passes(self, tmp_path: Path, progressive: int) -> None:
+        image = textured()
+        path = tmp_path / "frame.jpg"
+        data = encoded(image, ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
+        path.write_bytes(data + b"whatever a camera appends")
+        assert np.std(read_grey(path, CAMERA).astype(float) - image) < 3.0
+
+    @pytest.mark.parametrize("progressive", [0, 1])
+    @pytest.mark.parametrize("damage", ["cut", "cut and ended", "short by 40", "zeroed"])
+    def test_a_damaged_jpeg_is_rejected_in_silence(
+        self, tmp_path: Path, capfd: pytest.CaptureFixture[str], damage: str, progressive: int
+    ) -> None:
+        data = encoded(textured(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, progressive)
+        middle = len(data) // 2
+        path = tmp_path / "frame.jpg"
+        path.write_bytes(
+            {
+                "cut": data[:middle],
+                "cut and ended": data[:middle] + b"\xff\xd9",
+                "short by 40": data[:-40],
+                "zeroed": data[:middle] + bytes(2000) + data[middle + 2000 :],
+            }[damage]
+        )
+        assert rejection(path).reason is Reason.DECODE_FAILED
+        assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp", ".jp2"])
+    def test_other_damaged_images_are_rejected_in_silence(
+        self, tmp_path: Path, capfd: pytest.CaptureFixture[str], suffix: str
+    ) -> None:
+        image = textured(channels=3)
+        path = tmp_path / f"frame{suffix}"
+        path.write_bytes(encoded(image, suffix)[:-1000])
+        assert rejection(path).reason is Reason.DECODE_FAILED
+        assert capfd.readouterr() == ("", "")
+
+    @pytest.mark.skipif(sys.platform != "linux", reason="counts memory as Linux does")
+    def test_a_png_takes_no_more_memory_than_it_has_bytes(self) -> None:
+        """The chunk of an animated PNG says that it is 2 GB long, and some decoders believe it."""
+        path = Path(__file__).parents[3] / "fuzz/found/frames/long_chunk.png"
+        script = """
+import resource, sys
+from pathlib import Path
+from kgcp.errors import Rejection
+from kgcp.geometry.camera import Camera
+from kgcp.io.images.frames import read_grey
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    read_grey(Path(sys.argv[1]), Camera(40, 30, 50.0, 50.0, 20.0, 15.0))
+except Rejection as rejection:
+    print(rejection.reason, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+        ran = subprocess.run(
+            [sys.executable, "-c", script, path], check=True, capture_output=True, text=True
+        )
+        reason, kilobytes = ran.stdout.split()
+        assert reason == Reason.DECODE_FAILED
+        assert int(kilobytes) < 100_000
+
+    @pytest.mark.parametrize("content", [b"", b"\xff", b"no image at all\n" * 50])
+    def test_what_is_no_image_is_rejected(self, tmp_path: Path, content: bytes) -> None:
+        path = tmp_path / "text.jpg"
+        path.write_bytes(content)
+        caught = rejection(path)
+        assert caught.reason is Reason.DECODE_FAILED
+        assert f"{len(content)} bytes" in caught.detail
+
+    def test_a_frame_that_vanished_is_rejected(self, tmp_path: Path) -> None:
+        assert rejection(tmp_path / "gone.jpg").reason is Reason.DECODE_FAILED
+
+    def test_floating_point_is_rejected(self, tmp_path: Path) -> None:
+        path = tmp_path / "float.tif"
+        path.write_bytes(encoded(textured().astype(np.float32), ".tif"))
+        assert "float32" in rejection(path).detail
+
+    @pytest.mark.parametrize("shape", [(1, 1), (WIDTH, HEIGHT), (HEIGHT, WIDTH + 1)])
+    def test_another_size_is_rejected_with_both(
+        self, tmp_path: Path, shape: tuple[int, int]
+    ) -> None:
+        path = tmp_path / "frame.png"
+        path.write_bytes(encoded(np.zeros(shape, np.uint8), ".png"))
+        caught = rejection(path)
+        assert caught.reason is Reason.WRONG_SIZE
+        assert caught.detail == f"{shape[1]} x {shape[0]} px, the camera has {WIDTH} x {HEIGHT}"
+
+
+class TestFrameTimes:
+    def write(self, folder: Path, content: str | bytes) -> Path:
+        path = folder / "frames.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    def test_reads_both_notations_and_passes_over_the_rest(self, tmp_path: Path) -> None:
+        path = self.write(
+            tmp_path,
+            "\ufeffframe,note,time\r\n"
+            "a.jpg,,1970-01-01T00:00:01.5Z\r\n"
+            '\r\n"b,c\\d.jpg","x, y",2.25\r\n',
+        )
+        assert read_frame_times(path) == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            ("", "frames.csv: has no column frame and time"),
+            ("frame;time\na.jpg;1\n", "has no column frame and time"),
+            ("frame,when\na.jpg,1\n", "has no column time"),
+            ("frame,time\na.jpg,1\na.jpg,2\n", r"frames.csv:3: frame 'a.jpg' is named a second"),
+            ("frame,time\na.jpg\n", r"frames.csv:2: lacks a frame or a time"),
+            ("frame,time\n,1\n", r"frames.csv:2: lacks a frame or a time"),
+            ("frame,time\na.jpg,\n", r"frames.csv:2: time: '' is not a time"),
+            ("frame,time\na.jpg,2026-05-04T09:30:05\n", r"frames.csv:2: .* no time zone"),
+            (b"frame,time\n\xe9.jpg,1\n", "no text in UTF-8"),
+        ],
+    )
+    def test_a_bad_file_is_an_error_with_its_line(
+        self, tmp_path: Path, content: str | bytes, words: str
+    ) -> None:
+        with pytest.raises(KgcpError, match=words) as caught:
+            read_frame_times(self.write(tmp_path, content))
+        assert "\n" not in str(caught.value)
+
+    def test_a_missing_file_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(KgcpError, match=r"does not exist; .* \[frames\] times"):
+            read_frame_times(tmp_path / "frames.csv")

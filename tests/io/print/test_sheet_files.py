@@ -1,0 +1,284 @@
+"""From print to detection: files as they are, rasterised, photographed and found."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import ezdxf
+import numpy as np
+import pypdfium2
+import pytest
+import resvg_py
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.io.print.dxf import dxf_of
+from kgcp.io.print.pdf import pdf_of
+from kgcp.io.print.png import check_pixels
+from kgcp.io.print.svg import svg_of
+from kgcp.io.print.typeface import set_text
+from kgcp.io.print.write import FORMATS, check_stems, file_stem, write_sheets
+from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.records import Miss, Observation
+from kgcp.settings import DetectSettings
+from kgcp.targets.artwork import Plate, draw_target
+from kgcp.targets.layout import Ring, Target
+from kgcp.targets.shapes import Box, Sheet, Text
+from kgcp.targets.sheets import Paper, lay_out
+from kgcp.targets.validation import check_targets
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DPI = 600
+PX_PER_MM = DPI / 25.4
+RING = Ring("Südtor 1", 0.09, 0.045, 0.0643, 0.0129, (0.0, 47.0, 100.0, 260.0))
+TARGET = Target(RING, (RING.scaled("inner", 0.3, (0.0, 70.0, 190.0)),))
+
+
+def sheet_of(target: Target = TARGET, paper: Paper = Paper.FIT) -> Sheet:
+    return lay_out(draw_target(target, None), target.name, paper, is_tiled=False)[0]
+
+
+def raster_of_pdf(sheet: Sheet, dpi: int) -> GreyArray:
+    (page,) = pypdfium2.PdfDocument(pdf_of([sheet], "test"))
+    return np.asarray(page.render(scale=dpi / 72.0, grayscale=True).to_pil().convert("L"))
+
+
+def raster_of_svg(sheet: Sheet, dpi: int) -> GreyArray:
+    picture = resvg_py.svg_to_bytes(svg_string=svg_of(sheet).decode(), dpi=float(dpi))
+    return np.asarray(Image.open(io.BytesIO(bytes(picture))).convert("L"))
+
+
+def edges(profile: FloatArray) -> FloatArray:
+    """Where a profile crosses the middle of black and white, in samples."""
+    above = profile - 127.5
+    before = np.flatnonzero(above[:-1] * above[1:] < 0.0)
+    crossings: FloatArray = before + above[before] / (above[before] - above[before + 1])
+    return crossings
+
+
+def bare_sheet() -> Sheet:
+    """A target without its legend, which needs no measuring."""
+    bare = replace(draw_target(TARGET, None), box=Box(-46.0, -47.0, 48.0, 49.0))
+    return lay_out(bare, "bare", Paper.FIT, is_tiled=False)[0]
+
+
+def edges_mm(grey: GreyArray, sheet: Sheet, px_per_mm: FloatArray, way_deg: float) -> FloatArray:
+    """Distances of all edges on a line through the centre, from it; negative ones first."""
+    centre = np.array(sheet.centre_mm) * px_per_mm - 0.5
+    reach_mm = np.arange(-50.0, 50.0, 0.02)
+    way = math.radians(way_deg)
+    steps = reach_mm[:, None] * np.array([math.cos(way), math.sin(way)])
+    places = (centre + steps * px_per_mm).astype(np.float32)
+    profile = cv2.remap(grey, places[None, :, 0], places[None, :, 1], cv2.INTER_LINEAR)[0]
+    found = np.interp(edges(profile.astype(float)), np.arange(len(reach_mm)), reach_mm)
+    return np.asarray(found)
+
+
+DIAMETERS_MM = np.array([90.0, 45.0, 27.0, 13.5])
+BETWEEN_DOTS_DEG = (28.0, 122.0, 140.0, 160.0)
+
+
+@pytest.mark.parametrize("rasterise", [raster_of_pdf, raster_of_svg])
+def test_diameters_are_true_at_600_dpi(rasterise: Callable[[Sheet, int], GreyArray]) -> None:
+    sheet = bare_sheet()
+    grey = rasterise(sheet, DPI)
+    scale = np.array(grey.shape[::-1]) / (sheet.width_mm, sheet.height_mm)
+    assert scale == pytest.approx([PX_PER_MM, PX_PER_MM], rel=1e-3)
+    for way_deg in BETWEEN_DOTS_DEG:
+        found_mm = edges_mm(grey, sheet, scale, way_deg)
+        assert len(found_mm) == 8
+        np.testing.assert_allclose(found_mm[::-1][:4] - found_mm[:4], DIAMETERS_MM, atol=0.02)
+        np.testing.assert_allclose(found_mm[:4], -0.5 * DIAMETERS_MM, atol=0.03)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_browser_draws_the_svg_at_its_true_size(tmp_path: Path) -> None:
+    assert CHROMIUM is not None
+    sheet, picture = bare_sheet(), tmp_path / "seen.png"
+    (tmp_path / "sheet.svg").write_bytes(svg_of(sheet))
+    seen = subprocess.run(
+        [
+            *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
+            *("--enable-logging=stderr", f"--user-data-dir={tmp_path / 'profile'}"),
+            *("--window-size=600,600", f"--screenshot={picture}"),
+            (tmp_path / "sheet.svg").as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert "CONSOLE" not in seen.stderr
+    with Image.open(picture) as opened:
+        grey = np.asarray(opened.convert("L"))
+    css_px_per_mm = np.full(2, 96.0 / 25.4)  # and pages are rounded to whole ones, of 0.26 mm
+    for way_deg in BETWEEN_DOTS_DEG:
+        found_mm = edges_mm(grey, sheet, css_px_per_mm, way_deg)
+        np.testing.assert_allclose(found_mm[:4], -0.5 * DIAMETERS_MM, atol=0.2)
+        np.testing.assert_allclose(found_mm[::-1][:4], 0.5 * DIAMETERS_MM, atol=0.2)
+
+
+def random_targets(count: int) -> tuple[Target, ...]:
+    """Random codes, but none that flight.toml would not take beside the others."""
+    rng = np.random.default_rng(7)
+    targets: list[Target] = []
+    while len(targets) < count:
+        dots = int(rng.integers(3, 6))
+        gaps = 33.0 + (360.0 - dots * 33.0) * rng.dirichlet(np.ones(dots))
+        code = tuple(np.round(np.cumsum(gaps) - gaps[0], 1))
+        ring = Ring(f"N{len(targets)}", 0.12, 0.06, 0.12 / 1.4, 0.12 / 7.0, code)
+        with suppress(SettingError):
+            check_targets((*targets, Target(ring)))
+            targets.append(Target(ring))
+    return tuple(targets)
+
+
+TARGETS = random_targets(10)
+CAMERA = Camera(480, 360, 700.0, 703.0, 241.3, 176.8)
+_FINE = 2
+
+
+def cluttered(rng: np.random.Generator) -> FloatArray:
+    """A photo-like background: structures of all sizes, from soil to fields."""
+    height, width = _FINE * CAMERA.height, _FINE * CAMERA.width
+    light = np.full((height, width), 0.38)
+    for size in (4, 9, 20, 45, 100, 220):
+        cells = rng.normal(0.0, 0.05, (size * 3 // 4, size)).astype(np.float32)
+        light += cv2.resize(cells, (width, height), interpolation=cv2.INTER_CUBIC)
+    for _ in range(25):
+        x, y, r = rng.uniform((0, 0, 5), (width, height, 60)).astype(int)
+        cv2.circle(light, (int(x), int(y)), int(r), float(rng.uniform(0.05, 0.8)), -1, cv2.LINE_AA)
+    return np.asarray(light)
+
+
+def photograph(print_grey: GreyArray, sheet: Sheet, pose: Pose, seed: int) -> GreyArray:
+    """Put a printed sheet into a frame, in perspective."""
+    rng = np.random.default_rng(seed)
+    px_per_m = 1e3 * print_grey.shape[1] / sheet.width_mm
+    x0, y0 = (np.array(sheet.centre_mm) * print_grey.shape[1] / sheet.width_mm) - 0.5
+    plate_from_print = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, px_per_m]])
+    camera = np.array([[CAMERA.fx, 0.0, CAMERA.cx], [0.0, CAMERA.fy, CAMERA.cy], [0.0, 0.0, 1.0]])
+    fine = np.array([[_FINE, 0, (_FINE - 1) / 2], [0, _FINE, (_FINE - 1) / 2], [0, 0, 1.0]])
+    plate = np.column_stack((pose.rotation[:, :2], pose.translation_m))
+    homography = fine @ camera @ plate @ plate_from_print
+    size = (_FINE * CAMERA.width, _FINE * CAMERA.height)
+    printed = 0.05 + 0.8 * print_grey / 255.0
+    seen = cv2.warpPerspective(printed, homography, size, flags=cv2.INTER_LINEAR)
+    share = cv2.warpPerspective(np.ones_like(printed), homography, size, flags=cv2.INTER_LINEAR)
+    light = seen + (1.0 - share) * cluttered(rng)
+    light = np.asarray(cv2.GaussianBlur(light, (0, 0), 0.7 * _FINE), dtype=float)
+    frame = cv2.resize(light, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    frame = frame + rng.normal(0.0, 0.006, frame.shape)
+    return np.asarray(np.clip(np.rint(230.0 * frame), 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("number", range(len(TARGETS)))
+def test_what_was_printed_is_found_with_its_code(number: int) -> None:
+    """From the file to the measurement: right code, right heading, right scale."""
+    rng = np.random.default_rng(100 + number)
+    sheet = sheet_of(TARGETS[number])
+    rasterise = (raster_of_pdf, raster_of_svg)[number % 2]
+    radius_px = rng.uniform(22.0, 45.0)
+    distance_m = 0.06 * CAMERA.mean_focal_px / radius_px
+    turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
+    tilt = Rotation.from_rotvec(np.radians([*rng.uniform(-18.0, 18.0, 2), 0.0]))
+    x, y = rng.uniform((150.0, 120.0), (330.0, 240.0))
+    ray = np.array([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, 1.0])
+    pose = Pose((tilt * turn).as_matrix(), distance_m * ray / np.linalg.norm(ray))
+    frame = photograph(rasterise(sheet, 127), sheet, pose, number)
+    outcomes = measure_frame(frame, CAMERA, TARGETS, DetectSettings())
+    found = [outcome for outcome in outcomes if isinstance(outcome, Observation)]
+    assert [observation.target for observation in found] == [TARGETS[number].name]
+    assert all(isinstance(outcome, Miss) for outcome in outcomes if outcome not in found)
+    assert found[0].pose.distance_m == pytest.approx(distance_m, rel=2e-3)
+    turned = found[0].pose.rotation @ pose.rotation.T
+    assert np.degrees(Rotation.from_matrix(turned).magnitude()) < 5.0
+
+
+def test_dxf_is_read_back_with_its_circles_in_millimetres() -> None:
+    artwork = draw_target(TARGET, Plate(180.0, hole_mm=6.0))
+    drawing = ezdxf.read(io.StringIO(dxf_of(artwork).decode("utf-8")))
+    assert not drawing.audit().has_errors
+    assert drawing.units == ezdxf.units.MM
+    circles = [
+        (c.dxf.layer, round(2.0 * c.dxf.radius, 4), tuple(round(v, 4) for v in c.dxf.center.xyz))
+        for c in drawing.modelspace().query("CIRCLE")
+    ]
+    assert ("INK", 90.0, (0.0, 0.0, 0.0)) in circles
+    assert ("WHITE", 45.0, (0.0, 0.0, 0.0)) in circles
+    assert ("INK", 27.0, (0.0, 0.0, 0.0)) in circles
+    assert sum(layer == "HOLES" and size == 6.0 for layer, size, _ in circles) == 4
+    angle = math.radians(47.0)  # clockwise as seen: y is up in DXF
+    where = (round(32.15 * math.cos(angle), 4), round(-32.15 * math.sin(angle), 4), 0.0)
+    assert ("WHITE", 12.9, where) in circles
+    words = [text.dxf.text for text in drawing.modelspace().query("TEXT")]
+    assert "Südtor 1" in words
+
+
+def test_svg_has_true_circles_and_millimetres() -> None:
+    text = svg_of(sheet_of(paper=Paper.A4)).decode()
+    assert re.search(r'width="210mm" height="297mm" viewBox="0 0 210 297"', text)
+    assert re.search(r'<circle cx="0" cy="0" r="45" fill="#000000" />', text)
+    assert 'aria-label="Südtor 1"' in text
+    assert "<text" not in text
+
+
+def test_pdf_is_not_to_be_scaled_and_can_be_searched() -> None:
+    tiles = lay_out(draw_target(TARGET, Plate(400.0)), "Südtor 1", Paper.A4, is_tiled=True)
+    document = pypdfium2.PdfDocument(pdf_of(tiles, "Target Südtor 1"))
+    assert len(document) == len(tiles) > 1
+    assert sorted(document[0].get_size()) == pytest.approx([595.28, 841.89], abs=0.01)
+    assert "row 1 of" in document[0].get_textpage().get_text_bounded()
+    assert "Südtor 1" in document[len(tiles) - 2].get_textpage().get_text_bounded()
+    assert b"/PrintScaling /None" in pdf_of(tiles, "x")
+
+
+def test_png_carries_its_resolution(tmp_path: Path) -> None:
+    (path,) = write_sheets([sheet_of()], "Südtor 1", tmp_path, ("png",), 150)
+    with Image.open(path) as picture:
+        assert picture.info["dpi"] == pytest.approx((150.0, 150.0), abs=0.02)
+        assert picture.mode == "L"
+        assert picture.width / 150.0 * 25.4 == pytest.approx(sheet_of().width_mm, abs=0.2)
+
+
+def test_the_same_sheets_are_the_same_bytes(tmp_path: Path) -> None:
+    sheets = lay_out(draw_target(TARGET, Plate(200.0)), "A", Paper.A4, is_tiled=True)
+    assert len(sheets) == 2
+    first = write_sheets(sheets, "A", tmp_path / "1", FORMATS, 20)
+    again = write_sheets(sheets, "A", tmp_path / "2", FORMATS, 20)
+    assert [path.name for path in first] == [path.name for path in again]
+    assert len(first) == 2 + 2 * len(sheets)
+    for one, other in zip(first, again, strict=True):
+        assert one.read_bytes() == other.read_bytes(), one.name
+
+
+def test_pictures_of_too_many_pixels_are_refused() -> None:
+    check_pixels(1000.0, 1000.0, 500)
+    with pytest.raises(SettingError, match=r"dpi: 1200 makes .* give at most 508"):
+        check_pixels(1000.0, 1000.0, 1200)
+
+
+def test_file_names_are_safe_and_differ() -> None:
+    assert file_stem("A/../b c") == "target_A_.._b_c"
+    check_stems(["A", "B"])
+    with pytest.raises(SettingError, match="'a b' and 'A_B' would both be"):
+        check_stems(["a b", "A_B"])
+
+
+def test_text_fits_into_its_room_and_knows_what_it_cannot_write() -> None:
+    printed = set_text(Text("a very long name " * 9, (0.0, 0.0), 7.0, 50.0))
+    assert printed.points_mm[:, 0].max() == pytest.approx(50.0, rel=0.01)
+    assert set_text(Text("$x^2$ \U0001f6f8 Ω", (0.0, 0.0), 3.0, 99.0)).words == "$x^2$ ? Ω"

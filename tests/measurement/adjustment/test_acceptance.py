@@ -1,0 +1,113 @@
+"""What a fit must show before it is reported: code, residuals, precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
+from kgcp.measurement.adjustment.covariance import propagate
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.two_poses import fit_both_poses
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.records import Appearance, Observation
+from kgcp.targets.layout import Target
+
+PlacePlate = Callable[..., Pose]
+DrawFrame = Callable[..., GreyArray]
+FitPlate = Callable[[tuple[float, ...], float], Fit]
+CODE = (0.0, 43.0, 78.0, 180.0)
+
+
+@pytest.fixture(scope="module")
+def fit_plate(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    draw_frame: DrawFrame,
+    imaging_of: Callable[..., Imaging],
+) -> FitPlate:
+    """The target fitted to a plate with dots in these directions, of this radius [px]."""
+
+    def fit(code_deg: tuple[float, ...], radius_px: float) -> Fit:
+        pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
+        shown = Target(replace(target.ring, code_deg=code_deg), target.replicas)
+        imaging = imaging_of(draw_frame((shown, pose)), camera, target, pose)
+        return fit_both_poses(imaging, pose, Blur(0.5, 0.5, 0.0)).best
+
+    return fit
+
+
+@pytest.mark.parametrize("radius_px", [12.0, 40.0])
+@pytest.mark.parametrize("code_deg", [CODE, (0.0, 43.0, 180.0)], ids=["whole", "one dot dirty"])
+def test_the_target_s_own_code_passes(
+    fit_plate: FitPlate, target: Target, code_deg: tuple[float, ...], radius_px: float
+) -> None:
+    fit = fit_plate(code_deg, radius_px)
+    check_fit(fit)
+    check_code(fit, target.ring)
+
+
+MORE, ELSEWHERE = (*CODE, 260.0), (0.0, 43.0, 78.0, 210.0)
+MISSING, ANOTHER = (0.0, 180.0), (0.0, 60.0, 150.0, 240.0)
+MOVED = (0.0, 43.0, 88.0, 180.0)  # by less than half a dot
+
+
+@pytest.mark.parametrize(
+    ("code_deg", "radius_px"),
+    [
+        (code, radius)
+        for code in (MORE, ELSEWHERE, MISSING, ANOTHER, MOVED)
+        for radius in (12.0, 40.0)
+    ],
+)
+def test_other_dots_are_another_code(
+    fit_plate: FitPlate, target: Target, code_deg: tuple[float, ...], radius_px: float
+) -> None:
+    fit = fit_plate(code_deg, radius_px)
+    with pytest.raises(Rejection) as caught:
+        check_code(fit, target.ring)
+    assert caught.value.reason is Reason.OTHER_CODE
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda fit: replace(fit, misfit=replace(fit.misfit, weight=0.1 * fit.misfit.weight)),
+        lambda fit: replace(fit, sd=0.3 * np.ones_like(fit.sd)),
+    ],
+    ids=["outliers", "noise"],
+)
+def test_what_does_not_fit_is_refused(fit_plate: FitPlate, spoil: Callable[[Fit], Fit]) -> None:
+    with pytest.raises(Rejection) as caught:
+        check_fit(spoil(fit_plate(CODE, 12.0)))
+    assert caught.value.reason is Reason.POOR_FIT
+
+
+def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlacePlate) -> None:
+    pose = place_plate((205.4, 190.7), 20.0)
+    along = pose.translation_m / pose.distance_m
+
+    def observed(relative_sd: float) -> Observation:
+        cov = 1e-8 * np.eye(6)
+        cov[:3, :3] += (relative_sd * pose.distance_m) ** 2 * np.outer(along, along)
+        return Observation(
+            *("A", "A", 0, 0.9, pose, camera.project(pose.translation_m), 0.0),
+            Appearance(20.0, 0.1, 0.8, 0.0),
+            None,
+            propagate(camera, pose, cov),
+        )
+
+    check_precision(observed(0.009))
+    check_precision(replace(observed(0.5), uncertainty=None))
+    with pytest.raises(Rejection) as caught:
+        check_precision(observed(0.011))
+    assert caught.value.reason is Reason.POOR_FIT

@@ -1,0 +1,96 @@
+"""From the covariance of a pose to what is reported, against samples of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
+from kgcp.measurement.adjustment.normal_equations import normal_matrix
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.two_poses import fit_both_poses
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.targets.layout import Target
+
+PlacePlate = Callable[..., Pose]
+DRAWS = 4000
+
+
+def some_covariance(seed: int) -> FloatArray:
+    """Centimetres along the ray, millimetres across, tenths of a degree; all correlated."""
+    root = np.random.default_rng(seed).normal(size=(6, 6))
+    scale = np.array([0.002, 0.003, 0.02, 0.004, 0.003, 0.002])
+    scaled = scale[:, None] * root
+    return np.asarray(scaled @ scaled.T)
+
+
+@pytest.mark.parametrize("turn_deg", [31.0, 179.9])
+def test_deviations_are_the_scatter_of_poses_drawn_from_the_covariance(
+    camera: Camera, place_plate: PlacePlate, turn_deg: float
+) -> None:
+    pose = place_plate((80.0, 290.0), 25.0, tilt_deg=30.0, way_deg=70.0, turn_deg=turn_deg)
+    cov = some_covariance(3)
+    reported = propagate(camera, pose, cov)
+    steps = np.random.default_rng(4).multivariate_normal(np.zeros(6), cov, DRAWS)
+    drawn = [
+        Pose(
+            Rotation.from_rotvec(step[3:]).as_matrix() @ pose.rotation,
+            pose.translation_m + step[:3],
+        )
+        for step in steps
+    ]
+    band = 4.0 / np.sqrt(2.0 * DRAWS)
+    for sd, values in (
+        (reported.sd_distance_m, [each.distance_m for each in drawn]),
+        (reported.sd_roll_deg, [each.roll_deg for each in drawn]),
+        (reported.sd_pitch_deg, [each.pitch_deg for each in drawn]),
+    ):
+        assert sd == pytest.approx(np.std(values), rel=band)
+    headings = np.array([image_heading_deg(camera, each) for each in drawn])
+    off = (headings - image_heading_deg(camera, pose) + 180.0) % 360.0 - 180.0
+    assert reported.sd_heading_deg == pytest.approx(off.std(), rel=band)
+    centres = camera.project(np.array([each.translation_m for each in drawn]))
+    scatter = np.cov(centres.T)
+    size = np.sqrt(np.outer(np.diag(scatter), np.diag(scatter)))
+    np.testing.assert_allclose(reported.centre_cov_px2 / size, scatter / size, atol=2.0 * band)
+    np.testing.assert_array_equal(reported.pose_cov, cov)
+
+
+@pytest.fixture(scope="module")
+def fit(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    draw_frame: Callable[..., GreyArray],
+    imaging_of: Callable[..., Imaging],
+) -> Fit:
+    pose = place_plate((205.4, 190.7), 25.0, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
+    grey = draw_frame((target, pose))
+    return fit_both_poses(imaging_of(grey, camera, target, pose), pose, Blur(0.5, 0.5, 0.0)).best
+
+
+def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: Fit) -> None:
+    covariance = pose_covariance(fit)
+    plain = np.linalg.inv(normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns))[:6, :6]
+    assert eigh(covariance.pose_cov, plain, eigvals_only=True).min() > 1.0 - 1e-6
+    np.testing.assert_allclose(covariance.pose_cov, covariance.pose_cov.T, rtol=1e-6)
+    assert 1.0 <= covariance.inflation < 3.0
+
+
+def test_residuals_that_run_along_the_edges_make_it_worse(fit: Fit) -> None:
+    """The same residuals, constant over each of some stripes: fewer independent ones."""
+    x = fit.prediction.points_m[0] * fit.sample.imaging.outer_radius_px / 0.45
+    stripe = (x // 5.0).astype(int) - int(x.min() // 5.0)
+    sign = np.random.default_rng(1).choice((-1.0, 1.0), stripe.max() + 1)[stripe]
+    score = sign * np.abs(fit.misfit.score)
+    striped = replace(fit, misfit=replace(fit.misfit, score=score))
+    assert pose_covariance(striped).inflation > 3.0 * pose_covariance(fit).inflation

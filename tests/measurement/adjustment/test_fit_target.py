@@ -1,0 +1,196 @@
+"""The image model on simulated frames: are errors what their deviations say, in all conditions?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.records import Observation
+from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
+from kgcp.simulation.imaging import Sensor, ToneCurve
+
+Photograph = Callable[..., GreyArray]
+StartNear = Callable[..., Observation]
+LENS = Camera(
+    *(480, 340, 1310.0, 1306.0, 121.2, 91.7, -0.09, 0.06, 8e-4, -6e-4, -0.01),
+    response=Response.LINEAR,
+)
+TARGET = TARGET_PLATE.target
+FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of some measurements, against their truth."""
+
+    distance_percent: FloatArray
+    distance_sigmas: FloatArray
+    centre_sigmas: FloatArray
+    pose_chi2: FloatArray
+
+
+def random_pose(camera: Camera, radius_px: float, rng: np.random.Generator) -> Pose:
+    """Anywhere in the frame, tilted, at any heading."""
+    ray = np.append(camera.undistort(rng.uniform((70.0, 70.0), (410.0, 270.0))), 1.0)
+    way = rng.uniform(0.0, 2.0 * np.pi)
+    axis = np.array([np.cos(way), np.sin(way), 0.0])
+    tilt = Rotation.from_rotvec(np.radians(rng.uniform(12.0, 40.0)) * axis)
+    rotation = (tilt * Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)).as_matrix()
+    radius_px *= rng.uniform(0.9, 1.1)
+    return Pose(rotation, ray * 0.45 * camera.mean_focal_px / radius_px)
+
+
+@pytest.fixture(scope="module")
+def errors_of(photograph: Photograph, start_near: StartNear) -> Callable[..., Errors]:
+    """Errors over some frames of random poses."""
+
+    def measure(camera: Camera, radius_px: float, count: int, **light: object) -> Errors:
+        rows = []
+        for seed in range(count):
+            rng = np.random.default_rng(seed)
+            pose = random_pose(camera, radius_px, rng)
+            grey = photograph(camera, pose, rng, **light)
+            seen = measure_by_model(grey, camera, TARGET, start_near(camera, pose, rng))
+            rows.append(standardised(camera, seen, pose))
+        percent, sigmas, x, y, chi2 = np.array(rows).T
+        return Errors(percent, sigmas, np.concatenate((x, y)), chi2)
+
+    return measure
+
+
+def standardised(camera: Camera, seen: Observation, truth: Pose) -> tuple[float, ...]:
+    assert seen.uncertainty is not None
+    off_m = seen.pose.distance_m - truth.distance_m
+    off_px = seen.centre_px - camera.project(truth.translation_m)
+    turn = Rotation.from_matrix(seen.pose.rotation @ truth.rotation.T).as_rotvec()
+    error = np.concatenate((seen.pose.translation_m - truth.translation_m, turn))
+    return (
+        100.0 * off_m / truth.distance_m,
+        off_m / seen.uncertainty.sd_distance_m,
+        *(off_px / np.sqrt(np.diag(seen.uncertainty.centre_cov_px2))),
+        float(error @ np.linalg.solve(seen.uncertainty.pose_cov, error)),
+    )
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.mark.parametrize(("radius_px", "percent"), [(12.0, 0.06), (24.0, 0.02)])
+def test_errors_are_as_large_as_reported(
+    errors_of: Callable[..., Errors], radius_px: float, percent: float
+) -> None:
+    errors = errors_of(LENS, radius_px, 24)
+    assert 0.6 < rms(errors.distance_sigmas) < 1.4
+    assert 0.6 < rms(errors.centre_sigmas) < 1.4
+    assert 3.2 < np.median(errors.pose_chi2) < 8.0  # of χ² with 6 degrees of freedom: 5.3
+    assert errors.pose_chi2.max() < 30.0
+    assert 0.2 * percent < rms(errors.distance_percent) < percent
+
+
+@pytest.mark.parametrize(
+    ("response", "sensor", "gain"),
+    [
+        (Response.LINEAR, Sensor(), 0.54),
+        (Response.LINEAR, Sensor(), 1.44),  # white clips
+        (Response.SRGB, Sensor(tone=ToneCurve.SRGB), 0.9),
+        (Response.SRGB, Sensor(tone=ToneCurve.SRGB), 1.44),
+        (Response.UNKNOWN, Sensor(), 0.9),
+        (Response.UNKNOWN, FILM, 0.9),
+        (Response.UNKNOWN, FILM, 0.5),
+    ],
+)
+def test_exposure_and_tone_do_not_move_the_distance(
+    errors_of: Callable[..., Errors], response: Response, sensor: Sensor, gain: float
+) -> None:
+    camera = replace(LENS, response=response)
+    errors = errors_of(camera, 20.0, 6, sensor=sensor, gain=gain)
+    assert np.abs(errors.distance_percent).max() < 0.1
+    assert abs(np.mean(errors.distance_percent)) < 0.02
+    assert rms(errors.distance_sigmas) < 1.7
+    assert rms(errors.centre_sigmas) < 1.5
+
+
+def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(
+    errors_of: Callable[..., Errors],
+) -> None:
+    """Three shapes of a curve whose shoulder is cut off say less: two deviations too long."""
+    camera = replace(LENS, response=Response.UNKNOWN)
+    errors = errors_of(camera, 20.0, 6, sensor=FILM, gain=1.4)
+    assert np.abs(errors.distance_percent).max() < 0.1
+    assert rms(errors.distance_sigmas) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "gain", "seed", "percent"),
+    [(17.0, 1.25, 7, 0.06), (40.0, 1.25, 6, 0.02), (40.0, 1.25, 7, 0.02), (70.0, 1.6, 9, 0.01)],
+)
+def test_compression_does_not_hide_that_the_plate_is_burnt(
+    photograph: Photograph,
+    start_near: StartNear,
+    radius_px: float,
+    gain: float,
+    seed: int,
+    percent: float,
+) -> None:
+    """It smears white over the levels below: taken as they were, they doubled the deviations.
+
+    In the larger rings white made its own noise of them, and ran away with it.
+    """
+    camera = replace(LENS, response=Response.UNKNOWN)
+    rng = np.random.default_rng(seed)
+    pose = random_pose(camera, radius_px, rng)
+    grey = photograph(camera, pose, rng, sensor=FILM, gain=gain)
+    _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    assert decoded is not None
+    smeared = decoded.astype(np.uint8)
+    seen = measure_by_model(smeared, camera, TARGET, start_near(camera, pose, rng))
+    assert seen.appearance.saturated > 0.15
+    assert seen.uncertainty is not None
+    assert 100.0 * seen.uncertainty.sd_distance_m / pose.distance_m < percent
+    error_m = abs(seen.pose.distance_m - pose.distance_m)
+    assert error_m < 4.0 * seen.uncertainty.sd_distance_m
+
+
+def test_both_poses_are_reported_whichever_the_start(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    rng = np.random.default_rng(3)
+    pose = random_pose(LENS, 30.0, rng)
+    grey = photograph(LENS, pose, rng)
+    start = start_near(LENS, pose, rng)
+    mirrored = replace(start, pose=start.pose.mirrored())
+    one, other = (measure_by_model(grey, LENS, TARGET, each) for each in (start, mirrored))
+    for seen in (one, other):
+        assert seen.alternative is not None
+        assert seen.pose.normal @ pose.normal > np.cos(np.radians(1.0))
+        assert seen.alternative.pose.normal @ pose.mirrored().normal > np.cos(np.radians(5.0))
+        assert seen.alternative.ambiguity > 20.0
+        assert seen.ring == "A"
+    assert one.uncertainty is not None
+    sd = np.sqrt(np.diag(one.uncertainty.pose_cov))[:3]
+    assert np.all(np.abs(one.pose.translation_m - other.pose.translation_m) < 0.5 * sd)
+
+
+@pytest.mark.parametrize("radius_px", [12.0, 30.0])
+def test_another_plate_is_not_measured_as_ours(
+    photograph: Photograph, start_near: StartNear, radius_px: float
+) -> None:
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        pose = random_pose(LENS, radius_px, rng)
+        grey = photograph(LENS, pose, rng, plate=replace(DECOY_PLATE, outline=TARGET_PLATE.outline))
+        with pytest.raises(Rejection) as caught:
+            measure_by_model(grey, LENS, TARGET, start_near(LENS, pose, rng))
+        assert caught.value.reason in {Reason.OTHER_CODE, Reason.POOR_FIT}

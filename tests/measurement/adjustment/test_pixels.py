@@ -1,0 +1,181 @@
+"""Which pixels take part: plate only, of whatever shape the plate is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import Sample, choose_sample
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import predict
+from kgcp.measurement.image_model.blur import Blur, pair_edges
+from kgcp.measurement.image_model.blurred_plate import white_level
+from kgcp.measurement.image_model.photometry import Imager, Light
+from kgcp.measurement.image_model.plate import EVEN, plate_points
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import Plate, PlateImage, image_plate
+from kgcp.simulation.shapes import ConvexPolygon, regular_polygon
+from kgcp.targets.layout import Target
+
+PlacePlate = Callable[..., Pose]
+ImagingOf = Callable[..., Imaging]
+PSF_PX = 0.7
+BLUR = Blur(PSF_PX**2 + 1.0 / 12.0, PSF_PX**2 + 1.0 / 12.0, 0.0)
+WHITE, BLACK = 0.8, 0.06
+LIGHT = Light(BLACK, WHITE)
+WIDE, NARROW = regular_polygon(8, 0.60), regular_polygon(4, 0.51)
+BORDER_PX = 2.4
+
+
+def photograph(
+    camera: Camera, target: Target, pose: Pose, outline: ConvexPolygon, ground: float
+) -> tuple[GreyArray, PlateImage]:
+    image = image_plate(camera, Plate(target, outline, WHITE, BLACK), pose, Optics(PSF_PX))
+    irradiance = np.full((camera.height, camera.width), ground)
+    image.paste(irradiance)
+    return Sensor().expose(irradiance, 1.0, np.random.default_rng(5)), image
+
+
+def opacity_of(sample: Sample, image: PlateImage) -> FloatArray:
+    window = sample.imaging.window
+    x, y = window.pixels(sample.index).astype(int)
+    return np.asarray(image.opacity[y - image.window.row, x - image.window.column])
+
+
+def beyond_px(sample: Sample, pose: Pose) -> FloatArray:
+    """How far the pixels are beyond the outer circle."""
+    imaging = sample.imaging
+    points = plate_points(pose, sample.rays)
+    beyond = np.hypot(*points) / imaging.outer_radius_m - 1.0
+    return np.asarray(beyond * imaging.outer_radius_px)
+
+
+@pytest.mark.parametrize("ground", [0.05, 0.35])
+@pytest.mark.parametrize("corners", [4, 5, 8])
+@pytest.mark.parametrize("radius_px", [14.0, 40.0])
+def test_what_mixes_with_the_surroundings_is_left_out(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    imaging_of: ImagingOf,
+    ground: float,
+    corners: int,
+    radius_px: float,
+) -> None:
+    """On a plate whose border is nowhere narrower than BORDER_PX."""
+    pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
+    outline = regular_polygon(corners, 0.45 * (1.0 + BORDER_PX / radius_px))
+    grey, image = photograph(camera, target, pose, outline, ground)
+    imaging = imaging_of(grey, camera, target, pose)
+    sample = choose_sample(imaging, pose, BLUR, LIGHT)
+    everything = choose_sample(imaging, pose, BLUR, None)
+    mixed, unfiltered = (
+        (WHITE - ground) * (1.0 - opacity_of(each, image)) for each in (sample, everything)
+    )
+    assert mixed.max() < 0.05
+    assert np.mean(mixed > 0.02) < 0.015
+    assert len(sample.levels) > 0.75 * len(everything.levels)
+    assert unfiltered.max() > 0.05, "without levels nothing is known to be foreign"
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 31.0])
+def test_where_a_streak_carries_the_surroundings_to_the_ring_nothing_is_used(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    imaging_of: ImagingOf,
+    turn_deg: float,
+) -> None:
+    """Along the streak the plate is nowhere as bright as across it, and ends within the blur."""
+    streak = (5.6, 2.0)
+    pose = place_plate((205.4, 190.7), 13.0, turn_deg=turn_deg)
+    image = image_plate(
+        camera, Plate(target, regular_polygon(4, 0.58), WHITE, BLACK), pose, Optics(1.1, streak)
+    )
+    irradiance = np.full((camera.height, camera.width), 0.2)
+    image.paste(irradiance)
+    grey = Sensor().expose(irradiance, 1.0, np.random.default_rng(5))
+    imaging = imaging_of(grey, camera, target, pose)
+    blur = Blur(1.1**2 + 1.0 / 12.0, 1.1**2 + 1.0 / 12.0, 0.0, *streak)
+    sample, everything = (choose_sample(imaging, pose, blur, light) for light in (LIGHT, None))
+    mixed, unfiltered = (
+        (WHITE - 0.2) * (1.0 - opacity_of(each, image)) for each in (sample, everything)
+    )
+    assert unfiltered.max() > 0.15
+    assert mixed.max() < 0.05
+    assert np.mean(mixed > 0.02) < 0.03
+    assert len(sample.levels) > 0.6 * len(everything.levels)
+
+
+def test_surroundings_as_bright_as_the_plate_are_no_loss(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    pose = place_plate((205.4, 190.7), 20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, NARROW, WHITE)
+    imaging = imaging_of(grey, camera, target, pose)
+    found, everything = (choose_sample(imaging, pose, BLUR, light) for light in (LIGHT, None))
+    np.testing.assert_array_equal(found.index, everything.index)
+
+
+def test_all_that_says_where_edges_are_is_used(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    """On a wide plate: all pixels within 1.5 σ of a circle, and levels beyond the ring."""
+    pose = place_plate((205.4, 190.7), 40.0, tilt_deg=20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, WIDE, 0.2)
+    imaging = imaging_of(grey, camera, target, pose)
+    sample = choose_sample(imaging, pose, BLUR, LIGHT)
+    window = imaging.window
+    everywhere = plate_points(pose, window.rays)
+    near = np.zeros(everywhere.shape[1], bool)
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    for centre, radius in zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True):
+        off_edge = np.hypot(*(everywhere - centre[:, None])) - radius
+        near |= np.abs(off_edge) * px_per_m < 1.5 * BLUR.largest_sd_px
+    assert set(np.flatnonzero(near)) <= set(sample.index)
+    assert 1.5 < beyond_px(sample, pose).max() < 4.0
+    np.testing.assert_array_equal(sample.levels, window.levels[sample.index])
+
+
+def test_a_target_outside_its_window_has_lost_its_edges(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    pose, elsewhere = place_plate((205.4, 190.7), 20.0), place_plate((300.0, 250.0), 20.0)
+    grey, _ = photograph(camera, target, pose, NARROW, 0.05)
+    imaging = imaging_of(grey, camera, target, pose)
+    with pytest.raises(Rejection) as caught:
+        choose_sample(imaging, elsewhere, BLUR, LIGHT)
+    assert caught.value.reason is Reason.EDGES_LOST
+
+
+def test_sharpening_feels_the_far_tails_of_edges(
+    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+) -> None:
+    """They take no part themselves. Against the whole window, exposed and sharpened by OpenCV."""
+    pose = place_plate((205.4, 190.7), 12.0, tilt_deg=20.0, turn_deg=31.0)
+    grey, _ = photograph(camera, target, pose, WIDE, WHITE)
+    imaging = replace(imaging_of(grey, camera, target, pose), sharpening_px=1.2)
+    light = Light(BLACK, WHITE, tone_1=1.0, tone_2=-0.3, sharpening=0.6)
+    sample = choose_sample(imaging, pose, BLUR, light)
+    seen = predict(sample, Parameters.of(pose, BLUR, light)).levels
+
+    window = imaging.window
+    points_m, px_m = plate_points(pose, window.rays), 0.45 / 12.0
+    pairs = pair_edges(points_m, 1.07 * px_m, imaging.circles, BLUR, EVEN)
+    share = white_level(pose.matrix, window.rays, BLUR.vector, pairs).value
+    plain = Imager(np.zeros((2, len(share))), imaging.response, None).levels(share, light)
+    kernel = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
+    kernel /= kernel.sum()
+    smooth = cv2.sepFilter2D(plain.reshape(window.height, -1), cv2.CV_64F, kernel, kernel).ravel()
+    expected = (plain + 0.6 * (plain - smooth))[sample.index]
+    assert len(sample.index) < 0.8 * len(share)
+    np.testing.assert_allclose(seen, expected, rtol=0.0, atol=1e-5)

@@ -1,0 +1,185 @@
+"""The likelihood: its derivatives, the noise it takes from residuals, and clipped pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.measurement.image_model.noise import Censoring, estimate_noise, find_censoring, misfit
+
+COUNT = 1.0 / 255.0
+OUTLYING = 3.5
+
+
+def no_clipping(count: int) -> Censoring:
+    return Censoring(2.0, -1.0, np.zeros(count, bool), np.zeros(count, bool))
+
+
+def all_clipped(count: int, *, high: bool) -> Censoring:
+    return Censoring(1.0, 0.0, np.full(count, high), np.full(count, not high))
+
+
+def loss(levels: FloatArray, model: FloatArray, sd: FloatArray, clip: Censoring) -> FloatArray:
+    """The loss of each pixel: that of all when only one counts."""
+    parts = []
+    for i in range(len(model)):
+        one = slice(i, i + 1)
+        each = Censoring(clip.high, clip.low, clip.at_high[one], clip.at_low[one])
+        parts.append(misfit(levels[one], model[one], sd[one], each).total)
+    return np.array(parts)
+
+
+def check_derivatives(model: FloatArray, clip: Censoring, *, curved: BoolArray) -> None:
+    levels, sd = np.full_like(model, 0.5), np.full_like(model, 0.02)
+    if clip.at_high.any():
+        levels = np.ones_like(model)
+    elif clip.at_low.any():
+        levels = np.zeros_like(model)
+    result = misfit(levels, model, sd, clip)
+    step = 1e-4
+    low, middle, high = (loss(levels, model + s * step * sd, sd, clip) for s in (-1.0, 0.0, 1.0))
+    np.testing.assert_allclose(result.score, (low - high) / (2.0 * step), atol=1e-6)
+    second = (high - 2.0 * middle + low) / step**2
+    np.testing.assert_allclose(result.weight[curved], second[curved], atol=1e-5)
+    assert np.all(result.weight > 0.0)
+
+
+def test_score_and_weight_are_derivatives_of_the_loss() -> None:
+    z = np.array([-9.0, -4.0, -3.3, -1.0, 0.0, 0.4, 2.0, 3.4, 3.6, 20.0])
+    inlying = np.abs(z) < OUTLYING
+    check_derivatives(0.5 - 0.02 * z, no_clipping(len(z)), curved=inlying)
+
+
+@pytest.mark.parametrize("high", [True, False])
+def test_clipped_pixels_have_derivatives_of_their_tail(high: bool) -> None:  # noqa: FBT001 - a case
+    """Up to the point where they count as outliers."""
+    missing = np.array([-6.0, -2.0, -0.5, 0.0, 1.0, 2.5, 3.1])
+    model = 1.0 - 0.02 * missing if high else 0.02 * missing
+    check_derivatives(
+        model, all_clipped(len(missing), high=high), curved=np.full(7, fill_value=True)
+    )
+
+
+def test_clipped_pixels_say_only_at_least() -> None:
+    model = np.array([1.3, 1.1, 0.9])
+    result = misfit(np.ones(3), model, np.full(3, 0.02), all_clipped(3, high=True))
+    np.testing.assert_allclose(result.score[:2], 0.0, atol=1e-4)
+    assert result.score[2] > 1.0
+
+
+def test_outliers_pull_less_the_farther_they_are_and_are_never_lost() -> None:
+    z = np.array([3.4, 5.0, 10.0, 50.0])
+    result = misfit(0.02 * z, np.zeros(4), np.full(4, 0.02), no_clipping(4))
+    assert np.all(np.diff(np.abs(result.score)) < 0.0)
+    np.testing.assert_allclose(result.weight, np.minimum(1.0, OUTLYING**2 / z**2))
+
+
+def test_outlying_clipped_pixels_pull_with_a_bounded_force() -> None:
+    model = np.array([0.95, 0.8, 0.5, 0.0])
+    result = misfit(np.ones(4), model, np.full(4, 0.01), all_clipped(4, high=True))
+    assert np.all(result.score > 0.0)
+    assert np.all(result.score <= OUTLYING + 1e-12)
+    assert np.all(np.diff(loss(np.ones(4), model, np.full(4, 0.01), all_clipped(4, high=True))) > 0)
+
+
+def scattered(rng: np.random.Generator, edge_factor: float) -> tuple[FloatArray, FloatArray]:
+    """Residuals of 300 pixels of ink, 300 of plate and 600 of edges."""
+    share = np.concatenate((np.zeros(300), np.ones(300), rng.uniform(0.21, 0.79, 600)))
+    sd = np.sqrt(0.008**2 + (0.02**2 - 0.008**2) * share)
+    sd[600:] *= edge_factor
+    return rng.normal(0.0, sd), share
+
+
+def test_noise_follows_the_level() -> None:
+    rng = np.random.default_rng(6)
+    found = []
+    for _ in range(20):
+        residuals, share = scattered(rng, 1.0)
+        noise = estimate_noise(residuals, share, np.full(1200, fill_value=True), COUNT)
+        found.append((noise.sd[0], noise.sd[300], noise.sd[share > 0.2].mean()))
+    dark, bright, _ = np.mean(found, axis=0)
+    assert dark == pytest.approx(0.008, rel=0.04)
+    assert bright == pytest.approx(0.02, rel=0.04)
+    assert np.std(found, axis=0)[0] < 0.1 * 0.008
+
+
+@pytest.mark.parametrize(("factor", "low", "high"), [(1.0, 1.0, 1.1), (3.0, 2.5, 3.3)])
+def test_edges_have_the_scatter_they_show(factor: float, low: float, high: float) -> None:
+    residuals, share = scattered(np.random.default_rng(7), factor)
+    noise = estimate_noise(residuals, share, np.full(1200, fill_value=True), COUNT)
+    middle = np.abs(share - 0.5) < 0.1
+    assert low <= np.median(noise.sd[middle] / noise.plateau_sd[middle]) < high
+    np.testing.assert_allclose(noise.sd[:600], noise.plateau_sd[:600])
+
+
+def test_a_few_wild_pixels_and_clipped_ones_do_not_count() -> None:
+    residuals, share = scattered(np.random.default_rng(8), 1.0)
+    usable = np.full(1200, fill_value=True)
+    plain = estimate_noise(residuals, share, usable, COUNT)
+    residuals[[3, 70, 170, 330, 410, 700, 900]] = 0.6
+    residuals[200:240], usable[200:240] = 0.3, False
+    dirty = estimate_noise(residuals, share, usable, COUNT)
+    np.testing.assert_allclose(dirty.sd, plain.sd, rtol=0.15)
+
+
+def test_noise_is_never_below_that_of_rounding() -> None:
+    share = np.linspace(0.0, 1.0, 100)
+    noise = estimate_noise(np.zeros(100), share, np.full(100, fill_value=True), COUNT)
+    np.testing.assert_allclose(noise.sd, 0.3 * COUNT)
+    none_usable = estimate_noise(np.zeros(100), share, np.zeros(100, bool), COUNT)
+    np.testing.assert_allclose(none_usable.sd, 0.3 * COUNT)
+
+
+def test_the_ends_of_the_range_are_clipped() -> None:
+    levels = np.array([0.0, 1.0, 2.0, 100.0, 254.0, 255.0]) * COUNT
+    clip = find_censoring(levels, COUNT)
+    assert clip.at_low.tolist() == [True] + [False] * 5
+    assert clip.at_high.tolist() == [False] * 5 + [True]
+    assert 254.0 * COUNT < clip.high < 1.0
+    assert clip.share == pytest.approx(1.0 / 3.0)
+
+
+def test_twelve_bits_in_a_file_of_sixteen_clip_where_values_pile_up() -> None:
+    rng = np.random.default_rng(2)
+    full, count = 4095, 1.0 / 65535.0
+    bright = np.minimum(np.rint(rng.normal(1.1 * full, 0.02 * full, 900)), full)
+    dark = np.rint(rng.normal(300.0, 20.0, 1500))
+    levels = np.concatenate((dark, bright)) * count
+    clip = find_censoring(levels, count)
+    np.testing.assert_array_equal(clip.at_high, levels == full * count)
+    assert not clip.at_low.any()
+    assert clip.high == pytest.approx(full * count, abs=count)
+
+
+@pytest.mark.parametrize("burnt", [True, False])
+def test_what_compression_makes_of_clipped_levels_says_no_more_than_they(
+    burnt: bool,  # noqa: FBT001 - a case
+) -> None:
+    """At either end of the range, with grey values of edges all over it."""
+    rng = np.random.default_rng(4)
+    smeared = np.clip(np.rint(rng.normal(255.0, 2.0, 800)), 0.0, 255.0)
+    edges, other = rng.integers(0, 256, 500), np.rint(rng.normal(90.0, 3.0, 800))
+    counts = np.concatenate((smeared, edges, other))
+    clip = find_censoring((counts if burnt else 255.0 - counts) * COUNT, COUNT)
+    at_end, high = (clip.at_high, clip.high) if burnt else (clip.at_low, 1.0 - clip.low)
+    assert 247.0 < high / COUNT < 251.0
+    assert at_end[:800].mean() > 0.97
+    assert at_end[800:1300].mean() < 0.04
+    assert not at_end[1300:].any()
+
+
+def test_levels_that_are_clipped_at_once_are_not_smeared() -> None:
+    rng = np.random.default_rng(4)
+    edges = rng.integers(0, 256, 500)
+    clip = find_censoring(np.concatenate((np.full(800, 255), edges)) * COUNT, COUNT)
+    assert clip.high / COUNT == pytest.approx(254.5)
+
+
+def test_a_bright_plate_below_saturation_is_not_clipped() -> None:
+    rng = np.random.default_rng(3)
+    for count, full in ((COUNT, 200.0), (1.0 / 65535.0, 3600.0)):
+        levels = np.rint(rng.normal(full, 0.02 * full, 2000)) * count
+        clip = find_censoring(levels, count)
+        assert not clip.at_high.any()
+        assert clip.high > levels.max()

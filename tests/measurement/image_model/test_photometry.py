@@ -1,0 +1,151 @@
+"""From white share to grey value: every row of the Jacobian, and the known curve."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kgcp.geometry.camera import Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Imager, Light, Param, srgb_encoded
+from kgcp.measurement.image_model.sharpening import unsharp_mask
+
+WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
+STEP = 1e-6
+LIGHT = Light(0.06, 0.8, 0.04, -0.03, tone_1=0.35, tone_2=-0.2, sharpening=0.5)
+LINEAR = replace(LIGHT, tone_1=0.0, tone_2=0.0, sharpening=0.0)
+CASES = [
+    (Response.LINEAR, 0.0, LINEAR),
+    (Response.SRGB, 0.0, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
+    (Response.SRGB, SHARPENING_PX, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
+    (Response.UNKNOWN, 0.0, LIGHT),
+    (Response.UNKNOWN, SHARPENING_PX, LIGHT),
+]
+
+
+def make_imager(response: Response, sharpening_px: float) -> Imager:
+    """Two pixels of three are modelled; the others are ink or plate."""
+    rng = np.random.default_rng(8)
+    index = np.sort(rng.permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT * 2 // 3])
+    offsets = np.stack((index % WIDTH / WIDTH - 0.5, index // WIDTH / HEIGHT - 0.5))
+    if sharpening_px == 0.0:
+        return Imager(offsets, response, None)
+    plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
+    mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, sharpening_px)
+    return Imager(offsets, response, mask)
+
+
+def make_share(imager: Imager) -> WhiteShare:
+    rng = np.random.default_rng(9)
+    count = int(imager.offsets.shape[1])
+    return WhiteShare(np.zeros((2, count)), rng.random(count), rng.normal(size=(11, count)))
+
+
+@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+def test_levels_are_the_same_with_and_without_derivatives(
+    response: Response, sharpening_px: float, light: Light
+) -> None:
+    imager = make_imager(response, sharpening_px)
+    share = make_share(imager)
+    levels, jacobian = imager.linearised(share, light)
+    np.testing.assert_allclose(levels, imager.levels(share.value, light), atol=1e-14)
+    assert jacobian.shape == (PARAM_COUNT, len(levels))
+
+
+@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+def test_geometric_rows_of_the_jacobian_are_derivatives(
+    response: Response, sharpening_px: float, light: Light
+) -> None:
+    imager = make_imager(response, sharpening_px)
+    share = make_share(imager)
+    _, jacobian = imager.linearised(share, light)
+    for row in range(11):
+        high, low = (
+            imager.levels(share.value + sign * STEP * share.jacobian[row], light)
+            for sign in (1.0, -1.0)
+        )
+        expected = (high - low) / (2.0 * STEP)
+        np.testing.assert_allclose(jacobian[row], expected, atol=1e-7, err_msg=str(row))
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Light)])
+@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+def test_photometric_rows_of_the_jacobian_are_derivatives(
+    response: Response,
+    sharpening_px: float,
+    light: Light,
+    name: str,
+) -> None:
+    imager = make_imager(response, sharpening_px)
+    share = make_share(imager)
+    _, jacobian = imager.linearised(share, light)
+    # a gradient over a whole ring is flat over the mask: its rows leave sharpening out
+    seen = make_imager(response, 0.0) if name.startswith("slope") else imager
+    high, low = (
+        seen.levels(share.value, replace(light, **{name: getattr(light, name) + sign * STEP}))
+        for sign in (1.0, -1.0)
+    )
+    expected = (high - low) / (2.0 * STEP)
+    if name.startswith("tone") and response is not Response.UNKNOWN:
+        expected = np.zeros_like(high)  # the curve is known: none to be estimated
+    np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("modelled", [0.05, 0.5, 1.0])
+def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> None:
+    """The same as OpenCV's blur of the plain image, in which other pixels are ink or plate."""
+    rng = np.random.default_rng(1)
+    index = np.flatnonzero(rng.random(WIDTH * HEIGHT) < modelled)
+    share = rng.random(len(index))
+    plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
+    even = np.zeros((2, len(index)))
+    plain = np.where(plateau > 0.5, LIGHT.white, LIGHT.black)
+    plain[index] = Imager(even, Response.UNKNOWN, None).levels(share, LIGHT)
+    smooth = cv2.GaussianBlur(
+        plain.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
+    ).ravel()
+    mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
+    sharp = Imager(even, Response.UNKNOWN, mask).levels(share, LIGHT)
+    expected = (plain + LIGHT.sharpening * (plain - smooth))[index]
+    np.testing.assert_allclose(sharp, expected, atol=1e-12)
+
+
+def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
+    imager = make_imager(Response.UNKNOWN, 0.0)
+    count = imager.offsets.shape[1]
+    even = replace(LIGHT, slope_x=0.0, slope_y=0.0)
+    np.testing.assert_allclose(imager.levels(np.zeros(count), even), even.black)
+    np.testing.assert_allclose(imager.levels(np.ones(count), even), even.white)
+
+
+@given(st.floats(0.0, 1.0))
+def test_srgb_decodes_to_the_light_it_encodes(light: float) -> None:
+    grey = float(srgb_encoded(np.array([light]))[0])
+    back = grey / 12.92 if grey <= 0.04045 else ((grey + 0.055) / 1.055) ** 2.4
+    assert back == pytest.approx(light, abs=2e-7)  # the standard's two branches meet to 1e-7
+
+
+def test_steps_add_to_every_parameter_in_order() -> None:
+    start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
+    of_light = np.linspace(-0.02, 0.02, len(fields(Light)))
+    step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light])
+    moved = start.moved(step)
+    np.testing.assert_allclose(moved.vector, start.vector + step)
+
+
+def test_a_step_never_leaves_a_blur_that_cannot_be() -> None:
+    start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
+    for mean, difference, xy in ((-3.0, 0.0, 0.0), (0.0, 2.0, 1.0), (-0.3, -5.0, 3.0)):
+        step = np.zeros(PARAM_COUNT)
+        step[Param.BLUR_MEAN : Param.STREAK_X] = mean, difference, xy
+        blur = start.moved(step).blur
+        assert np.linalg.eigvalsh([[blur.xx, blur.xy], [blur.xy, blur.yy]])[0] > 0.0
+        assert 0.5 * (blur.xx + blur.yy) > 1.0 / 13.5, "a pixel alone spreads by 1/12"

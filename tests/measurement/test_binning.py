@@ -1,0 +1,147 @@
+"""Rings so large that means over squares of pixels are measured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pixel_grid import normalised_grid
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.fit_target import imaging_of
+from kgcp.measurement.adjustment.residual_image import residuals_of
+from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.image_model.plate import circles_of
+from kgcp.measurement.image_model.window import contour_px, cut_window
+from kgcp.measurement.records import Observation
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Sensor, ToneCurve
+
+CAMERA = Camera(753, 610, 1206.0, 1202.0, 381.3, 296.8, k1=-0.072, k2=0.055, p1=0.0004, p2=-0.0003)
+RADIUS_M = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
+SENSORS = {
+    Response.LINEAR: Sensor(),
+    Response.SRGB: Sensor(tone=ToneCurve.SRGB),
+    Response.UNKNOWN: Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1),
+}
+TURN = Rotation.from_euler("z", 71.0, degrees=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    camera: Camera
+    pose: Pose
+    psf_px: float
+    grey: GreyArray
+
+    def measured(self) -> Observation:
+        settings = DetectSettings()
+        outcome = measure_frame(self.grey, self.camera, (TARGET_PLATE.target,), settings)[0]
+        assert isinstance(outcome, Observation)
+        return outcome
+
+
+def shoot(response: Response, gain: float, rng: np.random.Generator) -> Shot:
+    camera = replace(CAMERA, response=response)
+    radius_px, psf_px = rng.uniform(160.0, 215.0), rng.uniform(0.6, 1.1)
+    centre_px = np.array([376.0, 304.0]) + rng.uniform(-20.0, 20.0, 2)
+    tilt, way = np.radians(rng.uniform(4.0, 20.0)), rng.uniform(0.0, 2.0 * np.pi)
+    rotation = Rotation.from_rotvec(tilt * np.array([math.cos(way), math.sin(way), 0.0])) * TURN
+    ray = np.append(camera.undistort(centre_px), 1.0)
+    pose = Pose(rotation.as_matrix(), ray * RADIUS_M * camera.mean_focal_px / radius_px)
+    light = irradiance(camera, pose, math.hypot(psf_px, 12**-0.5))
+    return Shot(camera, pose, psf_px, SENSORS[response].expose(light, gain, rng))
+
+
+def irradiance(camera: Camera, pose: Pose, spread_px: float) -> FloatArray:
+    """Blur every edge across itself: exact where straight, and to 1e-4 px on these circles."""
+    columns, rows = np.arange(float(camera.width)), np.arange(float(camera.height))
+    rays = np.stack((*normalised_grid(camera, columns, rows), np.ones((len(rows), len(columns)))))
+    depth_m = (pose.normal @ pose.translation_m) / np.tensordot(pose.normal, rays, 1)
+    off_m = rays * depth_m - pose.translation_m[:, None, None]
+    x, y = np.tensordot(pose.rotation[:, :2].T, off_m, 1)
+    steps = np.stack((np.gradient(x), np.gradient(y)))  # plate axes by frame axes
+    circles = circles_of(TARGET_PLATE.target.rings)
+    share = np.ones_like(x)
+    for (a, b), radius_m, sign in zip(
+        circles.centres_m.T, circles.radii_m, circles.signs, strict=True
+    ):
+        near = np.hypot(x - a, y - b) < 1.1 * radius_m + 0.02
+        away = np.stack((x[near] - a, y[near] - b))
+        rho_m = np.hypot(*away) + 1e-12
+        across = np.hypot(*(away[:, None] / rho_m * steps[:, :, near]).sum(axis=0))
+        spread_m = spread_px * across
+        share[near] += sign * ndtr((radius_m - rho_m) / spread_m - 0.5 * spread_m / radius_m)
+    is_plate = np.maximum(np.abs(x), np.abs(y)) < 0.61
+    return np.where(is_plate, 0.05 + 0.83 * np.clip(share, 0.0, 1.0), 0.25)
+
+
+def standardised(shot: Shot) -> FloatArray:
+    found = shot.measured()
+    assert found.uncertainty is not None
+    off_m = found.pose.distance_m - shot.pose.distance_m
+    off_px = found.centre_px - shot.camera.project(shot.pose.translation_m[None])[0]
+    sd_px = np.sqrt(np.diag(found.uncertainty.centre_cov_px2))
+    assert abs(off_m) < 5e-5 * shot.pose.distance_m
+    assert found.appearance.blur_px == pytest.approx(math.hypot(shot.psf_px, 12**-0.5), rel=0.25)
+    return np.append(off_px / sd_px, off_m / found.uncertainty.sd_distance_m)
+
+
+@pytest.mark.parametrize(
+    ("response", "gain"),
+    [(Response.LINEAR, 0.9), (Response.LINEAR, 1.4), (Response.SRGB, 0.8), (Response.UNKNOWN, 0.9)],
+)
+def test_errors_of_large_rings_are_those_that_are_reported(response: Response, gain: float) -> None:
+    rng = np.random.default_rng(5)
+    errors = np.array([standardised(shoot(response, gain, rng)) for _ in range(6)])
+    assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.6  # 18 values
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_bins_have_a_camera_of_their_own(count: int) -> None:
+    points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.15, 1.1]])
+    seen, bins = CAMERA.project(points), CAMERA.binned(count).project(points)
+    np.testing.assert_allclose(count * bins + 0.5 * (count - 1), seen, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("count", [2, 3])
+def test_bins_are_means_and_know_which_share_is_clipped(count: int, dtype: type) -> None:
+    full = np.iinfo(dtype).max
+    frame = np.random.default_rng(4).integers(0, full, (610, 753), dtype)
+    frame[frame > 0.7 * full] = full
+    camera = CAMERA.binned(count)
+    pose = Pose(np.eye(3), np.array([0.02, -0.01, 2.5]))
+    window = cut_window(frame, camera, contour_px(camera, pose, RADIUS_M), 12.0, count)
+    rows = slice(count * window.y0, count * (window.y0 + window.height))
+    columns = slice(count * window.x0, count * (window.x0 + window.width))
+    part = frame[rows, columns]
+    clipped = (part == full) | (part == 0)
+    assert window.clipped is not None
+    for values, bins in ((part / full, window.levels), (clipped, window.clipped)):
+        shape = (window.height, count, window.width, count)
+        expected = values.reshape(shape).mean(axis=(1, 3))
+        np.testing.assert_allclose(bins.reshape(expected.shape), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        camera.distort(window.rays[:2, :3].T),
+        [[window.x0 + i, window.y0] for i in range(3)],
+        atol=1e-5,
+    )
+
+
+def test_residuals_of_bins_lie_where_their_pixels_are() -> None:
+    shot = shoot(Response.LINEAR, 0.9, np.random.default_rng(2))
+    assert imaging_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose).window.binning == 2
+    left = residuals_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
+    rows, columns = np.nonzero(np.isfinite(left.share))
+    centre = np.array([left.x0 + columns.mean(), left.y0 + rows.mean()])
+    seen = shot.camera.project(shot.pose.translation_m[None])[0]
+    np.testing.assert_allclose(centre, seen, atol=0.02 * np.ptp(columns))
+    assert np.nanmedian(np.abs(left.share)) < 0.01

@@ -1,0 +1,164 @@
+"""The prior on the plate's normal: which of two poses, and never another value."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.normal_prior import NormalPrior, normal_priors
+from kgcp.measurement.records import Alternative, Observation
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import image_plate
+from kgcp.targets.layout import Target
+
+CAMERA = Camera(1600, 1200, 2306.0, 2302.0, 792.6, 603.9, response=Response.LINEAR)
+DOWN = np.array([0.0, 0.0, 1.0])
+SD_DEG = 1.5
+PRIOR = NormalPrior(DOWN, SD_DEG)
+FRAMES = 12
+SENSOR = Sensor(full_well_e=2000.0, read_noise_e=20.0)
+
+
+def far_pose(rng: np.random.Generator) -> Pose:
+    """A plate that lies level but for SD_DEG, 120 m away and off the axis: R = 9 px."""
+    ray = np.array([*rng.choice((-1.0, 1.0), 2) * rng.uniform((0.06, 0.06), (0.2, 0.2)), 1.0])
+    tilt = Rotation.from_rotvec(np.radians([*rng.normal(0.0, SD_DEG, 2), 0.0]))
+    turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
+    return Pose((tilt * turn).as_matrix(), ray * 120.0 / float(np.linalg.norm(ray)))
+
+
+def photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
+    irradiance = np.full((CAMERA.height, CAMERA.width), 0.2)
+    image_plate(CAMERA, TARGET_PLATE, pose, Optics(1.0)).paste(irradiance)
+    return SENSOR.expose(irradiance, 0.9, rng)
+
+
+def measure(
+    grey: GreyArray, prior: NormalPrior | None, target: Target = TARGET_PLATE.target
+) -> Observation:
+    (outcome,) = measure_frame(grey, CAMERA, (target,), DetectSettings(), prior)
+    assert isinstance(outcome, Observation)
+    return outcome
+
+
+@cache
+def frame(number: int) -> tuple[Pose, GreyArray, Observation]:
+    """The truth, the image and what the image alone says."""
+    rng = np.random.default_rng(number)
+    pose = far_pose(rng)
+    grey = photograph(pose, rng)
+    return pose, grey, measure(grey, None)
+
+
+def angle_deg(one: Pose, other: Pose) -> float:
+    return math.degrees(math.acos(min(1.0, float(one.normal @ other.normal))))
+
+
+def other_pose(seen: Observation) -> Alternative:
+    assert seen.alternative is not None
+    return seen.alternative
+
+
+def is_right(seen: Observation, truth: Pose) -> bool:
+    return angle_deg(seen.pose, truth) < angle_deg(other_pose(seen).pose, truth)
+
+
+def test_the_prior_finds_the_right_side_where_the_image_cannot() -> None:
+    by_image = [other_pose(frame(i)[2]).ambiguity for i in range(FRAMES)]
+    assert np.median(by_image) < 4.0, "the image alone is not sure"
+    corrected = [measure(frame(i)[1], PRIOR) for i in range(FRAMES)]
+    assert all(is_right(seen, frame(i)[0]) for i, seen in enumerate(corrected))
+    assert min(other_pose(seen).ambiguity for seen in corrected) > 10.0
+
+
+def test_a_turned_choice_exchanges_the_poses_and_nothing_else() -> None:
+    for number in range(5):
+        _, grey, before = frame(number)
+        after = measure(grey, NormalPrior(other_pose(before).pose.normal, SD_DEG))
+        assert angle_deg(after.pose, other_pose(before).pose) < 1.0
+        assert angle_deg(other_pose(after).pose, before.pose) < 1.0
+        assert before.uncertainty is not None
+        assert abs(after.pose.distance_m - before.pose.distance_m) < (
+            2.0 * before.uncertainty.sd_distance_m
+        )
+        assert other_pose(after).ambiguity >= 0.0
+
+
+def test_a_confirmed_choice_keeps_every_value() -> None:
+    _, grey, before = frame(0)
+    after = measure(grey, NormalPrior(before.pose.normal, SD_DEG))
+    assert np.array_equal(after.pose.rotation, before.pose.rotation)
+    assert np.array_equal(after.pose.translation_m, before.pose.translation_m)
+    assert other_pose(after).ambiguity > other_pose(before).ambiguity
+
+
+def test_a_confirmed_choice_is_surer_by_what_the_other_pose_added() -> None:
+    """The chance that it is the right one, times the square of how far it is off."""
+    _, grey, before = frame(0)
+    after = measure(grey, NormalPrior(before.pose.normal, SD_DEG))
+    assert before.uncertainty is not None
+    assert after.uncertainty is not None
+    often, hardly = (expit(-0.5 * other_pose(seen).ambiguity) for seen in (before, after))
+    assert hardly < 0.01
+    assert often > 0.05
+    off_m = other_pose(before).pose.translation_m - before.pose.translation_m
+    less = (before.uncertainty.pose_cov - after.uncertainty.pose_cov)[:3, :3]
+    expected = (often - hardly) * np.outer(off_m, off_m)
+    np.testing.assert_allclose(less, expected, rtol=0.0, atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_vague_prior_says_nothing() -> None:
+    _, grey, before = frame(0)
+    after = measure(grey, NormalPrior(DOWN, 5000.0))
+    assert np.array_equal(after.pose.rotation, before.pose.rotation)
+    assert other_pose(after).ambiguity == pytest.approx(other_pose(before).ambiguity, abs=1e-3)
+
+
+def test_a_target_that_stands_still_is_not_taken_for_level() -> None:
+    _, grey, before = frame(0)
+    turning = NormalPrior(other_pose(before).pose.normal, SD_DEG)
+    static = Target(TARGET_PLATE.target.ring, TARGET_PLATE.target.replicas, (0.0, 0.0, 0.0))
+    assert np.array_equal(measure(grey, turning, static).pose.rotation, before.pose.rotation)
+
+
+def test_chi2_counts_prior_and_measurement() -> None:
+    pose = Pose(Rotation.from_euler("x", 3.0, degrees=True).as_matrix(), 10.0 * DOWN)
+    exact = np.zeros((3, 3))
+    assert NormalPrior(DOWN, 1.5).chi2(pose, exact) == pytest.approx(4.0)
+    noisy = math.radians(2.0) ** 2 * np.eye(3)
+    assert NormalPrior(DOWN, 1.5).chi2(pose, noisy) == pytest.approx(9.0 / (1.5**2 + 2.0**2))
+    about_z = np.diag([0.0, 0.0, 1.0])  # a heading that is not known does not excuse a tilt
+    upright = Pose(np.eye(3), 10.0 * DOWN)
+    assert NormalPrior(pose.normal, 1.5).chi2(upright, about_z) == pytest.approx(4.0)
+    assert NormalPrior(pose.normal, 1.5).chi2(pose, noisy) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_attitudes_come_from_poses_and_else_from_the_plumb() -> None:
+    opk_deg = np.array([[4.0, -7.0, 130.0], [-20.0, 10.0, 3.0]])
+    poses = ReferencePoses(("a", "b"), np.zeros((2, 3)), opk_deg, None, np.array([0.5, 1.2]))
+    a, c, b = normal_priors(["a", "c", "b"], poses, level_sd_deg=0.9, plumb_sd_deg=4.0)
+    assert a is not None
+    assert b is not None
+    assert c is not None
+    assert b.sd_deg == pytest.approx(1.5)
+    assert c.sd_deg == pytest.approx(4.1)
+    assert np.array_equal(c.direction_camera, DOWN)
+    camera_from_map = CAMERA_FROM_PHOTO @ rotation_from_opk(opk_deg[0]).T
+    assert np.allclose(a.direction_camera, camera_from_map @ -DOWN)
+    assert normal_priors(["c"], poses, level_sd_deg=0.9, plumb_sd_deg=None) == [None]
+    unsure = ReferencePoses(("a",), np.zeros((1, 3)), opk_deg[:1], None, None)
+    (exact,) = normal_priors(["a"], unsure, level_sd_deg=0.9, plumb_sd_deg=None)
+    assert exact is not None
+    assert exact.sd_deg == 0.9

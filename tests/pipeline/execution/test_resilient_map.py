@@ -1,0 +1,173 @@
+"""What dies, hangs or raises among the items of a pool, and what becomes of the others."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import closing
+from functools import partial
+from itertools import count, islice
+from pathlib import Path
+
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.pipeline.execution.local_processes import LocalPool
+from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map
+
+DEADLY, UNLUCKY, SLOW = 3, 5, 7
+LIMIT_S = 1.5
+
+
+def work(folder: Path, item: int) -> int:
+    """Square a number; of some, the process dies, always or once, or hangs."""
+    if item == DEADLY:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item == UNLUCKY and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item == SLOW:
+        time.sleep(60.0)
+    return item * item
+
+
+def wait_forever(folder: Path, item: int) -> int:
+    (folder / f"{os.getpid()}.{item}").touch()
+    time.sleep(300.0)
+    return item
+
+
+def fail(item: int) -> int:
+    raise LookupError(str(item))
+
+
+def pool(jobs: int) -> Executor:
+    return LocalPool(jobs, LIMIT_S)
+
+
+def long_pool(jobs: int) -> Executor:
+    return LocalPool(jobs, 300.0)
+
+
+def broken_pool(jobs: int) -> Executor:
+    """A pool whose processes do not live to see their first item."""
+    executor = LocalPool(jobs, LIMIT_S)
+    executor._initializer = os._exit
+    executor._initargs = (1,)
+    return executor
+
+
+def test_what_kills_its_process_is_lost_and_nothing_else(tmp_path: Path) -> None:
+    results = dict(
+        careful_map(*(partial(work, tmp_path), range(9)), start=pool, jobs=2, limit_s=LIMIT_S)
+    )
+    lost = {DEADLY: Loss.DIED, SLOW: Loss.LATE}
+    assert results == {item: lost.get(item, item * item) for item in range(9)}
+    assert (tmp_path / "died").exists(), "died once, and was tried again"
+
+
+def test_few_items_are_taken_before_their_time() -> None:
+    taken = 0
+
+    def numbers() -> Iterator[int]:
+        nonlocal taken
+        for taken in count(1):  # noqa: UP028 - it is to be seen
+            yield taken
+
+    for jobs, ahead in ((0, 1), (2, 5)):
+        taken = 0
+        start = pool if jobs else lambda _: Inline()
+        mapped = careful_map(abs, numbers(), start=start, jobs=jobs, limit_s=LIMIT_S)
+        with closing(mapped) as results:
+            for done, _ in enumerate(islice(results, 30), start=1):
+                assert taken <= done + ahead
+
+
+def test_what_an_item_raises_arrives() -> None:
+    for jobs, start in ((0, lambda _: Inline()), (1, pool)):
+        with pytest.raises(LookupError, match="4"):
+            list(careful_map(fail, (4,), start=start, jobs=jobs, limit_s=LIMIT_S))
+
+
+@pytest.mark.usefixtures("sigint_raises")
+def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
+    steps: list[str] = []
+
+    def stop(item: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        steps.append(f"{item} ended")
+
+    inline = careful_map(stop, (1, 2), start=lambda _: Inline(), jobs=0, limit_s=LIMIT_S)
+    with pytest.raises(KeyboardInterrupt):
+        list(inline)
+    assert steps == ["1 ended"]
+
+
+def test_processes_that_cannot_start_are_a_line() -> None:
+    with pytest.raises(KgcpError, match="end as soon as they are started; free memory"):
+        list(careful_map(abs, (1, 2), start=broken_pool, jobs=1, limit_s=LIMIT_S))
+
+
+def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
+    start_s = time.monotonic()
+
+    def stop() -> Iterator[int]:
+        yield 0
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(
+            careful_map(
+                *(partial(wait_forever, tmp_path), stop()), start=long_pool, jobs=1, limit_s=300.0
+            )
+        )
+    assert time.monotonic() - start_s < 60.0
+    wait_until_gone(workers_in(tmp_path))
+
+
+def workers_in(folder: Path) -> list[int]:
+    return [int(path.name.partition(".")[0]) for path in folder.iterdir()]
+
+
+def wait_until_gone(pids: list[int]) -> None:
+    assert pids
+    until = time.monotonic() + 30.0
+    while any(Path(f"/proc/{pid}/cmdline").exists() and is_alive(pid) for pid in pids):
+        assert time.monotonic() < until, "a worker has outlived its parent"
+        time.sleep(0.05)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes() != b""  # that of a zombie is empty
+    except OSError:
+        return False
+
+
+def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
+    program = (
+        "from functools import partial; from pathlib import Path; import sys\n"
+        "sys.path.insert(0, sys.argv[2])\n"
+        "from test_resilient_map import long_pool, wait_forever\n"
+        "from kgcp.pipeline.execution.resilient_map import careful_map\n"
+        "if __name__ == '__main__':\n"
+        "    work = partial(wait_forever, Path(sys.argv[1]))\n"
+        "    list(careful_map(work, (1, 2), start=long_pool, jobs=2, limit_s=300.0))\n"
+    )
+    script, marks = tmp_path / "parent.py", tmp_path / "marks"
+    marks.mkdir()
+    script.write_text(program, encoding="utf-8")
+    command = [sys.executable, str(script), str(marks), str(Path(__file__).parent)]
+    with subprocess.Popen(command) as parent:
+        while len(list(marks.iterdir())) < 2:
+            assert parent.poll() is None
+            time.sleep(0.05)
+        parent.kill()
+    wait_until_gone(workers_in(marks))

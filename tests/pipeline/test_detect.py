@@ -1,0 +1,236 @@
+"""From flight.toml to the table: what is known beforehand, and what all frames have in common."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.flight.flight import read_flight
+from kgcp.io.tables.columns import DETECTION_COLUMNS
+from kgcp.io.tables.parquet import read_table
+from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.frame_task import Debug
+from kgcp.pipeline.run_summary import SurveySummary
+from kgcp.pipeline.simulate import write_simulated_flight
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import plan_flight
+from kgcp.simulation.imaging import Sensor
+from kgcp.simulation.presets import preset
+
+LEVEL = ("sd_time_s = ", "level_sd_deg = 2.0\nsd_time_s = ")
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Far and noisy, from a tilted camera: the image cannot tell the two poses apart."""
+    settings = replace(
+        preset("far"),
+        sensor=Sensor(full_well_e=2000.0, read_noise_e=20.0),
+        frames=FRAMES,
+        distance_m=(105.0, 130.0),
+        tilt_deg=(12.0, 25.0),
+        absent_share=0.0,
+        decoy_share=0.0,
+    )
+    folder = tmp_path_factory.mktemp("survey") / "flight"
+    write_simulated_flight(plan_flight(settings, 5), folder, jobs=1, on_frame=lambda: None)
+    return folder
+
+
+def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> SurveySummary:
+    original = (folder / "flight.toml").read_text(encoding="utf-8")
+    text = original
+    for old, new in edits:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    (folder / "flight.toml").write_text(text, encoding="utf-8")
+    try:
+        return detect_flight(read_flight(folder), DetectSettings(), out, jobs=jobs)
+    finally:
+        (folder / "flight.toml").write_text(original, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """So far that the search passes over some of the rings; trajectory and reference are there."""
+    settings = replace(
+        preset("far"),
+        camera=replace(preset("far").camera, width=800, height=600, cx=404.2, cy=297.1),
+        frames=12,
+        distance_m=(100.0, 215.0),
+        absent_share=0.17,
+        decoy_share=0.0,
+    )
+    folder = tmp_path_factory.mktemp("tiny") / "flight"
+    write_simulated_flight(plan_flight(settings, 3), folder, jobs=1, on_frame=lambda: None)
+    return folder
+
+
+def measured(out: Path) -> pd.DataFrame:
+    table = read_table(out / "detections.parquet", DETECTION_COLUMNS)
+    return table[table["status"] == "measured"].set_index("frame")
+
+
+def is_right(rows: pd.DataFrame, folder: Path) -> pd.Series[bool]:
+    """Whether the reported normal is nearer to the true one than the other pose's."""
+    truth = pd.read_csv(folder / "truth.csv", index_col="frame").loc[rows.index]
+    true_normal = truth[["r02", "r12", "r22"]].to_numpy()
+    near, far = (
+        np.einsum("ni,ni->n", true_normal, normals(rows[columns].to_numpy()))
+        for columns in (["qw", "qx", "qy", "qz"], ["alt_qw", "alt_qx", "alt_qy", "alt_qz"])
+    )
+    return pd.Series(near > far, index=rows.index)
+
+
+def normals(quaternions: FloatArray) -> FloatArray:
+    w, x, y, z = quaternions.T
+    return np.column_stack(
+        (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    )
+
+
+def test_a_level_plate_and_reference_attitudes_find_the_right_side(
+    flight: Path, tmp_path: Path
+) -> None:
+    detect(flight, tmp_path / "plain")
+    summary = detect(flight, tmp_path / "level", LEVEL)
+    plain, level = measured(tmp_path / "plain"), measured(tmp_path / "level")
+    assert summary.frames_without_attitude == 0
+    assert len(plain) == len(level) >= FRAMES - 1
+    assert plain["ambiguity"].median() < 4.0, "the image alone is not sure"
+    assert level["ambiguity"].min() > 10.0
+    assert is_right(level, flight).all()
+    kept = is_right(plain, flight)
+    values = ["distance_m", "tx_m", "qw", "qx", "qy", "qz", "x_px"]
+    pd.testing.assert_frame_equal(plain.loc[kept, values], level.loc[kept, values])
+    surer = level.loc[kept, "sd_distance_m"] / plain.loc[kept, "sd_distance_m"]
+    assert surer.between(0.99, 1.0).all(), "the other pose is hardly elsewhere"
+
+
+def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_path: Path) -> None:
+    edits = (
+        LEVEL,
+        ('[[target]]\nname = "A"', '[[target]]\nsd_outer_diameter_m = 3e-4\nname = "A"'),
+    )
+    tables = []
+    for jobs in (0, 2):
+        detect(flight, tmp_path / str(jobs), *edits, jobs=jobs)
+        tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
+    assert tables[0] == tables[1]
+
+
+def test_a_second_look_finds_what_the_reference_promises(tiny: Path, tmp_path: Path) -> None:
+    flight = read_flight(tiny)
+    summaries = {
+        (is_guided, jobs): detect_flight(
+            flight,
+            DetectSettings(is_guided=is_guided),
+            tmp_path / f"{is_guided}{jobs}",
+            jobs=jobs,
+        )
+        for is_guided, jobs in ((False, 0), (True, 0), (True, 2))
+    }
+    first, second = (measured(tmp_path / name) for name in ("False0", "True0"))
+    assert not first["guided"].any()
+    assert summaries[True, 0].guided == second["guided"].sum() == len(second) - len(first) >= 2
+    truth = pd.read_csv(tiny / "truth.csv", index_col="frame")
+    assert set(second.index) == set(truth.index[truth["present"] == 1])
+    off_px = second[["x_px", "y_px"]].to_numpy() - truth.loc[second.index, ["x", "y"]].to_numpy()
+    assert np.abs(off_px).max() < 0.2
+    tables = [(tmp_path / name / "detections.parquet").read_bytes() for name in ("True0", "True2")]
+    assert tables[0] == tables[1]
+    rows = read_table(tmp_path / "True0" / "detections.parquet", DETECTION_COLUMNS)
+    details = rows.loc[rows["status"] != "measured", "detail"]
+    assert details.str.contains("expected by the reference at").all()
+
+
+def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path: Path) -> None:
+    late = ("[vehicle]\n", "[vehicle]\ntime_offset_s = 5000.0\n")
+    summary = detect(tiny, tmp_path / "out", late)
+    assert summary.guided == 0
+    assert summary.guide_problem is not None
+    assert "none of the" in summary.guide_problem
+    missing = ('poses = "reference.csv"', 'poses = "later.csv"')
+    assert detect(tiny, tmp_path / "out", missing).guide_problem is None
+
+
+def test_pictures_are_drawn_of_the_frames_asked_for(tiny: Path, tmp_path: Path) -> None:
+    debug = Debug(tmp_path / "debug", "frame_00[01]*")
+    detect_flight(
+        *(read_flight(tiny), DetectSettings(), tmp_path / "out"),
+        jobs=2,
+        debug=debug,
+    )
+    pictures = sorted(path.name for path in debug.folder.iterdir())
+    first = [f"frame_{index:04d}.png.jpg" for index in range(12)]
+    assert [name for name in pictures if "guided" not in name] == first
+    looked_again = [name for name in pictures if name.endswith(".guided.jpg")]
+    assert looked_again
+    assert len(looked_again) + len(first) == len(pictures)
+
+
+def test_without_reference_poses_the_camera_is_plumb_or_unknown(
+    flight: Path, tmp_path: Path
+) -> None:
+    no_poses = ('poses = "reference.csv"', 'poses = "later.csv"')
+    assert detect(flight, tmp_path / "a", LEVEL, no_poses).frames_without_attitude == FRAMES
+    plumb = ("[camera]\n", "[camera]\nplumb_sd_deg = 20.0\n")
+    assert detect(flight, tmp_path / "b", LEVEL, no_poses, plumb).frames_without_attitude == 0
+    with pytest.raises(KgcpError, match=r"plumb_sd_deg: stands without \[vehicle\] level_sd_deg;"):
+        detect(flight, tmp_path / "c", plumb)
+
+
+def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
+    plain_out, out = tmp_path / "plain", tmp_path / "common"
+    detect(flight, plain_out)
+    cov = 'cov_of = ["fx", "fy"]\ncov = [4.0, 4.0, 4.0, 4.0]\n'
+    detect(flight, out, ("[camera]\n", f"[camera]\n{cov}"))
+    plain, common = measured(plain_out), measured(out)
+    added = ["sd_common_distance_m", "sd_common_direction_mrad", "common_pose_cov"]
+    assert plain[added].isna().all(axis=None)
+    share = common["sd_common_distance_m"] / common["distance_m"]
+    assert np.allclose(share, 2.0 / 2306.0, rtol=0.1)
+    assert common["common_pose_cov"].map(len).eq(36).all()
+    pd.testing.assert_frame_equal(plain.drop(columns=added), common.drop(columns=added))
+
+
+def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    (folder / "frames" / "east").mkdir(parents=True)
+    shutil.copy(flight / "flight.toml", folder)
+    for name in ("frame_0000.png", "frame_0003.png"):
+        shutil.copy(flight / "frames" / name, folder / "frames")
+    shutil.copy(flight / "frames" / "frame_0002.png", folder / "frames" / "east")
+    content = (flight / "frames" / "frame_0001.png").read_bytes()
+    (folder / "frames" / "frame_0001.png").write_bytes(content[: len(content) // 3])
+    (folder / "frames.csv").write_text(
+        "frame,time\nframe_0001.png,2026-06-16T08:15:01Z\nfrom_another_flight.png,12.0\n",
+        encoding="utf-8",
+    )
+    tables = []
+    for jobs in (0, 2):
+        summary = detect(folder, tmp_path / str(jobs), jobs=jobs)
+        tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
+    assert tables[0] == tables[1]
+    table = read_table(tmp_path / "0" / "detections.parquet", DETECTION_COLUMNS)
+    names = ["east/frame_0002.png", "frame_0000.png", "frame_0001.png", "frame_0003.png"]
+    assert table["frame"].to_list() == names
+    assert table["status"].to_list() == ["measured", "measured", "unreadable", "measured"]
+    assert table["reason"].to_list() == ["", "", "decode_failed", ""]
+    assert table["time"].notna().all(), "from EXIF where the times file has none"
+    assert (summary.frames, summary.times_without_frame) == (4, 1)
+    assert summary.reasons == {"decode_failed": 1}
+    metadata = pq.read_schema(tmp_path / "0" / "detections.parquet").metadata
+    assert metadata[b"kgcp.flight_toml"] == (folder / "flight.toml").read_bytes()
+    settings = json.loads(metadata[b"kgcp.settings"])
+    assert settings == asdict(DetectSettings())

@@ -1,0 +1,95 @@
+"""One frame, looked at once and again: what becomes of each target's row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.io.tables.detections import FrameResult
+from kgcp.measurement.guided import Expectation
+from kgcp.measurement.records import Miss, Observation
+from kgcp.pipeline.frame_task import (
+    FrameNote,
+    FrameTask,
+    SecondLook,
+    examine_frame,
+    examine_frame_again,
+)
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import image_plate
+from kgcp.targets.layout import Ring, Target
+
+CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
+A = Target(replace(TARGET_PLATE.target.ring, sd_outer_diameter_m=1e-3))
+B = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 60.0, 150.0, 240.0)))
+POSE = Pose(np.eye(3), np.array([0.5, -0.4, 30.0]))
+NOTE = FrameNote("a.png", 12.0, None)
+STRICT = DetectSettings(min_score=1.0)  # more than any ring in a frame has
+EXPECTED = Expectation(CAMERA.project(POSE.translation_m), 1.0, 13.5, 0.03, "a test")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("examine")
+    irradiance = np.full((CAMERA.height, CAMERA.width), 0.3)
+    image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7)).paste(irradiance)
+    decoy = Pose(np.eye(3), np.array([-3.0, 2.0, 30.0]))
+    image_plate(CAMERA, DECOY_PLATE, decoy, Optics(0.7)).paste(irradiance)
+    assert cv2.imwrite(
+        str(path / "a.png"), Sensor().expose(irradiance, 0.9, np.random.default_rng(1))
+    )
+    return path
+
+
+def look_twice(
+    folder: Path, expected: dict[str, Expectation], settings: DetectSettings = STRICT
+) -> tuple[FrameResult, FrameResult]:
+    task = FrameTask(folder, CAMERA, None, (A, B), settings)
+    first = examine_frame(task, NOTE)
+    return first, examine_frame_again(task, SecondLook(NOTE, first, expected))
+
+
+def test_what_is_found_again_explains_no_other_s_miss(folder: Path) -> None:
+    first, second = look_twice(folder, {"A": EXPECTED})
+    assert all(isinstance(one, Miss) and one.candidates == 2 for one in first.outcomes)
+    found, missed = second.outcomes
+    assert isinstance(found, Observation)
+    assert found.is_guided
+    assert found.common is not None
+    assert isinstance(missed, Miss)
+    assert missed.target == "B"
+    assert missed.candidates == 1, "the decoy's ring, not that of A"
+    assert replace(second, outcomes=first.outcomes) == first
+
+
+def test_a_miss_is_explained_by_the_ring_at_the_expected_place(folder: Path) -> None:
+    _, second = look_twice(folder, {"B": EXPECTED})
+    _, missed = second.outcomes
+    assert isinstance(missed, Miss)
+    assert missed.reason is Reason.OTHER_CODE
+    x, y = EXPECTED.centre_px
+    assert missed.detail.startswith(f"ring at ({x:.0f}, {y:.0f}), radius 13.")
+
+
+def test_where_nothing_is_the_first_reason_stays(folder: Path) -> None:
+    away = replace(EXPECTED, centre_px=np.array([400.0, 60.0]))
+    first, second = look_twice(folder, {"A": away, "B": away})
+    assert second.outcomes == first.outcomes
+
+
+def test_a_measured_target_is_left_as_it_is(folder: Path) -> None:
+    first, second = look_twice(folder, {"B": EXPECTED}, DetectSettings())
+    assert isinstance(first.outcomes[0], Observation)
+    assert second.outcomes[0] is first.outcomes[0]
+    missed = second.outcomes[1]
+    assert isinstance(missed, Miss)
+    assert missed == first.outcomes[1], "the plate of A is not looked at for B"

@@ -1,0 +1,352 @@
+"""Runs that are stopped, disturbed or started twice end with the table of one that was not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.io.flight.flight import read_flight
+from kgcp.io.tables.columns import DETECTION_COLUMNS
+from kgcp.io.tables.detections import FrameResult
+from kgcp.io.tables.parquet import read_table
+from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.execution.resilient_map import Loss
+from kgcp.pipeline.frame_task import (
+    Debug,
+    FrameNote,
+    FrameTask,
+    SecondLook,
+    examine_frame,
+    examine_frame_again,
+)
+from kgcp.pipeline.run_summary import SurveySummary
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import image_plate
+
+CAMERA = Camera(320, 240, 900.0, 904.0, 156.3, 124.2)
+FRAMES, EMPTY = 9, (3, 6)
+FLIGHT = """\
+[camera]
+width = 320
+height = 240
+fx = 900.0
+fy = 904.0
+cx = 156.3
+cy = 124.2
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+class Stop:
+    """A watcher who presses Ctrl-C after some looks, and remembers what was said."""
+
+    def __init__(self, after: int = 1000) -> None:
+        self.after = after
+        self.notes: list[str] = []
+        self.done = self.total = self.found = 0
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def progress(self, done: int, total: int, found: int) -> None:
+        self.done, self.total, self.found = done, total, found
+        if done >= self.after:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def master(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A smooth passage, in two frames of which the target is hidden: they get a second look."""
+    folder = tmp_path_factory.mktemp("master")
+    (folder / "frames").mkdir()
+    rng = np.random.default_rng(4)
+    times = ["frame,time"]
+    for number in range(FRAMES):
+        irradiance = np.full((CAMERA.height, CAMERA.width), 0.3)
+        if number not in EMPTY:
+            pose = Pose(np.eye(3), np.array([-1.6 + 0.4 * number, -0.5, 27.0 + 0.3 * number]))
+            image_plate(CAMERA, TARGET_PLATE, pose, Optics(0.7)).paste(irradiance)
+        grey = Sensor().expose(irradiance, 0.9, rng)
+        assert cv2.imwrite(str(folder / "frames" / f"f_{number}.png"), grey)
+        times.append(f"f_{number}.png,2026-06-16T08:15:{number:02d}Z")
+    (folder / "frames.csv").write_text("\n".join(times), encoding="utf-8")
+    (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def flight(master: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(master, tmp_path / "flight")
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Count what is looked at, and how often."""
+    counter: Counter[str] = Counter()
+
+    def counted(task: FrameTask, note: FrameNote) -> FrameResult:
+        counter[note.frame] += 1
+        return examine_frame(task, note)
+
+    def counted_again(task: FrameTask, look: SecondLook) -> FrameResult:
+        counter[f"{look.note.frame} again"] += 1
+        return examine_frame_again(task, look)
+
+    monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame", counted)
+    monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame_again", counted_again)
+    return counter
+
+
+def detect(
+    folder: Path,
+    watcher: Stop | None = None,
+    *,
+    debug: Debug | None = None,
+    is_restart: bool = False,
+    min_radius_px: float = 6.0,
+) -> SurveySummary:
+    return detect_flight(
+        *(read_flight(folder), DetectSettings(min_radius_px=min_radius_px), folder / "kgcp"),
+        jobs=0,
+        watcher=watcher,
+        debug=debug,
+        is_restart=is_restart,
+    )
+
+
+def table(folder: Path) -> bytes:
+    return (folder / "kgcp" / "detections.parquet").read_bytes()
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "kgcp").iterdir())
+
+
+def stop(folder: Path, after: int) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        detect(folder, Stop(after))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(master: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    folder = shutil.copytree(master, tmp_path_factory.mktemp("undisturbed") / "flight")
+    detect(folder)
+    return table(folder)
+
+
+def test_a_run_stopped_after_every_look_does_nothing_twice(
+    flight: Path, undisturbed: bytes, looks: Counter[str]
+) -> None:
+    after, total = 1, FRAMES
+    while after <= total:
+        watcher = Stop(after)
+        with pytest.raises(KeyboardInterrupt):
+            detect(flight, watcher)
+        after, total = after + 1, watcher.total
+        assert files(flight) == [".detections.journal"]
+    watcher = Stop()
+    summary = detect(flight, watcher)
+    assert set(looks.values()) == {1}
+    assert looks.keys() >= {
+        *(f"f_{number}.png" for number in range(FRAMES)),
+        *(f"f_{number}.png again" for number in EMPTY),
+    }
+    assert table(flight) == undisturbed
+    assert files(flight) == ["detections.parquet", "run.json"]
+    assert summary.kept == FRAMES
+    rows = read_table(flight / "kgcp" / "detections.parquet", DETECTION_COLUMNS)
+    assert watcher.done == watcher.total
+    assert watcher.found == (rows["status"] == "measured").sum() > FRAMES // 2
+    (note,) = watcher.notes
+    assert note == (
+        f"going on with an interrupted run: {FRAMES} of {FRAMES} frames are done,"
+        " 0 have changed since (--restart ignores it)"
+    )
+
+
+def test_a_finished_run_leaves_nothing_to_go_on_with(flight: Path, looks: Counter[str]) -> None:
+    watchers = [Stop(), Stop()]
+    for watcher in watchers:
+        detect(flight, watcher)
+    assert looks["f_0.png"] == 2
+    assert not watchers[1].notes
+
+
+def test_restart_forgets(flight: Path, undisturbed: bytes, looks: Counter[str]) -> None:
+    stop(flight, FRAMES)
+    watcher = Stop()
+    detect(flight, watcher, is_restart=True)
+    assert looks["f_0.png"] == 2
+    assert not watcher.notes
+    assert table(flight) == undisturbed
+
+
+def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
+    stop(flight, FRAMES + 1)
+    frames = flight / "frames"
+    shutil.copyfile(frames / "f_8.png", frames / "f_1.png")  # another size, most likely
+    os.utime(frames / "f_2.png", ns=(1, 1))
+    shutil.copyfile(frames / "f_4.png", frames / "g_0.png")  # a new one
+    (frames / "f_5.png").unlink()
+    text = (flight / "frames.csv").read_text(encoding="utf-8")
+    (flight / "frames.csv").write_text(text.replace("08:15:07", "08:15:07.1"), encoding="utf-8")
+    for after in (FRAMES - 2, 1000):
+        watcher = Stop(after)
+        if after < 1000:
+            with pytest.raises(KeyboardInterrupt):
+                detect(flight, watcher)
+            assert watcher.notes[0].startswith(
+                f"going on with an interrupted run: 5 of {FRAMES} frames are done, 3 have changed"
+            )
+        else:
+            detect(flight, watcher)
+            assert watcher.notes[0].startswith(
+                f"going on with an interrupted run: 7 of {FRAMES} frames are done, 1 have changed"
+            )
+    twice = {"f_1.png", "f_2.png", "f_7.png"}
+    first = {frame: times for frame, times in looks.items() if "again" not in frame}
+    assert first == {
+        **{f"f_{number}.png": 1 for number in range(FRAMES)},
+        **dict.fromkeys(twice, 2),
+        "g_0.png": 1,
+    }
+    resumed = table(flight)
+    detect(flight, is_restart=True)
+    assert table(flight) == resumed
+
+
+@pytest.mark.parametrize(
+    ("edit", "min_radius_px", "what"),
+    [
+        (("fx = 900.0", "fx = 901.0"), 6.0, "the camera"),
+        (("0, 43, 78", "0, 44, 78"), 6.0, "the targets"),
+        (("", ""), 7.0, "the settings"),
+    ],
+)
+def test_what_all_depends_on_starts_anew(
+    edit: tuple[str, str], min_radius_px: float, what: str, flight: Path, looks: Counter[str]
+) -> None:
+    stop(flight, 3)
+    text = (flight / "flight.toml").read_text(encoding="utf-8")
+    (flight / "flight.toml").write_text(text.replace(*edit), encoding="utf-8")
+    watcher = Stop()
+    detect(flight, watcher, min_radius_px=min_radius_px)
+    assert watcher.notes == [
+        f"starting anew, not with the interrupted run's results: {what} changed since"
+    ]
+    assert looks["f_0.png"] == 2
+
+
+def test_a_table_that_cannot_be_written_keeps_the_journal(
+    flight: Path, undisturbed: bytes, looks: Counter[str]
+) -> None:
+    (flight / "kgcp" / "detections.parquet" / "occupied").mkdir(parents=True)
+    with pytest.raises(KgcpError, match=r"detections\.parquet: cannot be written"):
+        detect(flight)
+    shutil.rmtree(flight / "kgcp" / "detections.parquet")
+    detect(flight)
+    assert table(flight) == undisturbed
+    assert set(looks.values()) == {1}
+
+
+def test_frames_that_vanish_stop_the_run_and_are_no_rows(
+    flight: Path, undisturbed: bytes, looks: Counter[str]
+) -> None:
+    frames, elsewhere = flight / "frames", flight / "elsewhere"
+
+    class Unmount(Stop):
+        def progress(self, done: int, total: int, found: int) -> None:
+            super().progress(done, total, found)
+            if done == 4:
+                frames.rename(elsewhere)
+
+    with pytest.raises(KgcpError, match=r"f_\d\.png: has vanished; when the frames are there"):
+        detect(flight, Unmount())
+    elsewhere.rename(frames)
+    detect(flight)
+    assert table(flight) == undisturbed
+    assert looks["f_0.png"] == looks["f_3.png"] == 1
+
+
+def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
+    class Second(Stop):
+        def progress(self, done: int, total: int, found: int) -> None:
+            super().progress(done, total, found)
+            with pytest.raises(KgcpError, match=rf"writing here \(process {os.getpid()}\)"):
+                detect(flight)
+
+    detect(flight, Second())
+    assert table(flight) == undisturbed
+
+
+def examine_or_die(task: FrameTask, note: FrameNote) -> FrameResult:
+    if note.frame == "f_8.png":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return examine_frame(task, note)
+
+
+def test_a_frame_that_kills_its_worker_costs_no_other(
+    flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("kgcp.pipeline.detection_run.examine_frame", examine_or_die)
+        settings = DetectSettings(is_guided=False)  # a second look would start more processes
+        detect_flight(read_flight(flight), settings, flight / "kgcp", jobs=1)
+    table_path = flight / "kgcp" / "detections.parquet"
+    rows = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
+    assert rows.index[rows["status"] == "unreadable"].to_list() == ["f_8.png"]
+    assert rows.loc["f_8.png", "reason"] == "worker_died"
+    table_path.write_bytes(undisturbed)
+    others = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
+    measured = (others["status"] == "measured") & ~others["guided"].astype(bool)
+    first = others.index[measured & (others.index != "f_8.png")]
+    assert len(first) > FRAMES // 3
+    pd.testing.assert_frame_equal(rows.loc[first], others.loc[first])
+
+
+def test_who_is_lost_is_tried_again_by_the_next_run(
+    flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lossy(
+        function: Callable[[Any], FrameResult], items: Iterable[Any], **_: object
+    ) -> Generator[tuple[Any, FrameResult | Loss]]:
+        for item in items:
+            is_deadly = isinstance(item, FrameNote) and item.frame == "f_2.png"
+            is_hopeless = isinstance(item, SecondLook) and item.note.frame == "f_6.png"
+            yield item, Loss.DIED if is_deadly else Loss.LATE if is_hopeless else function(item)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("kgcp.pipeline.execution.executor.careful_map", lossy)
+        stop(flight, FRAMES)
+        summary = detect(flight)
+    assert summary.kept == FRAMES - 1, "who has died is tried again by the next run"
+    assert summary.reasons["worker_died"] == summary.status["unreadable"] == 1
+    rows = read_table(flight / "kgcp" / "detections.parquet", DETECTION_COLUMNS).set_index("frame")
+    died = rows.loc["f_2.png"]
+    assert (died["status"], died["reason"], died["detail"]) == ("unreadable", "worker_died", "")
+    assert pd.Timestamp(str(died["time"])).second == 2
+    assert rows.loc["f_6.png", "reason"] == "no_candidate"
+    assert "second look: timed_out" in str(rows.loc["f_6.png", "detail"])
+    detect(flight)
+    assert table(flight) == undisturbed

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.quality.bias_causes import Regression, regress
+from kgcp.quality.bias_study import BiasStudy, edge_distances
+from kgcp.quality.exposure_effects import QUANTITIES, Residuals, in_time
+from kgcp.quality.robust_gls import Noise
+from kgcp.settings import Method
+
+Fly = Callable[..., BiasStudy]
+
+SCALE, OFFSET_M = 0.001, 0.030
+SEEDS = range(5)
+
+
+def by(study: BiasStudy, edges: int | None = None) -> Regression:
+    """Regress the reported distances, or those by one or two edges."""
+    compared = in_time(study.trusted)
+    measured, radii = [], []
+    for one in compared:
+        found = edge_distances(one, study.method)
+        assert found is not None
+        assert one.attempt.sighting is not None
+        reported = one.attempt.sighting.distance_m
+        measured.append({None: reported, 1: found.one_m, 2: found.two_m}[edges])
+        radii.append(found.one_px)
+    radius = np.array(radii) if edges == 1 else None
+    regression = regress(Residuals.of(compared, np.array(measured), radius))
+    assert regression is not None
+    return regression
+
+
+def errors(found: Regression, **truth: float) -> list[float]:
+    """Errors of terms over their deviations."""
+    terms = [(found.term(name), value) for name, value in truth.items()]
+    return [(term.value - value) / term.sd for term, value in terms if term is not None]
+
+
+def test_injected_errors_come_back_within_their_deviations(fly: Fly) -> None:
+    """0.1 % of focal length, 30 mm of lever arm, and all of δ with the one-edge method."""
+    scaled = []
+    for seed in SEEDS:
+        found = by(fly(seed, Method.PAPER, SCALE, OFFSET_M))
+        scaled.append(errors(found, scale=SCALE, offset_m=OFFSET_M, edge_shift_px=1.0))
+        shift = found.term("edge_shift_px")
+        assert shift is not None
+        assert shift.is_significant
+        assert found.exposure_share > 0.9
+    assert np.mean(np.abs(scaled) < 2.0) > 0.8
+    assert np.all(np.abs(scaled) < 4.0)
+    assert np.all(np.abs(np.mean(scaled, axis=0)) < 1.4)  # 3 deviations of a mean of five
+
+
+def test_with_both_edges_nothing_follows_the_exposure(fly: Fly) -> None:
+    scaled = []
+    for seed in SEEDS:
+        found = by(fly(seed, Method.MODEL, SCALE, OFFSET_M))
+        assert not found.is_exposure_significant
+        assert found.exposure_share < 0.3
+        scaled.append(errors(found, scale=SCALE, offset_m=OFFSET_M, edge_shift_px=0.0))
+    assert np.mean(np.abs(scaled) < 2.0) > 0.8
+
+
+def test_what_both_methods_say_of_one_and_two_edges_agrees(fly: Fly) -> None:
+    for edges, expected in ((1, 1.0), (2, 0.0)):
+        for method in Method:
+            shift = by(fly(3, method), edges).term("edge_shift_px")
+            assert shift is not None
+            assert shift.value == pytest.approx(expected, abs=4.0 * shift.sd)
+
+
+def test_a_true_flight_has_no_significant_term(fly: Fly) -> None:
+    found = [by(fly(seed)) for seed in SEEDS]
+    false = [term.name for one in found for term in one.terms if term.is_significant]
+    assert len(false) <= 1  # at 1 % per flight
+    assert 0.7 < np.mean([one.scatter for one in found]) < 1.3
+
+
+def test_a_large_error_is_significant(fly: Fly) -> None:
+    found = by(fly(1, Method.MODEL, 0.005, 0.15, frames=200))
+    assert {term.name for term in found.terms if term.is_significant} == {"scale", "offset_m"}
+
+
+def plain(
+    distance_m: FloatArray, residual_m: FloatArray, sd_m: float, **exposure: FloatArray
+) -> Residuals:
+    n = len(distance_m)
+    noise = Noise(np.full(n, sd_m**2), np.zeros(n), np.arange(float(n)))
+    missing = {quantity.name: np.full(n, np.nan) for quantity in QUANTITIES}
+    return Residuals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
+
+
+def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
+    rng = np.random.default_rng(9)
+    distance = np.exp(rng.uniform(2.3, 4.6, 300))
+    residual = 0.5 * distance**3 / 1000.0**2 + 0.005 * rng.standard_normal(300)  # R: 1000 / D
+    found = regress(plain(distance, residual, 0.005))
+    assert found is not None
+    curved = found.term("edge_curvature_px2")
+    assert curved is not None
+    assert curved.value == pytest.approx(0.5, abs=3.0 * curved.sd)
+    assert found.exposure_terms == ()
+
+
+def test_of_quantities_that_look_alike_the_less_believed_is_given_up() -> None:
+    rng = np.random.default_rng(3)
+    distance = np.exp(rng.uniform(2.3, 4.6, 100))
+    exposure = 0.001 * np.exp(rng.uniform(-1.0, 1.0, 100))
+    alike = {"exposure_time_s": exposure, "white": np.log(exposure), "iso": np.full(100, 200.0)}
+    residual = 0.03 * np.log2(
+        1000.0 * exposure
+    ) * distance**2 / 1000.0 + 0.01 * rng.standard_normal(100)
+    found = regress(plain(distance, residual, 0.01, **alike))
+    assert found is not None
+    assert found.tangled == ("white",)
+    time = found.term("exposure_time_s")
+    assert time is not None
+    assert time.is_significant
+    assert time.value == pytest.approx(0.03, abs=3.0 * time.sd)  # px per doubling
+    assert found.term("iso") is None
+    assert found.exposure_share > 0.8
+    assert found.exposure_probability is not None
+    assert found.exposure_probability < 1e-6
+
+
+def test_too_little_is_no_regression() -> None:
+    distance = np.linspace(10.0, 100.0, 5)
+    assert regress(plain(distance, 0.0 * distance, 0.01)) is None
+    alike = 50.0 + 0.01 * np.arange(40.0)
+    assert regress(plain(alike, 0.001 * np.sin(np.arange(40.0)), 0.01)) is None
+
+
+def test_few_frames_have_few_terms() -> None:
+    rng = np.random.default_rng(1)
+    distance = np.linspace(10.0, 100.0, 13)
+    many = {quantity.name: rng.uniform(1.0, 2.0, 13) for quantity in QUANTITIES}
+    many["edge_shift_px"] = rng.uniform(-1.0, 1.0, 13)
+    found = regress(plain(distance, 0.01 * rng.standard_normal(13), 0.01, **many))
+    assert found is not None
+    assert [term.name for term in found.terms] == ["scale", "offset_m", "edge_shift_px"]
+
+
+def test_frames_without_a_quantity_have_no_part_and_rare_quantities_none_at_all() -> None:
+    rng = np.random.default_rng(4)
+    distance = np.linspace(10.0, 100.0, 60)
+    white, blur = rng.uniform(0.4, 0.9, 60), rng.uniform(0.6, 0.9, 60)
+    white[:3], blur[:30] = np.nan, np.nan
+    residual = 0.01 * rng.standard_normal(60)
+    found = regress(plain(distance, residual, 0.01, white=white, blur_px=blur))
+    assert found is not None
+    assert found.used.sum() == 57
+    assert found.term("white") is not None
+    assert found.term("blur_px") is None
+    assert found.systematic_m.shape == (60,)

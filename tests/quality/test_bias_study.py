@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import Absence, Whereabouts
+from kgcp.georef.trajectory import Trajectory
+from kgcp.quality.bias_study import Attempt, Exposure, edge_distances, study_bias
+from kgcp.settings import Method, VehicleSettings
+from kgcp.targets.layout import Ring, Target
+
+_CAMERA = Camera(width=1600, height=1200, fx=2300.0, fy=2300.0, cx=800.0, cy=600.0, k1=-0.06)
+_TARGET = Target(Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0, 180.0)))
+_NOTHING = Exposure(*[None] * 9)
+_METHOD = Method.MODEL
+_START = np.array([430606.1, 4583523.0, 120.0])
+
+_TIME_S = np.arange(0.0, 10.01, 0.1)
+_TRAJECTORY = Trajectory(
+    _TIME_S,
+    _START + np.outer(_TIME_S, [5.0, 5.0, 0.0]),
+    np.zeros((len(_TIME_S), 3)),
+    np.full((len(_TIME_S), 3), 0.03),
+    None,
+)
+_WHEREABOUTS = Whereabouts.of("EPSG:25831", [_TARGET], _TRAJECTORY, VehicleSettings())
+
+
+def _frame(index: int) -> str:
+    return f"f_{index:04d}.png"
+
+
+def _nadir_poses(
+    above_m: FloatArray, aside_m: float = 0.0, sd_m: float | None = 0.04
+) -> ReferencePoses:
+    """Cameras straight above the vehicle at times 0, 1, …, looking down, x to the true east."""
+    n = len(above_m)
+    places = _WHEREABOUTS.places(["A"] * n, [float(i) for i in range(n)])
+    enu = np.array([place.position_m for place in places if not isinstance(place, Absence)])
+    centre = enu + np.column_stack((np.full(n, aside_m), np.zeros(n), above_m))
+    grids = np.array([_WHEREABOUTS.frame.grid_rotation(point) for point in centre])
+    enu_from_photo = np.diag([1.0, -1.0, -1.0]) @ CAMERA_FROM_PHOTO
+    return ReferencePoses(
+        frames=tuple(_frame(index) for index in range(n)),
+        position_map=_WHEREABOUTS.frame.map_from_enu(centre),
+        opk_deg=opk_from_rotation(np.swapaxes(grids, 1, 2) @ enu_from_photo),
+        sd_position_m=None if sd_m is None else np.full((n, 3), sd_m),
+        sd_angle_deg=None,
+    )
+
+
+def _attempt(index: int, distance_m: float | None, centre: tuple[float, float]) -> Attempt:
+    sighting = None
+    if distance_m is not None:
+        sighting = Sighting(
+            frame=_frame(index),
+            number=index + 1,
+            target="A",
+            instance=0,
+            time_s=float(index),
+            centre_px=np.array(centre),
+            centre_cov_px2=None,
+            distance_m=distance_m,
+            sd_distance_m=None,
+            sd_common_distance_m=None,
+        )
+    return Attempt(_frame(index), "A", float(index), sighting, _NOTHING)
+
+
+_ABOVE = np.array([20.0, 40.0, 60.0, 80.0])
+_MIDDLE = (800.0, 600.0)
+
+
+def _attempts(scale: float = 1.0) -> list[Attempt]:
+    return [_attempt(i, scale * above, _MIDDLE) for i, above in enumerate(_ABOVE)]
+
+
+def test_residuals_are_measured_minus_reference() -> None:
+    study = study_bias(
+        _attempts(1.002), _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+    )
+    assert study.attitudes_agree
+    assert len(study.trusted) == 4
+    for one, above in zip(study.measured, _ABOVE, strict=True):
+        assert one.reference_distance_m == pytest.approx(above, abs=1e-5)
+        assert one.residual_m == pytest.approx(0.002 * above, abs=1e-5)
+        assert one.residual_percent == pytest.approx(0.2, abs=1e-4)
+        np.testing.assert_allclose(one.expected_px, _MIDDLE, atol=0.01)
+        assert one.expected_radius_px == pytest.approx(0.45 * 2300.0 / above)
+        assert one.sds is not None
+        assert one.sds.pose_m == pytest.approx(0.04, rel=1e-3)
+        assert one.sds.place_m == pytest.approx(0.03, rel=1e-3)
+        assert one.sds.common_m == 0.0
+        assert one.sds.total_m == pytest.approx(0.05, rel=1e-3)
+
+
+def test_unknown_deviations_stay_unknown() -> None:
+    study = study_bias(
+        _attempts(), _nadir_poses(_ABOVE, sd_m=None), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+    )
+    assert study.measured[0].sds is None
+
+
+def test_only_frames_that_must_show_the_whole_target_are_chances() -> None:
+    camera = Camera(1600, 1200, 2300.0, 2300.0, 800.0, 600.0)
+    poses = _nadir_poses(_ABOVE, aside_m=-13.8)  # the target lies 13.8 m to the camera's east
+    at_x = [800.0 + 2300.0 * 13.8 / above for above in _ABOVE]
+    assert at_x[0] > 1600.0 > at_x[1] > 1600.0 - 0.45 * 2300.0 / 40.0  # outside; cut by the rim
+    attempts = [
+        *(_attempt(i, None, _MIDDLE) for i in range(3)),
+        _attempt(3, 81.2, (at_x[3], 600.0)),
+    ]
+    study = study_bias(attempts, poses, _WHEREABOUTS, camera, [_TARGET], _METHOD)
+    assert [one.attempt.frame for one in study.chances] == [_frame(2), _frame(3)]
+    assert [study.trusts(one) for one in study.chances] == [False, True]
+
+
+def test_what_is_not_where_it_must_be_is_astray() -> None:
+    attempts = [*_attempts()[:3], _attempt(3, 75.0, (400.0, 300.0))]
+    study = study_bias(attempts, _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    assert [one.is_astray for one in study.measured] == [False, False, False, True]
+    assert len(study.trusted) == 3
+
+
+def test_wrong_attitudes_do_not_hide_the_distances() -> None:
+    poses = _nadir_poses(_ABOVE)
+    upside_down = replace(poses, opk_deg=poses.opk_deg + np.array([180.0, 0.0, 0.0]))
+    study = study_bias(_attempts(1.001), upside_down, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    assert not study.attitudes_agree
+    assert len(study.trusted) == len(study.chances) == 4
+    assert study.measured[0].residual_percent == pytest.approx(0.1, abs=1e-4)
+
+
+def test_frames_without_pose_or_place_are_counted() -> None:
+    attempts = [*_attempts()[:3], _attempt(77, 50.0, _MIDDLE)]
+    late = replace(attempts[2], time_s=99.0, sighting=None)
+    study = study_bias(
+        [*attempts[:2], late, attempts[3]],
+        _nadir_poses(_ABOVE),
+        _WHEREABOUTS,
+        _CAMERA,
+        [_TARGET],
+        _METHOD,
+    )
+    assert study.frames_without_pose == (_frame(77),)
+    assert study.absences == (Absence.AFTER_TRAJECTORY,)
+    assert len(study.measured) == 2
+
+
+def test_second_plates_are_not_compared() -> None:
+    attempts = _attempts()
+    sighting = attempts[0].sighting
+    assert sighting is not None
+    second = replace(attempts[0], sighting=replace(sighting, instance=1, distance_m=99.0))
+    study = study_bias(
+        [*attempts, second], _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+    )
+    assert len(study.measured) == 4
+
+
+def test_nothing_to_compare_is_an_error_with_a_remedy() -> None:
+    poses = _nadir_poses(_ABOVE)
+    with pytest.raises(KgcpError, match="no target was measured"):
+        study_bias([_attempt(0, None, _MIDDLE)], poses, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    renamed = replace(poses, frames=("a.jpg", "b.jpg", "c.jpg", "d.jpg"))
+    with pytest.raises(KgcpError, match=r"'f_0000\.png'.*'a\.jpg'.*relative to the frames folder"):
+        study_bias(_attempts(), renamed, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+
+
+def test_errors_that_all_frames_share_stand_apart() -> None:
+    settings = VehicleSettings(sd_lever_arm_m=(0.0, 0.0, 0.02), sd_time_s=0.001)
+    whereabouts = Whereabouts.of("EPSG:25831", [_TARGET], _TRAJECTORY, settings)
+    study = study_bias(_attempts(), _nadir_poses(_ABOVE), whereabouts, _CAMERA, [_TARGET], _METHOD)
+    sds = study.measured[0].sds
+    assert sds is not None
+    assert sds.common_m == pytest.approx(0.02, rel=1e-3)  # what is horizontal does not count
+    assert sds.place_m == pytest.approx(0.03, rel=1e-3)
+
+
+def test_of_a_static_target_all_of_its_place_is_shared() -> None:
+    position = tuple(_WHEREABOUTS.frame.map_from_enu(np.zeros((1, 3)))[0].tolist())
+    static = replace(_TARGET, position_m=position, sd_position_m=(0.01, 0.01, 0.05))
+    whereabouts = Whereabouts.of("EPSG:25831", [static], _TRAJECTORY, VehicleSettings())
+    study = study_bias(_attempts(), _nadir_poses(_ABOVE), whereabouts, _CAMERA, [static], _METHOD)
+    sds = study.measured[0].sds
+    assert sds is not None
+    assert sds.place_m == 0.0
+    assert sds.common_m == pytest.approx(0.05, rel=0.01)
+
+
+@pytest.mark.parametrize("method", [Method.MODEL, Method.PAPER])
+def test_one_edge_is_displaced_and_two_are_not(method: Method) -> None:
+    delta, radius, true_m = 0.4, 20.0, _ABOVE[0]
+    displaced_m = true_m * radius / (radius - delta)  # a smaller ring seems farther away
+    seen_px, seen_m = (radius, true_m) if method is Method.MODEL else (radius - delta, displaced_m)
+    exposure = replace(_NOTHING, edge_shift_px=delta, radius_px=seen_px)
+    attempt = replace(_attempt(0, seen_m, _MIDDLE), exposure=exposure)
+    study = study_bias([attempt], _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], method)
+    found = edge_distances(study.measured[0], method)
+    assert found is not None
+    assert found.one_m == pytest.approx(displaced_m, rel=1e-12)
+    assert found.two_m == pytest.approx(true_m, rel=1e-12)
+
+
+def test_without_edge_shift_there_are_no_edge_distances() -> None:
+    study = study_bias(_attempts(), _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    assert edge_distances(study.measured[0], _METHOD) is None

@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+_PROGRAM = """
+import os
+from kgcp.report.style import load_matplotlib
+here = os.getcwd()
+load_matplotlib()
+import matplotlib
+assert os.getcwd() == here
+print(matplotlib.rcParams["figure.dpi"])
+"""
+
+
+def test_a_flight_s_folder_does_not_set_how_figures_look(tmp_path: Path) -> None:
+    (tmp_path / "matplotlibrc").write_bytes(b"figure.dpi: 7\n\xff\n")
+    ran = subprocess.run(
+        [sys.executable, "-c", _PROGRAM], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert float(ran.stdout) != 7.0
+    assert ran.stderr == ""
