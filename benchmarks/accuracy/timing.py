@@ -13,7 +13,7 @@ from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import InitialPose, Observation
 from kgcp.settings import DetectSettings, Method
 
 
@@ -31,9 +31,18 @@ def time_measurement(flight: Flight, frames: Sequence[str]) -> list[float]:
         for start in measure_frame(grey, flight.camera, flight.targets, search):
             if not isinstance(start, Observation):
                 continue
+            near = start.appearance
+            start_pose = InitialPose(
+                start.ring,
+                start.score,
+                start.pose,
+                near.radius_px,
+                near.edge_shift_px or 0.0,
+                near.blur_px or 0.0,
+            )
             begin_s = time.process_time()
             try:
-                measure_by_model(grey, flight.camera, targets[start.target], start)
+                measure_by_model(grey, flight.camera, targets[start.target], start_pose)
             except Rejection:
                 continue
             times_ms.append(1e3 * (time.process_time() - begin_s))

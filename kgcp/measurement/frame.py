@@ -10,16 +10,17 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import BoolArray, GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.closed_form.chain import points_of_code
+from kgcp.measurement.closed_form.chain import measure_ring
 from kgcp.measurement.closed_form.circles import paper_outlines
 from kgcp.measurement.diagnosis import explain
 from kgcp.measurement.normal_prior import NormalPrior
 from kgcp.measurement.records import Considered, Miss, Observation, Outcome
 from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
-from kgcp.measurement.search.code_signal import fixed_lag_score
+from kgcp.measurement.search.code_signal import CodeMatch, fixed_lag_score, points_of_code
 from kgcp.measurement.search.false_alarm import check_chance
-from kgcp.measurement.search.initial_pose import start_pose
+from kgcp.measurement.search.initial_pose import initial_pose
 from kgcp.measurement.search.template_match import judge_at
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Ring, Target
@@ -164,40 +165,58 @@ def _try_target(
             if any(seen.covers(match.outer) for seen in found):
                 continue
             try:
-                start = start_pose(grey, camera, target, match, settings.method)
-                found.append(confirm(grey, camera, target, start, settings, prior))
+                found.append(measure_match(grey, camera, target, match, settings, prior))
             except Rejection as rejection:
                 candidate = replace(candidate, reason=rejection.reason, detail=rejection.detail)
             considered.append(candidate)
     return _Trial(target, tuple(found), tuple(considered))
 
 
-def confirm(
+def measure_match(
     grey: GreyArray,
     camera: Camera,
     target: Target,
-    start: Observation,
+    match: CodeMatch,
     settings: DetectSettings,
     prior: NormalPrior | None,
 ) -> Observation:
-    """Measure what a start has found, and make sure that it is the target.
+    """Measure a matched ring by the method of the settings, and make sure that it is the target.
 
     Raises
     ------
     Rejection
         With the reason of the first test that is not passed.
     """
-    ring = next(ring for ring in target.rings if ring.name == start.ring)
-    verdict = judge_at(grey, camera, start.pose, ring)
-    verdict.check(settings.min_score)
-    visible = verdict.visible
-    if ring is not target.ring:
-        visible = _check_main_ring(grey, camera, target.ring, start, settings)
     if settings.method is Method.PAPER:
-        return start
+        observation = measure_ring(grey, camera, target, match)
+        _check_plate(grey, camera, target, match.ring, observation.pose, settings)
+        return observation
+    start = initial_pose(grey, camera, target, match)
+    visible = _check_plate(grey, camera, target, match.ring, start.pose, settings)
     observation = measure_by_model(grey, camera, target, start, prior, visible)
-    check_chance(observation, target, ring, settings.false_alarm)
+    check_chance(observation, target, match.ring, settings.false_alarm)
     return observation
+
+
+def _check_plate(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    ring: Ring,
+    pose: Pose,
+    settings: DetectSettings,
+) -> BoolArray | None:
+    """Refuse a plate that does not look like the target; return where it is seen, None: all of it.
+
+    Raises
+    ------
+    Rejection
+    """
+    verdict = judge_at(grey, camera, pose, ring)
+    verdict.check(settings.min_score)
+    if ring is target.ring:
+        return verdict.visible
+    return _check_main_ring(grey, camera, target.ring, ring, pose, settings)
 
 
 def miss_of(
@@ -215,14 +234,19 @@ def miss_of(
 
 
 def _check_main_ring(
-    grey: GreyArray, camera: Camera, main: Ring, start: Observation, settings: DetectSettings
+    grey: GreyArray,
+    camera: Camera,
+    main: Ring,
+    replica: Ring,
+    pose: Pose,
+    settings: DetectSettings,
 ) -> BoolArray | None:
     """Refuse a replica that sits on a plate with another main code; return where that is seen.
 
     Plates of several targets may carry the same small ring. Where enough of the main ring is in
     the frame it must show its code at the heading of the replica.
     """
-    points = points_of_code(camera, start.pose, main)
+    points = points_of_code(camera, pose, main)
     height, width = grey.shape
     within = np.all((points >= 0.0) & (points <= (width - 1.0, height - 1.0)), axis=1)
     if within.mean() < _MIN_VISIBLE:
@@ -230,12 +254,12 @@ def _check_main_ring(
     score = fixed_lag_score(grey, points, within, main)
     if score >= _MIN_MAIN_SCORE:
         return None
-    verdict = judge_at(grey, camera, start.pose, main)  # a part of it may be hidden
+    verdict = judge_at(grey, camera, pose, main)  # a part of it may be hidden
     turn_deg = abs((verdict.lag_deg + 180.0) % 360.0 - 180.0)
     if verdict.visible is None or turn_deg > _MOST_TURNED_DEG:
         raise Rejection(
             Reason.CODE_MISMATCH,
-            f"the ring around the replica {start.ring} is not {main.name}: {score:.2f}",
+            f"the ring around the replica {replica.name} is not {main.name}: {score:.2f}",
         )
     verdict.check(settings.min_score)
     return verdict.visible

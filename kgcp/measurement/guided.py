@@ -12,12 +12,11 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
-from kgcp.measurement.frame import confirm
+from kgcp.measurement.frame import measure_match
 from kgcp.measurement.normal_prior import NormalPrior
 from kgcp.measurement.records import Considered, Observation
 from kgcp.measurement.search.candidates import find_rings_at
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.initial_pose import start_pose
 from kgcp.measurement.search.template_match import judge, polar_patch
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
@@ -130,8 +129,7 @@ def look_again(
         if any(rival.covers(candidate.outline) for rival in rivals):
             continue
         try:
-            start = start_pose(grey, camera, target, match, settings.method)
-            observation = confirm(grey, camera, target, start, lowered, prior)
+            observation = measure_match(grey, camera, target, match, lowered, prior)
             expectation.check(observation)
         except Rejection as rejection:
             considered.append(replace(candidate, reason=rejection.reason, detail=rejection.detail))

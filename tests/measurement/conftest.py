@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
-from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import Imaging
 from kgcp.measurement.image_model.noise import find_censoring
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
-from kgcp.measurement.records import Appearance, Observation
+from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import Plate, image_plate
@@ -167,19 +167,15 @@ def photograph() -> Callable[..., GreyArray]:
 
 
 @pytest.fixture(scope="session")
-def start_near() -> Callable[..., Observation]:
-    """What the closed-form chain might say: a per cent, some tenths of a pixel, three degrees."""
+def start_near() -> Callable[..., InitialPose]:
+    """What the search might say: a per cent, some tenths of a pixel, three degrees."""
 
-    def observe(camera: Camera, pose: Pose, rng: np.random.Generator) -> Observation:
+    def observe(camera: Camera, pose: Pose, rng: np.random.Generator) -> InitialPose:
         error = rng.normal(0.0, (0.3, 0.3, 0.01, 0.05, 0.05, 0.01))
         translation_m = pose.translation_m * (1.0 + error[2])
         translation_m[:2] += error[:2] * pose.distance_m / camera.mean_focal_px
         near = Pose(pose.rotation, translation_m).moved(np.array([0.0, 0.0, 0.0, *error[3:]]))
-        return Observation(
-            *("A", "A", 0, 0.97, near, camera.project(translation_m)),
-            image_heading_deg(camera, near),
-            Appearance(semi_major_axis_px(contour_px(camera, near, 0.45)), 0.1, 0.8, 0.0, 0.0),
-            *(None, None),
-        )
+        radius_px = semi_major_axis_px(contour_px(camera, near, 0.45))
+        return InitialPose("A", 0.97, near, radius_px, edge_shift_px=0.0, blur_px=0.0)
 
     return observe

@@ -16,17 +16,16 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.frame import confirm, measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.frame import measure_frame, measure_match
+from kgcp.measurement.records import InitialPose, Observation
 from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
-from kgcp.measurement.search.initial_pose import start_pose
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.plate import Plate
 from kgcp.simulation.shapes import Disc, Shape, rectangle
 
 Photograph = Callable[..., GreyArray]
-StartNear = Callable[..., Observation]
+StartNear = Callable[..., InitialPose]
 LENS = Camera(
     *(480, 340, 1310.0, 1306.0, 121.2, 91.7, -0.09, 0.06, 8e-4, -6e-4, -0.01),
     response=Response.LINEAR,
@@ -206,8 +205,7 @@ def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Ph
     settings, replica = DetectSettings(), target.rings[1]
     candidates = find_dotted(grey, find_rings(grey, settings), [replica])
     matches, _ = find_code(candidates[replica], replica, settings)
-    start = start_pose(grey, LENS, target, matches[0], settings.method)
-    seen = confirm(grey, LENS, target, start, settings, None)
+    seen = measure_match(grey, LENS, target, matches[0], settings, None)
     assert seen.uncertainty is not None
     off_m = abs(seen.pose.distance_m - pose.distance_m)
     assert off_m < 5.0 * seen.uncertainty.sd_distance_m

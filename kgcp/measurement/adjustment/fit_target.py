@@ -31,7 +31,7 @@ from kgcp.measurement.image_model.noise import find_censoring
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
 from kgcp.measurement.normal_prior import NormalPrior
-from kgcp.measurement.records import Alternative, Observation
+from kgcp.measurement.records import Alternative, InitialPose, Observation
 from kgcp.targets.layout import Target
 
 _MARGIN_PX = 12.0
@@ -44,7 +44,7 @@ def measure_by_model(
     grey: GreyArray,
     camera: Camera,
     target: Target,
-    start: Observation,
+    start: InitialPose,
     prior: NormalPrior | None = None,
     visible: BoolArray | None = None,
 ) -> Observation:
@@ -57,8 +57,7 @@ def measure_by_model(
     camera : Camera
     target : Target
         Its layout.
-    start : Observation
-        By `kgcp.measurement.search.initial_pose`.
+    start : InitialPose
     prior : NormalPrior, optional
         Of the plate's normal. It only helps to choose between the two poses, whose values remain
         those of the image.
@@ -82,13 +81,12 @@ def measure_by_model(
     return observation
 
 
-def _without_edge_shift(start: Observation) -> Pose:
+def _without_edge_shift(start: InitialPose) -> Pose:
     """Return the pose that the start would have if the outer edge were not displaced.
 
     Its distance is from the outer circle alone, of which the radius is short by δ.
     """
-    radius_px = start.appearance.radius_px
-    shrink = radius_px / (radius_px + (start.appearance.edge_shift_px or 0.0))
+    shrink = start.radius_px / (start.radius_px + start.edge_shift_px)
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
@@ -138,10 +136,9 @@ def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:
     return sum(2 + len(ring.code_deg) for ring in rings)
 
 
-def _start_blur(start: Observation, binning: int) -> Blur:
+def _start_blur(start: InitialPose, binning: int) -> Blur:
     """Return the blur that the start has seen, in bins; that of a sharp frame at least."""
-    appearance = start.appearance
-    seen_px = min(appearance.blur_px or 0.0, _LARGEST_START_BLUR * appearance.radius_px)
+    seen_px = min(start.blur_px, _LARGEST_START_BLUR * start.radius_px)
     variance = variance_in_bins(max(_SHARP_PX2, seen_px * seen_px), binning)
     return Blur(variance, variance, 0.0)
 
@@ -149,7 +146,7 @@ def _start_blur(start: Observation, binning: int) -> Blur:
 def _observation(
     camera: Camera,
     target: Target,
-    start: Observation,
+    start: InitialPose,
     poses: TwoPoses,
     prior: NormalPrior | None,
 ) -> Observation:
@@ -162,7 +159,7 @@ def _observation(
     return Observation(
         target=target.name,
         ring=start.ring,
-        instance=start.instance,
+        instance=0,
         score=start.score,
         pose=pose,
         centre_px=camera.project(pose.translation_m[None])[0],

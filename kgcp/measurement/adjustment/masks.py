@@ -73,7 +73,10 @@ def see_plate(imaging: Imaging, pose: Pose, blur: Blur, slack_px: float = 0.0) -
     middle = imaging.window.nearest(imaging.centre_px)
     spread = blur_on_plate(pose, rays[:, middle].copy(), blur.total_covariance, sd_px * scale)
     bare = look_at_plate(
-        *(imaging, pose, rays),
+        imaging.circles,
+        imaging.measured_count,
+        pose,
+        rays,
         small_m=_SMALL_SIGMAS * sd_px * scale,
         reach_m=reach_px * scale,
         spread=spread,
@@ -94,7 +97,8 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     levels = np.ascontiguousarray(window.levels[some])
     outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
     rays = np.ascontiguousarray(window.rays[:, some])
-    bare = look_at_plate(imaging, pose, rays, reach_m=outer_m - inner_m)
+    circles, count = imaging.circles, imaging.measured_count
+    bare = look_at_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
     black, white = _plateaus(levels, bare.rho_m, bare.share, bare.off_edge_m, outer_m)
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")

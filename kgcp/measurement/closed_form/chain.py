@@ -23,7 +23,12 @@ from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.closed_form.edges import EdgeFit, Patch, fit_edge, patch_around
 from kgcp.measurement.records import Alternative, Appearance, Observation
-from kgcp.measurement.search.code_signal import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
+from kgcp.measurement.search.code_signal import (
+    CODE_ANGLES_RAD,
+    CodeMatch,
+    match_code,
+    points_of_code,
+)
 from kgcp.measurement.search.sampling import sample_grey
 from kgcp.targets.layout import Ring, Target
 
@@ -188,13 +193,6 @@ def _posed(
     measured = ellipse_from_conic(edges.inner.conic).centre
     misfit_px = camera.mean_focal_px * float(np.linalg.norm(inner - measured))
     return PosedRing(pose, float(scores[0]), misfit_px)
-
-
-def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
-    """Return raw pixels (360, 2) of a ring's code circle where a pose puts it, one per degree."""
-    radius_m = np.array([0.5 * ring.code_diameter_m])
-    circles = camera.project_circles(pose.rotation, pose.translation_m, radius_m, CODE_CIRCLE)
-    return circles.reshape(-1, 2)
 
 
 def edge_shift_px(pose: Pose, ring: Ring, edges: RingEdges) -> float:

@@ -9,21 +9,19 @@ import numpy as np
 from scipy import ndimage
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse, sampson_distance
+from kgcp.measurement.search.code_signal import clear_of_dots
+from kgcp.measurement.search.sampling import FAINTEST_SLOPE
 from kgcp.targets.layout import Ring
 
 _OFFSETS_PX = np.array([-1.5, -0.5, 0.5, 1.5])
 _CUBIC_FROM_SAMPLES = np.linalg.inv(np.vander(_OFFSETS_PX, 4, increasing=True))
 _SEARCH_PX = np.arange(-2.5, 2.75, 0.25)
 _MAX_SHIFT_PX = 1.5
-FAINTEST = 0.25  # grey values per pixel: less is rounding
 _MIN_SLOPE = 0.3  # of the median slope along the contour
 _PASSES = 3
-_DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
-_MIN_CLEAR = 0.55  # of the edge
 _MARGIN_PX = 8
 _MIN_POINTS = 8
 _MIN_SHARE = 0.25  # of the contour's length
@@ -84,39 +82,6 @@ def patch_around(grey: GreyArray, ellipse: Ellipse) -> Patch:
     return Patch(ndimage.spline_filter(part, order=3, mode="mirror"), left, top)
 
 
-def clear_of_dots(
-    angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
-
-    On a small ring with many dots none may be: then the places farthest from dots are taken.
-    """
-    dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
-    gap_m = np.empty(len(angles_rad))
-    _measure_gaps(angles_rad, 0.5 * edge_diameter_m, dots_rad, 0.5 * ring.code_diameter_m, gap_m)
-    gap_m -= 0.5 * ring.dot_diameter_m
-    fewest = math.ceil((1.0 - _MIN_CLEAR) * (len(gap_m) - 1))
-    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.partition(gap_m, fewest)[fewest]))
-    return np.asarray(gap_m >= reach_m)
-
-
-@compiled
-def _measure_gaps(
-    angles_rad: FloatArray,
-    radius: float,
-    others_rad: FloatArray,
-    other_radius: float,
-    gaps: FloatArray,
-) -> None:
-    """Fill in how far points of one circle are from the nearest of some points of another."""
-    for i in range(len(angles_rad)):
-        nearest = -1.0
-        for other_rad in others_rad:
-            nearest = max(nearest, math.cos(angles_rad[i] - other_rad))
-        square = radius**2 + other_radius**2 - 2.0 * radius * other_radius * nearest
-        gaps[i] = math.sqrt(max(square, 0.0))
-
-
 def steepest_ellipse(
     patch: Patch, start: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
 ) -> Ellipse:
@@ -154,7 +119,7 @@ def edge_points(
     with np.errstate(divide="ignore", invalid="ignore"):  # no cubic term: no inflection, left out
         shift = -quadratic / (3.0 * cubic)
         slope = linear + shift * quadratic
-    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST)
+    plausible = (np.abs(shift) <= _MAX_SHIFT_PX) & (cubic < 0.0) & (slope > FAINTEST_SLOPE)
     if plausible.any():
         plausible &= slope >= _MIN_SLOPE * np.median(slope[plausible])
     return np.asarray((base + shift[:, None] * normals)[plausible])

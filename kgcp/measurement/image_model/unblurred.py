@@ -10,8 +10,7 @@ import numpy as np
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.image_model.plate import EVEN, find_skips, plate_points
+from kgcp.measurement.image_model.plate import EVEN, Circles, find_skips, plate_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +40,8 @@ class BarePlate:
 
 
 def look_at_plate(
-    imaging: Imaging,
+    circles: Circles,
+    measured_count: int,
     pose: Pose,
     rays: FloatArray,
     *,
@@ -53,7 +53,10 @@ def look_at_plate(
 
     Parameters
     ----------
-    imaging : Imaging
+    circles : Circles
+        All of the plate.
+    measured_count : int
+        How many of them, the first, are measured.
     pose : Pose
     rays : (6, n) array
         As in `Window`.
@@ -64,12 +67,12 @@ def look_at_plate(
     spread : (3,) array
         By `blur_on_plate`.
     """
-    points_m, circles = plate_points(pose, rays), imaging.circles
+    points_m = plate_points(pose, rays)
     centres_m, radii_m, signs = circles.centres_m, circles.radii_m, circles.signs
     circle_table = np.vstack((centres_m, radii_m, signs))
-    skips, count = find_skips(centres_m, radii_m), imaging.measured_count
+    skips = find_skips(centres_m, radii_m)
     return BarePlate(
-        points_m, *_look(points_m, circle_table, *skips, count, small_m, reach_m, spread)
+        points_m, *_look(points_m, circle_table, *skips, measured_count, small_m, reach_m, spread)
     )
 
 

@@ -11,7 +11,9 @@ import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.pose import Pose
 from kgcp.measurement.search.sampling import sample_grey
 from kgcp.targets.layout import Ring
 
@@ -19,6 +21,8 @@ _SAMPLES = 360
 CODE_ANGLES_RAD = np.linspace(0.0, 2.0 * math.pi, _SAMPLES, endpoint=False)
 CODE_CIRCLE = np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=-1)
 _BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # edge spreads that the code is tried with
+_DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
+_MIN_CLEAR = 0.55  # of an edge
 _HEADING_SLACK = 6  # degrees that a replica's heading may be off
 
 
@@ -152,3 +156,43 @@ def _standardised(signals: FloatArray) -> FloatArray:
     centred = signals - signals.mean(axis=-1, keepdims=True)
     norm = np.linalg.norm(centred, axis=-1, keepdims=True)
     return np.asarray(centred / np.where(norm > 0.0, norm, 1.0))
+
+
+def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
+    """Return raw pixels (360, 2) of a ring's code circle where a pose puts it, one per degree."""
+    radius_m = np.array([0.5 * ring.code_diameter_m])
+    circles = camera.project_circles(pose.rotation, pose.translation_m, radius_m, CODE_CIRCLE)
+    return circles.reshape(-1, 2)
+
+
+def clear_of_dots(
+    angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
+) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
+
+    On a small ring with many dots none may be: then the places farthest from dots are taken.
+    """
+    dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
+    gap_m = np.empty(len(angles_rad))
+    _measure_gaps(angles_rad, 0.5 * edge_diameter_m, dots_rad, 0.5 * ring.code_diameter_m, gap_m)
+    gap_m -= 0.5 * ring.dot_diameter_m
+    fewest = math.ceil((1.0 - _MIN_CLEAR) * (len(gap_m) - 1))
+    reach_m = min(_DOT_REACH_PX / px_per_m, float(np.partition(gap_m, fewest)[fewest]))
+    return np.asarray(gap_m >= reach_m)
+
+
+@compiled
+def _measure_gaps(
+    angles_rad: FloatArray,
+    radius: float,
+    others_rad: FloatArray,
+    other_radius: float,
+    gaps: FloatArray,
+) -> None:
+    """Fill in how far points of one circle are from the nearest of some points of another."""
+    for i in range(len(angles_rad)):
+        nearest = -1.0
+        for other_rad in others_rad:
+            nearest = max(nearest, math.cos(angles_rad[i] - other_rad))
+        square = radius**2 + other_radius**2 - 2.0 * radius * other_radius * nearest
+        gaps[i] = math.sqrt(max(square, 0.0))

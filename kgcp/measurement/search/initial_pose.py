@@ -14,13 +14,16 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes, pose_on_plane
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.ellipse_fit import fit_ellipses
-from kgcp.geometry.pose import image_heading_deg
-from kgcp.measurement.closed_form.chain import measure_ring, points_of_code
-from kgcp.measurement.closed_form.edges import FAINTEST, clear_of_dots
-from kgcp.measurement.records import Appearance, Observation
-from kgcp.measurement.search.code_signal import CODE_ANGLES_RAD, CODE_CIRCLE, CodeMatch, match_code
-from kgcp.measurement.search.sampling import sample_ellipses, sample_grey
-from kgcp.settings import Method
+from kgcp.measurement.records import InitialPose
+from kgcp.measurement.search.code_signal import (
+    CODE_ANGLES_RAD,
+    CODE_CIRCLE,
+    CodeMatch,
+    clear_of_dots,
+    match_code,
+    points_of_code,
+)
+from kgcp.measurement.search.sampling import FAINTEST_SLOPE, sample_ellipses, sample_grey
 from kgcp.targets.layout import Target
 
 _REACH_PX, _STEP_PX = 3.0, 0.2
@@ -31,27 +34,16 @@ _MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
 _AXIS_ERROR_PX = 0.3  # of an outline
 
 
-def start_pose(
-    grey: GreyArray, camera: Camera, target: Target, match: CodeMatch, method: Method
-) -> Observation:
-    """Start by the method's own means: the paper's chain, or the outline of the search.
+def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> InitialPose:
+    """Return the better one of the two poses that the outline of a matched ring has.
 
     The outline is good to some tenths of a pixel, and the image model needs no more.
 
     Raises
     ------
     Rejection
-        With the method `paper`, where its chain breaks.
+        POOR_ELLIPSE, if the outline lies beyond the lens model's reach.
     """
-    if method is Method.PAPER:
-        return measure_ring(grey, camera, target, match)
-    return _pose_of_outline(grey, camera, target, match)
-
-
-def _pose_of_outline(
-    grey: GreyArray, camera: Camera, target: Target, match: CodeMatch
-) -> Observation:
-    """Take the better one of the two poses that an outline has."""
     ring = match.ring
     towards = camera.undistort(match.outer.points(math.radians(match.lag_deg) + _OUTLINE_RAD))
     poses = [
@@ -67,17 +59,20 @@ def _pose_of_outline(
         pose = pose.turned(turn_deg)
     # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
-    return Observation(
-        target=target.name,
+    outer, inner = (
+        _profile(grey, match, diameter_m)
+        for diameter_m in (ring.outer_diameter_m, ring.inner_diameter_m)
+    )
+    contrast = match.white - match.black
+    slope = max(outer.slope_per_px, FAINTEST_SLOPE)
+    shift_px = (inner.radius_px - ring.inner_ratio * outer.radius_px) / (1.0 + ring.inner_ratio)
+    return InitialPose(
         ring=ring.name,
-        instance=0,
         score=float(scores[best]),
         pose=pose,
-        centre_px=camera.project(pose.translation_m[None])[0],
-        heading_deg=image_heading_deg(camera, pose),
-        appearance=_appearance(grey, target, match),
-        alternative=None,
-        uncertainty=None,
+        radius_px=match.outer.a * target.ring.outer_diameter_m / ring.outer_diameter_m,
+        edge_shift_px=shift_px,
+        blur_px=contrast / (math.sqrt(2.0 * math.pi) * slope),
     )
 
 
@@ -128,28 +123,6 @@ class _Profile:
 
     radius_px: float
     slope_per_px: float
-
-
-def _appearance(grey: GreyArray, target: Target, match: CodeMatch) -> Appearance:
-    """Return size, levels, blur and δ as the mean profile along radii shows them.
-
-    Where the plate is burnt white its light spills over the edges, and the outline is too small.
-    """
-    ring, full_range = match.ring, float(np.iinfo(grey.dtype).max)
-    outer, inner = (
-        _profile(grey, match, diameter_m)
-        for diameter_m in (ring.outer_diameter_m, ring.inner_diameter_m)
-    )
-    contrast = match.white - match.black
-    return Appearance(
-        radius_px=match.outer.a * target.ring.outer_diameter_m / ring.outer_diameter_m,
-        black=match.black / full_range,
-        white=match.white / full_range,
-        saturated=0.0,
-        edge_shift_px=(inner.radius_px - ring.inner_ratio * outer.radius_px)
-        / (1.0 + ring.inner_ratio),
-        blur_px=contrast / (math.sqrt(2.0 * math.pi) * max(outer.slope_per_px, FAINTEST)),
-    )
 
 
 def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Profile:

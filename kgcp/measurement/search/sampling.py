@@ -13,6 +13,8 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 
+FAINTEST_SLOPE = 0.25  # of an edge, in grey values per pixel: less is rounding
+
 
 def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray:
     """Sample a frame bilinearly at points (m, n, 2) [px]; beyond its border it repeats itself."""

@@ -15,12 +15,12 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import InitialPose, Observation
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 
 Photograph = Callable[..., GreyArray]
-StartNear = Callable[..., Observation]
+StartNear = Callable[..., InitialPose]
 LENS = Camera(
     *(480, 340, 1310.0, 1306.0, 121.2, 91.7, -0.09, 0.06, 8e-4, -6e-4, -0.01),
     response=Response.LINEAR,

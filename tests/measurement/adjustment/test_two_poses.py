@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import InitialPose, Observation
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 
@@ -38,7 +38,7 @@ def check_distance(seen: Observation, truth: Pose) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 13, 20])
 def test_a_start_that_is_tilted_the_wrong_way_is_turned(
-    photograph: Callable[..., GreyArray], start_near: Callable[..., Observation], seed: int
+    photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], seed: int
 ) -> None:
     """Three of these stayed near the tilt of 0, by 1.0 … 1.6 % too far away."""
     rng = np.random.default_rng(seed)
@@ -52,7 +52,7 @@ def test_a_start_that_is_tilted_the_wrong_way_is_turned(
 
 @pytest.mark.parametrize("seed", [67, 122, 144])
 def test_from_straight_above_the_distance_is_found(
-    photograph: Callable[..., GreyArray], start_near: Callable[..., Observation], seed: int
+    photograph: Callable[..., GreyArray], start_near: Callable[..., InitialPose], seed: int
 ) -> None:
     """Where nothing tells which way to tilt: steps that turned the plate over got nowhere."""
     rng = np.random.default_rng(seed)

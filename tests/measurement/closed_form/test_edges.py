@@ -11,7 +11,8 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.closed_form.edges import clear_of_dots, edge_points, fit_edge, patch_around
+from kgcp.measurement.closed_form.edges import edge_points, fit_edge, patch_around
+from kgcp.measurement.search.code_signal import clear_of_dots
 from kgcp.targets.layout import Target
 
 AROUND = np.linspace(0.0, 2.0 * math.pi, 200, endpoint=False)
