@@ -27,9 +27,8 @@ from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_pri
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.calibrations import read_calibration
 from kgcp.io.formats.frame_times import TimesFormat, read_times
-from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
 from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
 from kgcp.io.formats.trajectories.records import Wander
 from kgcp.io.images.frames import read_exif, read_grey
@@ -58,7 +57,7 @@ OPF_PARTS = {
 
 LATE_MODULES = (
     *CALIBRATION_FORMATS.values(),
-    *POSE_FORMATS.values(),
+    "kgcp.io.formats.orientations",
     "kgcp.io.formats.orientations.georeference",
     *(f"PIL.{name}ImagePlugin" for name in ("Bmp", "Jpeg", "Jpeg2K", "Mpo")),
     *(f"PIL.{name}ImagePlugin" for name in ("Png", "Ppm", "Tiff", "WebP")),
@@ -110,7 +109,7 @@ def poses(data: bytes, folder: Path) -> None:
     path = _written_among_parts(folder, data)
     _allow(lambda: read_reference_poses(path, crs=CRS, frames=FRAMES))
     stated = _chosen(data, (None, CRS, "EPSG:4978"))
-    notation = PoseNotation(_chosen(data, tuple(POSE_FORMATS)), stated)
+    notation = PoseNotation(_chosen(data, tuple(PoseFormat)), stated)
     read_reference_poses(path, notation, crs=CRS, frames=FRAMES)
 
 

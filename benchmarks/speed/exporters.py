@@ -15,8 +15,9 @@ import numpy as np
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.gcp import Kgcp
-from kgcp.io.exporters import FORMATS, export
+from kgcp.io.exporters.formats import FORMATS
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 
 LIMIT_S = 30.0
 _START = np.array([430606.0, 4583523.0, 122.0])

@@ -42,10 +42,8 @@ def command(
 
     Example: kgcp bias-report sample_flight
     """
-    from kgcp.errors import KgcpError
-    from kgcp.io.flight.data import read_whereabouts
+    from kgcp.io.flight.data import FlightData
     from kgcp.io.flight.flight import read_flight
-    from kgcp.io.formats.orientations import read_flight_poses
     from kgcp.io.tables.sightings import read_attempts, read_settings
     from kgcp.pipeline.workspace import DETECTIONS, workplace
     from kgcp.quality.bias_study import study_bias
@@ -59,15 +57,14 @@ def command(
         table = detections or place.out / DETECTIONS
         attempts = read_attempts(table, the_flight.targets)
         settings = read_settings(table)
-        poses = read_flight_poses(the_flight, [attempt.frame for attempt in attempts])
-        if poses is None:
-            raise KgcpError(
-                f"{the_flight.folder / 'flight.toml'}: has no [reference]; give poses ="
-                " 'reference.csv' with the camera's poses from an adjustment"
-            )
-        whereabouts = read_whereabouts(the_flight)
+        data = FlightData(the_flight, [attempt.frame for attempt in attempts])
         study = study_bias(
-            attempts, poses, whereabouts, the_flight.camera, the_flight.targets, settings.method
+            attempts,
+            data.reference_poses,
+            data.whereabouts,
+            the_flight.camera,
+            the_flight.targets,
+            settings.method,
         )
         report = write_report(
             *(study, the_flight, settings, place.out, reexpose), place.frames_of(the_flight)

@@ -15,7 +15,7 @@ from kgcp.cli.options import (
     out_place_option,
     selection_options,
 )
-from kgcp.io.exporters import DEFAULT_FORMATS, FORMATS, export, not_renewed
+from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
     from kgcp.georef.target_positions import Carrier
@@ -88,6 +88,7 @@ def command(
     """
     from kgcp.georef.selection import Selection
     from kgcp.io.exporters.points import MapPoints
+    from kgcp.io.exporters.write import not_renewed
     from kgcp.io.flight.flight import read_flight
     from kgcp.io.tables.columns import KGCP_COLUMNS
     from kgcp.io.tables.consistency import write_consistency
@@ -122,6 +123,7 @@ def _export(
     Returns paths, and why formats were left out.
     """
     from kgcp.errors import KgcpError
+    from kgcp.io.exporters.write import export
 
     written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from kgcp.errors import KgcpError
@@ -14,10 +12,18 @@ VEHICLE_CRS = "flight.toml: [vehicle] crs"
 _STEP_M, _STEP_DEG = 10.0, 1e-4  # curvature cancels in the central difference
 
 
-def convert_positions(path: Path, position: FloatArray, source: str, target: str) -> FloatArray:
+def convert_positions(file: str, position: FloatArray, source: str, target: str) -> FloatArray:
     """Bring positions (n, 3) from one CRS to another by PROJ's best operation.
 
     x is easting or longitude and y northing or latitude on both sides.
+
+    Parameters
+    ----------
+    file : str
+        Where the positions come from, for messages.
+    position : (n, 3) array
+    source, target : str
+        CRS, for pyproj.
 
     Raises
     ------
@@ -28,7 +34,7 @@ def convert_positions(path: Path, position: FloatArray, source: str, target: str
     transformer = best_transformer(
         parse_crs(source, VEHICLE_CRS),
         parse_crs(target),
-        f"{path}: the way of its positions from {source!r} to the flight's crs {target!r}",
+        f"{file}: the way of its positions from {source!r} to the flight's crs {target!r}",
     )
     converted = np.column_stack(transformer.transform(*position.T))
     found = np.isfinite(converted).all(axis=1)
@@ -38,7 +44,7 @@ def convert_positions(path: Path, position: FloatArray, source: str, target: str
     if lost.size:
         where = ", ".join(f"{value:.10g}" for value in position[lost[0]])
         raise KgcpError(
-            f"{path}: the point ({where}) of epoch {lost[0] + 1} has no place in {target!r};"
+            f"{file}: the point ({where}) of epoch {lost[0] + 1} has no place in {target!r};"
             f" correct the file, or [vehicle] crs in flight.toml, which is {source!r} now"
         )
     return converted

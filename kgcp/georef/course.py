@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from kgcp.errors import KgcpError
@@ -16,7 +14,7 @@ _MIN_SPEED_M_S = 0.5  # slower, the noise of positions has a say in the course
 
 
 def attitude_from_course(
-    path: Path, time_s: FloatArray, position: FloatArray, crs: str
+    file: str, time_s: FloatArray, position: FloatArray, crs: str
 ) -> FloatArray:
     """Return roll = pitch = 0 and the course over ground as heading (n, 3) [deg].
 
@@ -42,7 +40,7 @@ def attitude_from_course(
     moves = np.hypot(east, north) > _MIN_SPEED_M_S * (end - start)
     if not moves.any():
         raise KgcpError(
-            f"{path}: the vehicle never moves, so that its course tells no heading;"
+            f"{file}: the vehicle never moves, so that its course tells no heading;"
             " give a trajectory with attitude"
         )
     last_move = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), -1))

@@ -11,10 +11,9 @@ from pathlib import Path
 from kgcp import __version__
 from kgcp.errors import KgcpError
 from kgcp.io.files.lock import locked
-from kgcp.io.files.safe_read import is_file
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import read_times
-from kgcp.io.formats.orientations import read_flight_poses
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import DETECTION_COLUMNS, SCHEMA_VERSION, Row
 from kgcp.io.tables.detections import detection_rows
@@ -108,7 +107,8 @@ def detect_flight(
         times = {}
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
-        notes = _take_notes(flight, frames, times)
+        data = FlightData(flight, frames)
+        notes = _take_notes(flight, data, frames, times)
         sheet = None if overlay is None else _sheet(flight, overlay)
     task = FrameTask(
         stored_frames or flight.frames_folder,
@@ -132,7 +132,7 @@ def detect_flight(
         guide_problem = None
         if settings.is_guided:
             with stopwatch.stage("second look"):
-                expected, guide_problem = expectations(flight, looks.sightings)
+                expected, guide_problem = expectations(flight, data, looks.sightings)
                 looks.look_again(expected)
         tally = Tally(times)
         if sheet is not None:
@@ -187,18 +187,14 @@ def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, f
 
 
 def _take_notes(
-    flight: Flight, frames: Sequence[str], times: Mapping[str, float]
+    flight: Flight, data: FlightData, frames: Sequence[str], times: Mapping[str, float]
 ) -> list[FrameNote]:
-    """Return what is known of each frame before it is read.
-
-    Reference poses are mostly made after the detections: a file that is not there yet is no error.
-    """
+    """Return what is known of each frame before it is read."""
     priors: Sequence[NormalPrior | None] = [None] * len(frames)
     if flight.vehicle is not None and flight.vehicle.level_sd_deg is not None:
-        path = flight.reference_file
         priors = normal_priors(
             frames,
-            read_flight_poses(flight, frames) if path is not None and is_file(path) else None,
+            data.reference_poses if data.has_reference else None,
             level_sd_deg=flight.vehicle.level_sd_deg,
             plumb_sd_deg=flight.plumb_sd_deg,
         )

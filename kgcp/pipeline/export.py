@@ -13,9 +13,8 @@ from kgcp.georef.crs import MapChange
 from kgcp.georef.gcp import Kgcp, Skip, build_kgcps, on_map
 from kgcp.georef.selection import Selection, select
 from kgcp.georef.target_positions import Carrier
-from kgcp.io.flight.data import read_whereabouts
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.tables.sightings import read_attempts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.quality.consistency import Consistency, study_consistency
@@ -65,18 +64,14 @@ def prepare(flight: Flight, detections: Path, wanted: Selection, crs: str | None
             f"{detections}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
-    whereabouts = read_whereabouts(flight)
+    data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
+    whereabouts = data.whereabouts
     frame = whereabouts.frame
     placed, absent = build_kgcps(sightings, whereabouts, flight.camera)
     kgcps, unwanted = select(placed, sightings, frame, flight.camera, wanted)
     consistency = None
-    if flight.reference_file is not None and flight.reference_file.exists():
-        poses = read_reference_poses(
-            flight.reference_file,
-            flight.reference_notation,
-            crs=flight.crs,
-            frames=sorted({attempt.frame for attempt in attempts}),
-        )
+    if data.has_reference:
+        poses = data.reference_poses
         consistency = study_consistency(sightings, whereabouts, poses, flight.camera)
     if crs is not None and kgcps:
         change = MapChange.to(crs, frame, np.asarray(kgcps[0].position_map))

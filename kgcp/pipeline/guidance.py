@@ -9,12 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.prediction import Track, expect, reference_states, state_of
-from kgcp.io.files.safe_read import is_file
-from kgcp.io.flight.data import read_whereabouts
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.orientations import read_flight_poses
 from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.guided import Expectation
 from kgcp.measurement.records import Miss, Observation, is_unreadable
@@ -63,7 +60,7 @@ class Sightings:
 
 
 def expectations(
-    flight: Flight, sightings: Sightings
+    flight: Flight, data: FlightData, sightings: Sightings
 ) -> tuple[dict[int, dict[str, Expectation]], str | None]:
     """Return, for each frame, where its missing targets must be, as far as that is sure.
 
@@ -82,35 +79,21 @@ def expectations(
             continue
         states = None
         try:
-            states = _reference_states(flight, target, sightings)
+            if data.has_reference and data.has_position_of(target):
+                states = reference_states(
+                    sightings.frames,
+                    [None if math.isnan(time_s) else float(time_s) for time_s in sightings.time_s],
+                    target,
+                    data.reference_poses,
+                    data.whereabouts,
+                    flight.camera,
+                )
         except KgcpError as error:
             problem = str(error)
         for row, one in enumerate(expect(track, states)):
             if one is not None and one.is_sure:
                 expected.setdefault(row, {})[target.name] = one
     return expected, problem
-
-
-def _reference_states(flight: Flight, target: Target, sightings: Sightings) -> FloatArray | None:
-    """Return where the reference puts a target; None where there is no reference (yet)."""
-    files = [flight.reference_file]
-    if target.position_m is None:
-        files.append(flight.trajectory_file)
-    if flight.crs is None or not all(path is not None and is_file(path) for path in files):
-        return None
-    poses = read_flight_poses(flight, sightings.frames)
-    return (
-        None
-        if poses is None
-        else reference_states(
-            sightings.frames,
-            [None if math.isnan(time_s) else float(time_s) for time_s in sightings.time_s],
-            target,
-            poses,
-            read_whereabouts(flight),
-            flight.camera,
-        )
-    )
 
 
 def with_expectations(result: FrameResult, expected: Mapping[str, Expectation]) -> FrameResult:

@@ -10,6 +10,8 @@ import numpy as np
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
 from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.formats.calibrations import FORMATS, read_calibration
+from kgcp.io.formats.calibrations.entry import camera_of
 from kgcp.settings import require_range
 
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
@@ -55,8 +57,6 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
 
 
 def _inline_camera(table: TomlTable) -> Camera:
-    from kgcp.io.formats.calibrations.entry import camera_of
-
     for key in ("format", "camera"):
         if key in table:
             raise table.error(key, "stands without a file", "give file, too, or delete it")
@@ -69,8 +69,6 @@ def _inline_camera(table: TomlTable) -> Camera:
 
 
 def _file_camera(table: TomlTable, folder: Path) -> Camera:
-    from kgcp.io.formats.calibrations import FORMATS, read_calibration
-
     for key in CALIBRATION_PARAMETERS:
         if key in table:
             raise table.error(key, "stands beside a calibration file", "delete one of the two")

@@ -1,30 +1,87 @@
-"""From a flight's files to where its targets were."""
+"""The files that flight.toml names: each is read once, when it is first needed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
+
 from kgcp.errors import KgcpError
+from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import Whereabouts
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.settings import VehicleSettings
+from kgcp.targets.layout import Target
 
 
-def read_whereabouts(flight: Flight) -> Whereabouts:
-    """Read the vehicle's trajectory, if the flight has one, and place the flight's targets.
+class FlightData:
+    """Reference poses of the camera and positions of the targets of one flight.
 
-    Raises
-    ------
-    KgcpError
-        If flight.toml has no crs, its crs is unusable, no target has a position, or the
-        trajectory cannot be read.
+    Both files may come later than the frames: detections need neither, and reference poses are
+    mostly made with the points that kgcp exports. `has_reference` and `has_position_of` tell
+    whether they are there; here, and nowhere else, this is decided.
+
+    Parameters
+    ----------
+    flight : Flight
+    frames : sequence of str
+        Its frames, by which the images of the poses' file are known.
     """
-    if flight.crs is None:
-        raise KgcpError(
-            f"{flight.folder / 'flight.toml'}: has no crs; name that of the coordinates,"
-            ' for example crs = "EPSG:25831"'
+
+    def __init__(self, flight: Flight, frames: Sequence[str]) -> None:
+        self._flight, self._frames = flight, frames
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether flight.toml names reference poses that exist."""
+        return self._flight.reference_file is not None and self._flight.reference_file.exists()
+
+    def has_position_of(self, target: Target) -> bool:
+        """Tell whether there is what a target's position is made from."""
+        file = self._flight.trajectory_file
+        is_placed = target.position_m is not None or (file is not None and file.exists())
+        return self._flight.crs is not None and is_placed
+
+    @cached_property
+    def reference_poses(self) -> ReferencePoses:
+        """Reference poses, in the flight's CRS.
+
+        Raises
+        ------
+        KgcpError
+            If flight.toml names none; else as `read_reference_poses`.
+        """
+        flight = self._flight
+        if flight.reference_file is None:
+            raise KgcpError(
+                f"{flight.folder / 'flight.toml'}: has no [reference]; give poses ="
+                " 'reference.csv' with the camera's poses from an adjustment"
+            )
+        return read_reference_poses(
+            flight.reference_file, flight.reference_notation, crs=flight.crs, frames=self._frames
         )
-    trajectory = None
-    if flight.trajectory_file is not None and flight.trajectory_notation is not None:
-        trajectory = read_trajectory(flight.trajectory_file, flight.crs, flight.trajectory_notation)
-    settings = flight.vehicle or VehicleSettings()
-    return Whereabouts.of(flight.crs, flight.targets, trajectory, settings)
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """Where the flight's targets were, by the vehicle's trajectory if it has one.
+
+        Raises
+        ------
+        KgcpError
+            If flight.toml has no crs, its crs is unusable, no target has a position, or the
+            trajectory cannot be read.
+        """
+        flight = self._flight
+        if flight.crs is None:
+            raise KgcpError(
+                f"{flight.folder / 'flight.toml'}: has no crs; name that of the coordinates,"
+                ' for example crs = "EPSG:25831"'
+            )
+        trajectory = None
+        if flight.trajectory_file is not None and flight.trajectory_notation is not None:
+            trajectory = read_trajectory(
+                flight.trajectory_file, flight.crs, flight.trajectory_notation
+            )
+        settings = flight.vehicle or VehicleSettings()
+        return Whereabouts.of(flight.crs, flight.targets, trajectory, settings)

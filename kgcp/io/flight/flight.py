@@ -22,7 +22,7 @@ from kgcp.io.flight.target_table import read_targets
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import read_vehicle
 from kgcp.io.formats.frame_times import TimesFormat
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
 from kgcp.io.formats.trajectories.records import TrajectoryNotation
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
@@ -48,13 +48,11 @@ def read_reference(flight: TomlTable, folder: Path) -> tuple[Path | None, PoseNo
     KgcpError
         If a key is unknown, missing or of the wrong type.
     """
-    from kgcp.io.formats.orientations import FORMATS
-
     if "reference" not in flight:
         return None, PoseNotation()
     table = flight.table("reference", REFERENCE_KEYS)
     notation = PoseNotation(
-        form=table.choice("format", tuple(FORMATS)) if "format" in table else None,
+        form=PoseFormat(table.choice("format", tuple(PoseFormat))) if "format" in table else None,
         crs=table.text("crs") if "crs" in table else None,
         offset_file=table.existing_file("offset", folder) if "offset" in table else None,
     )

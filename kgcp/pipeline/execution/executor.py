@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kgcp.io.images.remote import StoredFolder
+from kgcp.pipeline.execution.dask_client import connected
 from kgcp.pipeline.execution.local_processes import LocalPool
 from kgcp.pipeline.execution.profiling import profiled
 from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map, usable_cores
@@ -101,8 +102,6 @@ def hired(
     if scheduler is None:
         yield Crew(usable_cores() if jobs is None else jobs, limit_s, stages_s)
         return
-    from kgcp.pipeline.execution.dask_client import connected
-
     folders = (frames,) if isinstance(frames, Path) else ()
     with connected(scheduler, limit_s, folders) as cluster:
         yield Crew(jobs or cluster.jobs, limit_s, stages_s, cluster.executor)

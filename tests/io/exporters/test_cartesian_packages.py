@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters import colmap, export, micmac, mmvii
+from kgcp.io.exporters import colmap, micmac, mmvii
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 
 Factory = Callable[..., MapPoints]
 _GRID = Transformer.from_crs("EPSG:4258", "EPSG:25831", always_xy=True)

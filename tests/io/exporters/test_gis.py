@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from kgcp.io.exporters import export, geojson, geopackage
+from kgcp.io.exporters import geojson, geopackage
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 
 
 def test_gdal_reads_the_geopackage(points: MapPoints, tmp_path: Path) -> None:

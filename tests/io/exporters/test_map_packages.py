@@ -18,8 +18,9 @@ from pyproj import Transformer
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import opk_deg
-from kgcp.io.exporters import export, metashape, opensfm, opf, pix4d
+from kgcp.io.exporters import metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 
 Factory = Callable[..., MapPoints]
 

@@ -19,18 +19,10 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
 from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.crs import MapFrame
-from kgcp.io.exporters import (
-    DEFAULT_FORMATS,
-    FORMATS,
-    camera_priors,
-    export,
-    geopackage,
-    metashape,
-    odm,
-    opf,
-    pix4d,
-)
+from kgcp.io.exporters import camera_priors, geopackage, metashape, odm, opf, pix4d
+from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 
 ROOT = Path(__file__).resolve().parents[3]
 Factory = Callable[..., MapPoints]

@@ -14,7 +14,7 @@ from pyproj import CRS, Transformer
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.target_positions import Place
 from kgcp.io.files.time_text import parse_time
-from kgcp.io.flight.data import read_whereabouts
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.formats.frame_times import read_times
 
@@ -48,7 +48,7 @@ def places(folder: Path, keys: str) -> tuple[FloatArray, FloatArray]:
     (folder / "frames").mkdir(exist_ok=True)
     shutil.copy(SAMPLE / "frames.csv", folder)
     shutil.copy(SAMPLE / "vehicle.csv", folder)
-    whereabouts = read_whereabouts(read_flight(folder))
+    whereabouts = FlightData(read_flight(folder), ()).whereabouts
     times = list(read_times(SAMPLE / "frames.csv", []).values())
     found = [p for p in whereabouts.places(["A"] * len(times), times) if isinstance(p, Place)]
     assert len(found) == len(times)

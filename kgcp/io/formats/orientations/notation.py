@@ -3,7 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
+
+
+class PoseFormat(StrEnum):
+    """A format of reference poses, by its name in flight.toml, in the order they are tried in."""
+
+    OPF = "opf"
+    OPENSFM = "opensfm"
+    ODM = "odm"
+    METASHAPE = "metashape"
+    PIX4D = "pix4d"
+    CSV = "csv"
+    COLMAP = "colmap"
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,8 +25,8 @@ class PoseNotation:
 
     Attributes
     ----------
-    form : str or None
-        One of `kgcp.io.formats.orientations.FORMATS`; None: the content tells.
+    form : PoseFormat or None
+        None: the content tells.
     crs : str or None
         Of the file's coordinates, for pyproj, where the file does not say it; None: the flight's,
         or as the format has it.
@@ -21,6 +34,6 @@ class PoseNotation:
         Holds what was subtracted from the file's coordinates; None: nothing was.
     """
 
-    form: str | None = None
+    form: PoseFormat | None = None
     crs: str | None = None
     offset_file: Path | None = None

@@ -53,7 +53,7 @@ def read_trajectory(
         epochs = _on_map(path, epochs, flight_crs)
     attitude_deg, sd_attitude_deg = epochs.attitude_deg, epochs.sd_attitude_deg
     if notation.course_sd_deg is not None:
-        attitude_deg = attitude_from_course(path, epochs.time_s, epochs.position, flight_crs)
+        attitude_deg = attitude_from_course(str(path), epochs.time_s, epochs.position, flight_crs)
         sd_attitude_deg = np.tile(notation.course_sd_deg, (len(epochs.time_s), 1))
     if attitude_deg is None:
         raise KgcpError(
@@ -141,7 +141,7 @@ def _read(
 
 def _on_map(path: Path, epochs: Epochs, crs: str) -> Epochs:
     """Bring positions, and what is given along the axes, to the flight's CRS."""
-    position = convert_positions(path, epochs.position, epochs.crs, crs)
+    position = convert_positions(str(path), epochs.position, epochs.crs, crs)
     cov = epochs.cov_position_m2
     if cov is None and epochs.sd_position_m is not None:
         cov = _diagonal(epochs.sd_position_m**2)

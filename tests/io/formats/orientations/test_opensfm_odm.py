@@ -16,7 +16,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -101,7 +101,7 @@ def test_opendronemap_s_overwritten_file_is_utm_less_an_offset(
     check(read_reference_poses(original, crs="EPSG:32631"), truth["utm"], truth["utm_from_photo"])
     offset = tmp_path / "coords.txt"
     offset.write_text("WGS84 UTM 31N\n299000.0 4585000.0\n12.5 7.5 512.25\n")
-    notation = PoseNotation("opensfm", "EPSG:32631", offset)
+    notation = PoseNotation(PoseFormat.OPENSFM, "EPSG:32631", offset)
     check(
         read_reference_poses(path, notation, crs="EPSG:32631"),
         truth["utm"],

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.formats.orientations import FORMATS, read_flight_poses, read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations import read_reference_poses
+from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
 
 SAMPLES: dict[str, Any] = {
     "csv": "frame,x,y,z,omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0\n",
@@ -52,7 +53,7 @@ OPF_PARTS: dict[str, dict[str, object]] = {
 
 
 def test_every_format_has_a_sample() -> None:
-    assert SAMPLES.keys() == FORMATS.keys()
+    assert SAMPLES.keys() == set(PoseFormat)
 
 
 @pytest.mark.parametrize("form", sorted(SAMPLES))
@@ -64,7 +65,7 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
         kind = {"format": f"application/opf-{name.replace('_', '-')}+json"}
         (tmp_path / f"{name}.json").write_text(json.dumps({**part, **kind}))
     stated = "EPSG:32631" if form in {"colmap", "metashape", "opensfm"} else None
-    named = read_reference_poses(path, PoseNotation(form, stated), crs="EPSG:32631")
+    named = read_reference_poses(path, PoseNotation(PoseFormat(form), stated), crs="EPSG:32631")
     found = read_reference_poses(path, PoseNotation(None, stated), crs="EPSG:32631")
     assert found.frames == named.frames == ("a.jpg",)
     np.testing.assert_array_equal(found.position_map, named.position_map)
@@ -142,7 +143,7 @@ def test_a_missing_grid_is_named(tmp_path: Path) -> None:
         read_reference_poses(path)
 
 
-@pytest.mark.parametrize("form", sorted(FORMATS))
+@pytest.mark.parametrize("form", sorted(PoseFormat))
 @pytest.mark.parametrize(
     "content", ["", "no such thing\n", "[1, 2]", "{}", "<a/>", "\x00\x01", "a,b\n1,2\n", "[]"]
 )
@@ -152,7 +153,7 @@ def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
     path = tmp_path / "poses"
     path.write_text(content)
     with pytest.raises(KgcpError) as caught:
-        read_reference_poses(path, PoseNotation(form), crs="EPSG:32631")
+        read_reference_poses(path, PoseNotation(PoseFormat(form)), crs="EPSG:32631")
     assert str(caught.value).startswith(f"{path}")
     assert "\n" not in str(caught.value)
 
@@ -185,11 +186,16 @@ def test_flight_toml_describes_the_file(tmp_path: Path) -> None:
         "code_diameter_m = 0.642857143\ndot_diameter_m = 0.128571429\ncode_deg = [0, 43, 78]\n"
     )
     toml.write_text(flight)
-    assert read_flight_poses(read_flight(tmp_path)) is None
+    without = FlightData(read_flight(tmp_path), ())
+    assert not without.has_reference
+    with pytest.raises(KgcpError, match=r"flight.toml: has no \[reference\]; give poses"):
+        _ = without.reference_poses
     reference = '[reference]\nposes = "poses.txt"\ncrs = "EPSG:32631"\noffset = "shift.xyz"\n'
     toml.write_text(f'{flight}{reference}format = "colmap"\n')
-    poses = read_flight_poses(read_flight(tmp_path))
-    assert poses is not None
+    data = FlightData(read_flight(tmp_path), ("b/a.jpg",))
+    assert data.has_reference
+    poses = data.reference_poses
+    assert data.reference_poses is poses  # read once
     assert poses.frames == ("b/a.jpg",)
     np.testing.assert_allclose(poses.position_map, [[399_999.0, 4_499_998.0, -3.0]])
     toml.write_text(f'{flight}{reference}format = "bundler"\n')
