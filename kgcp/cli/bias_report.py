@@ -47,7 +47,7 @@ def command(
     from kgcp.io.tables.sightings import read_attempts, read_settings
     from kgcp.pipeline.workspace import DETECTIONS, workplace
     from kgcp.quality.bias_study import study_bias
-    from kgcp.report.style import load_matplotlib
+    from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
     from kgcp.pipeline.bias_report import write_report

@@ -98,7 +98,7 @@ def command(
     camera, calibration, targets = read_camera_and_targets(flight)
     target = chosen_targets(targets, (name,) if name else ())[0]
     if plot is not None:
-        from kgcp.report.style import load_matplotlib
+        from kgcp.report.plotting import load_matplotlib
 
         load_matplotlib()  # before the figure does
         from kgcp.report.plan_figure import check_figure_name

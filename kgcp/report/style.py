@@ -1,12 +1,11 @@
-"""What all figures share: style, PNG bytes, and where in a figure its points lie."""
+"""What all figures of the report share: style, PNG bytes, and where in it the points lie."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
-from contextlib import chdir, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 
 import numpy as np
 from matplotlib import style
@@ -34,16 +33,6 @@ _STYLE = {
     "legend.fontsize": 10.0,
     "savefig.dpi": _DPI,
 }
-
-
-def load_matplotlib() -> None:
-    """Import it without the settings of the current folder, before anything else imports it.
-
-    It reads a file matplotlibrc there, and commands are mostly run in a flight's folder, which may
-    come from anybody.
-    """
-    with chdir("/"):
-        import_module("matplotlib")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -129,7 +129,7 @@ def test_what_is_said_can_be_chosen(short_flight: Path, tmp_path: Path) -> None:
     assert [event["event"] for event in events[-2:]] == ["progress", "summary"]
     assert events[-1]["reasons"] == json.loads(told.stdout)["reasons"]
     profiled = run(short_flight, tmp_path / "c", "--profile")
-    for stage in ("first look", "table", "workers: io.frames.read_grey"):
+    for stage in ("first look", "table", "workers: io.images.frames.read_grey"):
         assert f" s  {stage}\n" in profiled.stderr
     tables = {(tmp_path / name / "detections.parquet").read_bytes() for name in "abc"}
     assert len(tables) == 1

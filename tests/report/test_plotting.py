@@ -6,7 +6,7 @@ from pathlib import Path
 
 _PROGRAM = """
 import os
-from kgcp.report.style import load_matplotlib
+from kgcp.report.plotting import load_matplotlib
 here = os.getcwd()
 load_matplotlib()
 import matplotlib
