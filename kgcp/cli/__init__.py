@@ -1,4 +1,4 @@
-"""The command line: thin commands, and the one place that turns known errors into one line."""
+"""The command line: thin commands, and the one place that prints known errors as one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kgcp import __version__
 from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
-# Name → module, in the order of the work; a module is imported when its command is called.
+# Name → module, in the order of use; a module is imported when its command is called.
 COMMANDS = {
     "detect": "kgcp.cli.detect",
     "export-gcp": "kgcp.cli.export_gcp",
@@ -53,10 +53,10 @@ def _one_line_warnings() -> Iterator[None]:
 
 
 class Program(click.Group):
-    """The `kgcp` command: imports what it runs, and ends known errors in one line."""
+    """The `kgcp` command: imports a command when it is called, prints known errors as one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """Name the commands in the order of the work."""
+        """Return the commands in the order of use."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
@@ -76,19 +76,19 @@ class Program(click.Group):
             click.echo(f"kgcp: error: {error}", err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
-            click.echo("kgcp: interrupted; files written so far are whole", err=True)
+            click.echo("kgcp: interrupted; files written so far are complete", err=True)
             ctx.exit(_EXIT_INTERRUPTED)
 
 
 @click.group(cls=Program, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="kgcp")
 def main() -> None:
-    """Measure coded circular targets in aerial frames and make ground control of them.
+    """Measure coded circular targets in aerial frames and compute ground control points.
 
-    The usual way through a flight folder:
+    The usual sequence for a flight folder:
 
     \b
       kgcp detect FLIGHT         find and measure the target in every frame
-      kgcp export-gcp FLIGHT     make kinematic ground control points of it
-      kgcp bias-report FLIGHT    compare the distances with reference poses
+      kgcp export-gcp FLIGHT     compute and export kinematic ground control points
+      kgcp bias-report FLIGHT    compare measured distances with reference poses
     """  # noqa: D301 - \b is click's mark for lines that stay

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 1000),
     default=12,
     show_default=True,
-    help="Measure N frames, near and far, again with darker and brighter grey values.",
+    help="Measure N frames, near and far, again with darker and brighter grey values; 0 skips it.",
 )
 @json_option
 def command(
@@ -34,10 +34,10 @@ def command(
     *,
     as_json: bool,
 ) -> None:
-    """Compare the measured distances of FLIGHT with reference poses of the camera.
+    """Compare measured distances with reference camera poses.
 
     Writes FLIGHT/kgcp/bias_report.html, its figures as PNG, bias_summary.json and bias.parquet.
-    Needs 'kgcp detect' before it, and in flight.toml a crs, [reference] poses, and a [vehicle] or
+    Run 'kgcp detect' first. flight.toml needs a crs, [reference] poses, and either a [vehicle] or
     targets with position_m.
 
     Example: kgcp bias-report sample_flight

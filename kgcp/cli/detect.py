@@ -25,30 +25,30 @@ _DEFAULTS = DetectSettings()
     "--jobs",
     type=click.IntRange(0, 256),
     default=None,
-    help="Worker processes; 0 works in this one, which a broken decoder may end."
-    "  [default: the usable cores, or all of the scheduler's]",
+    help="Number of worker processes; 0 runs in this process, not isolated from decoder crashes."
+    "  [default: the usable cores, or all threads of the scheduler's workers]",
 )
 @click.option(
     "--method",
     type=click.Choice([method.value for method in Method]),
     default=_DEFAULTS.method.value,
     show_default=True,
-    help="How a found target is measured: 'model' fits the image of the plate, 'paper' is the"
-    " closed-form chain of Cucci (2016).",
+    help="Measuring method: 'model' fits a model of the plate's image, 'paper' is the closed-form"
+    " chain of Cucci (2016).",
 )
 @click.option(
     "--min-radius",
     type=float,
     default=_DEFAULTS.min_radius_px,
     show_default=True,
-    help="Smallest radius of a ring to look for [px]; a larger one saves time.",
+    help="Smallest ring radius to search for [px]; a larger value saves time.",
 )
 @click.option(
     "--min-score",
     type=float,
     default=_DEFAULTS.min_score,
     show_default=True,
-    help="Threshold on the normalised cross-correlation of the ring and its dots.",
+    help="Smallest normalised cross-correlation of the ring and its dots with the code.",
 )
 @click.option(
     "--false-alarm",
@@ -56,40 +56,40 @@ _DEFAULTS = DetectSettings()
     metavar="P",
     default=_DEFAULTS.false_alarm,
     show_default=True,
-    help="Chance per frame, at most, that random light on a ring is taken for the code.",
+    help="Largest probability per frame of mistaking random light on a ring for the code.",
 )
 @click.option(
     "--guided/--no-guided",
     "is_guided",
     default=_DEFAULTS.is_guided,
     show_default=True,
-    help="Look again, closer, where other frames or reference poses say that a target must be.",
+    help="Search again, more closely, where other frames or reference poses predict a target.",
 )
 @click.option(
     "--debug",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Write a picture per frame to DIR: what was considered, and why it was dropped.",
+    help="Write one picture per frame to DIR, with every candidate ring and why it was rejected.",
 )
 @click.option(
     "--debug-frames",
     metavar="PATTERN",
     default="*",
     show_default=True,
-    help="Draw these frames only, for example 'east/*_01?.jpg'.",
+    help="Limit --debug to these frames, for example 'east/*_01?.jpg'.",
 )
 @click.option(
     "--overlay",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Write a contact sheet to DIR/index.html: every ring with its fitted contours, what the"
-    " fit leaves, and the values.",
+    help="Write a contact sheet to DIR/index.html: every ring with its fitted contours, residuals"
+    " and values.",
 )
 @click.option(
     "--restart",
     "is_restart",
     is_flag=True,
-    help="Begin anew, whatever a run that was interrupted has left.",
+    help="Discard the results of an interrupted run and start over.",
 )
 @click.option(
     "--frame-timeout",
@@ -97,16 +97,16 @@ _DEFAULTS = DetectSettings()
     metavar="S",
     default=300.0,
     show_default=True,
-    help="Give a frame up that takes longer than this [s].",
+    help="Give up on a frame after this time [s].",
 )
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Let a Dask cluster work, for example tcp://10.0.0.1:8786; local:4 is one on this machine."
-    " Needs kgcp[dask], there and here.",
+    help="Run on a Dask cluster, for example tcp://10.0.0.1:8786; local:4 starts one on this"
+    " machine. Needs kgcp[dask] on all machines.",
 )
 @click.option(
-    "--profile", "is_profiled", is_flag=True, help="Print the time per stage, which costs some."
+    "--profile", "is_profiled", is_flag=True, help="Print the time per stage, at a small cost."
 )
 @click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
 @click.option(
@@ -139,14 +139,14 @@ def command(
     """Find and measure the target in every frame of FLIGHT.
 
     Writes FLIGHT/kgcp/detections.parquet: one row per frame and target, with the projected
-    centre, the distance and the orientation, or the reason why there is none.
+    centre, the distance and the orientation, or the reason why the target was not measured.
 
-    A run that was interrupted goes on where it stopped when the same command is given again.
+    If a run is interrupted, repeat the command to resume it.
 
     Example: kgcp detect sample_flight --jobs 2
     """
     if scheduler is not None and jobs == 0:
-        raise click.UsageError("--jobs 0 works in this process, --scheduler in others: give one")
+        raise click.UsageError("--jobs 0 and --scheduler exclude each other; give one of them")
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.detect import detect_flight
     from kgcp.pipeline.frame_task import Debug

@@ -1,4 +1,4 @@
-"""What `kgcp detect` says on stderr: while it works, when it is stopped, at its end."""
+"""Messages of `kgcp detect` on stderr: progress, interruption, summary."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
-_PATIENCE_S = 10.0  # that a bar may stand still at its begin
-_SHORTEST_STAGE_S = 0.0005  # of which digits show
+_PATIENCE_S = 10.0  # without progress at the start before the wait is explained
+_SHORTEST_STAGE_S = 0.0005  # shorter ones would print as 0.000
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came: it stops the work as Ctrl-C does."""
+    """SIGTERM arrived: it stops the run as Ctrl-C does."""
 
 
 class Log:
-    """Progress as a bar, or as lines of JSON, or not at all.
+    """Progress as a bar, as lines of JSON, or not at all.
 
     Parameters
     ----------
@@ -66,20 +66,20 @@ class Log:
             self.event("progress", done=done, total=total, found=found)
 
     def explain_wait(self) -> None:
-        """Tell what takes so long where nothing is done yet."""
+        """Explain the wait if no frame is finished yet."""
         if not self.done:
             self.note(
-                "no frame is done yet: a first run compiles its inner loops, for a minute or two"
+                "no frame is finished yet: the first run compiles its inner loops (a minute or two)"
             )
 
     def stop(self) -> None:
-        """Tell how far the work went, and how to go on."""
+        """Report how far the run got and how to resume it."""
         self._bar.close()
         if self.is_json:
             self.event("stopped", done=self.done, total=self.total)
         else:
-            text = f"stopped; {self.done} of {self.total} looks at frames are done and kept"
-            click.echo(f"kgcp: {text}: the same command goes on", err=True)
+            text = f"stopped; {self.done} of {self.total} frames processed, results kept"
+            click.echo(f"kgcp: {text}: repeat the command to resume", err=True)
 
     def event(self, event: str, **values: object) -> None:
         """Print a line of JSON."""
@@ -91,10 +91,10 @@ def log_to_stderr(*, is_quiet: bool, as_json: bool) -> Iterator[Log]:
     """Show progress until the block ends."""
     from tqdm import tqdm
 
-    with tqdm(unit="look", disable=is_quiet or as_json) as bar:
+    with tqdm(unit="frame", disable=is_quiet or as_json) as bar:
         log = Log(bar, is_quiet=is_quiet, as_json=as_json)
         patience = Timer(_PATIENCE_S, log.explain_wait)
-        if sys.stderr.isatty():  # somebody may sit before it
+        if sys.stderr.isatty():  # a person may be waiting
             patience.start()
         try:
             yield log
@@ -104,7 +104,7 @@ def log_to_stderr(*, is_quiet: bool, as_json: bool) -> Iterator[Log]:
 
 @contextmanager
 def stopping(log: Log) -> Iterator[None]:
-    """End the program, with a line on how to go on, when SIGINT or SIGTERM stops the block."""
+    """Exit, with a line on how to resume, when SIGINT or SIGTERM stops the block."""
     previous = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
@@ -129,7 +129,7 @@ def report(
     *,
     as_json: bool,
 ) -> None:
-    """Print what became of the frames; with `as_json` also to stdout."""
+    """Print the counts of the run; with `as_json` also to stdout."""
     frames_per_s = (summary.frames - summary.kept) / seconds
     numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
     files = {"table": table}
@@ -161,29 +161,31 @@ def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float
     for reason, count in summary.reasons.items():
         click.echo(f"  {count:6d} {reason}", err=True)
     if summary.guided:
-        click.echo(f"{summary.guided} of them measured by a second look", err=True)
+        click.echo(f"{summary.guided} of them measured in the second pass", err=True)
     if summary.guide_problem is not None:
-        click.echo(f"no second look by the reference: {summary.guide_problem}", err=True)
+        click.echo(f"second pass without reference poses: {summary.guide_problem}", err=True)
     if summary.not_drawn:
-        click.echo(f"{summary.not_drawn} rings not drawn: their frames are not there", err=True)
+        click.echo(
+            f"rings not drawn because their frames are missing: {summary.not_drawn}", err=True
+        )
     if summary.frames_without_time:
         click.echo(
-            f"{summary.frames_without_time} frames have no time: name a times file in flight.toml"
-            " ([frames] times) to make KGCPs of them",
+            f"frames without a time: {summary.frames_without_time}; to turn them into KGCPs, name a"
+            " times file in flight.toml ([frames] times)",
             err=True,
         )
     if summary.exif_times_in_whole_seconds:
         click.echo(
-            f"{summary.exif_times_in_whole_seconds} frames have times from EXIF in whole seconds"
-            " only, in which a vehicle goes metres: name a times file in flight.toml"
-            " ([frames] times) to make KGCPs of them",
+            f"frames with EXIF times in whole seconds only: {summary.exif_times_in_whole_seconds};"
+            " a vehicle moves metres in a second: to turn them into KGCPs, name a times file in"
+            " flight.toml ([frames] times)",
             err=True,
         )
     if summary.frames_without_attitude:
         click.echo(
-            f"{summary.frames_without_attitude} frames have no camera attitude, so that a level"
-            " plate does not tell their two poses apart: give [camera] plumb_sd_deg",
+            f"frames without a camera attitude: {summary.frames_without_attitude}; a level plate"
+            " cannot tell their two poses apart: give [camera] plumb_sd_deg",
             err=True,
         )
     if summary.times_without_frame:
-        click.echo(f"{summary.times_without_frame} times belong to no frame", err=True)
+        click.echo(f"times without a frame of that name: {summary.times_without_frame}", err=True)

@@ -47,8 +47,8 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     type=click.Choice([*FORMATS, ALL]),
     multiple=True,
     default=DEFAULT_FORMATS,
-    help="What to write besides kgcps.parquet; may be repeated; 'all' leaves out what these points"
-    " do not fit.  [default: csv, odm]",
+    help="Format to write besides kgcps.parquet; may be repeated; 'all' skips formats that cannot"
+    " hold these points.  [default: csv, odm]",
 )
 @click.option(
     "--list-formats",
@@ -62,7 +62,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     "--crs",
     metavar="CRS",
     default=None,
-    help="Of the points, for example EPSG:25832.  [default: the flight's]",
+    help="CRS of the points, for example EPSG:25832.  [default: the flight's]",
 )
 @selection_options
 @detections_option
@@ -77,12 +77,13 @@ def command(
     as_json: bool,
     **selection: Any,  # noqa: ANN401 - the fields of a Selection
 ) -> None:
-    """Make kinematic ground control points of the detections of FLIGHT.
+    """Compute ground control points from the measurements.
 
     Interpolates the vehicle's trajectory at every frame's time, adds the lever arm, and writes
-    FLIGHT/kgcp/kgcps.parquet, kgcps.csv and OpenDroneMap's gcp_list.txt. Needs 'kgcp detect'
-    before it, and in flight.toml a crs and a [vehicle], or targets with position_m. Where there
-    are reference poses, it says how well they agree with the vehicle, and what to correct.
+    the kinematic ground control points to FLIGHT/kgcp: kgcps.parquet, kgcps.csv and OpenDroneMap's
+    gcp_list.txt. Run 'kgcp detect' first. flight.toml needs a crs and either a [vehicle] or targets
+    with position_m. With reference poses, the summary reports how well they agree with the vehicle
+    and what to correct.
 
     Example: kgcp export-gcp sample_flight --format odm
     """
@@ -118,9 +119,9 @@ def command(
 def _export(
     points: MapPoints, formats: tuple[str, ...], folder: Path
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write the named formats; of those that only `all` names, the ones that can be written.
+    """Write the named formats; with `all`, every format that can hold the points.
 
-    Returns paths, and why formats were left out.
+    Returns the paths, and by format why it was left out.
     """
     from kgcp.errors import KgcpError
     from kgcp.io.exporters.write import export
@@ -162,7 +163,7 @@ def _report(
             "not_renewed": older,
         }
         click.echo(json.dumps(summary))
-    of_these = f" ({checks} to check)" if checks else ""
+    of_these = f" ({checks} check points)" if checks else ""
     click.echo(
         f"{len(made.kgcps)} KGCPs{of_these}, {len(made.skipped)} sightings left out", err=True
     )
@@ -176,11 +177,11 @@ def _report(
     for name, reason in left_out.items():
         click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
     if older:
-        click.echo(f"not renewed, of an earlier export: {', '.join(older)}", err=True)
+        click.echo(f"left as an earlier export wrote them: {', '.join(older)}", err=True)
 
 
 def _named(written: list[Path]) -> list[str]:
-    """Name files; of many in one folder, the folder."""
+    """Name files; where a folder has many of them, the folder."""
     from collections import Counter
 
     counts = Counter(path.parent for path in written)
@@ -193,11 +194,13 @@ def _named(written: list[Path]) -> list[str]:
 
 def _report_deviations(carrier: Carrier | None) -> None:
     if carrier is not None and carrier.motion.sd_position_m is None:
-        click.echo("the trajectory has no sd_x, sd_y, sd_z: KGCPs have no deviations", err=True)
+        click.echo(
+            "the trajectory has no sd_x, sd_y, sd_z: KGCPs have no standard deviations", err=True
+        )
     elif carrier is not None and carrier.motion.sd_attitude_deg is None:
         click.echo(
             "the trajectory has no sd_roll_deg, sd_pitch_deg, sd_heading_deg:"
-            " attitude counts as free of error",
+            " attitude is taken as free of error",
             err=True,
         )
 
@@ -208,7 +211,7 @@ def _report_consistency(found: Consistency) -> None:
     along, across, up = rms_m(found)
     outliers = sum(one.is_outlier for one in found.discrepancies)
     click.echo(
-        f"{len(found.discrepancies)} frames with reference pose: vehicle and camera differ by"
+        f"frames with a reference pose: {len(found.discrepancies)}; vehicle and camera differ by"
         f" {along:.3f} m along, {across:.3f} m across, {up:.3f} m up (RMS), {outliers} outliers",
         err=True,
     )

@@ -13,7 +13,7 @@ detections_option : `detections`, Path or None
 json_option : `as_json`, bool
     Print a machine-readable summary to stdout.
 selection_options : the fields of `kgcp.georef.selection.Selection`
-    Which points to hand over.
+    Which points to export.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _place(
     parameter: click.Parameter,  # noqa: ARG001
     value: str | None,
 ) -> Path | StoredFolder | None:
-    """Tell the URL of a folder, `s3://…`, `gs://…` or `file://…`, from its path."""
+    """Distinguish the URL of a folder, `s3://…`, `gs://…` or `file://…`, from a path."""
     if value is None or "://" not in value:
         return None if value is None else Path(value)
     from kgcp.io.images.remote import parsed_url
@@ -52,7 +52,7 @@ out_option = click.option(
     metavar="FOLDER",
     type=click.Path(path_type=Path),
     default=None,
-    help="Folder of the results.  [default: FLIGHT/kgcp]",
+    help="Folder for the results.  [default: FLIGHT/kgcp]",
 )
 
 out_place_option = click.option(
@@ -60,7 +60,7 @@ out_place_option = click.option(
     metavar="FOLDER",
     callback=_place,
     default=None,
-    help="Folder of the results, here or in an object store.  [default: FLIGHT/kgcp]",
+    help="Folder for the results, local or in an object store.  [default: FLIGHT/kgcp]",
 )
 
 detections_option = click.option(
@@ -68,7 +68,7 @@ detections_option = click.option(
     metavar="FILE",
     type=click.Path(path_type=Path),
     default=None,
-    help="What 'kgcp detect' wrote.  [default: detections.parquet in the results' folder]",
+    help="Table written by 'kgcp detect'.  [default: detections.parquet in the results' folder]",
 )
 
 json_option = click.option(
@@ -81,19 +81,19 @@ _SELECTION = (
         "max_sd_m",
         metavar="M",
         type=click.FloatRange(0.0, min_open=True),
-        help="Leave out points whose position may be farther off, along its worst axis [m].",
+        help="Leave out points with a larger standard deviation along their worst axis [m].",
     ),
     click.option(
         "--min-score",
         metavar="S",
         type=click.FloatRange(0.0, 1.0),
-        help="Leave out points whose code was matched less well.",
+        help="Leave out points whose code matched less well than this score.",
     ),
     click.option(
         "--min-ambiguity",
         metavar="A",
         type=click.FloatRange(0.0),
-        help="Leave out points whose two poses are harder to tell apart.",
+        help="Leave out points whose two poses are harder to tell apart than this Δχ².",
     ),
     click.option(
         "--min-spacing",
@@ -101,7 +101,7 @@ _SELECTION = (
         metavar="M",
         type=click.FloatRange(0.0),
         default=0.0,
-        help="Of points nearer to each other along the track, keep the best [m].",
+        help="Thin points to this spacing along the track, keeping the best [m].",
     ),
     click.option(
         "--checkpoints",
@@ -109,12 +109,12 @@ _SELECTION = (
         metavar="SHARE",
         type=click.FloatRange(0.0, 1.0),
         default=0.0,
-        help="Make this share of the points check points, evenly along the track.",
+        help="Declare this share of the points check points, spaced evenly along the track.",
     ),
     click.option(
         "--keep-flagged",
         is_flag=True,
-        help="Keep points whose distance or height jumps out of a smooth flight.",
+        help="Keep points whose distance or height jumps out of the smooth flight path.",
     ),
 )
 

@@ -1,4 +1,4 @@
-"""`kgcp plan`: what a camera and a target will give, before the flight."""
+"""`kgcp plan`: expected detection and accuracy, before the flight."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @click.command()
 @flight_argument
-@click.option("--target", "name", metavar="NAME", help="Which target.  [default: the first]")
+@click.option("--target", "name", metavar="NAME", help="Target to plan for.  [default: the first]")
 @click.option(
     "--height",
     "heights_m",
     metavar="M",
     type=float,
     multiple=True,
-    help="Camera above target [m]; may be given several times.  [default: a table of usual ones]",
+    help="Height of the camera above the target [m]; may be repeated.  [default: usual heights]",
 )
 @click.option(
     "--exposure",
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     type=float,
     default=1.0,
     show_default=True,
-    help="Motion of the image during the exposure, at most [px].",
+    help="Largest acceptable motion of the image during the exposure [px].",
 )
 @click.option(
     "--psf",
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     type=float,
     default=0.7,
     show_default=True,
-    help="Blur of lens and sensor: σ of the point spread [px].",
+    help="Blur of lens and sensor: σ of the point spread function [px].",
 )
 @click.option(
     "--accuracy",
@@ -59,13 +59,13 @@ if TYPE_CHECKING:
     type=float,
     default=0.05,
     show_default=True,
-    help="Wanted standard deviation of one distance [% of it].",
+    help="Required standard deviation of a single distance [% of the distance].",
 )
 @click.option(
     "--plot",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Draw the table, as .png or .svg.",
+    help="Plot the table to FILE, as .png or .svg.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of the table.")
 def command(
@@ -80,11 +80,12 @@ def command(
     plot: Path | None,
     as_json: bool,
 ) -> None:
-    """Say what the camera and the target of FLIGHT's flight.toml will give from some heights.
+    """Predict detection and accuracy for a range of heights.
 
-    For each height: the ring's radius in the image, how likely it is found, standard deviations of
-    distance and centre in one frame, the largest speed for a given motion blur, and the smallest
-    target for a wanted accuracy. Neither frames nor trajectory need exist.
+    Uses the camera and the target of FLIGHT's flight.toml. For each height: the ring's radius in
+    the image, the probability of detection, the standard deviations of distance and centre in one
+    frame, the largest speed for a given motion blur, and the smallest target for a required
+    accuracy. Frames and trajectory need not exist.
 
     \b
     Example:
@@ -141,7 +142,7 @@ _COLUMNS = (
 
 
 def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
-    """Yield the table and what its columns mean."""
+    """Yield the lines of the table and of the notes on its columns."""
     from kgcp.simulation.outlook import SURE_PX, TILT_DEG
 
     lines = [
@@ -154,12 +155,12 @@ def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> It
     for cells in lines:
         yield "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
     blur = f"{conditions.blur_px:g} px"
-    yield f"σ: of one frame, exposed well, in the middle of it, plate tilted by {TILT_DEG:g}°,"
-    yield f"  point spread {conditions.psf_px:g} px, motion blur {blur}; of the centre per axis."
-    yield "common: of calibration and print, in all frames alike."
-    yield f"speed: the largest that blurs by {blur} in {conditions.exposure_s:g} s, over ground."
+    yield f"σ: one well exposed frame, target in its middle, plate tilted by {TILT_DEG:g}°,"
+    yield f"  point spread {conditions.psf_px:g} px, motion blur {blur}; centre: per axis."
+    yield "common: errors of calibration and print, the same in all frames."
+    yield f"speed: over ground, the largest that blurs by {blur} in {conditions.exposure_s:g} s."
     yield (
-        f"diameter: the smallest for σ of {conditions.accuracy_percent:g} % of the distance,"
+        f"diameter: the smallest for a σ of {conditions.accuracy_percent:g} % of the distance"
         f" and a radius of {SURE_PX:g} px."
     )
 

@@ -1,4 +1,4 @@
-"""`kgcp simulate`: a flight folder with known truth, out of nothing."""
+"""`kgcp simulate`: a rendered flight folder with known truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "fa
     type=click.Choice(PRESET_NAMES),
     default="clean",
     show_default=True,
-    help="What the flight is like.",
+    help="Kind of flight: camera, exposure and geometry.",
 )
 @click.option(
     "--frames",
@@ -39,7 +39,7 @@ PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "fa
     "--survey-errors/--no-survey-errors",
     default=True,
     show_default=True,
-    help="Errors of trajectory, lever arm, frame times and reference poses.",
+    help="Simulate errors of trajectory, lever arm, frame times and reference poses.",
 )
 @click.option(
     "--jobs",
@@ -58,10 +58,10 @@ def command(
     survey_errors: bool,
     as_json: bool,
 ) -> None:
-    """Simulate a flight with known truth and write its flight folder OUT.
+    """Simulate a flight with known truth in a new folder OUT.
 
     A vehicle with the target on its roof drives round a ring road; a UAV climbs and descends
-    over it. OUT gets frames, flight.toml, frames.csv, vehicle.csv, reference.csv and truth.csv.
+    above it. Writes frames, flight.toml, frames.csv, vehicle.csv, reference.csv and truth.csv.
 
     Example: kgcp simulate flight_1 --preset consumer --frames 100 --seed 7
     """

@@ -1,4 +1,4 @@
-"""`kgcp target`: targets to be printed, of a flight or with new codes."""
+"""`kgcp target`: print files for the targets of a flight or for new ones."""
 
 from __future__ import annotations
 
@@ -20,33 +20,39 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
 
 @click.command()
 @click.argument("flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), required=False)
-@click.option("--target", "names", metavar="NAME", multiple=True, help="Only this one of FLIGHT.")
+@click.option(
+    "--target",
+    "names",
+    metavar="NAME",
+    multiple=True,
+    help="Draw only this target of FLIGHT; may be repeated.",
+)
 @click.option(
     "--new",
     "new_count",
     type=click.IntRange(1, 50),
-    help="Propose so many new targets with codes as far apart as possible.",
+    help="Propose this number of new targets, with codes as far apart as possible.",
 )
 @click.option(
     "--code",
     "codes",
     metavar="DEG,DEG,…",
     multiple=True,
-    help="A new target with dots in these directions.",
+    help="Draw a new target with dots in these directions; may be repeated.",
 )
 @click.option(
     "--diameter",
     "diameter_m",
     metavar="M",
     type=click.FloatRange(0.0, 100.0, min_open=True),
-    help="Outer diameter of new targets [m].  [default: that of FLIGHT's first]",
+    help="Outer diameter of new targets [m].  [default: that of FLIGHT's first target]",
 )
 @click.option(
     "--dots",
     type=click.IntRange(3, 6),
     default=4,
     show_default=True,
-    help="Dots of proposed codes.",
+    help="Number of dots of proposed codes.",
 )
 @click.option(
     "--format",
@@ -55,7 +61,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     multiple=True,
     default=("pdf",),
     show_default=True,
-    help="What to write; may be given several times.",
+    help="File format; may be repeated.",
 )
 @click.option(
     "--sheet",
@@ -63,10 +69,10 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     type=click.Choice(PAPERS),
     default="fit",
     show_default=True,
-    help="Paper; 'fit' is as large as the target needs.",
+    help="Paper size; 'fit' is as large as the target needs.",
 )
 @click.option(
-    "--tiled", "is_tiled", is_flag=True, help="Use several sheets where one is too small."
+    "--tiled", "is_tiled", is_flag=True, help="Spread a target over several sheets if needed."
 )
 @click.option(
     "--plate",
@@ -75,7 +81,7 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     type=click.FloatRange(0.0, 100.0, min_open=True),
     help="Draw the outline of a square plate of this width [m].",
 )
-@click.option("--round", "is_round", is_flag=True, help="The plate is round.")
+@click.option("--round", "is_round", is_flag=True, help="Make the plate round.")
 @click.option(
     "--holes",
     "hole_mm",
@@ -88,14 +94,14 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     type=click.IntRange(20, 2400),
     default=300,
     show_default=True,
-    help="Resolution of PNG.",
+    help="Resolution of PNG files.",
 )
 @click.option(
     "--out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
     default=None,
-    help="Where to put the files.  [default: FLIGHT/kgcp/targets, or targets without FLIGHT]",
+    help="Folder for the files.  [default: FLIGHT/kgcp/targets, or targets without FLIGHT]",
 )
 @json_option
 def command(
@@ -118,9 +124,9 @@ def command(
 ) -> None:
     """Draw targets at true scale, to be printed, cut or engraved.
 
-    Without --new and --code: those of FLIGHT's flight.toml. With them: new ones, whose codes
-    cannot be confused with each other nor with those of FLIGHT, if it is given. targets.toml has
-    the tables for flight.toml.
+    Without --new and --code, draws the targets of FLIGHT's flight.toml. With them, draws new
+    targets whose codes cannot be confused with each other or with those of FLIGHT, if given.
+    Also writes targets.toml, with the tables for flight.toml.
 
     \b
     Examples:
@@ -138,11 +144,11 @@ def command(
 
     is_new = bool(new_count or codes)
     if names and is_new:
-        raise SettingError("target", "stands beside --new or --code", "give one of them")
+        raise SettingError("target", "cannot be combined with --new or --code", "give one of them")
     if diameter_m is not None and not is_new:
-        raise SettingError("diameter", "stands without --new or --code", "give one of them, too")
+        raise SettingError("diameter", "applies to new targets only", "add --new or --code")
     if (is_round or hole_mm is not None) and plate_m is None:
-        raise SettingError("plate", "is missing beside --round or --holes", "give its width")
+        raise SettingError("plate", "is required by --round and --holes", "give its width")
     if flight is None and not is_new:
         flight = Path()
     known = () if flight is None else read_printed_targets(flight)
@@ -175,7 +181,7 @@ def _tell(
     *,
     as_json: bool,
 ) -> None:
-    """Say what was written, and how well the codes can be told apart."""
+    """Report what was written and how far apart the codes are."""
     import json
     import warnings
 
@@ -194,11 +200,11 @@ def _tell(
         code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
         count = sheets_of[target.name]
         click.echo(f"{target.name}: code [{code}], {count} sheet{'s'[: count > 1]}", err=True)
-    click.echo(f"codes at least {apart:.1f} dots apart, turned or mirrored", err=True)
+    click.echo(f"codes are at least {apart:.1f} dots apart, rotated or mirrored", err=True)
     if apart < LEAST_DISTANCE:
         warnings.warn(
-            f"turned or mirrored, codes are only {apart:.1f} dots apart: a dirty dot may give one"
-            " target the heading or the name of another; --new proposes better ones",
+            f"rotated or mirrored, codes are only {apart:.1f} dots apart: a dirty dot may give one"
+            " target the heading or the name of another; --new proposes better codes",
             KgcpWarning,
             stacklevel=2,
         )

@@ -228,9 +228,9 @@ def test_files_of_an_earlier_export_are_mentioned(flight: FlightFolder) -> None:
     flight.run("export-gcp", "--format", "odm", "--format", "micmac")
     result = flight.run("export-gcp", "--format", "csv", "--min-spacing", "30", "--json")
     assert json.loads(result.stdout)["not_renewed"] == ["odm", "micmac"]
-    assert "not renewed, of an earlier export: odm, micmac" in result.stderr
+    assert "left as an earlier export wrote them: odm, micmac" in result.stderr
     result = flight.run("export-gcp", "--format", "odm", "--format", "micmac", "--format", "csv")
-    assert "not renewed" not in result.stderr
+    assert "earlier export" not in result.stderr
 
 
 def test_formats_are_listed_with_their_files() -> None:

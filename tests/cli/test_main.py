@@ -87,6 +87,13 @@ def test_every_command_is_listed() -> None:
         assert f"\n  {name} " in text
 
 
+def test_the_list_of_commands_has_whole_sentences() -> None:
+    text = CliRunner().invoke(main, ["--help"]).stdout
+    lines = text.partition("Commands:\n")[2].splitlines()
+    assert len(lines) == len(COMMANDS)
+    assert all(line.endswith(".") and not line.endswith("...") for line in lines)
+
+
 def test_the_module_runs_and_knows_its_version() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "kgcp", "--version"], capture_output=True, text=True, check=True

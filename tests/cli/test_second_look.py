@@ -78,7 +78,7 @@ def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> 
         flight, tmp_path, "--debug", str(tmp_path / "debug"), "--debug-frames", f"f_{HAZY}*"
     )
     assert json.loads(result.stdout)["guided"] == 1
-    assert "1 of them measured by a second look" in result.stderr
+    assert "1 of them measured in the second pass" in result.stderr
     rows = pd.read_parquet(tmp_path / "detections.parquet").set_index("frame")
     assert rows["status"].eq("measured").all()
     assert rows.index[rows["guided"]].to_list() == [f"f_{HAZY}.png"]

@@ -108,7 +108,7 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
     (flight / "flight.toml").write_text(text, encoding="utf-8")
     result = run(flight, "--format", "svg")
     assert result.exit_code == 0
-    assert "kgcp: warning: turned or mirrored, codes are only 0.0 dots apart" in result.stderr
+    assert "kgcp: warning: rotated or mirrored, codes are only 0.0 dots apart" in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -120,12 +120,12 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
         (["FLIGHT", "--code", "10,53,88.25,190"], "rotations of each other"),
         (["FLIGHT", "--target", "C"], "'C' is not in flight.toml; give one of A, B b"),
         (["FLIGHT", "--plate", "0.16"], "give at least 0.1875 m"),
-        (["FLIGHT", "--holes", "5"], "plate: is missing"),
+        (["FLIGHT", "--holes", "5"], "plate: is required by --round"),
         (["FLIGHT", "--sheet", "A4", "--plate", "0.25"], "A4 is smaller; give --tiled"),
         (["FLIGHT", "--tiled"], "'fit' is one sheet"),
         (["FLIGHT", "--format", "png", "--dpi", "2400", "--plate", "0.5"], "million pixels"),
-        (["FLIGHT", "--target", "A", "--new", "1"], "target: stands beside --new"),
-        (["FLIGHT", "--diameter", "0.3"], "diameter: stands without --new"),
+        (["FLIGHT", "--target", "A", "--new", "1"], "target: cannot be combined with --new"),
+        (["FLIGHT", "--diameter", "0.3"], "diameter: applies to new targets only"),
         (["no_such_folder"], "flight.toml: does not exist"),
     ],
 )

@@ -156,7 +156,7 @@ def test_a_frame_that_is_gone_when_it_is_drawn_is_a_line(
     result = detect(flight, tmp_path / "sheet")
     assert result.exit_code == 0
     assert json.loads(result.stdout)["not_drawn"] == 1
-    assert "1 rings not drawn" in result.stderr
+    assert "their frames are missing: 1" in result.stderr
     lost, other, *_ = cards(tmp_path / "sheet")
     assert "<img" not in lost
     assert "not drawn: decode_failed: No such file or directory" in lost
