@@ -21,18 +21,18 @@ from kgcp.io.tables.columns import (
     KGCP_COLUMNS,
     Column,
 )
+from tests.test_layers import LAYERS, MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 CONVENTIONS = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+DESIGN = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 
-def section(heading: str) -> str:
-    """The text below a heading of docs/conventions.md, up to the next one of any level."""
-    match = re.search(
-        rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", CONVENTIONS, re.MULTILINE | re.DOTALL
-    )
+def section(heading: str, page: str = CONVENTIONS) -> str:
+    """The text below a heading of a page, up to the next one of any level."""
+    match = re.search(rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
     assert match, heading
     return match[1]
 
@@ -117,3 +117,33 @@ def test_the_make_targets_of_the_readme_exist() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     for target in re.findall(r"(?:`|^ {4})make ([a-z-]+)", text, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_the_design_page_shows_every_folder_and_top_level_module() -> None:
+    shown = {
+        f"{line[: line.index(name)].count('  ')}{name}"
+        for line in section("The tree", DESIGN).splitlines()
+        for name in re.findall(r"^ {6,}(\w+(?:/|\.py))", line)
+    }
+    package = ROOT / "kgcp"
+    folders = {path.parent for path in package.rglob("*.py")} - {package}
+    depths = {f"{len(path.relative_to(ROOT).parts) + 1}{path.name}/" for path in folders}
+    assert shown == depths | {"3settings.py", "3errors.py"}
+
+
+def test_the_design_page_has_the_layers_in_their_order() -> None:
+    lines = [line for line in section("Layers", DESIGN).splitlines() if line.startswith(" " * 4)]
+    shown = [set(re.split(r" {3}(?=\S)", line[4:52].strip())) for line in lines]
+    assert shown == [set(layer) for layer in reversed(LAYERS) if layer != ("__main__",)]
+
+
+def test_the_modules_of_the_data_flow_exist() -> None:
+    words = re.findall(
+        r"[a-z]\w*(?:\.\w+)+(?:, [a-z_]+)*$", section("Data flow", DESIGN), re.MULTILINE
+    )
+    assert len(words) > 20
+    for line in words:
+        first, *others = line.split(", ")
+        room = first.rpartition(".")[0]
+        for name in (first, *(other if "." in other else f"{room}.{other}" for other in others)):
+            assert any(f".{module}".endswith(f".{name}") for module in MODULES), name
