@@ -145,7 +145,7 @@ def _candidates(grey: GreyArray, target: Target, expectation: Expectation) -> It
         if scale * expectation.radius_px < _SMALLEST_PX:
             continue
         matches = [
-            CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)
+            verdict.code_match(ring, outline)
             for outline in _outlines(grey, expectation, scale)
             for verdict in (judge(polar_patch(grey, outline), ring),)
             if verdict.score > _WORTH_A_TRY

@@ -132,9 +132,7 @@ def find_code(
         except Rejection as rejection:
             refused.append(Refusal(outline, verdict.score, rejection))
             continue
-        matches.append(
-            CodeMatch(ring, outline, verdict.score, verdict.lag_deg, verdict.black, verdict.white)
-        )
+        matches.append(verdict.code_match(ring, outline))
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.search.correlation import Bank, bank_of, correlate
 from kgcp.measurement.search.sampling import sample_grey
 from kgcp.targets.layout import Ring
 
@@ -23,7 +24,8 @@ CODE_CIRCLE = np.stack((np.cos(CODE_ANGLES_RAD), np.sin(CODE_ANGLES_RAD)), axis=
 _BLURS_RAD = np.array([0.03, 0.1, 0.18, 0.28])  # edge spreads that the code is tried with
 _DOT_REACH_PX = 3.0  # samples reach 1.5 px inwards, blur as far again
 _MIN_CLEAR = 0.55  # of an edge
-_HEADING_SLACK = 6  # degrees that a replica's heading may be off
+_FREQUENCIES = 120  # of a code with a known heading: the least blur leaves 2e-3 of higher ones
+_LAGS_AT_HEADING = np.arange(-6, 7)  # degrees that a replica's heading may be off
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,9 @@ def reference_signals(ring: Ring) -> FloatArray:
 def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]:
     """Return the best normalised cross-correlation over all lags, and the lag (§2.3).
 
+    The score is reported, and the lag turns the pose that the adjustment starts from. Hence all
+    frequencies and double precision, unlike `kgcp.measurement.search.correlation.correlate`.
+
     Parameters
     ----------
     signals : (m, 360) array
@@ -78,15 +83,19 @@ def match_code(signals: FloatArray, ring: Ring) -> tuple[FloatArray, FloatArray]
     scores, lags_deg : (m,) arrays
         The lag is refined between samples by a parabola.
     """
-    by_blur = np.fft.irfft(np.fft.rfft(signals)[:, None] * _wanted_spectra(ring), _SAMPLES)
+    by_blur = np.fft.irfft(np.fft.rfft(signals)[:, None] * _reference_spectra(ring), _SAMPLES)
     scores, lags_deg = np.empty(len(signals)), np.empty(len(signals))
     _find_peaks(signals, by_blur, scores, lags_deg)
     return scores, lags_deg
 
 
 @lru_cache(maxsize=64)
-def _wanted_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
-    return np.conj(np.fft.rfft(_standardised(reference_signals(ring))))
+def _reference_spectra(ring: Ring) -> npt.NDArray[np.complex128]:
+    """Return the conjugate spectra of the reference signals, less their means, of norm 1."""
+    signals = reference_signals(ring)
+    centred = signals - signals.mean(axis=1, keepdims=True)
+    norm = np.linalg.norm(centred, axis=1, keepdims=True)
+    return np.conj(np.fft.rfft(centred / np.where(norm > 0.0, norm, 1.0)))
 
 
 @compiled
@@ -108,12 +117,7 @@ def _find_peaks(
         scores[i] = correlation[peak] / norm if norm > 0.0 else 0.0
 
 
-def fixed_lag_score(
-    grey: GreyArray,
-    points: FloatArray,
-    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    ring: Ring,
-) -> float:
+def fixed_lag_score(grey: GreyArray, points: FloatArray, visible: BoolArray, ring: Ring) -> float:
     """Return the correlation of a code where its heading is known, to a few degrees.
 
     Parameters
@@ -123,39 +127,13 @@ def fixed_lag_score(
     visible : (360,) array
         Which of them count.
     """
-    return _best_near(sample_grey(grey, points[None])[0], visible, reference_signals(ring))
+    scores = correlate(sample_grey(grey, points[None]), _code_circle(ring), visible)
+    return float(scores.take(_LAGS_AT_HEADING, axis=2, mode="wrap").max())
 
 
-@compiled
-def _best_near(
-    signal: FloatArray,
-    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    references: FloatArray,
-) -> float:
-    """Return the best correlation with references (m, 360), turned by little, where visible."""
-    best = -1.0
-    for reference in references:
-        for lag in range(-_HEADING_SLACK, _HEADING_SLACK + 1):
-            count = wanted = found = wanted_power = found_power = product = 0.0
-            for a in range(_SAMPLES):
-                if visible[a]:
-                    one, other = reference[(a - lag) % _SAMPLES], signal[a]
-                    count, wanted, found = count + 1.0, wanted + one, found + other
-                    wanted_power, found_power = (
-                        wanted_power + one * one,
-                        found_power + other * other,
-                    )
-                    product += one * other
-            variances = (wanted_power - wanted**2 / count) * (found_power - found**2 / count)
-            covariance = product - wanted * found / count
-            best = max(best, covariance / math.sqrt(max(variances, 1e-12)))
-    return best
-
-
-def _standardised(signals: FloatArray) -> FloatArray:
-    centred = signals - signals.mean(axis=-1, keepdims=True)
-    norm = np.linalg.norm(centred, axis=-1, keepdims=True)
-    return np.asarray(centred / np.where(norm > 0.0, norm, 1.0))
+@lru_cache(maxsize=64)
+def _code_circle(ring: Ring) -> Bank:
+    return bank_of(reference_signals(ring)[:, None], np.ones(1), _FREQUENCIES)
 
 
 def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
@@ -167,7 +145,7 @@ def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
 
 def clear_of_dots(
     angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+) -> BoolArray:
     """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
 
     On a small ring with many dots none may be: then the places farthest from dots are taken.

@@ -4,18 +4,14 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.search.partial_match import (
-    best_partial_template,
+from kgcp.measurement.search.correlation import bank_of, correlate
+from kgcp.measurement.search.template_match import (
+    best_placement,
+    judge,
     may_show_code,
     visible_angles,
 )
-from kgcp.measurement.search.templates import (
-    ANGLES,
-    ANGLES_RAD,
-    SHIFTS,
-    best_template,
-    templates_of,
-)
+from kgcp.measurement.search.templates import ANGLES, ANGLES_RAD, SHIFTS, templates_of
 from kgcp.targets.layout import Target
 
 _HIGHEST = 12  # frequency of the light in these tests
@@ -28,14 +24,41 @@ def some_light(rows: int, seed: int) -> FloatArray:
     return np.asarray(100.0 + 40.0 * np.fft.irfft(spectrum, ANGLES, axis=1))
 
 
-def correlation(
-    image: FloatArray, seen: FloatArray, weights: FloatArray, visible: np.ndarray
+def defined_score(
+    image: FloatArray, patch: FloatArray, weights: FloatArray, visible: np.ndarray
 ) -> float:
-    """Return the weighted normalised cross-correlation of what is visible, by its definition."""
+    """The weighted normalised cross-correlation of what is visible, by its definition."""
     share = np.repeat(weights, visible.sum())
-    one, other = image[:, visible].ravel(), seen[:, visible].ravel()
-    one, other = (values - np.average(values, weights=share) for values in (one, other))
-    return float(share @ (one * other) / np.sqrt((share @ one**2) * (share @ other**2)))
+    pair = [image[:, visible].ravel(), patch[:, visible].ravel()]
+    image, patch = (values - np.average(values, weights=share) for values in pair)
+    return float(share @ (image * patch) / np.sqrt((share @ image**2) * (share @ patch**2)))
+
+
+@pytest.mark.parametrize("hidden", [0, 1, 37, 55])
+@pytest.mark.parametrize("shape", [(3, 4, 48, 6), (1, 1, 60, 1), (2, 5, 30, 3)])
+def test_scores_are_those_of_the_definition(shape: tuple[int, ...], hidden: int) -> None:
+    count, rows, angles, shifts = shape
+    rng = np.random.default_rng(hidden + angles)
+    spectrum = rng.normal(size=(count, rows, 12)) + 1j * rng.normal(size=(count, rows, 12))
+    images = np.fft.irfft(spectrum, angles, axis=2)
+    row_weights = rng.uniform(0.5, 2.0, rows)
+    bank = bank_of(images, row_weights, 12)
+    patch = rng.uniform(0.0, 255.0, (rows + shifts - 1, angles))
+    visible = np.roll(np.arange(angles) >= hidden * angles // 100, 7)
+    scores = correlate(patch, bank, visible if hidden else None)
+    assert scores.shape == (count, shifts, angles)
+    expected = np.empty_like(scores)
+    for t, s, lag in np.ndindex(scores.shape):
+        turned = np.roll(images[t], lag, axis=1)
+        expected[t, s, lag] = defined_score(turned, patch[s : s + rows], row_weights, visible)
+    np.testing.assert_allclose(scores, expected, rtol=0.0, atol=2e-6)
+
+
+def test_the_unmasked_scores_are_those_of_a_mask_that_hides_nothing(target: Target) -> None:
+    templates = templates_of(target.ring)
+    patch = some_light(len(templates.weights) + 2 * SHIFTS, 5)
+    masked = correlate(patch, templates, np.ones(ANGLES, dtype=bool))
+    np.testing.assert_allclose(correlate(patch, templates), masked, rtol=0.0, atol=2e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -46,10 +69,10 @@ def test_the_best_template_is_the_best_of_all_turns_and_shifts(target: Target, s
     rows = templates.images.shape[1]
     patch = 2.0 * some_light(rows + 2 * SHIFTS, seed)
     patch[shift : shift + rows] += 50.0 * np.roll(templates.images[index], lag, axis=1)
-    score, *place = best_template(patch, templates)
+    score, *place = best_placement(correlate(patch, templates))
     everywhere = np.ones(ANGLES, dtype=bool)
     scores = [
-        correlation(
+        defined_score(
             np.roll(image, turn, axis=1), patch[s : s + rows], templates.weights, everywhere
         )
         for image in templates.images
@@ -57,21 +80,21 @@ def test_the_best_template_is_the_best_of_all_turns_and_shifts(target: Target, s
         for turn in range(ANGLES)
     ]
     assert score == pytest.approx(max(scores), abs=5e-3)  # higher frequencies are left out
-    found = np.ravel_multi_index(place, (len(templates.images), 2 * SHIFTS + 1, ANGLES))
-    assert scores[int(found)] > max(scores) - 5e-3
+    index = int(np.ravel_multi_index(place, (len(templates.images), 2 * SHIFTS + 1, ANGLES)))
+    assert scores[index] > max(scores) - 5e-3
 
 
 def test_a_ring_of_any_exposure_fits_its_template_perfectly(target: Target) -> None:
     templates = templates_of(target.ring)
     patch = np.full((len(templates.weights) + 2 * SHIFTS, ANGLES), 40.0)
     patch[3:-5] = 7.0 + 0.8 * np.roll(templates.images[9], 31, axis=1)
-    score, *place = best_template(patch, templates)
+    score, *place = best_placement(correlate(patch, templates))
     assert score == pytest.approx(1.0, abs=1e-3)
     assert place == [9, 3, 31]
 
 
 @pytest.mark.parametrize("first", [20, 60, 100])
-def test_what_is_seen_of_a_ring_fits_as_well(target: Target, first: int) -> None:
+def test_the_visible_part_of_a_ring_fits_as_well_as_all_of_it(target: Target, first: int) -> None:
     ring, templates = target.ring, templates_of(target.ring)
     turned = np.roll(templates.images[3], 17, axis=1)
     patch = np.full((len(templates.weights) + 2 * SHIFTS, ANGLES), 0.0)
@@ -82,12 +105,13 @@ def test_what_is_seen_of_a_ring_fits_as_well(target: Target, first: int) -> None
     assert visible is not None
     assert not visible[hidden].any()
     assert visible.sum() >= ANGLES - 26 - 8
-    match = best_partial_template(patch, visible, ring)
-    assert match is not None
-    assert match[0] == pytest.approx(1.0, abs=0.01)
-    assert match[1:] == (3, SHIFTS, 17)
-    expected = correlation(turned, patch[SHIFTS:-SHIFTS], templates.weights, visible)
-    assert expected == pytest.approx(1.0)
+    score, *place = best_placement(correlate(patch, templates, visible))
+    assert score == pytest.approx(1.0, abs=0.01)
+    assert place == [3, SHIFTS, 17]
+    verdict = judge(patch, ring)
+    assert verdict.visible is not None
+    assert verdict.lag_deg == pytest.approx(17 * 360.0 / ANGLES)
+    assert (verdict.black, verdict.white) == pytest.approx((20.0, 170.0), abs=1.0)
 
 
 @pytest.mark.parametrize("turn", [0, 11, 50, 87])
