@@ -11,9 +11,9 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.ellipse_fit import fit_ellipses
-from kgcp.measurement.search.edge_tracking import RAYS, RAYS_RAD, follow
+from kgcp.measurement.search.edge_tracking import RAYS, RAYS_RAD, track_edges
 from kgcp.measurement.search.pyramid import Pyramid, factor_of
-from kgcp.measurement.search.ring_check import look_around
+from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
 
 _SMALLEST_RATIO = 0.93  # of rings looked for in a level, to that radius
@@ -108,7 +108,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
     while first < last and factor_of(first) * PEAK_RADIUS_PX < _SMALLEST_RATIO * min_radius_px:
         first += 1
     peaks, ends = find_peaks(pyramid.reduced, pyramid.levels[first:])
-    rings = look_around(pyramid, peaks, ends)
+    rings = check_peaks(pyramid, peaks, ends)
     centres, radii, contrasts = np.ascontiguousarray(rings[:, :2]), *rings[:, 2:].T.copy()
     kept = distinct(centres, radii, contrasts, _NEAR_SEEDS, _ALIKE_SEEDS)
     return Seeds(centres, radii, contrasts).chosen(kept)
@@ -137,7 +137,7 @@ def _follow(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     """
     edges, inlying = np.empty((len(seeds), RAYS)), np.empty((len(seeds), RAYS), dtype=np.bool_)
     places = seeds.centres_px, seeds.radii_px
-    follow(pyramid.frame, pyramid.reduced, pyramid.levels, *places, edges, inlying)
+    track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, *places, edges, inlying)
     ellipses, shares = np.empty((len(seeds), 5)), np.empty(len(seeds))
     fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, ellipses, shares)
     good = np.flatnonzero(shares)

@@ -1,4 +1,12 @@
-"""Grey values on circles around places that may be a ring's: how dark it is, and how even."""
+"""Grey values on circles around places that may be a ring's: how dark it is, and how even.
+
+The ring filter answers to much that is no ring. Here few samples per place decide, dark ones on the
+ring and bright ones around it, in more and more directions; most places are dropped after eight. At
+last the samples on ring, core and surround, 24 each, must be of one grey value each. Order
+statistics measure that, not means: dots brighten and something in the way may hide a part of any
+circle, which moves the mean and the largest values, but not those of lower rank. docs/method.md,
+"Ring check", has the ranks.
+"""
 
 from __future__ import annotations
 
@@ -12,39 +20,48 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.pyramid import Pyramid
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX
 
-_RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # circles that are looked at, of the ring's radius
-_RING, _NEAR, _FAR, _CORE = range(4)  # the last is outside of a replica
-_ROUGH = np.array((0.85, 1.1))  # radii that are tried
-_FINE = np.array((0.9, 1.0, 1.1))
-_TRIALS = np.outer(_ROUGH, _FINE).ravel()
-_COARSER = np.array((2.0, 3.0))  # images than those that are looked at
-_FEW, _MANY, _ALL = 8, 16, 24  # directions that are looked in first, then, and at last
-_ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # hidden quarters and dots leave half of the ring
-_MIN_CONTRAST = 5  # grey values
+# Tuning of the check; its benchmark is `benchmarks.search.hard_frames`, the sets that tell most in
+# brackets. Radii are in units of the outer one.
+_RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # of circles that are sampled
+_RING, _NEAR, _FAR, _CORE = range(4)  # the core's circle is outside of a replica
+_ROUGH = np.array((0.85, 1.1))  # radii that are tried, of the one that the filter answers to most
+_FINE = np.array((0.9, 1.0, 1.1))  # and of each of those
+_FEW, _MANY, _ALL = 8, 16, 24  # directions that are sampled first, then, and at last
+_ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half (`hidden`)
+_MIN_CONTRAST = 5  # grey values (`haze`, `shadow`)
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
-_LARGE_PX = 22.0  # radius from which there are few seeds
-_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
+_LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
+_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast (`shadow`)
+# Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
+# value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
+# a third may be dark, hidden or beyond the plate, and only bright ranks tell.
+_RING_RANKS = 1, 4, 8
+_CORE_RANKS = 7, 11, 17
+_PLATE_RANKS = 11, 14, 19
 
-_Shifts = npt.NDArray[np.uintp]  # (radii, circles, directions)
+_TRIALS = np.outer(_ROUGH, _FINE).ravel()
+_COARSER = np.array((2.0, 3.0))  # pixels of the filtered images, in pixels of the sampled ones
+
+_Addresses = npt.NDArray[np.uintp]  # (radii, circles, directions)
 
 
 def _offsets(trials: FloatArray, circles: int, *counts: int) -> IndexArray:
     """Return x and y of samples on circles: (ratios of pixels, 2, radii, circles, directions)."""
     angles = np.concatenate([2.0 * np.pi / n * (np.arange(n) + 0.5) for n in counts])
-    ways = np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
+    unit = np.stack((np.cos(angles), np.sin(angles)))[:, None, None]
     radii = PEAK_RADIUS_PX * np.multiply.outer(np.outer(_COARSER, trials), _RATIOS[:circles])
-    return np.asarray(np.floor(radii[:, None, :, :, None] * ways + 0.5), np.intp)
+    return np.asarray(np.floor(radii[:, None, :, :, None] * unit + 0.5), np.intp)
 
 
-_FIRST = _offsets(_TRIALS[1 :: len(_FINE)], 3, _FEW)
-_REST = _offsets(_TRIALS, 4, _MANY, _ALL)
+_ROUGH_OFFSETS = _offsets(_TRIALS[1 :: len(_FINE)], 3, _FEW)
+_FINE_OFFSETS = _offsets(_TRIALS, 4, _MANY, _ALL)
 
 
-def look_around(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatArray:
-    """Tell which peaks are rings': of a ring, a core and a surround of one grey value each.
+def check_peaks(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatArray:
+    """Return the rings among the peaks: ring, core and surround are of one grey value each.
 
-    Each is looked at in a finer image. Cheap tests come first: dark and then bright in some of
-    eight directions, then in some of 16.
+    Each is sampled in an image that is two or three times finer than the one it was found in.
+    Cheap tests come first: dark and then bright in some of eight directions, then in some of 16.
 
     Parameters
     ----------
@@ -59,62 +76,66 @@ def look_around(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatA
     """
     rings = np.empty((len(peaks), 4))
     images = pyramid.frame, pyramid.reduced, pyramid.levels
-    count = _look_at_all(*images, peaks, ends, _FIRST, _REST, PEAK_RADIUS_PX, rings)
+    # What depends on another module's constants is passed: compiled code would keep old values.
+    count = _check_all(*images, peaks, ends, _ROUGH_OFFSETS, _FINE_OFFSETS, PEAK_RADIUS_PX, rings)
     return rings[:count]
 
 
 @compiled
-def _look_at_all(
+def _check_all(
     frame: GreyArray,
     reduced: GreyArray,
     levels: IndexArray,
     peaks: FloatArray,
     ends: IndexArray,
-    first: IndexArray,
-    rest: IndexArray,
+    rough_offsets: IndexArray,
+    fine_offsets: IndexArray,
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
-    """Fill in what `look_around` returns, and count it.
+    """Fill in what `check_peaks` returns, and count it.
 
     Where pixels are 2, 3, 4, 6, 8, 12, … of the frame's wide, images of 1, 1, 2, 2, 4, 4, … serve.
     """
     count, begin = 0, 0
     for k in range(len(ends)):
         octave, third = divmod(len(levels) - len(ends) + k, 2)
-        some, found = peaks[begin : ends[k]], rings[count:]
-        samples = first[third], rest[third], 2.0**octave, 2.0 + third, peak_radius
-        if octave == 0:
-            count += _look(frame, some, *samples, found)
+        rough, fine = rough_offsets[third], fine_offsets[third]
+        factor, coarser = 2.0**octave, 2.0 + third
+        part, out = peaks[begin : ends[k]], rings[count:]
+        if octave == 0:  # apart, since the frame may be a read-only array: another type
+            count += _check_level(frame, part, rough, fine, factor, coarser, peak_radius, out)
         else:
             at = levels[2 * octave - 2]
             image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
-            count += _look(image, some, *samples, found)
+            count += _check_level(image, part, rough, fine, factor, coarser, peak_radius, out)
         begin = ends[k]
     return count
 
 
 @compiled
-def _look(
+def _check_level(
     image: GreyArray,
     peaks: FloatArray,
-    first: IndexArray,
-    rest: IndexArray,
+    rough_offsets: IndexArray,
+    fine_offsets: IndexArray,
     factor: float,
     coarser: float,
     peak_radius: float,
     rings: FloatArray,
 ) -> int:
-    """Look at the peaks of one level.
+    """Check the peaks of one level.
 
     A pixel of `image` is `factor` pixels of the frame wide, one of the level `coarser` times that.
+    Samples are read by their distance from the place in the flattened image; only next to the
+    border their addresses are worked out one by one.
     """
     height, width = image.shape
-    pixels, reach = image.reshape(-1), rest.max()
+    pixels, reach = image.reshape(-1), fine_offsets.max()
     radius = factor * coarser * peak_radius
     clear = _CLEAR_LARGE if radius >= _LARGE_PX else _CLEAR
-    first_shifts, rest_shifts = _shifts(first, width), _shifts(rest, width)
-    first_places, rest_places = np.empty_like(first_shifts), np.empty_like(rest_shifts)
+    rough_steps, fine_steps = _steps(rough_offsets, width), _steps(fine_offsets, width)
+    rough_places, fine_places = np.empty_like(rough_steps), np.empty_like(fine_steps)
     values = np.empty((3, _ALL), np.uint8)
     count = 0
     for i in range(len(peaks)):
@@ -124,36 +145,36 @@ def _look(
         inside = reach <= x < width - reach and reach <= y < height - reach
         at = np.uintp(y * width + x if inside else 0)
         if not inside:
-            _keep_inside(first, x, y, width, height, first_places)
-        samples = first_shifts if inside else first_places
-        rough = _roughly(pixels, at, samples, dark, bright)
+            _keep_inside(rough_offsets, x, y, width, height, rough_places)
+        samples = rough_steps if inside else rough_places
+        rough = _rough_radius(pixels, at, samples, dark, bright)
         if rough < 0:
             continue
         if not inside:
-            _keep_inside(rest, x, y, width, height, rest_places)
-        samples = rest_shifts if inside else rest_places
-        found = _clearest(pixels, at, samples, rough, dark, bright, clear, values)
-        if found[0] > 0.0:
+            _keep_inside(fine_offsets, x, y, width, height, fine_places)
+        samples = fine_steps if inside else fine_places
+        clearness, trial = _clearest(pixels, at, samples, rough, dark, bright, clear, values)
+        if clearness > 0.0:
             rings[count, 0] = factor * coarser * (peaks[i, 0] + 0.5) - 0.5
             rings[count, 1] = factor * coarser * (peaks[i, 1] + 0.5) - 0.5
-            rings[count, 2], rings[count, 3] = radius * _TRIALS[found[1]], found[0]
+            rings[count, 2], rings[count, 3] = radius * _TRIALS[trial], clearness
             count += 1
     return count
 
 
 @compiled
-def _shifts(offsets: IndexArray, width: int) -> _Shifts:
-    """Return how many pixels further samples on circles are, in images of a width.
+def _steps(offsets: IndexArray, width: int) -> _Addresses:
+    """Return how many pixels further samples are than their place, in an image of this width.
 
-    Those that are nearer have wrapped about, as their sums with a pixel's place do.
+    Steps back are unsigned numbers that wrap around, as their sums with the place's address do.
     """
-    shifts: _Shifts = (offsets[1] * width + offsets[0]).view(np.uintp)
-    return shifts
+    steps: _Addresses = (offsets[1] * width + offsets[0]).view(np.uintp)
+    return steps
 
 
 @compiled
 def _keep_inside(
-    offsets: IndexArray, x: int, y: int, width: int, height: int, places: _Shifts
+    offsets: IndexArray, x: int, y: int, width: int, height: int, places: _Addresses
 ) -> None:
     """Fill in where samples are; those beyond the image's border move to its last pixels."""
     columns, rows, out = offsets[0].reshape(-1), offsets[1].reshape(-1), places.reshape(-1)
@@ -163,11 +184,13 @@ def _keep_inside(
 
 
 @inlined
-def _roughly(pixels: GreyArray, at: np.uintp, shifts: _Shifts, dark: int, bright: int) -> int:
+def _rough_radius(
+    pixels: GreyArray, at: np.uintp, steps: _Addresses, dark: int, bright: int
+) -> int:
     """Return the number of the rough radius at which there may be a ring, or -1."""
     most, best = _ENOUGH_OF_FEW - 1, -1
     for trial in range(len(_ROUGH)):
-        count = _count(pixels, at, shifts, trial, _FEW, dark, bright)
+        count = _count_directions(pixels, at, steps, trial, _FEW, dark, bright)
         if count > most:
             most, best = count, trial
     return best
@@ -177,7 +200,7 @@ def _roughly(pixels: GreyArray, at: np.uintp, shifts: _Shifts, dark: int, bright
 def _clearest(
     pixels: GreyArray,
     at: np.uintp,
-    shifts: _Shifts,
+    steps: _Addresses,
     rough: int,
     dark: int,
     bright: int,
@@ -187,29 +210,33 @@ def _clearest(
     """Return how clear the clearest ring of about a radius is, and the number of its radius."""
     best, clearest = 0, 0.0
     for k in range(rough * len(_FINE), (rough + 1) * len(_FINE)):
-        if _count(pixels, at, shifts, k, _MANY, dark, bright) >= _ENOUGH_OF_MANY:
-            clearness = _clearness(pixels, at, shifts, k, clear, values)
+        if _count_directions(pixels, at, steps, k, _MANY, dark, bright) >= _ENOUGH_OF_MANY:
+            clearness = _clearness(pixels, at, steps, k, clear, values)
             if clearness > clearest:
                 clearest, best = clearness, k
     return clearest, best
 
 
 @inlined
-def _count(
+def _count_directions(
     pixels: GreyArray,
     at: np.uintp,
-    shifts: _Shifts,
+    steps: _Addresses,
     trial: int,
     directions: int,
     dark: int,
     bright: int,
 ) -> int:
-    """Count the directions in which a dark ring is followed by a brighter surround."""
+    """Count the directions in which a dark ring is followed by a brighter surround.
+
+    The surround may be seen on the nearer circle alone, if the plate's margin is narrow, or on the
+    farther one alone, if blur brings the ring's edge to the nearer.
+    """
     count = 0
     for k in range(directions):
-        is_dark = pixels[at + shifts[trial, _RING, k]] < dark
-        is_near = pixels[at + shifts[trial, _NEAR, k]] > bright
-        is_far = pixels[at + shifts[trial, _FAR, k]] > bright
+        is_dark = pixels[at + steps[trial, _RING, k]] < dark
+        is_near = pixels[at + steps[trial, _NEAR, k]] > bright
+        is_far = pixels[at + steps[trial, _FAR, k]] > bright
         count += is_dark & (is_near | is_far)
     return count
 
@@ -218,25 +245,26 @@ def _count(
 def _clearness(
     pixels: GreyArray,
     at: np.uintp,
-    shifts: _Shifts,
+    steps: _Addresses,
     trial: int,
     clear: float,
     values: GreyArray,
 ) -> float:
     """Return the contrast, less the ring's spread; 0 if anything is spread too much."""
     for k in range(_ALL):
-        values[0, k] = pixels[at + shifts[trial, _RING, _MANY + k]]
-        values[1, k] = pixels[at + shifts[trial, _CORE, _MANY + k]]
-    darkest, ring, ring_bright = _ranked(values[0], 1, 4, 8)
-    core_dark, core, core_bright = _ranked(values[1], 7, 11, 17)
-    contrast, spread = core - ring, ring_bright - darkest
+        values[0, k] = pixels[at + steps[trial, _RING, _MANY + k]]
+        values[1, k] = pixels[at + steps[trial, _CORE, _MANY + k]]
+    ring_dark, ring, ring_bright = _order_statistics(values[0], _RING_RANKS)
+    core_dark, core, core_bright = _order_statistics(values[1], _CORE_RANKS)
+    contrast, spread = core - ring, ring_bright - ring_dark
     limit = clear * contrast
+    # Most fail by ring and core alone: the surround is sampled only where they do not.
     if contrast < _MIN_CONTRAST or spread > limit or core_bright - core_dark > limit:
         return 0.0
     for k in range(_ALL):
-        near = pixels[at + shifts[trial, _NEAR, _MANY + k]]
-        values[2, k] = max(near, pixels[at + shifts[trial, _FAR, _MANY + k]])
-    plate_dark, plate, plate_bright = _ranked(values[2], 11, 14, 19)
+        near = pixels[at + steps[trial, _NEAR, _MANY + k]]
+        values[2, k] = max(near, pixels[at + steps[trial, _FAR, _MANY + k]])
+    plate_dark, plate, plate_bright = _order_statistics(values[2], _PLATE_RANKS)
     difference = abs(core - plate)
     contrast = min(core, plate) - ring
     limit = clear * contrast
@@ -248,16 +276,20 @@ def _clearness(
 
 
 @compiled
-def _ranked(
-    values: GreyArray, low: int, middle: int, high: int
+def _order_statistics(
+    values: GreyArray, ranks: tuple[int, int, int]
 ) -> tuple[np.int64, np.int64, np.int64]:
-    """Return three values of ascending ranks: the largest that so many or less are smaller than."""
-    one, two, three = np.uint8(0), np.uint8(0), np.uint8(0)
+    """Return the values of three ascending ranks, from 0, without sorting.
+
+    The value of rank r is the largest that at most r others are less than. 24 comparisons fit into
+    one vector of bytes, so that all are faster than a sort.
+    """
+    low, middle, high = np.uint8(0), np.uint8(0), np.uint8(0)
     for i in range(_ALL):
         value, smaller = values[i], np.uint8(0)
         for k in range(_ALL):
             smaller += np.uint8(values[k] < value)
-        one = max(one, value if smaller <= low else np.uint8(0))
-        two = max(two, value if smaller <= middle else np.uint8(0))
-        three = max(three, value if smaller <= high else np.uint8(0))
-    return np.int64(one), np.int64(two), np.int64(three)
+        low = max(low, value if smaller <= ranks[0] else np.uint8(0))
+        middle = max(middle, value if smaller <= ranks[1] else np.uint8(0))
+        high = max(high, value if smaller <= ranks[2] else np.uint8(0))
+    return np.int64(low), np.int64(middle), np.int64(high)

@@ -1,8 +1,18 @@
-"""Where box filters answer to a ring: a first glance at every pixel, which must be cheap.
+"""Where box filters answer to a ring: the first test of every pixel, which must be cheap.
 
-The filters go through an image row by row, in strips: every loop is over one row of small integers,
-of which the processor takes some tens at once, and all that is between two loops stays in its
-cache.
+A small ring is a bright core in a dark disc in a bright surround. Of the means over 3 x 3, 5 x 5
+and 7 x 7 pixels (the last weighted less towards its corners, as the mean of nine 5 x 5 means) the
+score is
+
+    core − disc + surround − disc
+
+which is positive where a disc is darker than both its core and its surround, 0 on edges and planes,
+and negative on dots. docs/method.md, "Ring filter", has its answer by radius. Larger rings are
+found in reduced images.
+
+Speed decides the form: the filters go through an image row by row, in strips. Every loop is over
+one row of small integers, of which the processor takes some tens at once, and all that is kept
+between two loops stays in its cache.
 """
 
 from __future__ import annotations
@@ -13,18 +23,20 @@ import numpy.typing as npt
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
+# Tuning of the filter; its benchmarks are `benchmarks.search.hard_frames`, for what is found, and
+# `benchmarks.speed.relative_costs`, for what more peaks cost the stages that follow.
 PEAK_RADIUS_PX = 2.8
 """Radius of the rings that the filters answer to most; a quarter more or less is as good."""
-_REACH = 4  # rows and columns that the filters look around a pixel, neighbours included
+_UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
+_MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
+_MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around: less is texture
+_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
+
+_REACH = 4  # rows and columns around a pixel that decide about it, neighbours' filters included
 _STRIP = 1024 - 2 * _REACH  # columns
 _VECTOR = 32  # columns that the processor may take at once
 _ROWS = 8  # rows of grey values that are kept, of which the filters look at seven
 _KEPT = 3  # rows of their answers that are kept
-_UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
-_MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
-_MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around
-
-_MAX_PEAK_SHARE, _MAX_PEAKS = 1 / 400, 1000  # of the pixels; in small images
 
 _Rows = npt.NDArray[np.generic]
 
@@ -33,9 +45,9 @@ _Rows = npt.NDArray[np.generic]
 def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, IndexArray]:
     """Return where the filters answer clearly, image by image.
 
-    The score is core - disc + surround - disc, of the means of 3 x 3, 5 x 5 and, less at its
-    corners, 7 x 7 pixels. It must be a maximum, of some grey values, and at least a fifth of the
-    range of grey values in 5 x 5 pixels. Of very many, those with the largest share are kept.
+    The score must be a maximum among its eight neighbours, of some grey values, and at least a
+    fifth of the range of grey values in 5 x 5 pixels. If there are very many such places, those
+    with the largest share of the range are kept.
 
     Parameters
     ----------
@@ -57,19 +69,19 @@ def find_peaks(reduced: GreyArray, levels: IndexArray) -> tuple[FloatArray, Inde
         # Maxima have no neighbours.
         at_most = ((levels[i, 2] + 1) // 2) * ((levels[i, 3] + 1) // 2)
         most, kept = max(most, at_most), kept + min(at_most, _limit(levels[i]))
-    found, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
+    peaks, ends = np.empty((kept + most, 4)), np.empty(len(levels), np.intp)
     count = 0
     for i in range(len(levels)):
         at, end, share = levels[i], count, _MIN_SHARE
         image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
         for first in range(0, image.shape[1], _STRIP):
-            end += _scan(image, first, share, found[end:])
+            end += _scan(image, first, share, peaks[end:])
             if end - count > _limit(at):
-                end = count + _keep_best(found[count:end], _limit(at))
-                share = np.int16(found[count:end, 3].min())  # what is less will not be kept
+                end = count + _keep_best(peaks[count:end], _limit(at))
+                share = np.int16(peaks[count:end, 3].min())  # lower ones would be dropped
         count = end
         ends[i] = count
-    return found[:count], ends
+    return peaks[:count], ends
 
 
 @compiled
@@ -79,26 +91,31 @@ def _limit(level: IndexArray) -> int:
 
 
 @compiled
-def _keep_best(found: FloatArray, limit: int) -> int:
-    """Move the peaks with the largest shares, so many, to the begin; return their number."""
-    least = np.partition(found[:, 3].copy(), len(found) - limit)[len(found) - limit]
-    count, alike = 0, limit - np.sum(found[:, 3] > least)
-    for i in range(len(found)):
-        if found[i, 3] > least or (found[i, 3] == least and alike > 0):
-            alike -= found[i, 3] == least
-            found[count] = found[i]
+def _keep_best(peaks: FloatArray, limit: int) -> int:
+    """Move the `limit` peaks with the largest shares to the front; return their number.
+
+    Of those that share the least of these shares the first are kept.
+    """
+    least = np.partition(peaks[:, 3].copy(), len(peaks) - limit)[len(peaks) - limit]
+    count, alike = 0, limit - np.sum(peaks[:, 3] > least)
+    for i in range(len(peaks)):
+        if peaks[i, 3] > least or (peaks[i, 3] == least and alike > 0):
+            alike -= peaks[i, 3] == least
+            peaks[count] = peaks[i]
             count += 1
     return count
 
 
 @compiled
-def _scan(image: GreyArray, first: int, share: np.int16, found: FloatArray) -> int:
+def _scan(image: GreyArray, first: int, share: np.int16, peaks: FloatArray) -> int:
     """Fill in columns and rows of peaks, grey values between core and ring, shares; count them.
 
-    It is a strip from the first column on that is scanned, for peaks of at least some share. Entry
-    0 of what is kept of a row is left of that column: by 4 columns in `grey` and `sums`, by 3 in
-    `core`, by 2 in `disc`, `wide` and `extent`, by 1 in `score`. Rows are kept at their numbers
-    modulo 8 (`grey`) or 3.
+    A strip is scanned from the first column on, for peaks of at least some share. Every filter
+    needs the columns to its right that it has not seen yet, so that entry 0 of a row is left of the
+    strip's first column: by 4 columns in `grey` and `sums`, by 3 in `core`, by 2 in `disc`, `wide`
+    and `extent`, by 1 in `score`. The same holds for rows: with row r of grey values + 2 at hand,
+    sums and discs are those of row r, scores of r − 1 and maxima of r − 2. Rows are kept at their
+    numbers modulo 8 (`grey`) or 3.
     """
     count = 0
     columns = min(image.shape[1] - first, _STRIP)
@@ -111,9 +128,9 @@ def _scan(image: GreyArray, first: int, share: np.int16, found: FloatArray) -> i
     words, places = np.zeros(width // 8, np.uint64), np.empty(width + 8, np.int64)
     is_peak = words.view(np.uint8)
     for row in range(-_REACH, 2):
-        _take(image, row, first - _REACH, grey)
+        _copy_row(image, row, first - _REACH, grey)
     for row in range(-2, image.shape[0] + 2):
-        _take(image, row + 2, first - _REACH, grey)
+        _copy_row(image, row + 2, first - _REACH, grey)
         _sum_columns(grey, row, sums, width)
         _sum_rows(sums, (row + _KEPT) % _KEPT, core, disc, width)
         if row < 0:
@@ -124,21 +141,21 @@ def _scan(image: GreyArray, first: int, share: np.int16, found: FloatArray) -> i
             continue
         _extents(grey, row - 2, extent, width)
         _mark(score, row - 2, extent, share, is_peak)
-        some = places[: _list(words, is_peak, columns, places)]
+        some = places[: _list_marked(words, is_peak, columns, places)]
         if len(some) > 0:
-            count += _describe(some, first, row - 2, score, core, disc, extent, found[count:])
+            count += _describe(some, first, row - 2, score, core, disc, extent, peaks[count:])
     return count
 
 
 @inlined
-def _take(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
-    """Keep a row from some column on; beyond its border the image repeats its last pixels."""
+def _copy_row(image: GreyArray, row: int, first: int, grey: _Rows) -> None:
+    """Copy a row from some column on; beyond its border the image repeats its last pixels."""
     height, width = image.shape
     line, out = image[min(max(row, 0), height - 1)], grey[row % _ROWS]
     left, right = max(-first, 0), min(len(out), width - first)
-    seen, copy = line[first + left : first + right], out[left:right]
+    source, copy = line[first + left : first + right], out[left:right]
     for x in range(len(copy)):
-        copy[x] = seen[x]
+        copy[x] = source[x]
     out[:left] = line[0]
     out[right:] = line[width - 1]
 
@@ -166,7 +183,11 @@ def _sum_rows(sums: _Rows, slot: int, core: _Rows, disc: _Rows, width: int) -> N
 
 @inlined
 def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width: int) -> None:
-    """Combine sums over 9, 25 and 225 pixels, so that nothing exceeds 16 bits."""
+    """Combine sums over 9, 25 and 225 pixels, so that nothing exceeds 16 bits.
+
+    The common denominator is 225, of which 16 bits without sign just hold 255 times; a quarter of
+    that leaves room for the differences, and for signs.
+    """
     for x in range(width):
         wide[0, x] = disc[0, x] + disc[1, x] + disc[2, x]
     for x in range(width):
@@ -178,7 +199,7 @@ def _score(core: _Rows, disc: _Rows, slot: int, wide: _Rows, score: _Rows, width
 
 @inlined
 def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
-    """Return the range of grey values in 5 x 5 pixels; rows 1 and 2 are for its use."""
+    """Fill in the range of grey values in 5 x 5 pixels in row 0; rows 1 and 2 are for its use."""
     a, b, c = (row - 2) % _ROWS, (row - 1) % _ROWS, row % _ROWS
     d, e = (row + 1) % _ROWS, (row + 2) % _ROWS
     high, low = 1, 2
@@ -194,7 +215,10 @@ def _extents(grey: _Rows, row: int, out: _Rows, width: int) -> None:
 
 @inlined
 def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows) -> None:
-    """Tell where peaks may be: pixels above four neighbours; of equal ones the first."""
+    """Mark where peaks may be: pixels above four neighbours; of equal ones the first.
+
+    The four others wait for `_describe`: few pixels come so far.
+    """
     before, at, after = (row + 2) % _KEPT, row % _KEPT, (row + 1) % _KEPT
     for x in range(len(is_peak)):
         value = score[at, x + 1]
@@ -209,8 +233,12 @@ def _mark(score: _Rows, row: int, extent: _Rows, share: np.int16, is_peak: _Rows
 
 
 @inlined
-def _list(words: _Rows, is_peak: _Rows, columns: int, places: IndexArray) -> int:
-    """Fill in where the peaks of a row are, of which eight are one word; return how many."""
+def _list_marked(words: _Rows, is_peak: _Rows, columns: int, places: IndexArray) -> int:
+    """Fill in where the peaks of a row are, of which eight are one word; return how many.
+
+    Nearly all words are 0. Within one that is not, every place is written and the next one
+    overwrites it unless it was a peak: no branch that the processor may guess wrong.
+    """
     count = 0
     for word in range(-(-columns // 8)):
         if words[word]:
@@ -229,7 +257,7 @@ def _describe(
     core: _Rows,
     disc: _Rows,
     extent: _Rows,
-    found: FloatArray,
+    peaks: FloatArray,
 ) -> int:
     """Fill in column and row of a row's peaks, grey values between core and ring, and shares.
 
@@ -243,15 +271,15 @@ def _describe(
             continue
         if max(score[after, x], score[after, x + 2]) > top:
             continue
-        found[count, 0] = first + x + _beside(score[at, x], top, score[at, x + 2])
-        found[count, 1] = row + _beside(up, top, down)
-        found[count, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
-        found[count, 3] = top / max(extent[0, x + 2], 1)
+        peaks[count, 0] = first + x + _parabola_offset(score[at, x], top, score[at, x + 2])
+        peaks[count, 1] = row + _parabola_offset(up, top, down)
+        peaks[count, 2] = (25 * core[at, x + 3] + 9 * disc[at, x + 2]) / 450.0
+        peaks[count, 3] = top / max(extent[0, x + 2], 1)
         count += 1
     return count
 
 
 @compiled
-def _beside(before: int, top: int, after: int) -> float:
+def _parabola_offset(before: int, top: int, after: int) -> float:
     """Return how far beside a maximum the parabola through the scores has its own: up to ±0.5."""
     return 0.5 * (before - after) / min(before - 2 * top + after, -1)

@@ -12,7 +12,7 @@ from scipy import ndimage
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.measurement.search.outlines import distinct, find_outlines, find_seeds
 from kgcp.measurement.search.pyramid import build_pyramid, factor_of
-from kgcp.measurement.search.ring_check import look_around
+from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import find_peaks
 
 SUPER = 8  # drawn so many times as large
@@ -100,7 +100,7 @@ def test_beyond_its_border_the_image_repeats_its_last_pixels(third: int) -> None
     peaks = np.column_stack((x.ravel() / coarser, y.ravel() / coarser, np.full((x.size, 2), 115.0)))
     moved = np.array([36.0, 36.0, 0.0, 0.0])
     seen, expected = (
-        look_around(pyramid, places, np.repeat((0, x.size), (third, len(pyramid.levels) - third)))
+        check_peaks(pyramid, places, np.repeat((0, x.size), (third, len(pyramid.levels) - third)))
         for pyramid, places in (
             (build_pyramid(cut), peaks),
             (build_pyramid(padded), peaks + moved / coarser),
