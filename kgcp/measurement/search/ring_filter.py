@@ -26,7 +26,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 # Tuning of the filter; its benchmarks are `benchmarks.search.hard_frames`, for what is found, and
 # `benchmarks.speed.relative_costs`, for what more peaks cost the stages that follow.
 PEAK_RADIUS_PX = 2.8
-"""Radius of the rings that the filters answer to most; a quarter more or less is as good."""
+"""Radius that a peak stands for; the check tries rings from 0.76 to 1.21 of it."""
 _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter
 _MIN_SCORE = np.int16(5.0 * _UNIT)  # grey values; a ring's is half of its contrast, or less
 _MIN_SHARE = np.int16(0.2 * _UNIT)  # of the range of grey values around: less is texture
