@@ -14,6 +14,8 @@ from kgcp.measurement.search.template_match import CODE_LIKE, judge, polar_patch
 from kgcp.measurement.search.templates import SAMPLED_RADII
 from kgcp.targets.layout import Ring
 
+# Shares from which on something is the reason why a target was not measured. They only choose the
+# word of a miss: the sets of `benchmarks.search.hard_frames` are named for these words.
 _CUT = 0.1  # of the outline outside the frame
 _FAINT_DOTS = 0.25  # of the ring's contrast
 _UNSEEN = 0.15  # of the outer edge
@@ -26,8 +28,8 @@ _DISC = 0.8  # of the inner radius
 def explain(grey: GreyArray, ring: Ring, candidate: Considered, min_radius_px: float) -> Considered:
     """Give a dropped candidate the reason that lies in the image, where one is plain to see.
 
-    A ring that is hardly like the target keeps its reason, since no other would be known: it is
-    something else. The detail begins with where the ring is.
+    A ring that is hardly like the target keeps its reason: it is something else, and how it is
+    seen does not matter. The detail begins with where the ring is.
 
     Parameters
     ----------
@@ -35,18 +37,18 @@ def explain(grey: GreyArray, ring: Ring, candidate: Considered, min_radius_px: f
     ring : Ring
         What it was compared with.
     candidate : Considered
-        A dropped one.
+        Dropped by one of the tests.
     min_radius_px : float
         Smallest radius that is looked for [px].
     """
     outline = candidate.outline
     at = f"ring at ({outline.x:.0f}, {outline.y:.0f}), radius {outline.mean_radius:.1f} px"
     reason = candidate.reason
-    found = None
+    finding = None
     if candidate.is_match or candidate.score >= CODE_LIKE:
-        found = _plain_cause(grey, ring, outline, min_radius_px)
-    if found is not None:
-        reason, cause = found
+        finding = _plain_cause(grey, ring, outline, min_radius_px)
+    if finding is not None:
+        reason, cause = finding
         at = f"{at}, {cause}"
     detail = f"{at}: {candidate.detail}" if candidate.detail else at
     return replace(candidate, reason=reason, detail=detail)

@@ -52,7 +52,7 @@ class _Trial:
     """What became of one target, before the others are known."""
 
     target: Target
-    found: tuple[Observation, ...]
+    plates: tuple[Observation, ...]
     considered: tuple[Considered, ...]
 
 
@@ -105,12 +105,12 @@ def examine(
     considered: list[Considered] = []
     for trial in trials:
         others = (other for other in trials if other is not trial)
-        rivals = [*known, *(seen for other in others for seen in other.found)]
-        own = _undisputed(trial.found, rivals)
+        rivals = [*known, *(plate for other in others for plate in other.plates)]
+        own = _undisputed(trial.plates, rivals)
         free = [
-            one
-            for one in trial.considered
-            if not any(rival.covers(one.outline) for rival in rivals)
+            candidate
+            for candidate in trial.considered
+            if not any(rival.covers(candidate.outline) for rival in rivals)
         ]
         outcomes += own or (miss_of(grey, trial.target, free, settings),)
         considered += trial.considered
@@ -118,21 +118,21 @@ def examine(
 
 
 def _undisputed(
-    found: tuple[Observation, ...], rivals: list[Observation]
+    plates: tuple[Observation, ...], rivals: list[Observation]
 ) -> tuple[Observation, ...]:
     """Leave out plates that look more like another target's; number the others by score."""
     kept = [
-        seen
-        for seen in found
-        if not any(rival.score > seen.score and _share_a_plate(rival, seen) for rival in rivals)
+        plate
+        for plate in plates
+        if not any(rival.score > plate.score and _share_a_plate(rival, plate) for rival in rivals)
     ]
-    kept.sort(key=lambda seen: -seen.score)
-    return tuple(replace(seen, instance=i) for i, seen in enumerate(kept))
+    kept.sort(key=lambda plate: -plate.score)
+    return tuple(replace(plate, instance=i) for i, plate in enumerate(kept))
 
 
-def _share_a_plate(one: Observation, other: Observation) -> bool:
-    radius_px = max(one.appearance.radius_px, other.appearance.radius_px)
-    return bool(np.linalg.norm(one.centre_px - other.centre_px) < radius_px)
+def _share_a_plate(first: Observation, second: Observation) -> bool:
+    radius_px = max(first.appearance.radius_px, second.appearance.radius_px)
+    return bool(np.linalg.norm(first.centre_px - second.centre_px) < radius_px)
 
 
 def _try_target(
@@ -144,32 +144,37 @@ def _try_target(
     prior: NormalPrior | None,
 ) -> _Trial:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
-    found: list[Observation] = []
+    plates: list[Observation] = []
     considered: list[Considered] = []
     for ring in target.rings:
         free = (
-            one for one in candidates[ring] if not any(seen.covers(one.outline) for seen in found)
+            candidate
+            for candidate in candidates[ring]
+            if not any(plate.covers(candidate.outline) for plate in plates)
         )
         matches, refused = find_code(free, ring, settings)
         considered += [
             Considered(
-                *(target.name, ring.name, one.outline, one.score),
+                target.name,
+                ring.name,
+                refusal.outline,
+                refusal.score,
                 is_match=False,
-                reason=one.rejection.reason,
-                detail=one.rejection.detail,
+                reason=refusal.rejection.reason,
+                detail=refusal.rejection.detail,
             )
-            for one in refused
+            for refusal in refused
         ]
         for match in matches:
             candidate = Considered(target.name, ring.name, match.outer, match.score, is_match=True)
-            if any(seen.covers(match.outer) for seen in found):
+            if any(plate.covers(match.outer) for plate in plates):
                 continue
             try:
-                found.append(measure_match(grey, camera, target, match, settings, prior))
+                plates.append(measure_match(grey, camera, target, match, settings, prior))
             except Rejection as rejection:
                 candidate = replace(candidate, reason=rejection.reason, detail=rejection.detail)
             considered.append(candidate)
-    return _Trial(target, tuple(found), tuple(considered))
+    return _Trial(target, tuple(plates), tuple(considered))
 
 
 def measure_match(
@@ -206,7 +211,9 @@ def _check_plate(
     pose: Pose,
     settings: DetectSettings,
 ) -> BoolArray | None:
-    """Refuse a plate that does not look like the target; return where it is seen, None: all of it.
+    """Refuse a plate that does not look like the target; return where it is visible.
+
+    None stands for all of it.
 
     Raises
     ------
@@ -222,13 +229,16 @@ def _check_plate(
 def miss_of(
     grey: GreyArray, target: Target, considered: Sequence[Considered], settings: DetectSettings
 ) -> Miss:
-    """Give the reason of the best candidate, of those that got as far as any."""
+    """Return why a target was not measured: the reason of its best candidate.
+
+    A candidate that carried the code is better than any that did not, whatever their scores.
+    """
     if not considered:
         return Miss(target.name, Reason.NO_CANDIDATE)
-    best = max(considered, key=lambda one: (one.is_match, one.score))
+    best = max(considered, key=lambda candidate: (candidate.is_match, candidate.score))
     ring = next(ring for ring in target.rings if ring.name == best.ring)
     best = explain(grey, ring, best, settings.min_radius_px)
-    outlines = {one.outline for one in considered}
+    outlines = {candidate.outline for candidate in considered}
     reason = best.reason or Reason.CODE_MISMATCH
     return Miss(target.name, reason, best.detail, best.score, len(outlines), best.outline)
 

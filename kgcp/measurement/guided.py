@@ -21,11 +21,13 @@ from kgcp.measurement.search.template_match import judge, polar_patch
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
-_SIGMAS = 4.0
+# Tuning of the second look; its benchmark is the table in docs/method.md, "The second pass": four
+# simulated flights, with what the second look adds to them.
+_SIGMAS = 4.0  # of the expectation, in place and radius
 _SMALLEST_PX = 3.0  # radius of a ring that is looked for
 _FARTHEST = 8.0  # radii that a target may be off: more is hardly known
 _LARGEST_RATIO = 2.0  # of the radius to the expected one
-_SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are followed from
+_SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are tracked from
 _LOWER_SCORE = 0.06
 _WORTH_A_TRY = 0.5  # score of the whole ring
 _TRIES = 4  # per ring: the best ones
@@ -99,18 +101,13 @@ def look_again(
 ) -> tuple[Observation | None, tuple[Considered, ...]]:
     """Look for one target where it must be, however faint its ring is.
 
-    The search lets pass what it would not in a whole frame. What is found must agree with the
-    expectation and pass all tests of the measurement, with a slightly lower score of the ring.
+    Rings are tracked from all possible places and radii, without the ring filter and the ring
+    check. A measurement must agree with the expectation and pass all tests of a first look, with
+    a slightly lower score of the ring.
 
     Parameters
     ----------
     grey : (height, width) array
-    camera : Camera
-    target : Target
-    expectation : Expectation
-    settings : DetectSettings
-    prior : NormalPrior or None
-        As for the first look.
     rivals : sequence of Observation
         Other targets in this frame.
 
@@ -155,7 +152,7 @@ def _candidates(grey: GreyArray, target: Target, expectation: Expectation) -> It
 
 
 def _outlines(grey: GreyArray, expectation: Expectation, scale: float) -> list[Ellipse]:
-    """Follow rings from all places and radii that the expectation allows."""
+    """Track rings from all places and radii that the expectation allows."""
     radius = scale * expectation.radius_px
     reach = _SIGMAS * expectation.sd_px
     steps = math.ceil(reach / (_SPACING * radius))
@@ -165,14 +162,14 @@ def _outlines(grey: GreyArray, expectation: Expectation, scale: float) -> list[E
     widest = _SIGMAS * expectation.sd_log_radius
     sizes = math.ceil(widest / math.log(_RATIO))
     radii = radius * np.exp(np.linspace(-widest, widest, 2 * sizes + 1))
-    found = find_rings_at(
+    outlines = find_rings_at(
         grey,
         np.repeat(expectation.centre_px + offsets, len(radii), axis=0),
         np.tile(radii, len(offsets)),
     )
     return [
         outline
-        for outline in found
+        for outline in outlines
         if np.linalg.norm(outline.centre - expectation.centre_px) <= reach + _SPACING * radius
         and abs(math.log(outline.a / radius)) <= widest + math.log(_RATIO)
     ]

@@ -1,7 +1,7 @@
-"""What all frames have wrong together: the camera's calibration and the size of the print.
+"""Errors that all frames share: the camera's calibration and the size of the print.
 
-These errors are the same in every frame. Averaging does not lessen them, so they are no part of an
-observation's own covariance, and are reported apart.
+Averaging over frames does not reduce them. They are therefore not part of an observation's own
+covariance, and are reported apart.
 """
 
 from __future__ import annotations
@@ -32,9 +32,8 @@ def common_uncertainty(
 
     Parameters
     ----------
-    camera : Camera
     calibration : CalibrationCovariance or None
-        None: nothing is said about it.
+        None if it is unknown.
     ring : Ring
         The target's main ring.
     pose : Pose

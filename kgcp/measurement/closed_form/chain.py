@@ -1,4 +1,4 @@
-"""From a matched cluster to a pose by closed forms: §2.4, §4 and §3 of Cucci (2016), in turn."""
+"""From a matched ring to a pose by closed forms: §2.4, §4 and §3 of Cucci (2016), in turn."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from kgcp.geometry.circle import (
 )
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.closed_form.edges import EdgeFit, Patch, fit_edge, patch_around
+from kgcp.measurement.closed_form.edges import EdgeFit, fit_edge, patch_around
 from kgcp.measurement.records import Alternative, Appearance, Observation
 from kgcp.measurement.search.code_signal import (
     CODE_ANGLES_RAD,
@@ -118,7 +118,15 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
     rejection = Rejection(Reason.NO_INNER_CIRCLE)
     for start in _inner_circles(camera, outer, ring):
         try:
-            fits.append(_fit_inner(patch, camera, match, start))
+            inner = fit_edge(
+                patch,
+                camera,
+                start,
+                ring=ring,
+                edge_diameter_m=ring.inner_diameter_m,
+                lag_deg=match.lag_deg,
+            )
+            fits.append(inner)
         except Rejection as failure:
             rejection = Rejection(Reason.NO_INNER_CIRCLE, failure.detail)
     if not fits:
@@ -140,17 +148,6 @@ def _inner_circles(camera: Camera, outer: EdgeFit, ring: Ring) -> list[Ellipse]:
     ]
 
 
-def _fit_inner(patch: Patch, camera: Camera, match: CodeMatch, start: Ellipse) -> EdgeFit:
-    return fit_edge(
-        patch,
-        camera,
-        start,
-        ring=match.ring,
-        edge_diameter_m=match.ring.inner_diameter_m,
-        lag_deg=match.lag_deg,
-    )
-
-
 def solve_poses(
     grey: GreyArray, camera: Camera, match: CodeMatch, edges: RingEdges
 ) -> tuple[PosedRing, PosedRing]:
@@ -164,8 +161,9 @@ def solve_poses(
     first, second = circle_planes(outer)
     centre = minimise_dispersion(outer, kim_centre(outer, edges.inner.conic))
     _check_minimum(centre, first, second, camera.mean_focal_px)
-    one, other = (_posed(grey, camera, match, edges, plane) for plane in (first, second))
-    return (one, other) if one.centre_misfit_px <= other.centre_misfit_px else (other, one)
+    posed = (_posed(grey, camera, match, edges, plane) for plane in (first, second))
+    better, worse = sorted(posed, key=lambda ring: ring.centre_misfit_px)
+    return better, worse
 
 
 def _check_minimum(

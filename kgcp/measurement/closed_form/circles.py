@@ -124,11 +124,13 @@ def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[Cluster, ...]:
 def _distinct(ellipses: list[Ellipse]) -> tuple[Ellipse, ...]:
     kept: list[Ellipse] = []
     for ellipse in ellipses:
-        if not any(_same(ellipse, other) for other in kept):
+        if not any(_are_one_circle(ellipse, other) for other in kept):
             kept.append(ellipse)
     return tuple(kept)
 
 
-def _same(one: Ellipse, other: Ellipse) -> bool:
-    difference = np.array([one.x - other.x, one.y - other.y, one.a - other.a, one.b - other.b])
+def _are_one_circle(first: Ellipse, second: Ellipse) -> bool:
+    difference = np.array(
+        [first.x - second.x, first.y - second.y, first.a - second.a, first.b - second.b]
+    )
     return bool(np.all(np.abs(difference) < _SAME_CIRCLE_PX))

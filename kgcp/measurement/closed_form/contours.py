@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.measurement.search.pyramid import eight_bit
 from kgcp.settings import DetectSettings
 
 _SMOOTHING_PX = 0.8  # as wide as a lens: noise and texture stop making edges, rings do not
-_BRIGHTEST_QUANTILE = 0.999
 
 _RIM = (0.9, 1.1)  # of the half widths of a contour's box: between them is its rim
 _SECTORS = 16
@@ -60,17 +60,6 @@ def joined(contours: Sequence[npt.NDArray[Any]]) -> Contours:
     return Contours(points=points.astype(np.float64), starts=starts)
 
 
-def eight_bit(grey: GreyArray) -> GreyArray:
-    """Return an 8-bit frame for the edge detector.
-
-    A 16-bit frame often holds 10 or 12 bits: its range is stretched to its brightest pixels.
-    """
-    if grey.dtype == np.uint8:
-        return grey
-    white = max(float(np.quantile(grey[::4, ::4], _BRIGHTEST_QUANTILE)), 1.0)
-    return cv2.convertScaleAbs(grey, alpha=255.0 / white)
-
-
 def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
     """Detect edges with Canny and follow them to contours (Suzuki & Abe 1985).
 
@@ -85,10 +74,10 @@ def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
     """
     smooth = cv2.GaussianBlur(eight_bit(grey), (0, 0), _SMOOTHING_PX)
     edges = cv2.Canny(smooth, settings.canny_low, settings.canny_high)
-    found, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    contours, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     # A digital circle has at least 4 √2 pixels per pixel of radius.
     shortest = max(6, int(4.0 * np.sqrt(2.0) * settings.min_radius_px))
-    return joined([contour[:, 0] for contour in found if len(contour) >= shortest])
+    return joined([contour[:, 0] for contour in contours if len(contour) >= shortest])
 
 
 def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatArray]:
@@ -99,7 +88,7 @@ def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatAr
     return [hull for hull in hulls if _is_circular(hull, settings)]
 
 
-def _goes_round(contours: Contours) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _goes_round(contours: Contours) -> BoolArray:
     """Tell for each contour (m,) whether most sectors of its box's rim have a part of it."""
     starts, counts = contours.starts[:-1], np.diff(contours.starts)
     low = np.minimum.reduceat(contours.points, starts)
@@ -109,11 +98,11 @@ def _goes_round(contours: Contours) -> np.ndarray[tuple[int, ...], np.dtype[np.b
     unit /= np.repeat(half, counts, axis=0)
     radii = np.hypot(unit[:, 0], unit[:, 1])
     sectors = np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / np.pi + 1.0) * (0.5 * _SECTORS))
-    seen = np.left_shift(1, sectors.astype(np.intp) % _SECTORS)
-    seen[(radii < _RIM[0]) | (radii > _RIM[1])] = 0
-    sectors_seen = _count_bits(np.bitwise_or.reduceat(seen, starts))
+    sector_bits = np.left_shift(1, sectors.astype(np.intp) % _SECTORS)
+    sector_bits[(radii < _RIM[0]) | (radii > _RIM[1])] = 0
+    occupied = _count_bits(np.bitwise_or.reduceat(sector_bits, starts))
     round_box = half.max(axis=1) < _MAX_BOX_RATIO * half.min(axis=1)
-    return np.asarray(round_box & (sectors_seen >= _MIN_SECTORS))
+    return np.asarray(round_box & (occupied >= _MIN_SECTORS))
 
 
 def _count_bits(masks: IndexArray) -> IndexArray:

@@ -1,7 +1,17 @@
 """The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach.
 
-Pixels are worked on in batches, step by step, in loops without a branch: several at once in the
-vector units of the processor. A batch is one flat array, row after row.
+A pixel sees the share of a disc that its blur covers: the integral of an anisotropic Gaussian, and
+of a motion, over the disc. There is no closed form. Along one direction the integral is closed, and
+two rules take care of the other one (docs/method.md, "Blurred discs", derives both):
+
+- discs that are large against the blur: their edge is a parabola there, and the mean over it is a
+  straight edge that is displaced, widened and skewed (`_add_straight`);
+- small ones: chords, at equal steps of the angle (`_add_chords`).
+
+Nearly all time of the measurement is spent here, so that speed decides the form. Pixels are worked
+on in batches, step by step, in loops without a branch: several at once in the vector units of the
+processor. A batch is one flat array, row after row. Derivatives are worked out with the values,
+from the same intermediate results.
 """
 
 from __future__ import annotations
@@ -24,12 +34,14 @@ from kgcp.measurement.image_model.quadrature import (
 )
 
 _EDGE = float(Quadrature.EDGE)
+# Limits of the series; tests/measurement/image_model/test_blurred_discs.py holds the results to
+# those of plain integration on either side of each.
 _SHORT_SMEAR = 0.2  # of the blur: below, differences of the profile lose their digits
-_SHORTEST_SMEAR = 0.01  # of the blur: from chords none shorter can be told
+_SHORTEST_SMEAR = 0.01  # of the blur: chords cannot tell a shorter one from none
 _SHORTEST_STREAK = 0.1  # of the blur: below, it has no direction
 _NOWHERE_M = 1e-12  # keeps directions finite in a circle's centre
 _PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
-_BATCH = 16
+_BATCH = 16  # pixels: two to four full vectors, and all rows stay in the first-level cache
 # rows of a batch: where on the plate from the circle's centre, and how the blur lies there …
 _X, _Y, _XX, _XY, _YY, _STREAK_X, _STREAK_Y, *_RESULTS = range(0, 32 * _BATCH, _BATCH)
 # … what comes of it: the white share, and its derivatives in the order of `render` …
@@ -44,7 +56,12 @@ _R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7 = TAIL_RATIO
 
 @fused
 def _normal(z: float) -> tuple[float, float]:
-    """Return the standard normal distribution function, to 3e-8, and its density."""
+    """Return the standard normal distribution function, to 3e-8, and its density.
+
+    `math.erf` has branches and cannot be vectorised. Here the density is a polynomial for
+    exp(−z²/64), squared five times; the tail is the density times Mills' ratio, a polynomial in
+    1 / (1 + 0.3 z). `quadrature` fits both.
+    """
     far = min(abs(z), FAR)
     q = far * far * (0.5 / 2**SQUARINGS)
     q2 = q * q
@@ -65,7 +82,8 @@ def _normal(z: float) -> tuple[float, float]:
 def _long_smear(z: float, half: float) -> tuple[float, float, float, float, float]:
     """Return the mean of the normal distribution function from z − half to z + half.
 
-    Also its derivatives by z and by `half`, and the densities at both ends.
+    Also its derivatives by z and by `half`, and the densities at both ends. As z Φ(z) + φ(z) is an
+    integral of Φ, the mean is the difference of its values at the ends, over the length.
     """
     below_high, density_high = _normal(z + half)
     below_low, density_low = _normal(z - half)
@@ -82,7 +100,9 @@ def _smeared_normal(
     """Do as `_long_smear` for any length, 0 unless it `smears`; with what a unit of bend adds.
 
     That is the mean over s, the place on the streak, −½ … ½, of φ(y) times
-    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y is the blur along the radius.
+    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y = z − 2 · half · s is the blur along
+    the radius. It is closed, too: moments of φ between the ends of the streak. Their differences
+    lose their digits on short streaks, where the first terms of a series in `half` stand for them.
     """
     (below, density), slanted, moved = _normal(z), slant * slant, motion_t * motion_t
     curving = (z * z - 1.0) * density
@@ -103,7 +123,7 @@ def _smeared_normal(
 
 @fused
 def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """Return the blur's covariance along a direction, across it and mixed."""
+    """Return the blur's covariance along a direction, across it and mixed, by a rotation."""
     along = (xx * x + 2.0 * xy * y) * x + yy * y * y
     return along, xx + yy - along, (yy - xx) * x * y + xy * (x * x - y * y)
 
@@ -112,11 +132,15 @@ def _turned(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float,
 def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) -> None:
     """Work out a batch of a circle that is large against the blur, in closed form.
 
-    The chord that tangential blur reaches is a parabola. To second order it shifts the edge inwards
-    by var_t/(2 r) + 3 var_t²/(8 r³) and widens it by var_t²/(2 r²). Motion along the radius
-    averages the profile over its length; motion across bends the edge as blur does, but widens it
-    less. Of blur or streak askew to the radius, what is met along it tells something of what is met
-    across, and so of the bend; derivatives of that, some per cent of the whole, are left out.
+    The arc that tangential blur ε reaches is a parabola: the edge is met at r − ε²/2r − ε⁴/8r³.
+    The mean of that shifts the edge inwards by v/2r + 3v²/8r³, with the variance v of ε; its
+    variance v²/2r² widens it. Motion along the radius averages the profile over its length. Motion
+    across bends the edge as blur does, but widens it less, because a uniform distribution has
+    shorter tails than a Gaussian of the same variance.
+
+    If blur or streak is oblique to the radius, its radial and tangential parts are correlated,
+    which changes the curvature term. The derivatives of this correction (a few per cent) are
+    neglected.
     """
     bend = 0.5 / radius
     for j in range(_BATCH):
@@ -132,8 +156,9 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
         per_sd = 1.0 / math.sqrt(radial + widened)
         z = (radius - sag * (1.0 + 3.0 * sag * bend) - rho) * per_sd
         half = 0.5 * abs(motion_r) * per_sd
-        askew = motion_t if motion_r > 0.0 else -motion_t
-        level, by_z, by_half, bent = _smeared_normal(z, half, mixed * per_sd, askew, smears)
+        # with the radial motion counted outwards
+        outward_t = motion_t if motion_r > 0.0 else -motion_t
+        level, by_z, by_half, bent = _smeared_normal(z, half, mixed * per_sd, outward_t, smears)
         w[_VALUE + j] = level - bent * bend * per_sd
         if only_level:
             continue
@@ -154,8 +179,10 @@ def _add_straight(w: FloatArray, radius: float, smears: bool, only_level: bool) 
 def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_level: bool) -> None:
     """Work out a batch of a circle that is small against blur or streak, chord by chord.
 
-    They are along the streak, or else along the radius. The blur across them weights each, that
-    along it, conditioned on where it is, has closed integrals.
+    Chords lie along the streak, or else along the radius. The density of the blur across them
+    weights each; the blur along them, given its part across, is Gaussian again and has closed
+    integrals. With the chord at r sin α, the step dα stands for a width of r cos α dα, which is
+    half the chord's length times dα.
     """
     for j in range(_BATCH):
         dx, dy = w[_X + j], w[_Y + j]
@@ -176,7 +203,7 @@ def _add_chords(w: FloatArray, radius: float, rule: int, smears: bool, only_leve
         nearest = np.inf
         for j in range(_BATCH):
             nearest = min(nearest, abs(at - w[_Y + j]) * w[_PER_SD_ACROSS + j])
-        if nearest < FAR:  # weighs anything for any pixel of the batch
+        if nearest < FAR:  # else the chord weighs nothing for all pixels of the batch
             _add_chord(w, at, half_length, smears, only_level)
     for j in range(_BATCH):
         scale = math.pi / (CHORD_COUNTS[rule] + 1) * w[_PER_SD_ACROSS + j]
@@ -212,10 +239,10 @@ def _add_chord(
     """Add one chord to the sums of a batch."""
     for j in range(_BATCH):
         off, per_sd, per_across = at - w[_Y + j], w[_PER_SD + j], w[_PER_SD_ACROSS + j]
-        there = off * per_across
-        _, density = _normal(there)
-        weight = half_length * density if abs(there) < FAR else 0.0
-        centre = w[_X + j] + w[_MIXED + j] * per_across * there
+        off_sigmas = off * per_across
+        _, density = _normal(off_sigmas)
+        weight = half_length * density if abs(off_sigmas) < FAR else 0.0
+        centre = w[_X + j] + w[_MIXED + j] * per_across * off_sigmas
         half_smear = 0.5 * w[_SMEAR + j] * per_sd
         far, near = (half_length - centre) * per_sd, (-half_length - centre) * per_sd
         if smears:
@@ -230,10 +257,10 @@ def _add_chord(
             continue
         slope, by_length = weight * (by_far - by_near), weight * (by_half_far - by_half_near)
         w[_FIRST + j] += slope
-        w[_SIDEWAYS + j] += share * there
+        w[_SIDEWAYS + j] += share * off_sigmas
         w[_SECOND + j] += weight * (by_far * far - by_near * near) + by_length * half_smear
         w[_BY_SLOPE + j] -= slope * off
-        w[_BY_WIDTH + j] += share * (there * there - 1.0)
+        w[_BY_WIDTH + j] += share * (off_sigmas * off_sigmas - 1.0)
         w[_BY_HALF + j] += by_length
 
 
@@ -269,8 +296,8 @@ def render(
     out : (9, n) or (1, n) array
         White share from circles out of reach; receives the share and, where there is room, its
         derivatives by the plate's motion along its two axes, by the relative depth, by the blur on
-        the plate xx, xy, yy and by the streak there x, y. That a turn of the plate changes the blur
-        on it is left out: of second order.
+        the plate xx, xy, yy and by the streak there x, y. A turn of the plate also changes the
+        blur on it; that is of second order and left out.
     """
     w = np.zeros(32 * _BATCH)
     only_level, smears = out.shape[0] == 1, blur[3] != 0.0 or blur[4] != 0.0
@@ -279,7 +306,7 @@ def render(
         for first in range(starts[c], starts[c + 1], _BATCH):
             pixels = members[first : min(first + _BATCH, starts[c + 1])]
             _gather(views, blur, circles[c], pixels, w)
-            if only_level:  # constants, so that loops have no branch
+            if only_level:  # constant arguments: four versions are compiled, without branches
                 _add(w, r, rule, True, True) if smears else _add(w, r, rule, False, True)
             else:
                 _add(w, r, rule, True, False) if smears else _add(w, r, rule, False, False)
@@ -292,7 +319,11 @@ def render(
 def _gather(
     views: FloatArray, blur: FloatArray, circle: FloatArray, pixels: IndexArray, w: FloatArray
 ) -> None:
-    """Fill a batch with where some pixels are, from the circle's centre, and their blur there."""
+    """Fill a batch with where some pixels are, from the circle's centre, and their blur there.
+
+    The blur on the plate is A B Aᵀ, with the metres per pixel A and the blur B in the image. A batch
+    that is not full repeats its last pixel.
+    """
     for j in range(_BATCH):
         i = pixels[min(j, len(pixels) - 1)]
         w[_X + j], w[_Y + j] = views[0, i] - circle[0], views[1, i] - circle[1]

@@ -54,10 +54,10 @@ class Mask:
         ink, plate : float
             Values of the others.
         """
-        seen, between = np.zeros(len(values) + 1), np.zeros(len(self.along_rows) + 1)
-        seen[:-1] = values
+        modelled, between = np.zeros(len(values) + 1), np.zeros(len(self.along_rows) + 1)
+        modelled[:-1] = values  # the last one is read for pixels that are not modelled
         smooth = ink * self.ink + plate * self.plate
-        _add_smooth(seen, self.along_rows, self.kernel, between)
+        _add_smooth(modelled, self.along_rows, self.kernel, between)
         _add_smooth(between, self.along_columns, self.kernel, smooth)
         return values - smooth
 
@@ -135,27 +135,27 @@ def _gather(index: IndexArray, height: int, width: int) -> tuple[NumberArray, Nu
     for i in range(count):
         row, column = index[i] // width, index[i] % width
         number[row, column] = i
-        for there in range(max(column - reach, 0), min(column + reach + 1, width)):
-            between[row, there] = -1
+        for beside in range(max(column - reach, 0), min(column + reach + 1, width)):
+            between[row, beside] = -1
     along_columns = np.empty((count, _TAPS), np.int32)
-    places, found = np.empty(min(_TAPS * count, height * width), np.intp), 0
+    places, used = np.empty(min(_TAPS * count, height * width), np.intp), 0
     for i in range(count):
         row, column = index[i] // width, index[i] % width
         for j in range(_TAPS):
-            there = min(max(row + j - reach, 0), height - 1)
-            if between[there, column] == -1:
-                between[there, column] = found
-                places[found] = there * width + column
-                found += 1
-            along_columns[i, j] = between[there, column]
-    along_rows = np.empty((found, _TAPS), np.int32)
-    for k in range(found):
+            beside = min(max(row + j - reach, 0), height - 1)
+            if between[beside, column] == -1:
+                between[beside, column] = used
+                places[used] = beside * width + column
+                used += 1
+            along_columns[i, j] = between[beside, column]
+    along_rows = np.empty((used, _TAPS), np.int32)
+    for k in range(used):
         row, column = places[k] // width, places[k] % width
         for j in range(_TAPS):
             along_rows[k, j] = number[row, min(max(column + j - reach, 0), width - 1)]
     for i in range(count):
         for j in range(_TAPS):
-            along_columns[i, j] = found if along_columns[i, j] < 0 else along_columns[i, j]
+            along_columns[i, j] = used if along_columns[i, j] < 0 else along_columns[i, j]
     return along_rows, along_columns
 
 
@@ -172,7 +172,7 @@ def _add_smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: Fl
 
 @compiled
 def _stack(jacobian: FloatArray, rows: IndexArray, layers: SingleArray) -> None:
-    """Put all that belongs to a pixel side by side."""
+    """Put all rows' values of a pixel side by side, for vectors across rows."""
     for i in range(jacobian.shape[1]):
         for k in range(len(rows)):
             layers[i, k] = jacobian[rows[k], i]

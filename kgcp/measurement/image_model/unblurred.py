@@ -49,7 +49,7 @@ def look_at_plate(
     reach_m: float = math.inf,
     spread: FloatArray = EVEN,
 ) -> BarePlate:
-    """See what is where on the plate.
+    """Find what is under every pixel of the plate as a pose puts it, without blur.
 
     Parameters
     ----------
@@ -57,7 +57,6 @@ def look_at_plate(
         All of the plate.
     measured_count : int
         How many of them, the first, are measured.
-    pose : Pose
     rays : (6, n) array
         As in `Window`.
     small_m : float
@@ -91,8 +90,8 @@ def _look(
 
     Circle by circle: loops over all pixels without a branch are several times faster.
     """
-    seen = np.empty((4, points_m.shape[1]))
-    rho_m, share, off_edge_m, off_measured_m = seen[0], seen[1], seen[2], seen[3]
+    result = np.empty((4, points_m.shape[1]))
+    rho_m, share, off_edge_m, off_measured_m = result[0], result[1], result[2], result[3]
     is_small, stretch = np.zeros(len(rho_m), np.bool_), np.empty(len(rho_m))
     for i in range(len(rho_m)):
         x, y = points_m[0, i], points_m[1, i]
@@ -123,7 +122,7 @@ def _look(
         c = beyond[c]
     for i in range(len(rho_m)):
         off_edge_m[i] = 0.0 if is_small[i] else off_edge_m[i]
-    return seen
+    return result
 
 
 @compiled

@@ -39,7 +39,7 @@ class Window:
         Normalised image coordinates x, y of the pixel centres, free of distortion, and their
         derivatives xx, xy, yx, yy with respect to the raw pixel coordinates.
     binning : int
-        So many by so many pixels of the frame are one of the window.
+        Binning factor: each window pixel is the mean of `binning` × `binning` frame pixels.
     clipped : (n,) array or None
         Share of clipped pixels in every bin; None without bins.
     """

@@ -21,12 +21,14 @@ from kgcp.measurement.search.templates import ANGLES, CIRCLE, SAMPLED_RADII
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
 
-_MIN_CONTRAST = 0.02  # of the grey values' range
-_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
-_UNEVEN = 0.5  # grey values of ink, disc and plate, of the contrast
+# Tuning of the candidates; its benchmark is `benchmarks.search.hard_frames` (the sets in brackets
+# tell most), and for what is let through without need `benchmarks.search.false_alarms`.
+_MIN_CONTRAST = 0.02  # of the grey values' range (`haze`)
+_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots (`blur`)
+_UNEVEN = 0.5  # spread of ink, disc and plate, of the contrast
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
-_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
-_SEED_REACH = 2.0  # around places that are pointed out, of their radii
+_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective (`oblique`)
+_SEED_REACH = 2.0  # around expected places, of their radii
 _SMALLEST_WINDOW_PX = 12
 _DIGITS = 6  # of proportions that are the same
 
@@ -100,14 +102,14 @@ def find_dotted(
     They have a dark ring between bright disc and plate, brighter in places. Rings of the same
     proportions, such as replicas, share their candidates.
     """
-    found: dict[tuple[float, float], tuple[Candidate, ...]] = {}
+    by_shape: dict[tuple[float, float], tuple[Candidate, ...]] = {}
     by_ring: dict[Ring, tuple[Candidate, ...]] = {}
     for ring in rings:
         ratios = ring.inner_ratio, ring.code_diameter_m / ring.outer_diameter_m
         shape = round(ratios[0], _DIGITS), round(ratios[1], _DIGITS)
-        if shape not in found:
-            found[shape] = _dotted(grey, outlines, *ratios)
-        by_ring[ring] = found[shape]
+        if shape not in by_shape:
+            by_shape[shape] = _dotted(grey, outlines, *ratios)
+        by_ring[ring] = by_shape[shape]
     return by_ring
 
 
@@ -143,14 +145,19 @@ def _dotted(
     radii = np.array((_DISC_SHARE * inner, code, _PLATE))
     values = np.sort(sample_ellipses(grey, outlines, radii, CIRCLE), axis=2)
     dotted = np.empty(len(outlines), dtype=bool)
-    _tell(values, _MIN_CONTRAST * float(np.iinfo(grey.dtype).max), dotted)
+    _mark_dotted(values, _MIN_CONTRAST * float(np.iinfo(grey.dtype).max), dotted)
     kept = tuple(outlines[i] for i in np.flatnonzero(dotted))
     return tuple(map(Candidate, kept, sample_ellipses(grey, kept, SAMPLED_RADII, CIRCLE)))
 
 
 @compiled
-def _tell(values: FloatArray, least: float, dotted: npt.NDArray[np.bool_]) -> None:
-    """Tell of which outlines disc, code circle and plate (n, 3, angles), sorted, are a ring's."""
+def _mark_dotted(values: FloatArray, least: float, dotted: npt.NDArray[np.bool_]) -> None:
+    """Mark outlines whose grey values, sorted, are consistent with a ring that has dots.
+
+    `values` (n, 3, angles) are those on disc, code circle and plate. As in the ring check, order
+    statistics stand for ink and white, since dots, dirt and hidden parts move means: a quarter up
+    from the darkest of the code circle is ink, the brightest 4 % are dots.
+    """
     for i in range(len(values)):
         disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
         black = code[_rank(0.25)]

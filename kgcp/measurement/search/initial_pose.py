@@ -1,4 +1,7 @@
-"""From a ring with the right code to the pose that the measurement starts from."""
+"""From a ring with the right code to the pose that the measurement starts from.
+
+docs/method.md, "The start", describes it.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +29,15 @@ from kgcp.measurement.search.code_signal import (
 from kgcp.measurement.search.sampling import FAINTEST_SLOPE, sample_ellipses, sample_grey
 from kgcp.targets.layout import Target
 
-_REACH_PX, _STEP_PX = 3.0, 0.2
+# Tuning of the start. The adjustment corrects all of it; a start that is worse costs rounds, and
+# beyond some per cent of the distance frames (`benchmarks.accuracy.presets`, CPU time and found).
+_REACH_PX, _STEP_PX = 3.0, 0.2  # of the profile across an edge
+_MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
+_AXIS_ERROR_PX = 0.3  # of an outline
+
 _OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # of an ellipse enough points give its undistorted image
 _EVERYWHERE = np.ones((1, len(_OUTLINE_RAD)), dtype=bool)
 _EDGE_RAD, _EDGE = CODE_ANGLES_RAD[::4], CODE_CIRCLE[::4]
-_MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
-_AXIS_ERROR_PX = 0.3  # of an outline
 
 
 def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> InitialPose:
@@ -50,14 +56,15 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
         pose_on_plane(plane, 0.5 * ring.outer_diameter_m, towards[0])
         for plane in circle_planes(_ellipse_through(towards).conic)
     ]
-    seen = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
-    scores, lags_deg = match_code(seen, ring)
+    codes = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
+    scores, lags_deg = match_code(codes, ring)
     best = int(scores.argmax())
     turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
     pose = poses[best]
-    if abs(turn_deg) < _MAX_TURN_DEG:  # else something hides the code, which the search knows
+    if abs(turn_deg) < _MAX_TURN_DEG:  # otherwise something hides the code, as the search knows
         pose = pose.turned(turn_deg)
-    # where the tilt is 0 nothing changes with it: an adjustment that starts there stays there
+    # At a tilt of 0 the image does not change with it, to first order: an adjustment that starts
+    # there stays there. So the start is tilted by what the outline cannot tell from 0.
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
     outer, inner = (
         _profile(grey, match, diameter_m)
@@ -80,11 +87,11 @@ def _ellipse_through(points: FloatArray) -> Ellipse:
     """Fit an ellipse to points (n, 2) all around, which are nearly on one."""
     lengths, directions = np.empty((1, len(points))), np.empty_like(points)
     x, y, unit = _measure_spokes(points, lengths[0], directions)
-    found, possible = np.empty((1, 5)), np.empty(1)
-    fit_ellipses(lengths, _EVERYWHERE, directions, math.inf, found, possible)
-    if not possible[0]:
+    ellipses, shares = np.empty((1, 5)), np.empty(1)
+    fit_ellipses(lengths, _EVERYWHERE, directions, math.inf, ellipses, shares)
+    if not shares[0]:
         raise Rejection(Reason.POOR_ELLIPSE, "the outline is beyond the lens model's reach")
-    right, down, a, b, angle_rad = found[0].tolist()
+    right, down, a, b, angle_rad = ellipses[0].tolist()
     return Ellipse(x + unit * right, y + unit * down, unit * a, unit * b, angle_rad)
 
 
@@ -133,20 +140,20 @@ def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Prof
     px_per_m = 2.0 * outline.mean_radius / ring.outer_diameter_m
     clear = clear_of_dots(_EDGE_RAD, ring, edge_diameter_m, match.lag_deg, px_per_m)
     factors = radii_px / outline.mean_radius
-    seen = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
+    values = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
     sign = 1.0 if edge_diameter_m > ring.inner_diameter_m else -1.0
-    steepest, rise = _steepest(seen, sign)
+    steepest, rise = _steepest(values, sign)
     return _Profile(float(radii_px[steepest]), rise / _STEP_PX)
 
 
 @compiled
-def _steepest(seen: FloatArray, sign: float) -> tuple[int, float]:
+def _steepest(values: FloatArray, sign: float) -> tuple[int, float]:
     """Return where the means of some rows rise most, or fall with −1, and by how much per row."""
-    rows, angles = seen.shape
+    rows, angles = values.shape
     means = np.zeros(rows)
     for r in range(rows):
         for a in range(angles):
-            means[r] += sign * seen[r, a] / angles
+            means[r] += sign * values[r, a] / angles
     best, most = 0, means[1] - means[0]
     for r in range(1, rows):
         after = means[min(r + 1, rows - 1)]

@@ -1,4 +1,7 @@
-"""From places that may be a ring's to the ellipses of outer edges, one for each ring."""
+"""From places that may be a ring's to the ellipses of outer edges, one for each ring.
+
+Ring filter, ring check, edge tracking and ellipse fit in turn; circles that are alike are one.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,15 @@ from kgcp.measurement.search.pyramid import Pyramid, factor_of
 from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
 
-_SMALLEST_RATIO = 0.93  # of rings looked for in a level, to that radius
-# Of one ring are seeds, or outlines, by distance of centres, of its radius, and ratio of radii.
+# Tuning: two seeds, or outlines, are the same ring if their centres are nearer than this, of the
+# radius, and the logarithms of their radii. Looser limits lose replicas inside rings, closer ones
+# only cost time (`benchmarks.search.hard_frames --only cut`, `benchmarks.speed.relative_costs`).
 _NEAR_SEEDS, _ALIKE_SEEDS = 0.3, 0.25
+_NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
+_SMALLEST_RATIO = 0.93  # of the radii that a level is searched for to the one of its peaks
+_MAX_AXIS_RATIO = 2.0  # tilts to 60°
 
 _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
-_MAX_AXIS_RATIO = 2.0
-_NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
 
 
 def distinct(
@@ -52,25 +57,28 @@ def _is_first(
     near: float,
     alike: float,
 ) -> BoolArray:
-    """Tell which circles (n,) are like no clearer one, from their orders by clearness and row."""
+    """Tell which circles (n,) are like no clearer one, from their orders by clearness and row.
+
+    Neighbours are looked for along the rows, up and down from each circle, as far as it reaches.
+    """
     first = np.ones(len(radii), np.bool_)
     position, rank = np.empty(len(radii), np.intp), np.empty(len(radii), np.intp)
     for i in range(len(radii)):
         position[by_row[i]], rank[order[i]] = i, i
-    for one in order:
-        if not first[one]:
+    for clearer in order:
+        if not first[clearer]:
             continue
-        reach = near * radii[one]
+        reach = near * radii[clearer]
         for step in (-1, 1):
-            place = position[one] + step
+            place = position[clearer] + step
             while 0 <= place < len(by_row):
                 other = by_row[place]
-                y = centres[other, 1] - centres[one, 1]
+                y = centres[other, 1] - centres[clearer, 1]
                 if abs(y) > reach:
                     break
-                x = centres[other, 0] - centres[one, 0]
-                if x * x + y * y <= reach * reach and rank[other] > rank[one]:
-                    first[other] &= abs(math.log(radii[other] / radii[one])) > alike
+                x = centres[other, 0] - centres[clearer, 0]
+                if x * x + y * y <= reach * reach and rank[other] > rank[clearer]:
+                    first[other] &= abs(math.log(radii[other] / radii[clearer])) > alike
                 place += step
     return first
 
@@ -115,7 +123,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
 
 
 def find_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
-    """Follow the outer edge of every seed's ring and fit an ellipse to it.
+    """Track the outer edge of every seed's ring and fit an ellipse to it.
 
     Twice: the centre of a large ring is known to some pixels at first.
     """
@@ -123,13 +131,13 @@ def find_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
     for _ in range(2):
         if not len(seeds):
             return ()
-        ellipses = _follow(pyramid, seeds)
+        ellipses = _fit_outlines(pyramid, seeds)
         centres, axes = np.ascontiguousarray(ellipses[:, :2]), ellipses[:, 2:4]
         seeds = Seeds(centres, np.sqrt(axes.prod(axis=1)), np.ones(len(ellipses)))
     return tuple(Ellipse(*row) for row in ellipses.tolist())
 
 
-def _follow(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
+def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     """Return centre, semi-axes [px] and direction [rad] of the seeds' outlines, clearest first.
 
     Those that agree with a clearer one are dropped. The unit of the edges is the seed's radius, the

@@ -1,6 +1,7 @@
 """A frame in 8 bits and what is made of it: images of a half, a third, a quarter, … of its size.
 
-All the reduced images are in one array, so that one call of a compiled loop goes through them.
+Levels are 1.33 and 1.5 apart, so that every ring has a radius between 2.5 and 3.75 px in some of
+them: there the ring filter answers. All are in one array, so that one compiled loop goes through.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def factor_of(level: int) -> float:
 
 
 def eight_bit(grey: GreyArray) -> GreyArray:
-    """Return an 8-bit frame for the search.
+    """Return an 8-bit frame for the search, contiguous.
 
     A 16-bit frame often holds 10 or 12 bits: its range is stretched to its brightest pixels.
     """

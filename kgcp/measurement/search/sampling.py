@@ -34,7 +34,6 @@ def sample_ellipses(
     ----------
     grey : (height, width) array
     outlines : sequence of n Ellipse
-        [px].
     factors : (m,) array
     circle : (k, 2) array
         Points of the unit circle, of which `Ellipse.points` makes those of the ellipse.
@@ -47,13 +46,22 @@ def sample_ellipses(
     if not outlines:
         return np.empty(shape)
     points = np.empty((*shape, 2), dtype=np.float32)
-    for one, around in zip(outlines, points, strict=True):
-        _place(one.x, one.y, one.a, one.b, one.angle_rad, factors, circle, around)
+    for outline, around in zip(outlines, points, strict=True):
+        _place_points(
+            outline.x,
+            outline.y,
+            outline.a,
+            outline.b,
+            outline.angle_rad,
+            factors,
+            circle,
+            around,
+        )
     return sample_grey(grey, points.reshape(len(outlines), -1, 2)).reshape(shape)
 
 
 @compiled
-def _place(
+def _place_points(
     x: float,
     y: float,
     a: float,
