@@ -1,4 +1,10 @@
-"""What is not the target: surroundings of its plate, and what hides a part of it."""
+"""What is not the target: surroundings of its plate, and what hides a part of it.
+
+Both are found before the adjustment, by an approximate pose, blur and light: where grey values
+cannot be those of the plate. Whatever blur may have mixed with such pixels is left out, too. The
+rules are local and one-sided, since leaving out too much costs a little accuracy and leaving out
+too little biases the distance. docs/method.md, "Masks", derives them.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +24,13 @@ from kgcp.measurement.image_model.photometry import Light, light_of_levels, plat
 from kgcp.measurement.image_model.plate import blur_on_plate, largest_metres_per_px
 from kgcp.measurement.image_model.unblurred import BarePlate, look_at_plate
 
+# Tuning of the masks, in units of the blur's σ and of the contrast. Benchmarks: the sets `hidden`
+# and `cut` of `benchmarks.search.hard_frames`, for what hides a part;
+# tests/measurement/test_obstacles.py and adjustment/test_pixels.py, for the bias that dirt, shadows
+# and surroundings leave; `benchmarks.accuracy.presets` (`far`, `consumer`), for what is lost.
 _BLURRED_SHARE = 0.7  # of ink and of plate, that is too near to edges for the level
 _ENOUGH_PIXELS = 2000  # for a median
-_CLEAR_SIGMAS = 2.6  # from an edge on, where ink and plate show their own levels
+_CLEAR_SIGMAS = 2.6  # from an edge on, ink and plate show their own levels: Φ(−2.6) is 0.5 %
 _FOREIGN_CONTRAST = 0.15  # off the plate's level: not plate, or mixed with what is not …
 _FOREIGN_SIGMAS = 2.0  # … and so much farther its blur is felt
 _BESIDE_RING_SIGMAS = 0.85  # from there on, grey values hardly depend on the camera's tone
@@ -178,8 +188,9 @@ def _mark_foreign(
 ) -> int:
     """Mark what is not plate outside a ring; return how many pixels that are.
 
-    Where the ring is not felt, by a level that is not the plate's; nearer, where the end of the
-    plate may be within the blur of the ring, by one that is darker than the ring makes it.
+    Beyond 2.6 σ from the ring, by a level that is not the plate's. Nearer, where the end of the
+    plate may be within the blur of the ring, by one that is darker than Φ(distance / σ), the
+    profile of the ring's own edge, makes it; σ is that of the blur in the pixel's direction.
     """
     count, level = 0, min(white, 1.0)
     for i in range(len(smooth)):
@@ -208,10 +219,12 @@ def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyAr
 
 
 def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
-    """Tell which pixels (n,) of the window show something else than ink and plate.
+    """Tell which pixels (n,) of the window show something other than ink and plate.
 
-    By levels that are neither where it is flat, and by edges that are not there: grey values
-    just beside one that are like those beyond it. The pose may be off by `slack_px`.
+    By levels that are neither ink nor plate where the plate is flat, and by missing edges: grey
+    values beside one that are those of its other side. The pose may be off by `slack_px`. If that
+    is more than half of all that is tested, it is rather the light or the pose that is wrong, and
+    nothing is left out.
     """
     imaging, sd_px, bare = seen.imaging, seen.blur.largest_sd_px, seen.bare
     other = np.zeros(len(bare.rho_m), dtype=np.bool_)
@@ -237,7 +250,7 @@ def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
 def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
     """Leave out what may be a dot too many or too few: it lies in the ring, and is no larger.
 
-    That speaks of another code, and must not be overlooked.
+    Such a patch is evidence of another code. Masked, it would not count against the target.
     """
     radii_m, rho_m, window = seen.imaging.circles.radii_m, seen.bare.rho_m, seen.imaging.window
     mask = other.reshape(window.height, window.width).view(np.uint8)
@@ -264,7 +277,12 @@ def _mark_other(
     sd_m: float,
     other: BoolArray,
 ) -> tuple[int, int]:
-    """Mark the pixels that are not what they should be; return their number, and of all tested."""
+    """Mark pixels that are not what they should be; return their number, and that of all tested.
+
+    `share` is the white share without blur. A pixel is clear, and its level known to a quarter of
+    the contrast, from 2.6 σ on beside any edge. From 1.2 σ on blur has moved it by at most 12 % of
+    the contrast towards the other side: by half of the contrast only a missing edge does.
+    """
     found = tested = 0
     for i in range(len(smooth)):
         off_m, beyond_m = off_edge_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m

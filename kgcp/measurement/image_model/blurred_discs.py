@@ -8,7 +8,7 @@ two rules take care of the other one (docs/method.md, "Blurred discs", derives b
   straight edge that is displaced, widened and skewed (`_add_straight`);
 - small ones: chords, at equal steps of the angle (`_add_chords`).
 
-Nearly all time of the measurement is spent here, so that speed decides the form. Pixels are worked
+Most time of the measurement is spent here, so that speed decides the form. Pixels are worked
 on in batches, step by step, in loops without a branch: several at once in the vector units of the
 processor. A batch is one flat array, row after row. Derivatives are worked out with the values,
 from the same intermediate results.
@@ -100,9 +100,10 @@ def _smeared_normal(
     """Do as `_long_smear` for any length, 0 unless it `smears`; with what a unit of bend adds.
 
     That is the mean over s, the place on the streak, −½ … ½, of φ(y) times
-    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y = z − 2 · half · s is the blur along
-    the radius. It is closed, too: moments of φ between the ends of the streak. Their differences
-    lose their digits on short streaks, where the first terms of a series in `half` stand for them.
+    (slant · y + motion_t · s)² − slant² − motion_t²/12, where y = z − 2 · half · s is the blur
+    along the radius. It is closed, too: moments of φ between the ends of the streak. Their
+    differences lose their digits on short streaks; there the first terms of a series in `half`
+    replace them.
     """
     (below, density), slanted, moved = _normal(z), slant * slant, motion_t * motion_t
     curving = (z * z - 1.0) * density
@@ -321,8 +322,8 @@ def _gather(
 ) -> None:
     """Fill a batch with where some pixels are, from the circle's centre, and their blur there.
 
-    The blur on the plate is A B Aᵀ, with the metres per pixel A and the blur B in the image. A batch
-    that is not full repeats its last pixel.
+    The blur on the plate is A B Aᵀ, with the metres per pixel A and the blur B in the image. A
+    batch that is not full repeats its last pixel.
     """
     for j in range(_BATCH):
         i = pixels[min(j, len(pixels) - 1)]

@@ -1,9 +1,8 @@
 """Rules of integration for blurred discs, and the normal distribution as polynomials.
 
 The radii up to which a rule is used were found by comparing it with the noncentral χ² distribution
-(isotropic blur) and with 70 chords (anisotropic): every rule stays below 3e-4 of the contrast, a
-twentieth of the noise of a good frame. tests/measurement/image_model/test_blurred_discs.py repeats
-the comparison.
+(isotropic blur) and with 70 chords (anisotropic): every rule stays below 3e-4 of the contrast.
+tests/measurement/image_model/test_blurred_discs.py repeats the comparison.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 
 FAR = 6.0  # standard deviations beyond which there is nothing to 1e-9
 SQUARINGS = 5  # of exp(−z²/64): so little is left of the range that a short polynomial holds it
-BEND = 0.3  # of t = 1 / (1 + BEND z), by which Mills' ratio is nearly straight
+BEND = 0.3  # of t = 1 / (1 + BEND z), in which a short polynomial holds Mills' ratio
 _EXPONENTIAL_ORDER, _RATIO_ORDER = 6, 7  # 3e-8 together
 
 
