@@ -68,7 +68,7 @@ LIBRARIES: dict[str, frozenset[str]] = {
     "io.flight": ARRAYS | {"pyproj"},
     "io.tables": IMAGES | {"pandas", "PIL", "pyarrow"},
     "io.exporters": ARRAYS | {"pyproj", "scipy"},
-    "io.print": ARRAYS | {"ezdxf", "matplotlib", "pypdfium2", "reportlab"},
+    "io.print": ARRAYS | {"ezdxf", "matplotlib", "PIL"},
     "report": IMAGES | {"jinja2", "matplotlib"},
     "report.bias": IMAGES | {"jinja2", "markupsafe", "matplotlib"},
     "pipeline.execution": frozenset({"cv2", "distributed", "numpy", "scipy", "threadpoolctl"}),

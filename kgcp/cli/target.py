@@ -133,6 +133,9 @@ def command(
       kgcp target sample_flight --format pdf --format dxf --plate 1.2 --holes 8
       kgcp target --new 6 --diameter 0.15 --sheet A4
     """  # noqa: D301 - \b is click's mark for lines that stay
+    from kgcp.report.plotting import load_matplotlib
+
+    load_matplotlib()  # before the drawing of sheets does
     from kgcp.errors import SettingError
     from kgcp.io.flight.flight import read_printed_targets
     from kgcp.io.flight.target_table import write_target_tables

@@ -8,7 +8,7 @@ import ezdxf
 from ezdxf import units
 from ezdxf.layouts import Modelspace
 
-from kgcp.io.print.typeface import CAP_HEIGHT, set_text
+from kgcp.io.print.typeface import CAP_HEIGHT, fit_text
 from kgcp.targets.shapes import Area, Artwork, Circle, Disc, Layer, Shape, Text
 
 _STYLE = "SANS"
@@ -35,11 +35,10 @@ def dxf_of(artwork: Artwork) -> bytes:
 
 def _add(space: Modelspace, shape: Shape) -> None:
     if isinstance(shape, Text):
-        printed = set_text(shape)
-        height = CAP_HEIGHT * printed.size_mm
+        words, size_mm = fit_text(shape)
         place = shape.start_mm[0], -shape.start_mm[1]
         look = {"layer": Layer.TEXT.value, "style": _STYLE, "insert": place}
-        space.add_text(printed.words, height=height, dxfattribs=look)
+        space.add_text(words, height=CAP_HEIGHT * size_mm, dxfattribs=look)
         return
     on_layer = {"layer": shape.layer.value}
     if isinstance(shape, Disc | Circle):

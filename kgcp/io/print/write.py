@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from kgcp.errors import SettingError
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.print.drawing import check_pixels, pdf_of, png_of, svg_of
+from kgcp.io.print.dxf import dxf_of
 from kgcp.targets.shapes import Sheet
 
 FORMATS = ("pdf", "svg", "dxf", "png")
@@ -43,20 +45,12 @@ def write_sheets(
     KgcpError
         If a picture would be too large, or a file cannot be written.
     """
-    from kgcp.io.print.png import check_pixels
-
     formats = tuple(dict.fromkeys(formats))
     if "png" in formats:
         check_pixels(sheets[0].width_mm, sheets[0].height_mm, dpi)
-    contents: dict[str, Callable[[], Iterator[tuple[str, bytes]]]] = {
-        "pdf": lambda: _pdf(sheets, name),
-        "svg": lambda: _svgs(sheets),
-        "dxf": lambda: _dxf(sheets),
-        "png": lambda: _pngs(sheets, name, dpi),
-    }
     files = []
     for form in formats:
-        for label, content in contents[form]():
+        for label, content in _contents(sheets, f"Target {name}", form, dpi):
             suffix = f"_{label}" if label else ""
             path = folder / f"{file_stem(name)}{suffix}.{form}"
             write_bytes(path, content)
@@ -64,27 +58,15 @@ def write_sheets(
     return files
 
 
-def _pdf(sheets: Sequence[Sheet], name: str) -> Iterator[tuple[str, bytes]]:
-    from kgcp.io.print.pdf import pdf_of
-
-    yield "", pdf_of(sheets, f"Target {name}")
-
-
-def _svgs(sheets: Sequence[Sheet]) -> Iterator[tuple[str, bytes]]:
-    from kgcp.io.print.svg import svg_of
-
-    yield from ((sheet.label, svg_of(sheet)) for sheet in sheets)
-
-
-def _dxf(sheets: Sequence[Sheet]) -> Iterator[tuple[str, bytes]]:
-    from kgcp.io.print.dxf import dxf_of
-
-    yield "", dxf_of(sheets[0].artwork)
-
-
-def _pngs(sheets: Sequence[Sheet], name: str, dpi: int) -> Iterator[tuple[str, bytes]]:
-    from kgcp.io.print.pdf import pdf_of
-    from kgcp.io.print.png import pngs_of
-
-    pictures = pngs_of(pdf_of(sheets, f"Target {name}"), dpi)
-    yield from ((s.label, picture) for s, picture in zip(sheets, pictures, strict=True))
+def _contents(
+    sheets: Sequence[Sheet], title: str, form: str, dpi: int
+) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of a format, each with the label of its sheet or, of all sheets, none."""
+    if form == "pdf":
+        yield "", pdf_of(sheets, title)
+    elif form == "dxf":
+        yield "", dxf_of(sheets[0].artwork)
+    elif form == "svg":
+        yield from ((sheet.label, svg_of(sheet)) for sheet in sheets)
+    else:
+        yield from ((sheet.label, png_of(sheet, dpi)) for sheet in sheets)

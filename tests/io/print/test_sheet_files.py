@@ -18,6 +18,7 @@ import numpy as np
 import pypdfium2
 import pytest
 import resvg_py
+from matplotlib.textpath import TextPath
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -25,18 +26,16 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.io.print.drawing import check_pixels, pdf_of, png_of, svg_of
 from kgcp.io.print.dxf import dxf_of
-from kgcp.io.print.pdf import pdf_of
-from kgcp.io.print.png import check_pixels
-from kgcp.io.print.svg import svg_of
-from kgcp.io.print.typeface import set_text
+from kgcp.io.print.typeface import fit_text, font
 from kgcp.io.print.write import FORMATS, check_stems, file_stem, write_sheets
 from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import Miss, Observation
 from kgcp.settings import DetectSettings
 from kgcp.targets.artwork import Plate, draw_target
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Box, Sheet, Text
+from kgcp.targets.shapes import Artwork, Box, Disc, Layer, Sheet, Text, rectangle
 from kgcp.targets.sheets import Paper, lay_out
 from kgcp.targets.validation import check_targets
 
@@ -59,6 +58,10 @@ def raster_of_pdf(sheet: Sheet, dpi: int) -> GreyArray:
 def raster_of_svg(sheet: Sheet, dpi: int) -> GreyArray:
     picture = resvg_py.svg_to_bytes(svg_string=svg_of(sheet).decode(), dpi=float(dpi))
     return np.asarray(Image.open(io.BytesIO(bytes(picture))).convert("L"))
+
+
+def raster_of_png(sheet: Sheet, dpi: int) -> GreyArray:
+    return np.asarray(Image.open(io.BytesIO(png_of(sheet, dpi))))
 
 
 def edges(profile: FloatArray) -> FloatArray:
@@ -91,17 +94,59 @@ DIAMETERS_MM = np.array([90.0, 45.0, 27.0, 13.5])
 BETWEEN_DOTS_DEG = (28.0, 122.0, 140.0, 160.0)
 
 
-@pytest.mark.parametrize("rasterise", [raster_of_pdf, raster_of_svg])
-def test_diameters_are_true_at_600_dpi(rasterise: Callable[[Sheet, int], GreyArray]) -> None:
+@pytest.mark.parametrize(
+    ("rasterise", "is_stretched"),
+    [(raster_of_pdf, True), (raster_of_svg, True), (raster_of_png, False)],
+)
+def test_diameters_are_true_at_600_dpi(
+    rasterise: Callable[[Sheet, int], GreyArray], *, is_stretched: bool
+) -> None:
+    """Whether it is to whole pixels that the page is stretched is up to who rasterises."""
     sheet = bare_sheet()
     grey = rasterise(sheet, DPI)
-    scale = np.array(grey.shape[::-1]) / (sheet.width_mm, sheet.height_mm)
-    assert scale == pytest.approx([PX_PER_MM, PX_PER_MM], rel=1e-3)
+    page_px = np.array(grey.shape[::-1])
+    np.testing.assert_allclose(page_px / PX_PER_MM, (sheet.width_mm, sheet.height_mm), atol=0.05)
+    scale = np.full(2, PX_PER_MM)
+    if is_stretched:
+        scale = page_px / (sheet.width_mm, sheet.height_mm)
     for way_deg in BETWEEN_DOTS_DEG:
-        found_mm = edges_mm(grey, sheet, scale, way_deg)
-        assert len(found_mm) == 8
-        np.testing.assert_allclose(found_mm[::-1][:4] - found_mm[:4], DIAMETERS_MM, atol=0.02)
-        np.testing.assert_allclose(found_mm[:4], -0.5 * DIAMETERS_MM, atol=0.03)
+        edge_mm = edges_mm(grey, sheet, scale, way_deg)
+        assert len(edge_mm) == 8
+        np.testing.assert_allclose(edge_mm[::-1][:4] - edge_mm[:4], DIAMETERS_MM, atol=0.02)
+        np.testing.assert_allclose(edge_mm[:4], -0.5 * DIAMETERS_MM, atol=0.02)
+
+
+@pytest.mark.parametrize("place_mm", [(50.0, 50.0), (50.013, 49.979)])
+def test_painted_circles_have_their_radius_and_centre(place_mm: tuple[float, float]) -> None:
+    """By area and centre of mass of the ink, whose edges are grey."""
+    radius_mm = 45.0
+    disc = Artwork((Disc(Layer.INK, (0.0, 0.0), radius_mm),), Box(-45.0, -45.0, 45.0, 45.0))
+    sheet = Sheet("", 100.0, 100.0, disc, place_mm, Box(0.0, 0.0, 100.0, 100.0))
+    ink = 1.0 - raster_of_png(sheet, DPI) / 255.0
+    assert math.sqrt(ink.sum() / math.pi) / PX_PER_MM == pytest.approx(radius_mm, abs=2e-3)
+    pixels_mm = (np.arange(len(ink)) + 0.5) / PX_PER_MM
+    weights = ink / ink.sum()
+    centre_mm = (weights.sum(axis=0) @ pixels_mm, weights.sum(axis=1) @ pixels_mm)
+    assert centre_mm == pytest.approx(place_mm, abs=1e-3)
+
+
+def circles_mm(svg: str) -> list[FloatArray]:
+    """Points (16, 2) of each circle, which are the ends of cubic curves."""
+    paths = re.findall(r'<path d="([^"]*)"', svg)
+    ends_pt = [re.findall(r"C .* ([\d.]+) ([\d.]+) $", path, re.MULTILINE) for path in paths]
+    return [25.4 / 72.0 * np.array(ends, dtype=float) for ends in ends_pt if len(ends) == 16]
+
+
+def test_circles_of_the_svg_are_true_to_a_micrometre() -> None:
+    sheet = bare_sheet()
+    circles = circles_mm(svg_of(sheet).decode())
+    diameters_mm = [*DIAMETERS_MM]
+    diameters_mm += [1e3 * ring.dot_diameter_m for ring in TARGET.rings for _ in ring.code_deg]
+    sizes_mm = [np.ptp(points, axis=0).max() for points in circles]
+    np.testing.assert_allclose(sorted(sizes_mm), sorted(diameters_mm), atol=1e-3)
+    outer = circles[int(np.argmax(sizes_mm))]
+    radii_mm = np.linalg.norm(outer - np.array(sheet.centre_mm), axis=1)
+    np.testing.assert_allclose(radii_mm, 45.0, atol=1e-3)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
@@ -228,22 +273,37 @@ def test_dxf_is_read_back_with_its_circles_in_millimetres() -> None:
     assert "Südtor 1" in words
 
 
-def test_svg_has_true_circles_and_millimetres() -> None:
+def test_svg_has_the_paper_s_size_and_needs_no_typeface() -> None:
     text = svg_of(sheet_of(paper=Paper.A4)).decode()
-    assert re.search(r'width="210mm" height="297mm" viewBox="0 0 210 297"', text)
-    assert re.search(r'<circle cx="0" cy="0" r="45" fill="#000000" />', text)
-    assert 'aria-label="Südtor 1"' in text
+    size = re.search(r'<svg [^>]*width="([\d.]+)pt" height="([\d.]+)pt"', text)
+    assert size is not None
+    assert [25.4 / 72.0 * float(side) for side in size.groups()] == pytest.approx([210.0, 297.0])
+    assert "Südtor 1" in text
     assert "<text" not in text
 
 
-def test_pdf_is_not_to_be_scaled_and_can_be_searched() -> None:
+def test_pdf_has_a_page_for_each_tile_and_can_be_searched() -> None:
     tiles = lay_out(draw_target(TARGET, Plate(400.0)), "Südtor 1", Paper.A4, is_tiled=True)
     document = pypdfium2.PdfDocument(pdf_of(tiles, "Target Südtor 1"))
     assert len(document) == len(tiles) > 1
     assert sorted(document[0].get_size()) == pytest.approx([595.28, 841.89], abs=0.01)
     assert "row 1 of" in document[0].get_textpage().get_text_bounded()
     assert "Südtor 1" in document[len(tiles) - 2].get_textpage().get_text_bounded()
-    assert b"/PrintScaling /None" in pdf_of(tiles, "x")
+    assert document.get_metadata_value("Title") == "Target Südtor 1"
+
+
+def test_tiles_overlap_by_their_bleed_and_show_nothing_beyond_it() -> None:
+    """Two tiles of a black square: each paints it up to 3 mm beyond the common cut."""
+    square = Artwork(
+        (rectangle(Layer.INK, Box(-140.0, -50.0, 140.0, 50.0)),), Box(-140, -50, 140, 50)
+    )
+    sheets = lay_out(square, "x", Paper.A4, is_tiled=True)
+    assert len(sheets) == 2
+    for sheet, (left, right) in zip(sheets, ((-140.0, 3.0), (-3.0, 140.0)), strict=True):
+        bare = replace(sheet, marks=())
+        columns = np.flatnonzero(raster_of_png(bare, 254).min(axis=0) < 128)
+        ends_mm = 0.1 * np.array([columns[0], columns[-1] + 1]) - sheet.centre_mm[0]
+        np.testing.assert_allclose(ends_mm, (left, right), atol=0.06)
 
 
 def test_png_carries_its_resolution(tmp_path: Path) -> None:
@@ -279,6 +339,8 @@ def test_file_names_are_safe_and_differ() -> None:
 
 
 def test_text_fits_into_its_room_and_knows_what_it_cannot_write() -> None:
-    printed = set_text(Text("a very long name " * 9, (0.0, 0.0), 7.0, 50.0))
-    assert printed.points_mm[:, 0].max() == pytest.approx(50.0, rel=0.01)
-    assert set_text(Text("$x^2$ \U0001f6f8 Ω", (0.0, 0.0), 3.0, 99.0)).words == "$x^2$ ? Ω"
+    words, size_mm = fit_text(Text("a very long name " * 9, (0.0, 0.0), 7.0, 50.0))
+    outline = TextPath((0.0, 0.0), words, size=size_mm, prop=font(is_bold=False))
+    assert outline.get_extents().x1 == pytest.approx(50.0, rel=0.01)
+    unknown = Text("$x^2$ \U0001f6f8 Ω", (0.0, 0.0), 3.0, 99.0)
+    assert fit_text(unknown) == ("$x^2$ ? Ω", 3.0)
