@@ -22,7 +22,7 @@ def _transformers(path: Path) -> list[ast.Call]:
 def test_every_transformer_has_x_first() -> None:
     modules = [*Path(kgcp.__file__).parent.rglob("*.py")]
     found = [(path.name, call) for path in modules for call in _transformers(path)]
-    assert len(found) >= 5  # the search finds them
+    assert len(found) >= 3  # the search finds them
     for name, call in found:
         keywords = {one.arg: ast.unparse(one.value) for one in call.keywords}
         assert keywords.get("always_xy") == "True", f"{name}, line {call.lineno}"

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from benchmarks.aat.settings import BlockSettings, axes_of, ground_m, map_frame, on_corridor
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
 from kgcp.simulation.path import BODY_FROM_PLATE, CarrierStates

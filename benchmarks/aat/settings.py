@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 
 CRS = "EPSG:25832"
 ORIGIN_MAP: FloatArray = np.array([689_412.0, 5_336_208.0, 545.0])

@@ -1,4 +1,4 @@
-"""Reference poses of the camera as an adjustment gives them: map position, omega, phi, kappa."""
+"""Attitudes and their covariances; reference poses of the camera as an adjustment gives them."""
 
 from __future__ import annotations
 
@@ -60,3 +60,26 @@ def down_in_camera(opk_deg: FloatArray) -> FloatArray:
     photo_from_map = np.swapaxes(rotation_from_opk(opk_deg), 1, 2)
     down: FloatArray = -photo_from_map[:, :, 2] @ CAMERA_FROM_PHOTO.T
     return down
+
+
+def attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:
+    """Return the axes (n, 3, 3) about which roll, pitch and heading turn a body, as columns.
+
+    Roll turns about the body's x, heading about the vertical `down` (n, 3), pitch about the
+    horizontal axis that is square to both.
+    """
+    forward = frame_from_body[:, :, 0]
+    right = np.cross(down, forward)
+    right = right / np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack((forward, right, down), axis=-1)
+
+
+def covariance_along(axes: FloatArray, sd: FloatArray) -> FloatArray:
+    """Return A diag(σ²) Aᵀ (..., m, m) for axes A (..., m, n), as columns, and σ (..., n)."""
+    scaled = axes * sd[..., None, :]
+    return np.asarray(scaled @ np.swapaxes(scaled, -1, -2))
+
+
+def cross_matrix(vectors: FloatArray) -> FloatArray:
+    """Return the matrices [v]× (..., 3, 3) of vectors (..., 3), with [v]× w = v × w."""
+    return np.asarray(np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2))

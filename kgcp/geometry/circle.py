@@ -22,8 +22,6 @@ _MAX_STEPS = 60
 _MAX_STEP = 0.05  # of the ellipse's radius
 _SMALLEST_RIDGE = 1e-12  # the two minima of a frontal circle are one, without any slope
 _NO_SPREAD = 1e-20  # sum of squared relative deviations
-_ALONG_X = 0.0
-_ALONG_Y = 0.5 * math.pi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,66 +45,29 @@ class CirclePlane:
         return np.asarray(self.centre[:2] / self.centre[2])
 
 
-def kim_candidates(outer: FloatArray, inner: FloatArray) -> FloatArray:
-    """Return the six candidates for the projected centre of two concentric circles.
+def kim_centre(outer: FloatArray, inner: FloatArray) -> FloatArray:
+    """Return the projected centre (2,) of two concentric circles, given their conics (3, 3).
 
     After Kim et al. (2005), as §4 of the paper uses it: for the repeated eigenvalue λ of
     Q_i Q_o⁻¹ each row of Q_o⁻¹ - λ Q_i⁻¹ is the centre. Of measured ellipses the repeated
-    eigenvalue becomes two, and each of them has three rows of its own.
-
-    Parameters
-    ----------
-    outer, inner : (3, 3) array
-        Conics of the two circles.
-
-    Returns
-    -------
-    (6, 2) array
-        Candidates; those of rows that are nearly zero lie far out.
+    eigenvalue becomes two, with three rows each: six candidates. They are reconciled here: with
+    the mean of the two eigenvalues, Q_o⁻¹ - λ Q_i⁻¹ is the centre times its transpose, of rank
+    one but for noise. Its dominant eigenvector, taken where the outer ellipse is the unit circle,
+    weights every row by what it knows of the centre.
     """
-    frame = _unit_circle_frame(outer)
-    twins, duals = _kim_pencil(frame, inner)
-    rows = np.concatenate([duals[0] - value * duals[1] for value in twins]) @ frame.T
-    with np.errstate(divide="ignore", invalid="ignore"):  # a zero row has no direction
-        return np.asarray(rows[:, :2] / rows[:, 2:])
-
-
-def kim_centre(outer: FloatArray, inner: FloatArray) -> FloatArray:
-    """Reconcile the six candidates of Kim's method into one projected centre (2,).
-
-    With the mean of the two eigenvalues, Q_o⁻¹ - λ Q_i⁻¹ is the centre times its transpose, of
-    rank one but for noise. Its dominant eigenvector, taken where the outer ellipse is the unit
-    circle, weights every row by what it knows of the centre.
-    """
-    frame = _unit_circle_frame(outer)
-    twins, duals = _kim_pencil(frame, inner)
-    pencil = duals[0] - twins.mean() * duals[1]
+    ellipse = ellipse_from_conic(outer)
+    frame = np.eye(3)  # from where the outer ellipse is the unit circle about the origin
+    frame[:2, :2] = ellipse.stretch
+    frame[:2, 2] = ellipse.centre
+    outer_unit = np.diag([1.0, 1.0, -1.0])
+    inner_unit = oriented(frame.T @ oriented(inner) @ frame)
+    # k² of the repeated value is the single one. A complex pair means that noise has pushed the
+    # twins together: their real part is both.
+    twins = np.sort(np.real(np.linalg.eigvals(inner_unit @ outer_unit)))[1:]
+    pencil = outer_unit - twins.mean() * np.linalg.inv(inner_unit)
     values, vectors = np.linalg.eigh(0.5 * (pencil + pencil.T))
     centre = frame @ vectors[:, np.argmax(np.abs(values))]
     return np.asarray(centre[:2] / centre[2])
-
-
-def _unit_circle_frame(conic: FloatArray) -> FloatArray:
-    """Homography (3, 3) that makes the ellipse of the unit circle about the origin."""
-    ellipse = ellipse_from_conic(conic)
-    frame = np.eye(3)
-    frame[:2, :2] = ellipse.stretch
-    frame[:2, 2] = ellipse.centre
-    return frame
-
-
-def _kim_pencil(
-    frame: FloatArray, inner: FloatArray
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
-    """Twin eigenvalues (2,) and the inverse conics where the outer ellipse is the unit circle."""
-    outer_unit = np.diag([1.0, 1.0, -1.0])
-    inner_unit = frame.T @ oriented(inner) @ frame
-    inner_unit = oriented(inner_unit)
-    # k² of the repeated value is the single one. A complex pair means that noise has pushed the
-    # twins together: their real part is both.
-    values = np.sort(np.real(np.linalg.eigvals(inner_unit @ outer_unit)))
-    twins: FloatArray = values[1:]
-    return twins, (outer_unit, np.asarray(np.linalg.inv(inner_unit)))
 
 
 def circle_distance(centre: FloatArray, gammas_rad: FloatArray, conic: FloatArray) -> FloatArray:
@@ -132,21 +93,11 @@ def circle_distance(centre: FloatArray, gammas_rad: FloatArray, conic: FloatArra
     OC = r sin(θ1 + θ2) / √(sin² θ1 + sin² θ2 - 2 sin θ1 sin θ2 cos(θ1 + θ2)),
     which is eq. 5 without its cancelling cosines.
     """
-    theta1, theta2 = _chord_angles(centre, gammas_rad, conic)[:2]
+    ray_c, rays = _rays(centre), _rays(chord(conic, centre, gammas_rad))
+    # The arc of the sine and the cosine: an arc cosine alone has no digits for small angles.
+    theta1, theta2 = np.arctan2(np.linalg.norm(np.cross(rays, ray_c), axis=-1), rays @ ray_c)
     s1, s2, both = np.sin(theta1), np.sin(theta2), theta1 + theta2
     return np.asarray(np.sin(both) / np.sqrt(s1**2 + s2**2 - 2.0 * s1 * s2 * np.cos(both)))
-
-
-def _chord_angles(
-    centre: FloatArray, gammas_rad: FloatArray, conic: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Angles θ1, θ2 (n,) of eqs. 2-3 and the viewing rays v_B (n, 3) of eq. 1."""
-    ends = chord(conic, centre, gammas_rad)
-    rays = _rays(ends)
-    ray_c = _rays(centre)
-    # The arc of the sine and the cosine: an arc cosine alone has no digits for small angles.
-    angles = np.arctan2(np.linalg.norm(np.cross(rays, ray_c), axis=-1), rays @ ray_c)
-    return angles[0], angles[1], rays[1]
 
 
 def _rays(points: FloatArray) -> FloatArray:
@@ -155,18 +106,14 @@ def _rays(points: FloatArray) -> FloatArray:
     return np.asarray(homogeneous / np.linalg.norm(homogeneous, axis=-1, keepdims=True))
 
 
-def dispersion(centre: FloatArray, conic: FloatArray) -> float:
-    """Return D(C') of eq. 13: the standard deviation of d over γ, in units of the radius."""
-    return float(np.std(circle_distance(centre, _GAMMAS, conic)))
-
-
 def minimise_dispersion(conic: FloatArray, start: FloatArray) -> FloatArray:
     """Return the projected centre C' (2,) that minimises D (eq. 14), from a starting point.
 
-    D is a root mean square, so damped Gauss-Newton steps replace the paper's gradient descent. D
-    itself falls towards the ellipse, where d falls to the radius; relative to the mean of d it
-    rises, with the same zeros: that is what is minimised. The end is one of the two minima of
-    `circle_planes`, the one in whose basin the start lies.
+    D(C') of eq. 13 is the standard deviation of d over γ: a root mean square, so damped
+    Gauss-Newton steps replace the paper's gradient descent. D itself falls towards the ellipse,
+    where d falls to the radius; relative to the mean of d it rises, with the same zeros: that is
+    what is minimised. The end is one of the two minima of `circle_planes`, the one in whose basin
+    the start lies.
     """
     scale = ellipse_from_conic(conic).mean_radius
     centre, damping = np.asarray(start, dtype=np.float64), 1e-3
@@ -243,21 +190,6 @@ def _circle_plane(normal: FloatArray, ray: FloatArray, height: float) -> CircleP
     """Place the circle: `ray` is Q'⁻¹ n, of either sign as n is."""
     sign = 1.0 if normal[2] > 0.0 else -1.0
     return CirclePlane(sign * normal, ray * (sign * height / float(normal @ ray)))
-
-
-def diameter_tilts_rad(centre: FloatArray, conic: FloatArray) -> tuple[float, float]:
-    """Return φ and θ [rad] of eqs. 6-11, given the projected centre (2,).
-
-    φ is the tilt of the diameter whose image is parallel to y, atan2 of its z and y components,
-    θ that of the diameter whose image is parallel to x. The law of sines gives OB (eqs. 6-9)
-    as 2 OC sin θ1 / sin(θ1 + θ2), without the two solutions of an arc sine.
-    """
-    gammas = np.array([_ALONG_Y, _ALONG_X])
-    theta1, theta2, ray_b = _chord_angles(centre, gammas, conic)
-    distance = circle_distance(centre, gammas, conic)
-    length_b = 2.0 * distance * np.sin(theta1) / np.sin(theta1 + theta2)
-    half = length_b[:, None] * ray_b - distance[:, None] * _rays(centre)  # eq. 10
-    return math.atan2(half[0, 2], half[0, 1]), math.atan2(half[1, 2], half[1, 0])
 
 
 def pose_on_plane(plane: CirclePlane, radius_m: float, towards_x: FloatArray) -> Pose:

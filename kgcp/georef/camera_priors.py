@@ -19,10 +19,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
+from kgcp.geometry.attitude import (
+    CAMERA_FROM_PHOTO,
+    attitude_axes,
+    covariance_along,
+    cross_matrix,
+    opk_from_rotation,
+)
 from kgcp.geometry.pose import rotation_about
-from kgcp.georef.crs import MapFrame
 from kgcp.georef.gcp import Kgcp
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Carrier, Whereabouts
 from kgcp.settings import VehicleSettings
@@ -184,31 +190,6 @@ class _Attitude:
     settings: VehicleSettings
 
 
-def _attitude_cov(enu_from_body: FloatArray, sd_deg: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of the vehicle's attitude as a left rotation in ENU [rad²].
-
-    Roll turns about the body's x, heading about the vertical, pitch about the horizontal axis that
-    is square to both.
-    """
-    forward, down = enu_from_body[:, 0], np.array([0.0, 0.0, -1.0])
-    right = np.cross(down, forward)
-    axes = np.column_stack((forward, right / np.linalg.norm(right), down))
-    scaled = axes * np.radians(sd_deg)
-    cov: FloatArray = scaled @ scaled.T
-    return cov
-
-
-def _mount_cov(enu_from_body: FloatArray, level_sd_deg: float | None) -> FloatArray:
-    """Return the covariance (3, 3) of how the plate lies on its vehicle, in ENU [rad²].
-
-    That the plate is level within `level_sd_deg` is the only thing known of its mount; none given
-    counts as exact, as does `mount_deg`.
-    """
-    tilts = enu_from_body[:, :2] * math.radians(level_sd_deg or 0.0)
-    cov: FloatArray = tilts @ tilts.T
-    return cov
-
-
 def _cov(
     cov_plate: FloatArray,
     cov_pose: FloatArray,
@@ -227,26 +208,23 @@ def _cov(
     ρ holds the attitude's effect on the lever arm, α × lever, from which it correlates with α.
     """
     body = vehicle.enu_from_body
-    cov_attitude = _attitude_cov(body, vehicle.sd_deg)
-    cov_mount = _mount_cov(body, vehicle.settings.level_sd_deg)
+    (turns,) = attitude_axes(body[None], np.array([[0.0, 0.0, -1.0]]))
+    cov_attitude = covariance_along(turns, np.radians(vehicle.sd_deg))
+    # Nothing else is known of the mount; without a deviation it counts as exact, as does its turn.
+    tilt_sd = math.radians(vehicle.settings.level_sd_deg or 0.0)
+    cov_mount = covariance_along(body[:, :2], np.full(2, tilt_sd))
     lever = body @ np.array(vehicle.settings.lever_arm_m)
-    arm = _cross_matrix(enu_from_camera @ translation)
+    arm = cross_matrix(enu_from_camera @ translation)
     from_pose = np.block(
         [
-            [-enu_from_camera, -enu_from_camera @ _cross_matrix(translation)],
+            [-enu_from_camera, -enu_from_camera @ cross_matrix(translation)],
             [np.zeros((3, 3)), -enu_from_camera],
         ]
     )
     from_turn = np.vstack((arm, np.eye(3)))
     shared = np.zeros((6, 6))
-    shared[:3] = -_cross_matrix(lever) @ cov_attitude @ from_turn.T
+    shared[:3] = -cross_matrix(lever) @ cov_attitude @ from_turn.T
     cov: FloatArray = from_pose @ cov_pose @ from_pose.T
     cov = cov + from_turn @ (cov_attitude + cov_mount) @ from_turn.T + shared + shared.T
     cov[:3, :3] += cov_plate
     return cov
-
-
-def _cross_matrix(vector: FloatArray) -> FloatArray:
-    """Return [v]×, with [v]× w = v × w."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -6,8 +6,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.axes import level_axes_ecef
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame, level_axes_ecef
 
 _HALF_BASE_S = 0.25  # one step of a fast logger is all noise
 _MIN_SPEED_M_S = 0.5  # slower, the noise of positions has a say in the course

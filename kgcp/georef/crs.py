@@ -1,22 +1,13 @@
-"""Map coordinates: a local Cartesian frame, other maps, and WGS 84.
-
-Map → the CRS's own geodetic coordinates (no datum shift) → Earth-centred Cartesian → local
-east, north, up (ENU) in metres, tangent to the ellipsoid at an origin. Distances, lever arms and
-attitudes are only meaningful in the latter: a grid shrinks 80 m by 32 mm in the middle of a UTM
-zone, and its north is not true north.
-"""
+"""Coordinate reference systems: how they are read, and the best ways between them by PROJ."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import GeographicCRS
-from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
@@ -24,186 +15,11 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 
 FLIGHT_TOML = "flight.toml: crs"
+VEHICLE_CRS = "flight.toml: [vehicle] crs"
 WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
 FARTHEST = 1e5
-"""Metres or feet from the Earth's surface, where no vehicle and no aircraft is."""
-_JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
-
-COMMAND_LINE = "--crs"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapFrame:
-    """A map and a local ENU frame over one point of it.
-
-    Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
-    the CRS's own units, and z = height: ellipsoidal and in metres unless the CRS is compound;
-    a compound CRS says itself what its heights are.
-
-    Attributes
-    ----------
-    crs : str
-        As in flight.toml.
-    origin_ecef_m : (3,) array
-        Origin of the ENU frame, Earth-centred [m].
-    ecef_from_enu : (3, 3) array
-        Directions east, north and up of the origin, as columns.
-    """
-
-    crs: str
-    origin_ecef_m: FloatArray
-    ecef_from_enu: FloatArray
-    _geodetic_from_map: Transformer
-    _ecef_from_geodetic: Transformer
-    _radians_per_unit: float
-    _where: str = FLIGHT_TOML
-
-    @classmethod
-    def at(cls, crs: str, origin_map: FloatArray, where: str = FLIGHT_TOML) -> Self:
-        """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
-
-        `where` is what an error names as the place that the CRS was given in.
-
-        Raises
-        ------
-        KgcpError
-            If the CRS is unknown or has no horizontal axes, if its heights need a grid that is
-            not installed, or if the origin lies outside the projection's domain.
-        """
-        horizontal = parse_crs(crs, where)
-        geodetic = horizontal.geodetic_crs
-        if geodetic is None or horizontal.is_geocentric:
-            raise KgcpError(
-                f"{where} {crs!r} has no easting and northing or longitude and latitude;"
-                " give a projected or geographic CRS"
-            )
-        geodetic_from_map = _geodetic_from_map(crs, horizontal, geodetic.to_3d(), where)
-        ellipsoid = geodetic.ellipsoid
-        if ellipsoid is None:
-            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give one that has")
-        cart = Transformer.from_pipeline(
-            f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
-        )
-        unit = geodetic.axis_info[0].unit_conversion_factor
-        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit, where)
-        geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
-        return cls(
-            crs,
-            draft._ecef(geodetic_origin)[0],
-            _level_axes(geodetic_origin)[0],
-            geodetic_from_map,
-            cart,
-            unit,
-            where,
-        )
-
-    def enu_from_map(self, xyz: FloatArray) -> FloatArray:
-        """Bring map points (n, 3) into the ENU frame (n, 3) [m]."""
-        ecef = self._ecef(self._geodetic(np.asarray(xyz, dtype=np.float64)))
-        return (ecef - self.origin_ecef_m) @ self.ecef_from_enu
-
-    def map_from_enu(self, enu: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the ENU frame [m] into the map (n, 3)."""
-        geodetic = self._geodetic_from_enu(enu)
-        geodetic[:, :2] /= self._radians_per_unit
-        return self._transform(self._geodetic_from_map, geodetic, TransformDirection.INVERSE)
-
-    @property
-    def semi_axes_m(self) -> tuple[float, float]:
-        """Semi-major and semi-minor axis of the ellipsoid [m]."""
-        axes = np.array([[0.0, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
-        equator, pole = self._ecef(axes)
-        return float(equator[0]), float(pole[2])
-
-    def geodetic_deg(self, enu: FloatArray) -> FloatArray:
-        """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of ENU points.
-
-        They belong to the datum of the map.
-        """
-        geodetic = self._geodetic_from_enu(enu)
-        geodetic[:, :2] = np.degrees(geodetic[:, :2])
-        return geodetic
-
-    def map_axes_enu(self, enu: FloatArray) -> FloatArray:
-        """Return the Jacobians (..., 3, 3) d(map)/d(enu) at points (..., 3) of the ENU frame.
-
-        Rows are map x, y, z in the CRS's units, columns metres east, north, up of the origin.
-        """
-        steps = _JACOBIAN_STEP_M * np.vstack((np.eye(3), -np.eye(3)))
-        around = np.asarray(enu, dtype=np.float64)[..., None, :] + steps
-        moved = self.map_from_enu(around.reshape(-1, 3)).reshape(around.shape)
-        differences = (moved[..., :3, :] - moved[..., 3:, :]) / (2.0 * _JACOBIAN_STEP_M)
-        jacobians: FloatArray = np.swapaxes(differences, -1, -2)
-        return jacobians
-
-    def grid_rotation(self, enu: FloatArray) -> FloatArray:
-        """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).
-
-        Their columns are the directions of map x, y and z there, made orthonormal by the polar
-        decomposition: meridian convergence and the change of the vertical, without the scale.
-
-        Raises
-        ------
-        KgcpError
-            If the map's axes are left-handed, or there are none at a point.
-        """
-        jacobian = self.map_axes_enu(enu)
-        lengths = np.linalg.norm(jacobian, axis=-1, keepdims=True)
-        if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # deep inside the Earth, say
-            raise KgcpError(
-                f"{self._where} {self.crs!r} has no directions at a point of its file;"
-                " give the CRS of the coordinates"
-            )
-        rows = jacobian / lengths
-        left, _, right = np.linalg.svd(rows)
-        enu_from_grid: FloatArray = np.swapaxes(left @ right, -1, -2)
-        if np.any(np.linalg.det(enu_from_grid) < 0.0):
-            raise KgcpError(
-                f"{self._where} {self.crs!r} has left-handed axes;"
-                " give a CRS whose axes are east and north (or west and south)"
-            )
-        return enu_from_grid
-
-    def level_rotations(self, enu: FloatArray) -> FloatArray:
-        """Return the rotations (n, 3, 3) from east, north, up at points (n, 3) to ENU axes."""
-        rotations: FloatArray = self.ecef_from_enu.T @ _level_axes(self._geodetic_from_enu(enu))
-        return rotations
-
-    def _geodetic(self, xyz: FloatArray) -> FloatArray:
-        """Return longitude, latitude [rad] and ellipsoidal height [m] (n, 3) of map points."""
-        geodetic = self._transform(self._geodetic_from_map, xyz)
-        geodetic[:, :2] *= self._radians_per_unit
-        return geodetic
-
-    def _geodetic_from_enu(self, enu: FloatArray) -> FloatArray:
-        ecef = np.asarray(enu, dtype=np.float64) @ self.ecef_from_enu.T + self.origin_ecef_m
-        return self._transform(self._ecef_from_geodetic, ecef, TransformDirection.INVERSE)
-
-    def _ecef(self, geodetic: FloatArray) -> FloatArray:
-        return self._transform(self._ecef_from_geodetic, geodetic)
-
-    def _transform(
-        self,
-        transformer: Transformer,
-        points: FloatArray,
-        direction: TransformDirection = TransformDirection.FORWARD,
-    ) -> FloatArray:
-        radians = transformer is self._ecef_from_geodetic
-        try:
-            x, y, z = points.T
-            columns = transformer.transform(x, y, z, direction=direction, radians=radians)
-        except ProjError as error:
-            raise KgcpError(_explain(self.crs, error, self._where)) from error
-        result = np.column_stack(columns).astype(np.float64)
-        lost = np.flatnonzero(~np.isfinite(result).all(axis=1))
-        if lost.size:
-            point = ", ".join(f"{value:.10g}" for value in points[lost[0]])
-            raise KgcpError(
-                f"{self._where} {self.crs!r} cannot hold the point ({point});"
-                " give the CRS of the coordinates, x = easting or longitude first"
-            )
-        return result
+"""Metres or feet from the Earth's surface, beyond any vehicle or aircraft."""
 
 
 def crs_of(text: str) -> CRS:
@@ -231,10 +47,16 @@ def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
     try:
         parsed = crs_of(crs)
     except ProjError as error:
-        raise KgcpError(_explain(crs, error, where)) from error
+        raise unusable(crs, error, where) from error
     while parsed.is_bound and parsed.source_crs is not None:  # its way to WGS 84 is not needed
         parsed = parsed.source_crs
     return parsed if parsed.is_compound else parsed.to_3d()
+
+
+def unusable(crs: str, error: ProjError, where: str) -> KgcpError:
+    """Return the error for a CRS that PROJ cannot use."""
+    text = " ".join(str(error).split())
+    return KgcpError(f"{where} {crs!r} cannot be used ({text}); give one that pyproj reads")
 
 
 def geographic_of(geocentric: CRS) -> str:
@@ -243,163 +65,85 @@ def geographic_of(geocentric: CRS) -> str:
     return str(geographic.to_3d().to_string())
 
 
-def _geodetic_from_map(crs: str, source: CRS, geodetic: CRS, where: str) -> Transformer:
-    """Return the transformer without datum shift; heights of a compound CRS through its geoid.
+def best_transformer(
+    source: CRS,
+    target: CRS,
+    where: str,
+    remedy: str = "give a CRS of the flight's datum and heights",
+) -> Transformer:
+    """Return the best operation between two CRS; x is easting or longitude in both.
 
-    With ballpark operations allowed PROJ would leave heights unchanged, silently, where a geoid
-    grid is missing; `only_best` alone does not prevent it.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
-        known = TransformerGroup(source, geodetic, always_xy=True, allow_ballpark=False)
-    if known.transformers:
-        return Transformer.from_crs(
-            source, geodetic, always_xy=True, only_best=True, allow_ballpark=False
-        )
-    missing = missing_grids(known)
-    if not missing:
-        raise KgcpError(
-            f"{where} {crs!r}: no way is known from its heights to ellipsoidal ones;"
-            " give ellipsoidal heights and the horizontal CRS alone"
-        )
-    raise KgcpError(
-        f"{where} {crs!r}: its heights need the grid {', '.join(missing)}, which is not installed;"
-        f" install it with 'pyproj sync --file {missing[0]}', or give ellipsoidal heights and the"
-        " horizontal CRS alone"
-    )
+    A second-best operation would be metres off and look the same, above all where the heights of
+    a geoid are taken as ellipsoidal: with ballpark operations allowed PROJ leaves heights
+    unchanged, silently, where a geoid grid is missing. `only_best` alone does not prevent it.
 
-
-def missing_grids(known: TransformerGroup) -> list[str]:
-    """Return the names of the grids that the best of these operations lacks, sorted."""
-    grids = (grid for operation in known.unavailable_operations[:1] for grid in operation.grids)
-    return sorted({grid.short_name for grid in grids if not grid.available})
-
-
-def _explain(crs: str, error: ProjError, where: str) -> str:
-    text = " ".join(str(error).split())
-    return f"{where} {crs!r} cannot be used ({text}); give one that pyproj reads"
-
-
-def _level_axes(geodetic: FloatArray) -> FloatArray:
-    """Return east, north, up (n, 3, 3), as columns in ECEF, at geodetic points (n, 3) [rad, m]."""
-    longitude, latitude = geodetic[:, 0], geodetic[:, 1]
-    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
-    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
-    east = np.column_stack((-sin_lon, cos_lon, np.zeros_like(longitude)))
-    north = np.column_stack((-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat))
-    up = np.column_stack((cos_lat * cos_lon, cos_lat * sin_lon, sin_lat))
-    return np.stack((east, north, up), axis=-1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapChange:
-    """The way from the flight's map to another one, datum and geoid included.
-
-    Attributes
+    Parameters
     ----------
-    source : MapFrame
-        The flight's.
-    target : MapFrame
-        Of the other CRS.
-    """
-
-    source: MapFrame
-    target: MapFrame
-    _between: Transformer
-    _where: str = COMMAND_LINE
-
-    @classmethod
-    def to(
-        cls, crs: str, source: MapFrame, near_map: FloatArray, where: str = COMMAND_LINE
-    ) -> Self:
-        """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
-
-        `where` is what an error names as the place that the CRS was given in.
-
-        Raises
-        ------
-        KgcpError
-            If the CRS is unknown or unusable, no exact operation leads to it, or one that PROJ
-            knows needs a grid that is not installed.
-        """
-        between = best_transformer(
-            parse_crs(source.crs),
-            parse_crs(crs, where),
-            f"{where} {crs!r}: the way from {source.crs!r}",
-        )
-        draft = cls(source, source, between, where)
-        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
-        return cls(source, target, between, where)
-
-    def positions(self, xyz: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the source map into the other one (n, 3)."""
-        x, y, z = np.asarray(xyz, dtype=np.float64).T
-        try:
-            moved = np.column_stack(self._between.transform(x, y, z, errcheck=True))
-        except ProjError as error:
-            text = " ".join(str(error).split())
-            raise KgcpError(
-                f"{self._where}: {self.source.crs!r} does not lead to the CRS asked for here"
-                f" ({text}); give one that covers the flight"
-            ) from error
-        return moved
-
-    def axes(self, xyz: FloatArray) -> FloatArray:
-        """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).
-
-        Both maps are compared with east, north and up of the same place: what datums differ
-        from each other in direction is some 1e-5, which no standard deviation feels.
-        """
-        points = np.reshape(np.asarray(xyz, dtype=np.float64), (-1, 3))
-        here = _level_from_grid(self.source, points)
-        there = _level_from_grid(self.target, self.positions(points))
-        turned: FloatArray = np.swapaxes(there, 1, 2) @ here
-        return turned.reshape(*np.shape(xyz), 3)
-
-
-def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
-    enu = frame.enu_from_map(xyz)
-    rotations: FloatArray = np.swapaxes(frame.level_rotations(enu), 1, 2) @ frame.grid_rotation(enu)
-    return rotations
-
-
-def best_transformer(source: CRS, target: CRS, where: str) -> Transformer:
-    """Return the best operation between two CRS, or say which grid it lacks.
-
-    A second-best one would be metres off and look the same, above all where the heights of a
-    geoid are taken as ellipsoidal.
+    where, remedy : str
+        Beginning and end of messages: what leads from where to where, and what else to give.
 
     Raises
     ------
     KgcpError
-        Beginning with `where`, which names both, if no exact operation is known, or one that PROJ
-        knows needs a grid that is not installed.
+        If no exact operation is known, or the best one needs a grid that is not installed.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a missing grid is an error below
-        known = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-    if known.best_available and known.transformers:
+        operations = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+    if operations.best_available and operations.transformers:
         return Transformer.from_crs(
             source, target, always_xy=True, only_best=True, allow_ballpark=False
         )
-    missing = missing_grids(known)
+    grids = [grid for best in operations.unavailable_operations[:1] for grid in best.grids]
+    missing = sorted({grid.short_name for grid in grids if not grid.available})
     if missing:
         raise KgcpError(
             f"{where} needs the grid {', '.join(missing)}, which is not installed; install it with"
-            f" 'pyproj sync --file {missing[0]}', or give a CRS of the flight's datum and heights"
+            f" 'pyproj sync --file {missing[0]}', or {remedy}"
         )
-    raise KgcpError(f"{where} is not known exactly; give a CRS of the flight's datum and heights")
+    raise KgcpError(f"{where} is not known exactly; {remedy}")
+
+
+def convert_positions(file: str, position: FloatArray, source: str, target: str) -> FloatArray:
+    """Bring a trajectory's positions (n, 3) from one CRS to another.
+
+    Parameters
+    ----------
+    file : str
+        Where the positions come from, for messages.
+
+    Raises
+    ------
+    KgcpError
+        As `best_transformer`, or if a point is out of the operation's domain or far from the
+        Earth's surface.
+    """
+    transformer = best_transformer(
+        parse_crs(source, VEHICLE_CRS),
+        parse_crs(target),
+        f"{file}: the way of its positions from {source!r} to the flight's crs {target!r}",
+    )
+    converted = np.column_stack(transformer.transform(*position.T))
+    is_valid = np.isfinite(converted).all(axis=1)
+    if not parse_crs(target).is_geocentric:
+        is_valid &= np.abs(converted[:, 2]) < FARTHEST
+    lost = np.flatnonzero(~is_valid)
+    if lost.size:
+        where = ", ".join(f"{value:.10g}" for value in position[lost[0]])
+        raise KgcpError(
+            f"{file}: the point ({where}) of epoch {lost[0] + 1} has no place in {target!r};"
+            f" correct the file, or [vehicle] crs in flight.toml, which is {source!r} now"
+        )
+    return converted
 
 
 def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> FloatArray:
     """Bring map points (n, 3) to longitude, latitude [deg] and ellipsoidal height [m] (n, 3).
 
-    Through the best transformation that PROJ has, datum and geoid included.
-
     Raises
     ------
     KgcpError
-        If none is known, or its grid is not installed; `where` is the format's name.
+        As `best_transformer`; `where` is the format's name.
     """
     if not positions:
         return np.empty((0, 3))

@@ -8,9 +8,14 @@ from typing import Self
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
+from kgcp.geometry.attitude import (
+    CAMERA_FROM_PHOTO,
+    ReferencePoses,
+    covariance_along,
+    rotation_from_opk,
+)
 from kgcp.geometry.camera import Camera
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 
 _FOLD_TOLERANCE = 1e-6
 
@@ -38,10 +43,8 @@ class Views:
         """Bring reference poses from the map into the ENU frame."""
         centre = frame.enu_from_map(poses.position_map)
         enu_from_map = frame.grid_rotation(centre)
-        cov = None
-        if poses.sd_position_m is not None:
-            scaled = enu_from_map * poses.sd_position_m[:, None, :]
-            cov = scaled @ np.swapaxes(scaled, 1, 2)
+        sd = poses.sd_position_m
+        cov = None if sd is None else covariance_along(enu_from_map, sd)
         # diag(1, -1, -1) is its own inverse
         enu_from_camera = enu_from_map @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
         return cls(centre, enu_from_camera, cov)

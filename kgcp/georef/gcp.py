@@ -10,7 +10,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.crs import MapChange
+from kgcp.georef.local_frame import MapChange
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Absence, Place, Whereabouts
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.crs import MapFrame
 from kgcp.georef.gcp import Flag, Kgcp, Omission, Skip
 from kgcp.georef.jumps import find_jumps
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.sighting import Sighting
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapFrame
+from kgcp.geometry.attitude import attitude_axes, covariance_along
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
@@ -117,7 +118,7 @@ class Carrier:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
         axes = self.frame.grid_rotation(states.position_m)
         if states.cov_position_m2 is None:
-            return _spread(axes, sd_position_m)
+            return covariance_along(axes, sd_position_m)
         turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
         return turned
 
@@ -126,9 +127,9 @@ class Carrier:
         if states.sd_attitude_deg is None:
             return np.zeros_like(states.frame_from_body)
         up = self.frame.level_rotations(states.position_m)[:, :, 2]
-        axes = _attitude_axes(states.frame_from_body, -up)
+        axes = attitude_axes(states.frame_from_body, -up)
         effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
-        return _spread(effects, np.radians(states.sd_attitude_deg))
+        return covariance_along(effects, np.radians(states.sd_attitude_deg))
 
     def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
         """Return what `Place.common_m` holds, (n, 3, 4)."""
@@ -268,25 +269,6 @@ def _static_places(targets: Sequence[Target], frame: MapFrame) -> dict[str, Plac
         if target.position_m is not None:
             position = frame.enu_from_map(np.array([target.position_m]))[0]
             axes = frame.grid_rotation(position)
-            cov = _spread(axes, np.array(target.sd_position_m))
+            cov = covariance_along(axes, np.array(target.sd_position_m))
             places[target.name] = Place(position, cov)
     return places
-
-
-def _attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:
-    """Return the axes (n, 3, 3) about which roll, pitch and heading turn the body, as columns.
-
-    Roll turns about the body's x, heading about the vertical, pitch about the horizontal axis
-    that is square to both.
-    """
-    forward = frame_from_body[:, :, 0]
-    right = np.cross(down, forward)
-    right = right / np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack((forward, right, down), axis=-1)
-
-
-def _spread(columns: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Return A diag(σ²) Aᵀ for matrices A (..., 3, 3) and deviations σ (..., 3)."""
-    scaled = columns * deviations[..., None, :]
-    product: FloatArray = scaled @ np.swapaxes(scaled, -1, -2)
-    return product

@@ -10,13 +10,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from kgcp.geometry.arrays import FloatArray
-
-IndexArray = npt.NDArray[np.intp]
+from kgcp.geometry.arrays import FloatArray, IndexArray
 
 ENU_FROM_NED: FloatArray = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.calibration import CalibrationCovariance, image_by_calibration
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
@@ -75,8 +76,8 @@ def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArr
     points = pose.transform(np.stack((cosine, sine), axis=-1))
     normalised = points[:, :2] / points[:, 2:]
     by_point = camera.distort_jacobian(normalised) @ _by_point(points)
-    by_turn = np.cross(np.eye(3)[None], (points - pose.translation_m)[:, None, :])
-    by_pose = np.concatenate((by_point, by_point @ np.swapaxes(by_turn, 1, 2)), axis=2)
+    by_turn = -cross_matrix(points - pose.translation_m)
+    by_pose = np.concatenate((by_point, by_point @ by_turn), axis=2)
     along_circle = np.stack((-sine, cosine), axis=-1) @ pose.rotation[:, :2].T
     weigh = _edge_weights((by_point @ along_circle[:, :, None])[:, :, 0])
     by_calibration = weigh @ image_by_calibration(camera, normalised)

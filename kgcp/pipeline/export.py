@@ -9,8 +9,8 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
-from kgcp.georef.crs import MapChange
 from kgcp.georef.gcp import Kgcp, Skip, build_kgcps, on_map
+from kgcp.georef.local_frame import MapChange
 from kgcp.georef.selection import Selection, select
 from kgcp.georef.target_positions import Carrier
 from kgcp.io.flight.data import FlightData

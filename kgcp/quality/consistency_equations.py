@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.attitude import ReferencePoses, cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import Views
@@ -99,7 +99,7 @@ class System:
         centre = views.centre_m[rows] + moved * since_middle * camera.readout_s
         offset = np.array([one.place.position_m for one in meetings]) - centre - sight
         columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
-        design = np.concatenate((*columns, attitude @ _cross(in_camera)), axis=2)
+        design = np.concatenate((*columns, attitude @ cross_matrix(in_camera)), axis=2)
         fading = np.array([_fading_m2(one.place) for one in meetings])
         white = _white_m2(meetings, views, poses, sight)
         shift = sd_time_s * velocity
@@ -131,7 +131,7 @@ def _white_m2(
     unstated = _UNSTATED_SD_M**2 * np.eye(3)
     total = total + (unstated if views.cov_m2 is None else views.cov_m2[rows])
     if poses.sd_angle_deg is not None:
-        effect = _cross(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
+        effect = cross_matrix(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
         total = total + effect @ np.swapaxes(effect, 1, 2)
     return np.asarray(total)
 
@@ -163,8 +163,3 @@ def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:
     none, one = np.zeros_like(east), np.ones_like(east)
     rows = ((east, north, none), (north, -east, none), (none, none, one))
     return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _cross(vectors: FloatArray) -> FloatArray:
-    """Return the matrices [v]× (n, 3, 3) of vectors (n, 3)."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None], axis=2).swapaxes(1, 2))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.pose import Pose
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
 from kgcp.simulation.ground import Ground

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.simulation.path import CameraState, drive
 from kgcp.simulation.presets import SimulationSettings

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.io.tables.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, time_cell
 from kgcp.io.tables.parquet import read_table, write_table
 
@@ -209,7 +209,7 @@ def test_a_crs_that_cannot_be_used_is_one_line(folder: Path) -> None:
     for crs in ("nonsense", "EPSG:2263", "EPSG:4978"):
         result = CliRunner().invoke(main, ["export-gcp", str(folder), "--crs", crs])
         assert result.exit_code == 1
-        assert f"--crs '{crs}'" in result.stderr
+        assert f"crs '{crs}'" in result.stderr
         assert result.stderr.count("\n") == 1
 
 

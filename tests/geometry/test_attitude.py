@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, down_in_camera, rotation_from_opk
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,11 @@ from kgcp.geometry.circle import (
     circle_planes,
     conic_of_circle,
     conic_on_plate,
-    diameter_tilts_rad,
-    dispersion,
-    kim_candidates,
     kim_centre,
     minimise_dispersion,
     pose_on_plane,
 )
-from kgcp.geometry.conic import ellipse_from_conic, sampson_distance
+from kgcp.geometry.conic import chord, ellipse_from_conic, sampson_distance
 from kgcp.geometry.pose import Pose, image_heading_deg
 
 RADIUS_M = 0.45
@@ -83,14 +80,6 @@ def test_kim_finds_the_centre_of_concentric_circles(pose: Pose) -> None:
     np.testing.assert_allclose(kim_centre(outer, inner), image_centre(pose), atol=1e-9)
 
 
-def test_all_six_candidates_agree_on_exact_conics() -> None:
-    pose = pose_of(0.2, -0.1, 20.0, 30.0, 1.0, 0.3)
-    outer, inner = conic_of_circle(pose, RADIUS_M), conic_of_circle(pose, 0.5 * RADIUS_M)
-    candidates = kim_candidates(outer, inner)
-    assert candidates.shape == (6, 2)
-    np.testing.assert_allclose(candidates, np.tile(image_centre(pose), (6, 1)), atol=1e-8)
-
-
 @given(poses)
 def test_one_of_two_planes_is_the_plate_and_both_are_at_its_distance(pose: Pose) -> None:
     planes = circle_planes(conic_of_circle(pose, RADIUS_M))
@@ -101,6 +90,11 @@ def test_one_of_two_planes_is_the_plate_and_both_are_at_its_distance(pose: Pose)
     assert abs(float(truth.normal @ pose.normal)) > 1.0 - 1e-9
     for plane in planes:
         assert RADIUS_M * np.linalg.norm(plane.centre) == pytest.approx(pose.distance_m, rel=1e-7)
+
+
+def dispersion(centre: FloatArray, conic: FloatArray) -> float:
+    """D(C') of eq. 13, in units of the radius."""
+    return float(np.std(circle_distance(centre, GAMMAS, conic)))
 
 
 @pytest.mark.parametrize("tilt_deg", [8.0, 25.0, 45.0])
@@ -131,6 +125,29 @@ def test_the_minimisation_never_ends_outside_the_valley(pose: Pose, dx: float, d
     first, second = (plane.image_centre for plane in circle_planes(conic))
     detour = np.linalg.norm(found - first) + np.linalg.norm(found - second)
     assert detour - np.linalg.norm(first - second) < 2e-3 * radius
+
+
+def diameter_tilts_rad(centre: FloatArray, conic: FloatArray) -> tuple[float, float]:
+    """φ and θ of eqs. 6-11: the tilts of the diameters whose images are parallel to y and to x.
+
+    The law of sines gives OB (eqs. 6-9) as 2 OC sin θ1 / sin(θ1 + θ2), without the two solutions
+    of an arc sine.
+    """
+    gammas = np.array([0.5 * math.pi, 0.0])
+    ray_a, ray_b, ray_c = (
+        rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        for rays in (
+            np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
+            for points in (*chord(conic, centre, gammas), centre[None])
+        )
+    )
+    theta1, theta2 = (
+        np.arcsin(np.linalg.norm(np.cross(ray, ray_c), axis=-1)) for ray in (ray_a, ray_b)
+    )
+    distance = circle_distance(centre, gammas, conic)
+    length_b = 2.0 * distance * np.sin(theta1) / np.sin(theta1 + theta2)
+    half = length_b[:, None] * ray_b - distance[:, None] * ray_c  # eq. 10
+    return math.atan2(half[0, 2], half[0, 1]), math.atan2(half[1, 2], half[1, 0])
 
 
 @given(poses)

@@ -20,8 +20,8 @@ from kgcp.georef.camera_priors import (
     opk_covs,
     opk_deg,
 )
-from kgcp.georef.crs import MapFrame
 from kgcp.georef.gcp import build_kgcps
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Carrier, Whereabouts
 from kgcp.georef.trajectory import Trajectory, body_to_ned

@@ -13,8 +13,9 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapChange, MapFrame, best_transformer, parse_crs
+from kgcp.georef.crs import best_transformer, parse_crs
 from kgcp.georef.gcp import Kgcp, on_map
+from kgcp.georef.local_frame import MapChange, MapFrame
 
 _UTM31 = np.array([430606.1, 4583523.0, 120.0])
 _LONGITUDE, _LATITUDE = 2.1698408834, 41.4002533376  # of that point, by the series below
@@ -140,11 +141,11 @@ def test_feet_become_metres_by_the_legal_ratio_in_plan_and_height() -> None:
 def test_no_way_is_better_than_a_second_best_one() -> None:
     with pytest.raises(KgcpError) as caught:  # NAD83 and ETRS89 differ by more than a metre
         _change("EPSG:25831", "EPSG:2263", _UTM31)
-    assert "--crs 'EPSG:2263'" in str(caught.value)
+    assert "crs 'EPSG:2263'" in str(caught.value)
     assert "\n" not in str(caught.value)
     with pytest.raises(KgcpError, match="no easting"):
         _change("EPSG:25831", "EPSG:4978", _UTM31)
-    with pytest.raises(KgcpError, match="--crs 'nonsense'"):
+    with pytest.raises(KgcpError, match="crs 'nonsense'"):
         _change("EPSG:25831", "nonsense", _UTM31)
 
 
@@ -154,8 +155,8 @@ pyproj.network.set_network_enabled(False)
 pyproj.datadir.append_data_dir({folder!r})
 import json, numpy as np
 from kgcp.errors import KgcpError
-from kgcp.georef.crs import MapChange
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapChange
+from kgcp.georef.local_frame import MapFrame
 xyz = np.array({xyz!r})
 def result(source, target):
     try:

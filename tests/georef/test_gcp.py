@@ -7,8 +7,8 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.crs import MapFrame
 from kgcp.georef.gcp import Omission, Skip, build_kgcps
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Absence, Place, Whereabouts
 from kgcp.georef.trajectory import Trajectory

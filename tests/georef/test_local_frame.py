@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kgcp.errors import KgcpError
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 
 _UTM31 = MapFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
 

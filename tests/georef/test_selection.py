@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.crs import MapFrame
 from kgcp.georef.gcp import Flag, Kgcp, Omission
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.selection import (
     Selection,
     flag_jumps,

@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Whereabouts
 from kgcp.georef.trajectory import ENU_FROM_NED, Trajectory, body_to_ned

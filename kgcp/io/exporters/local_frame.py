@@ -14,7 +14,7 @@ import numpy as np
 from pyproj.enums import WktVersion
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.io.exporters.points import MapPoints
 
 _ROUND_MAP, _ROUND_DEGREES, _ROUND_HEIGHT = 100.0, 0.001, 10.0

@@ -18,7 +18,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.io.exporters import camera_priors, geopackage, metashape, odm, opf, pix4d
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints

@@ -10,7 +10,8 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
-from kgcp.georef.crs import FARTHEST, FLIGHT_TOML, MapChange, MapFrame, geographic_of, parse_crs
+from kgcp.georef.crs import FARTHEST, FLIGHT_TOML, geographic_of, parse_crs
+from kgcp.georef.local_frame import MapChange, MapFrame
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations.notation import PoseNotation
 from kgcp.io.formats.orientations.source import SourcePoses, from_geocentric, from_level

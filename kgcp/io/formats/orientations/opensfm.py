@@ -16,7 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kgcp.georef.crs import WGS84_3D, MapFrame
+from kgcp.georef.crs import WGS84_3D
+from kgcp.georef.local_frame import MapFrame
 from kgcp.io.files.sniff import ForeignFile, JsonObject
 from kgcp.io.formats.orientations.source import SourcePoses, photo_rotation
 

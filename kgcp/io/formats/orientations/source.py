@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO
-from kgcp.georef.crs import MapFrame
+from kgcp.georef.local_frame import MapFrame
 from kgcp.io.files.sniff import ForeignFile
 
 _MAX_DISTORTION = 1e-3

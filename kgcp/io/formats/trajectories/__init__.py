@@ -9,8 +9,9 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.axes import convert_positions, map_axes_ecef, turn_covariances
 from kgcp.georef.course import attitude_from_course
+from kgcp.georef.crs import convert_positions
+from kgcp.georef.local_frame import map_axes_ecef, turn_covariances
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.files.safe_read import require_file
 from kgcp.io.formats.rtklib_pos import looks_like_solution

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.axes import level_axes_ecef, map_axes_ecef
+from kgcp.georef.local_frame import level_axes_ecef, map_axes_ecef
 from kgcp.georef.trajectory import ENU_FROM_NED
 from kgcp.io.files.safe_read import is_sound, read_lines
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times

@@ -1,0 +1,327 @@
+"""A map's local Cartesian frame, and the way from one map to another.
+
+Map → the CRS's own geodetic coordinates (no datum shift) → Earth-centred Cartesian → local
+east, north, up (ENU) in metres, tangent to the ellipsoid at an origin. Distances, lever arms and
+attitudes are only meaningful in the latter: a grid shrinks 80 m by 32 mm in the middle of a UTM
+zone, and its north is not true north.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from pyproj import Transformer
+from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import (
+    FLIGHT_TOML,
+    VEHICLE_CRS,
+    best_transformer,
+    geographic_of,
+    parse_crs,
+    unusable,
+)
+
+_JACOBIAN_STEP_M = 10.0  # curvature cancels in the central difference, rounding stays below 1e-9
+_STEP_M, _STEP_DEG = 10.0, 1e-4  # along a map's y axis, for the same reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFrame:
+    """A map and a local ENU frame over one point of it.
+
+    Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
+    the CRS's own units, and z = height: ellipsoidal and in metres unless the CRS is compound;
+    a compound CRS says itself what its heights are.
+
+    Attributes
+    ----------
+    crs : str
+        As in flight.toml.
+    origin_ecef_m : (3,) array
+        Origin of the ENU frame, Earth-centred [m].
+    ecef_from_enu : (3, 3) array
+        Directions east, north and up of the origin, as columns.
+    """
+
+    crs: str
+    origin_ecef_m: FloatArray
+    ecef_from_enu: FloatArray
+    _geodetic_from_map: Transformer
+    _ecef_from_geodetic: Transformer
+    _radians_per_unit: float
+    _where: str = FLIGHT_TOML
+
+    @classmethod
+    def at(cls, crs: str, origin_map: FloatArray, where: str = FLIGHT_TOML) -> Self:
+        """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
+
+        `where` is what an error names as the place that the CRS was given in.
+
+        Raises
+        ------
+        KgcpError
+            If the CRS is unknown or has no horizontal axes, if its heights need a grid that is
+            not installed, or if the origin lies outside the projection's domain.
+        """
+        horizontal = parse_crs(crs, where)
+        geodetic = horizontal.geodetic_crs
+        if geodetic is None or horizontal.is_geocentric:
+            raise KgcpError(
+                f"{where} {crs!r} has no easting and northing or longitude and latitude;"
+                " give a projected or geographic CRS"
+            )
+        ellipsoid = geodetic.ellipsoid
+        if ellipsoid is None:
+            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give one that has")
+        geodetic_from_map = best_transformer(
+            horizontal,
+            geodetic.to_3d(),
+            f"{where} {crs!r}: the way from its heights to ellipsoidal ones",
+            "give ellipsoidal heights and the horizontal CRS alone",
+        )
+        cart = Transformer.from_pipeline(
+            f"+proj=cart +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
+        )
+        unit = geodetic.axis_info[0].unit_conversion_factor
+        draft = cls(crs, np.zeros(3), np.eye(3), geodetic_from_map, cart, unit, where)
+        geodetic_origin = draft._geodetic(np.reshape(np.asarray(origin_map, float), (1, 3)))
+        return replace(
+            draft,
+            origin_ecef_m=draft._ecef(geodetic_origin)[0],
+            ecef_from_enu=_level_axes(geodetic_origin)[0],
+        )
+
+    def enu_from_map(self, xyz: FloatArray) -> FloatArray:
+        """Bring map points (n, 3) into the ENU frame (n, 3) [m]."""
+        ecef = self._ecef(self._geodetic(np.asarray(xyz, dtype=np.float64)))
+        return (ecef - self.origin_ecef_m) @ self.ecef_from_enu
+
+    def map_from_enu(self, enu: FloatArray) -> FloatArray:
+        """Bring points (n, 3) of the ENU frame [m] into the map (n, 3)."""
+        geodetic = self._geodetic_from_enu(enu)
+        geodetic[:, :2] /= self._radians_per_unit
+        return self._transform(self._geodetic_from_map, geodetic, TransformDirection.INVERSE)
+
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Semi-major and semi-minor axis of the ellipsoid [m]."""
+        axes = np.array([[0.0, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0]])
+        equator, pole = self._ecef(axes)
+        return float(equator[0]), float(pole[2])
+
+    def geodetic_deg(self, enu: FloatArray) -> FloatArray:
+        """Return longitude, latitude [deg] and ellipsoidal height [m] (n, 3) of ENU points.
+
+        They belong to the datum of the map.
+        """
+        geodetic = self._geodetic_from_enu(enu)
+        geodetic[:, :2] = np.degrees(geodetic[:, :2])
+        return geodetic
+
+    def map_axes_enu(self, enu: FloatArray) -> FloatArray:
+        """Return the Jacobians (..., 3, 3) d(map)/d(enu) at points (..., 3) of the ENU frame.
+
+        Rows are map x, y, z in the CRS's units, columns metres east, north, up of the origin.
+        """
+        steps = _JACOBIAN_STEP_M * np.vstack((np.eye(3), -np.eye(3)))
+        around = np.asarray(enu, dtype=np.float64)[..., None, :] + steps
+        moved = self.map_from_enu(around.reshape(-1, 3)).reshape(around.shape)
+        differences = (moved[..., :3, :] - moved[..., 3:, :]) / (2.0 * _JACOBIAN_STEP_M)
+        jacobians: FloatArray = np.swapaxes(differences, -1, -2)
+        return jacobians
+
+    def grid_rotation(self, enu: FloatArray) -> FloatArray:
+        """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).
+
+        Their columns are the directions of map x, y and z there, made orthonormal by the polar
+        decomposition: meridian convergence and the change of the vertical, without the scale.
+
+        Raises
+        ------
+        KgcpError
+            If the map's axes are left-handed, or there are none at a point.
+        """
+        jacobian = self.map_axes_enu(enu)
+        lengths = np.linalg.norm(jacobian, axis=-1, keepdims=True)
+        if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # deep inside the Earth, say
+            raise KgcpError(
+                f"{self._where} {self.crs!r} has no directions at a point of its file;"
+                " give the CRS of the coordinates"
+            )
+        rows = jacobian / lengths
+        left, _, right = np.linalg.svd(rows)
+        enu_from_grid: FloatArray = np.swapaxes(left @ right, -1, -2)
+        if np.any(np.linalg.det(enu_from_grid) < 0.0):
+            raise KgcpError(
+                f"{self._where} {self.crs!r} has left-handed axes;"
+                " give a CRS whose axes are east and north (or west and south)"
+            )
+        return enu_from_grid
+
+    def level_rotations(self, enu: FloatArray) -> FloatArray:
+        """Return the rotations (n, 3, 3) from east, north, up at points (n, 3) to ENU axes."""
+        rotations: FloatArray = self.ecef_from_enu.T @ _level_axes(self._geodetic_from_enu(enu))
+        return rotations
+
+    def _geodetic(self, xyz: FloatArray) -> FloatArray:
+        """Return longitude, latitude [rad] and ellipsoidal height [m] (n, 3) of map points."""
+        geodetic = self._transform(self._geodetic_from_map, xyz)
+        geodetic[:, :2] *= self._radians_per_unit
+        return geodetic
+
+    def _geodetic_from_enu(self, enu: FloatArray) -> FloatArray:
+        ecef = np.asarray(enu, dtype=np.float64) @ self.ecef_from_enu.T + self.origin_ecef_m
+        return self._transform(self._ecef_from_geodetic, ecef, TransformDirection.INVERSE)
+
+    def _ecef(self, geodetic: FloatArray) -> FloatArray:
+        return self._transform(self._ecef_from_geodetic, geodetic)
+
+    def _transform(
+        self,
+        transformer: Transformer,
+        points: FloatArray,
+        direction: TransformDirection = TransformDirection.FORWARD,
+    ) -> FloatArray:
+        radians = transformer is self._ecef_from_geodetic
+        try:
+            x, y, z = points.T
+            columns = transformer.transform(x, y, z, direction=direction, radians=radians)
+        except ProjError as error:
+            raise unusable(self.crs, error, self._where) from error
+        result = np.column_stack(columns).astype(np.float64)
+        lost = np.flatnonzero(~np.isfinite(result).all(axis=1))
+        if lost.size:
+            point = ", ".join(f"{value:.10g}" for value in points[lost[0]])
+            raise KgcpError(
+                f"{self._where} {self.crs!r} cannot hold the point ({point});"
+                " give the CRS of the coordinates, x = easting or longitude first"
+            )
+        return result
+
+
+def _level_axes(geodetic: FloatArray) -> FloatArray:
+    """Return east, north, up (n, 3, 3), as columns in ECEF, at geodetic points (n, 3) [rad, m]."""
+    longitude, latitude = geodetic[:, 0], geodetic[:, 1]
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    east = np.column_stack((-sin_lon, cos_lon, np.zeros_like(longitude)))
+    north = np.column_stack((-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat))
+    up = np.column_stack((cos_lat * cos_lon, cos_lat * sin_lon, sin_lat))
+    return np.stack((east, north, up), axis=-1)
+
+
+def map_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
+    """Return the axes x, y, z of a CRS at positions (n, 3), as columns in ECEF, (n, 3, 3).
+
+    Orthonormal: z is the ellipsoid's normal, y the map's y made square to it. Geocentric axes are
+    those of ECEF.
+    """
+    parsed = parse_crs(crs, VEHICLE_CRS)
+    if parsed.is_geocentric:
+        return np.broadcast_to(np.eye(3), (len(position), 3, 3))
+    frame = MapFrame.at(crs, position[0], VEHICLE_CRS)
+    step = np.array([0.0, _STEP_DEG if parsed.is_geographic else _STEP_M, 0.0])
+    up = frame.level_rotations(frame.enu_from_map(position))[:, :, 2]
+    along_y = frame.enu_from_map(position + step) - frame.enu_from_map(position - step)
+    x = np.cross(along_y, up)
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    axes: FloatArray = frame.ecef_from_enu @ np.stack((x, np.cross(up, x), up), axis=-1)
+    return axes
+
+
+def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
+    """Return east, north, up at positions (n, 3) of a CRS, as columns in ECEF, (n, 3, 3)."""
+    parsed = parse_crs(crs, VEHICLE_CRS)
+    if parsed.is_geocentric:
+        frame = MapFrame.at(geographic_of(parsed), np.zeros(3), VEHICLE_CRS)
+        enu = (position - frame.origin_ecef_m) @ frame.ecef_from_enu
+    else:
+        frame = MapFrame.at(crs, position[0], VEHICLE_CRS)
+        enu = frame.enu_from_map(position)
+    axes: FloatArray = frame.ecef_from_enu @ frame.level_rotations(enu)
+    return axes
+
+
+def turn_covariances(
+    cov_m2: FloatArray, old_axes_ecef: FloatArray, new_axes_ecef: FloatArray
+) -> FloatArray:
+    """Bring covariances (n, 3, 3) from one set of axes (n, 3, 3) to another."""
+    turn = np.swapaxes(new_axes_ecef, -1, -2) @ old_axes_ecef
+    turned: FloatArray = turn @ cov_m2 @ np.swapaxes(turn, -1, -2)
+    return turned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapChange:
+    """The way from the flight's map to another one, datum and geoid included.
+
+    Attributes
+    ----------
+    source : MapFrame
+        The flight's.
+    target : MapFrame
+        Of the other CRS.
+    """
+
+    source: MapFrame
+    target: MapFrame
+    _between: Transformer
+    _where: str
+
+    @classmethod
+    def to(cls, crs: str, source: MapFrame, near_map: FloatArray, where: str = "crs") -> Self:
+        """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
+
+        `where` is what an error names as the place that the CRS was given in.
+
+        Raises
+        ------
+        KgcpError
+            If the CRS is unknown or unusable, no exact operation leads to it, or one that PROJ
+            knows needs a grid that is not installed.
+        """
+        between = best_transformer(
+            parse_crs(source.crs),
+            parse_crs(crs, where),
+            f"{where} {crs!r}: the way from {source.crs!r}",
+        )
+        draft = cls(source, source, between, where)
+        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
+        return cls(source, target, between, where)
+
+    def positions(self, xyz: FloatArray) -> FloatArray:
+        """Bring points (n, 3) of the source map into the other one (n, 3)."""
+        x, y, z = np.asarray(xyz, dtype=np.float64).T
+        try:
+            moved = np.column_stack(self._between.transform(x, y, z, errcheck=True))
+        except ProjError as error:
+            text = " ".join(str(error).split())
+            raise KgcpError(
+                f"{self._where}: {self.source.crs!r} does not lead to the CRS asked for here"
+                f" ({text}); give one that covers the flight"
+            ) from error
+        return moved
+
+    def axes(self, xyz: FloatArray) -> FloatArray:
+        """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).
+
+        Both maps are compared with east, north and up of the same place: what datums differ
+        from each other in direction is some 1e-5, which no standard deviation feels.
+        """
+        points = np.reshape(np.asarray(xyz, dtype=np.float64), (-1, 3))
+        here = _level_from_grid(self.source, points)
+        there = _level_from_grid(self.target, self.positions(points))
+        turned: FloatArray = np.swapaxes(there, 1, 2) @ here
+        return turned.reshape(*np.shape(xyz), 3)
+
+
+def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
+    enu = frame.enu_from_map(xyz)
+    rotations: FloatArray = np.swapaxes(frame.level_rotations(enu), 1, 2) @ frame.grid_rotation(enu)
+    return rotations
