@@ -26,11 +26,14 @@ from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.calibrations import read_calibration
-from kgcp.io.formats.frame_times import TimesFormat, read_times
+from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
+from kgcp.io.formats.frame_times import read_times
+from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
-from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
-from kgcp.io.formats.trajectories.records import Wander
+from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.trajectories import FORMATS as TRAJECTORY_FORMATS
+from kgcp.io.formats.trajectories import read_trajectory
+from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
 from kgcp.io.images.frames import read_exif, read_grey
 from kgcp.pipeline.execution.journal import from_text
 
@@ -56,9 +59,6 @@ OPF_PARTS = {
 }
 
 LATE_MODULES = (
-    *CALIBRATION_FORMATS.values(),
-    "kgcp.io.formats.orientations",
-    "kgcp.io.formats.orientations.georeference",
     *(f"PIL.{name}ImagePlugin" for name in ("Bmp", "Jpeg", "Jpeg2K", "Mpo")),
     *(f"PIL.{name}ImagePlugin" for name in ("Png", "Ppm", "Tiff", "WebP")),
 )
@@ -68,10 +68,10 @@ _CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
 _COURSE = TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0))
 _DATED = replace(_COURSE, first_day=date(2026, 6, 16), time_system=TimeSystem.GPS)
 _NOTATIONS = (
-    *(TrajectoryNotation(format=kind) for kind in TrajectoryFormat),
-    *(replace(_DATED, format=kind) for kind in (TrajectoryFormat.CSV, TrajectoryFormat.TUM)),
-    replace(_DATED, format=TrajectoryFormat.SBET, course_sd_deg=None, wander=Wander.SUBTRACT),
-    replace(_COURSE, format=TrajectoryFormat.RTKLIB),
+    *(TrajectoryNotation(format=kind) for kind in TRAJECTORY_FORMATS.names),
+    *(replace(_DATED, format=kind) for kind in ("csv", "tum")),
+    replace(_DATED, format="sbet", course_sd_deg=None, wander=Wander.SUBTRACT),
+    replace(_COURSE, format="rtklib"),
     replace(_COURSE, time_system=TimeSystem.UTC, crs="EPSG:4258"),
     replace(_COURSE, time_system=TimeSystem.GPS),
 )
@@ -94,7 +94,7 @@ def times(data: bytes, folder: Path) -> None:
     """Read times of frames."""
     path = _written(folder, data)
     _allow(lambda: read_times(path, FRAMES))
-    read_times(path, FRAMES, _chosen(data, tuple(TimesFormat)))
+    read_times(path, FRAMES, _chosen(data, tuple(TIMES_FORMATS.names)))
 
 
 def trajectories(data: bytes, folder: Path) -> None:
@@ -109,7 +109,7 @@ def poses(data: bytes, folder: Path) -> None:
     path = _written_among_parts(folder, data)
     _allow(lambda: read_reference_poses(path, crs=CRS, frames=FRAMES))
     stated = _chosen(data, (None, CRS, "EPSG:4978"))
-    notation = PoseNotation(_chosen(data, tuple(PoseFormat)), stated)
+    notation = PoseNotation(_chosen(data, tuple(POSE_FORMATS.names)), stated)
     read_reference_poses(path, notation, crs=CRS, frames=FRAMES)
 
 
@@ -117,7 +117,7 @@ def calibrations(data: bytes, folder: Path) -> None:
     """Read a camera's calibration."""
     path = _written(folder, data)
     _allow(lambda: read_calibration(path, (None, None)))
-    read_calibration(path, (1600, 1200), _chosen(data, tuple(CALIBRATION_FORMATS)))
+    read_calibration(path, (1600, 1200), _chosen(data, tuple(CALIBRATION_FORMATS.names)))
 
 
 def frames(data: bytes, folder: Path) -> None:

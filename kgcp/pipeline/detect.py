@@ -148,7 +148,7 @@ def detect_flight(
         if sheet is not None:
             with stopwatch.stage("overlay"):
                 not_drawn = draw_overlay(sheet, flight.name, looks, task)
-        is_level = flight.vehicle is not None and flight.vehicle.level_sd_deg is not None
+        is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
         summary = tally.summary(
             kept=looks.kept,
             frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
@@ -191,11 +191,11 @@ def _take_notes(
 ) -> list[FrameNote]:
     """Return what is known of each frame before it is read."""
     priors: Sequence[NormalPrior | None] = [None] * len(frames)
-    if flight.vehicle is not None and flight.vehicle.level_sd_deg is not None:
+    if flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None:
         priors = normal_priors(
             frames,
             data.reference_poses if data.has_reference else None,
-            level_sd_deg=flight.vehicle.level_sd_deg,
+            level_sd_deg=flight.vehicle.settings.level_sd_deg,
             plumb_sd_deg=flight.plumb_sd_deg,
         )
     return [

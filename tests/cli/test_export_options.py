@@ -181,7 +181,7 @@ def test_gates_spacing_and_check_points(folder: Path) -> None:
     assert summary["skipped"]["ambiguous"] == 1
     strict = CliRunner().invoke(main, ["export-gcp", str(folder), "--max-sd", "0.009"])
     assert strict.exit_code == 1
-    assert "no point is left" in strict.stderr
+    assert "no points left" in strict.stderr
 
 
 def test_points_in_another_crs_are_the_same_places(folder: Path) -> None:

@@ -81,13 +81,13 @@ TOMLS: Mapping[str, tuple[str | bytes, str]] = {
     "a flight.toml with a mark of order": ("\ufeff" + TOML, ""),
     "a flight.toml with ends of DOS": (TOML.replace("\n", "\r\n"), ""),
     "a flight.toml with NUL": (TOML + "\0", "is not TOML: "),
-    "a flight.toml of half a megabyte": ("#\n" * (1 << 18), "has at most 262144"),
-    "lists in lists": (f"a = {'[' * 8000}{']' * 8000}", "is not TOML that can be read"),
-    "tables in tables": ("a = " + "{a=" * 4000 + "1" + "}" * 4000, "is not TOML that can be"),
+    "a flight.toml of half a megabyte": ("#\n" * (1 << 18), "more than the 262144 allowed"),
+    "lists in lists": (f"a = {'[' * 8000}{']' * 8000}", "is not readable TOML"),
+    "tables in tables": ("a = " + "{a=" * 4000 + "1" + "}" * 4000, "is not readable TOML"),
     "a key of many parts": (".".join("a" * 8000) + " = 1", "has a key of very many parts"),
     "a key without end": (f"{'k' * 200_000} = 1", "is not a known key"),
     "a key that clears the screen": ('"\\u001b[2J\\nkgcp: all is well" = 1', "\\x1b[2J kgcp: all"),
-    "5 000 digits": (TOML.replace("= 64", f"= {'6' * 5000}"), "is not TOML that can be read"),
+    "5 000 digits": (TOML.replace("= 64", f"= {'6' * 5000}"), "is not readable TOML"),
     "5 000 hexadecimal digits": (TOML.replace("= 64", f"= 0x{'f' * 5000}"), "width: is too large"),
     "a focal length of many digits": (TOML.replace("fx = 100.0", f"fx = 0x{'f' * 5000}"), "fx: is"),
     "infinity": (TOML.replace("fx = 100.0", "fx = inf"), "fx: inf is not a finite number"),
@@ -104,11 +104,11 @@ TOMLS: Mapping[str, tuple[str | bytes, str]] = {
     "a folder without end": (TOML.replace('"frames"', f'"{"f" * 5000}"'), "is not a folder"),
     "a folder with NUL": (TOML.replace('"frames"', '"a\\u0000b"'), "is not a folder"),
     "a file for frames": (TOML.replace('"frames"', '"vehicle.csv"'), "is not a folder"),
-    "times of a device": (TOML.replace("[camera]", 'times = "/dev/zero"\n[camera]'), "not exist"),
-    "times of a folder": (TOML.replace("[camera]", 'times = "frames"\n[camera]'), "not exist"),
-    "a name of two lines": (TOML.replace('"lies"', '"a\\nb"'), r"name: 'a\nb' is no name"),
+    "times of a device": (TOML.replace("[camera]", 'times = "/dev/zero"\n[camera]'), "a regular"),
+    "times of a folder": (TOML.replace("[camera]", 'times = "frames"\n[camera]'), "a regular"),
+    "a name of two lines": (TOML.replace('"lies"', '"a\\nb"'), r"name: 'a\nb' is not a name"),
     "a target's name of control": (TOML.replace('"A"', '"\\u0085"'), "name: "),
-    "a target's name without end": (TOML.replace('"A"', f'"{"A" * 9000}"'), "is no name"),
+    "a target's name without end": (TOML.replace('"A"', f'"{"A" * 9000}"'), "is not a name"),
     "no target": (TOML.replace("[[target]]", "[target]"), "target: is a table"),
     "1 000 targets": (_many_targets(1000), "target: has 1000 tables"),
     "200 targets of one code": (_many_targets(200), "are rotations of each other"),
@@ -116,26 +116,29 @@ TOMLS: Mapping[str, tuple[str | bytes, str]] = {
 }
 # name: content of frames.csv, words of the one line
 TIMES_FILES: Mapping[str, tuple[str | bytes, str]] = {
-    "empty times": ("", "has no column frame and time"),
+    "empty times": ("", "is empty; its first line must name frame, time"),
     "times without rows": ("frame,time\n", ""),
     "times with a mark of order": ("\ufeff" + TIMES, ""),
     "times with ends of DOS": (TIMES.replace("\n", "\r\n"), ""),
-    "times in UTF-16": (TIMES.encode("utf-16"), "is no text in UTF-8"),
-    "times of NUL": (TIMES + "\0\0\0\n", "is no line of text"),
-    "times of a PNG": (encoded(".png"), "is no text in UTF-8"),
-    "times without a column": ("frame\na.png\n", "has no column time"),
+    "times in UTF-16": (TIMES.encode("utf-16"), "is not text in UTF-8"),
+    "times of NUL": (TIMES + "\0\0\0\n", "is not a valid text line"),
+    "times of a PNG": (encoded(".png"), "is not text in UTF-8"),
+    "times without a column": ("frame\na.png\n", "lacks the columns time"),
     "a time that is no number": ("frame,time\na.png,nan\n", "'nan' is not a time"),
-    "a time of 1e999": ("frame,time\na.png,1e999\n", "is no date"),
-    "a time twice": (TIMES + TIMES.splitlines()[1], "is named a second time"),
+    "a time of 1e999": ("frame,time\na.png,1e999\n", "is out of range"),
+    "a time twice": (TIMES + TIMES.splitlines()[1], "stands in line 2 too"),
     "a time of nowhere": ("frame,time\na.png,2026-06-16T08:15:01\n", "names no time zone"),
-    "a time after the calendar": ("frame,time\na.png,9999-12-31T23:59:59-23:59\n", "is no date"),
+    "a time after the calendar": (
+        "frame,time\na.png,9999-12-31T23:59:59-23:59\n",
+        "is out of range",
+    ),
     "a time of very many digits": (f"frame,time\na.png,{'1' * 130_000}x\n", "is not a time"),
     "a cell without end": (f'frame,time\na.png,"{"x" * 200_000}', "field larger"),
-    "a line without end": (f"frame,time\n{'x' * (2 << 20)}", "is no line of text"),
+    "a line without end": (f"frame,time\n{'x' * (2 << 20)}", "is not a valid text line"),
     "a quote without end": ('frame,time\n"a.png,1\n' + "b.png,2\n" * 50_000, "field larger"),
-    "marks of very many digits": (f"1 {'9' * 9000} [2400]\n", "has no column"),
+    "marks of very many digits": (f"1 {'9' * 9000} [2400]\n", "lacks the columns frame, time"),
     "marks of a week that never comes": ("1 1.0 [999999999]\n", "none of its 1 numbers"),
-    "one mark twice": ("1 1.0 [2400]\n1 2.0 [2400]\n", "number 1 stands in line 1, too"),
+    "one mark twice": ("1 1.0 [2400]\n1 2.0 [2400]\n", "number 1 stands in line 1 too"),
     "events of an endless header": ("%" + " a(" * 300_000 + "\n", "lacks the header line"),
     "events of an infinite week": ("%  GPST x(m)\n1e400 1 2\n", "is not a time and numbers"),
     "events of a week of 9s": (f"%  GPST x(m)\n{'9' * 400} 1 2\n", "is not a time and numbers"),
@@ -158,17 +161,20 @@ TRAJECTORIES: Mapping[str, tuple[str | bytes, str]] = {
     "a trajectory with a time twice": (VEHICLE.replace(":02Z", ":01Z"), "repeats"),
     "a trajectory without a column": (VEHICLE.replace("pitch_deg", "p"), "lacks the columns"),
     "a trajectory with a column twice": (VEHICLE.replace("pitch_deg", "x"), "lacks the columns"),
-    "a trajectory with semicolons": (VEHICLE.replace(",", ";"), "is none of the known formats"),
+    "a trajectory with semicolons": (
+        VEHICLE.replace(",", ";"),
+        "is not a trajectory of a known format",
+    ),
     "a trajectory with a short row": (VEHICLE.replace(",0.2,12.0", ""), "has 5 cells"),
-    "a trajectory in UTF-16": (VEHICLE.encode("utf-16"), "is none of the known formats"),
-    "a trajectory of zeros": (bytes(17 * 8 * 9), "is none of the known formats"),
-    "records cut": (b"\x40" * (17 * 8 + 1), "is none of the known formats"),
+    "a trajectory in UTF-16": (VEHICLE.encode("utf-16"), "is UTF-16, not a trajectory; save"),
+    "a trajectory of zeros": (bytes(17 * 8 * 9), "is not a trajectory of a known"),
+    "records cut": (b"\x40" * (17 * 8 + 1), "is not a trajectory of a known"),
 }
 _IMAGES = "1 1e-200 0 0 0 1 2 3 1 sound.png\n\n"
 _SHOT = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
 # name: content of reference.csv, words of the one line
 POSES: Mapping[str, tuple[str | bytes, str]] = {
-    "empty poses": ("", "holds no reference poses of a known format"),
+    "empty poses": ("", "is not a file of reference poses of a known format"),
     "poses with a NaN": (REFERENCE.replace("560.0", "nan"), "line 2: z is 'nan'"),
     "poses with a frame twice": (REFERENCE + REFERENCE.splitlines()[1], "stands in line 2 too"),
     "poses that are a picture": (encoded(".png"), "of a known format"),
@@ -210,7 +216,7 @@ POSES: Mapping[str, tuple[str | bytes, str]] = {
                 ],
             }
         ),
-        "is no calibrated-cameras of OPF",
+        "is not a calibrated-cameras of OPF",
     ),
 }
 _SIZE = "width = 64\nheight = 48"
@@ -219,7 +225,7 @@ _ROS = f"{_MATRIX}distortion_coefficients:\n  data: [0, 0, 0, 0, 0]\nimage_width
 _ANCHORS = "".join(f"a{n}: &a{n} [{9 * f'*a{n - 1},'}1]\n" for n in range(1, 10))
 # name: content of the calibration, further keys, words of the one line
 CALIBRATIONS: Mapping[str, tuple[str | bytes, str, str]] = {
-    "an empty calibration": ("", "", "is no calibration of a known format"),
+    "an empty calibration": ("", "", "is not a calibration of a known format"),
     "a calibration of noise": (bytes(range(256)) * 99, "", "of a known format"),
     "a calibration of laughs": (_LAUGHS + "<calibration>&g;</calibration>", "", "; "),
     "aliases that multiply": (
@@ -227,12 +233,12 @@ CALIBRATIONS: Mapping[str, tuple[str | bytes, str, str]] = {
         "",
         "the distortion model [[[[",
     ),
-    "YAML in YAML": (f"{_ROS}image_height: {'[' * _DEEP}\n", "", "is no camera_info of ROS"),
-    "YAML of infinity": (f"{_ROS}image_height: .inf\n", "", "is no camera_info of ROS"),
+    "YAML in YAML": (f"{_ROS}image_height: {'[' * _DEEP}\n", "", "is not a camera_info of ROS"),
+    "YAML of infinity": (f"{_ROS}image_height: .inf\n", "", "is not a camera_info of ROS"),
     "YAML of a program": (
         f"{_ROS}image_height: !!python/object/apply:os.system [id]\n",
         "",
-        "no cam",
+        "is not a camera_info",
     ),
     "OpenCV in OpenCV": ('{"a":' * 5000 + "1" + "}" * 5000, "", "; "),
     "OpenCV of deep lists": ('{"a":' + "[" * _DEEP, "", "; "),
@@ -307,11 +313,16 @@ CASES = (
     Case("a CRS of a pipe", _crs_of_a_pipe, "'init=' is no longer in use", command=_EXPORT),
     Case("times that are a pipe", _instead("frames.csv", os.mkfifo)),
     Case(
-        "a pipe for a trajectory", _instead("vehicle.csv", os.mkfifo), "no regular", command=_EXPORT
+        "a pipe for a trajectory",
+        _instead("vehicle.csv", os.mkfifo),
+        "not a regular",
+        command=_EXPORT,
     ),
-    Case("a pipe for poses", _instead("reference.csv", os.mkfifo), "no regular", command=_REPORT),
-    Case("a gigabyte of flight.toml", _huge("flight.toml"), "bytes or more", is_huge=True),
-    Case("a gigabyte of times", _huge("frames.csv"), "is no line of text", is_huge=True),
+    Case(
+        "a pipe for poses", _instead("reference.csv", os.mkfifo), "not a regular", command=_REPORT
+    ),
+    Case("a gigabyte of flight.toml", _huge("flight.toml"), "has at least", is_huge=True),
+    Case("a gigabyte of times", _huge("frames.csv"), "is not a valid text line", is_huge=True),
     Case("a gigabyte of trajectory", _huge("vehicle.csv"), "known", command=_EXPORT, is_huge=True),
     Case("a gigabyte of poses", _huge("reference.csv"), "bytes", command=_REPORT, is_huge=True),
 )

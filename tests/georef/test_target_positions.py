@@ -198,8 +198,8 @@ def test_what_cannot_be_placed_at_all_is_an_error_with_a_remedy() -> None:
 @pytest.mark.parametrize("name", _NAMES)
 def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str) -> None:
     flight = read_flight(_FLIGHTS / name / "flight")
-    assert flight.trajectory_file is not None
-    assert flight.reference_file is not None
+    assert flight.vehicle is not None
+    assert flight.reference is not None
     assert flight.times_file is not None
     assert flight.crs is not None
     with (_FLIGHTS / name / "truth.csv").open() as stream:
@@ -209,8 +209,8 @@ def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str
     whereabouts = Whereabouts.of(
         flight.crs,
         flight.targets,
-        read_trajectory(flight.trajectory_file, flight.crs),
-        flight.vehicle or VehicleSettings(),
+        read_trajectory(flight.vehicle.trajectory_file, flight.crs),
+        flight.vehicle.settings,
     )
     places = whereabouts.places(["A"] * len(truth), times)
     enu = np.array([place.position_m for place in places if isinstance(place, Place)])
@@ -218,7 +218,7 @@ def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str
     assert len(enu) == len(truth)
     np.testing.assert_allclose(whereabouts.frame.map_from_enu(enu), expected, atol=0.5e-3)
 
-    poses = read_reference_poses(flight.reference_file)
+    poses = read_reference_poses(flight.reference.file)
     assert poses.frames == tuple(row["frame"] for row in truth)
     centres = whereabouts.frame.enu_from_map(poses.position_map)
     grids = np.array([whereabouts.frame.grid_rotation(centre) for centre in centres])

@@ -8,10 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
+from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.images.exif import read_exif
-from kgcp.io.images.frames import list_frames, read_frame_times, read_grey
+from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.simulation.flight import (
     CRS,
@@ -58,9 +59,9 @@ def test_the_folder_is_a_flight(flight: tuple[FlightPlan, Path]) -> None:
     plan, out = flight
     read = read_flight(out)
     assert read.camera == SMALL.camera
-    assert read.vehicle == plan.vehicle
-    assert read.trajectory_file is not None
-    assert read.reference_file is not None
+    assert read.vehicle is not None
+    assert read.vehicle.settings == plan.vehicle
+    assert read.reference is not None
     assert read.times_file is not None
     (target,) = read.targets
     assert target.name == "A"
@@ -69,13 +70,13 @@ def test_the_folder_is_a_flight(flight: tuple[FlightPlan, Path]) -> None:
         assert ring.outer_diameter_m == pytest.approx(printed.outer_diameter_m, abs=1e-12)
         assert ring.dot_diameter_m == pytest.approx(printed.dot_diameter_m, abs=1e-12)
     names = list_frames(read.frames_folder)
-    times = read_frame_times(read.times_file)
+    times = read_times(read.times_file, ())
     assert_allclose([times[name] for name in names], plan.recorded_times_s, atol=1e-6)
-    poses = read_reference_poses(read.reference_file)
+    poses = read_reference_poses(read.reference.file)
     assert poses.frames == tuple(names)
     assert_allclose(poses.position_map, plan.reference.position_map, atol=1e-5)
     assert_allclose(poses.opk_deg, plan.reference.opk_deg, atol=1e-7)
-    trajectory = read_trajectory(read.trajectory_file, CRS)
+    trajectory = read_trajectory(read.vehicle.trajectory_file, CRS)
     assert_allclose(trajectory.position_map, plan.trajectory.position_map, atol=1e-5)
     assert_allclose(trajectory.attitude_deg, plan.trajectory.attitude_deg, atol=1e-6)
     assert trajectory.sd_attitude_deg is not None

@@ -2,7 +2,7 @@
 
 By MMVII's Bundle_GCP.cpp, ctopodata.cpp and test data: XML of its serialisation, covariances as
 their upper triangle, row by row; topographic observations as lines `code from to value sigma`, code
-3 a distance, where a name that is no point is looked up among the cameras. MMVII adjusts in
+3 a distance, where a name that is not a point is looked up among the cameras. MMVII adjusts in
 Cartesian coordinates, so the points are in a local frame. Topographic observations need to know
 which (Topo.cpp, cSysCo.cpp): CurSysCo beside the points, `RTL*x*y*z*CRS` for east, north, up over
 a point of a CRS.
@@ -86,7 +86,7 @@ def _document(root: ET.Element) -> str:
 
 
 def _system(points: MapPoints) -> str:
-    """Return what the frame is; of a PROJ string's axes nobody doubts the order."""
+    """Return what the frame is; the order of a PROJ string's axes is unambiguous."""
     origin = origin_of(points)
     place = f"{origin.longitude}*{origin.latitude}*{origin.height}"
     root = ET.Element("SysCoData")

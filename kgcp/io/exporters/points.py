@@ -92,7 +92,7 @@ class MapPoints:
 
 @lru_cache(maxsize=8)
 def _parsed(crs: str) -> CRS:
-    """Parse a CRS without its way to WGS 84, which is no part of its axes."""
+    """Parse a CRS without its way to WGS 84, which does not concern its axes."""
     parsed = CRS.from_user_input(crs)
     while parsed.is_bound and parsed.source_crs is not None:
         parsed = parsed.source_crs

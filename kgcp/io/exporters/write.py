@@ -50,7 +50,7 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
         If there are no points, the format cannot hold them, or a file cannot be written.
     """
     if not points.kgcps:
-        raise KgcpError(f"{name}: no point is left to write; select less strictly")
+        raise KgcpError(f"{name}: no points left after selection; select less strictly")
     files: Mapping[str, str | bytes] = _WRITERS[name].files(points)
     contents = {
         folder / file_name: content.encode("utf-8") if isinstance(content, str) else content

@@ -1,10 +1,10 @@
-"""Comma-separated files whose columns are known by name: one text key and numbers."""
+"""Comma-separated files whose columns are known by name: texts and numbers."""
 
 from __future__ import annotations
 
 import csv
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,10 @@ class CsvColumns:
 
     Attributes
     ----------
-    path : Path
-        Where they come from.
     lines : tuple of int
         Line of each row in the file, from 1.
-    keys : tuple of str
-        The key column.
+    texts : mapping of tuples
+        The text columns by name.
     names : tuple of str
         Names of the number columns that the file has.
     numbers : (n, len(names)) array
@@ -35,9 +33,29 @@ class CsvColumns:
 
     path: Path
     lines: tuple[int, ...]
-    keys: tuple[str, ...]
+    texts: Mapping[str, tuple[str, ...]]
     names: tuple[str, ...]
     numbers: FloatArray
+
+    def frames(self) -> tuple[str, ...]:
+        """Return the column frame with `/` between folders.
+
+        Raises
+        ------
+        KgcpError
+            Naming the line of a frame that is empty or stands twice.
+        """
+        first_lines: dict[str, int] = {}
+        for line, text in zip(self.lines, self.texts["frame"], strict=True):
+            frame = text.replace("\\", "/")
+            if not frame:
+                raise KgcpError(f"{self.path}, line {line}: names no frame; repair the line")
+            if first_lines.setdefault(frame, line) != line:
+                raise KgcpError(
+                    f"{self.path}, line {line}: frame {frame!r} stands in line"
+                    f" {first_lines[frame]} too; keep one of them"
+                )
+        return tuple(first_lines)
 
     def block(self, names: Sequence[str]) -> FloatArray:
         """Return columns (n, len(names)) by name."""
@@ -66,16 +84,20 @@ class CsvColumns:
 
 
 def read_csv_columns(
-    path: Path, key: str, required: Sequence[str], optional: Sequence[str], toml_key: str
+    path: Path,
+    texts: Sequence[str],
+    required: Sequence[str],
+    optional: Sequence[str],
+    toml_key: str,
 ) -> CsvColumns:
-    """Read one text column and number columns, in any order; other columns are ignored.
+    """Read text columns and number columns, in any order; other columns are ignored.
 
     Parameters
     ----------
     path : Path
         The file: comma-separated, UTF-8, first line names the columns.
-    key : str
-        Name of the text column.
+    texts : sequence of str
+        Names of text columns; the file must have all of them.
     required, optional : sequence of str
         Names of number columns.
     toml_key : str
@@ -86,15 +108,16 @@ def read_csv_columns(
     KgcpError
         With the line: missing file or column, a cell that is not a finite number, a short row.
     """
+    wanted = (*texts, *required)
     rows = _read_rows(path, toml_key)
     first = next(rows, None)
     if first is None:
-        raise KgcpError(f"{path}: is empty; its first line names the columns {key}, …")
+        raise KgcpError(f"{path}: is empty; its first line must name {', '.join(wanted)}")
     header = [name.strip() for name in first[1]]
-    _check_header(header, (key, *required), f"{path}, line {first[0]}")
+    _check_header(header, wanted, f"{path}, line {first[0]}")
     names = tuple(name for name in (*required, *optional) if name in header)
-    places, key_place = [header.index(name) for name in names], header.index(key)
-    lines, keys, numbers = [], [], array("d")
+    places = [header.index(name) for name in names]
+    lines, text_cells, numbers = [], [], array("d")
     for line, cells in rows:
         if len(cells) != len(header):
             raise KgcpError(
@@ -102,17 +125,23 @@ def read_csv_columns(
                 " repair the line"
             )
         lines.append(line)
-        keys.append(cells[key_place].strip())
+        text_cells.append([cells[header.index(name)].strip() for name in texts])
         numbers.extend(
             _number(cells[place], f"{path}, line {line}: {name}")
             for place, name in zip(places, names, strict=True)
         )
+    columns = zip(*text_cells, strict=True) if text_cells else [()] * len(texts)
     block = np.array(numbers).reshape(len(lines), len(names))
-    return CsvColumns(path, tuple(lines), tuple(keys), names, block)
+    return CsvColumns(path, tuple(lines), dict(zip(texts, columns, strict=True)), names, block)
 
 
 def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> None:
     lacking = [name for name in wanted if name not in header]
+    if lacking and len(header) == 1 and ";" in header[0]:
+        raise KgcpError(
+            f"{where}: its cells are separated by ';';"
+            " save it with commas between the cells and points in the numbers"
+        )
     if lacking:
         raise KgcpError(
             f"{where}: lacks the columns {', '.join(lacking)};"

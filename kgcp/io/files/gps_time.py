@@ -89,9 +89,9 @@ def unwrap_week(seconds: FloatArray) -> FloatArray:
 
 
 def clock_from_date(first_day: date, seconds: FloatArray) -> FloatArray | None:
-    """Return clock times of seconds (n,) of the week, n ≥ 1, of which the first is on a given day.
+    """Return clock times of seconds (n,) of the week, n ≥ 1, the first of which is on a given day.
 
-    None, if the first is on another day of the week than the date.
+    None if the first is on another day of the week than the date.
     """
     seconds = unwrap_week(np.asarray(seconds, dtype=np.float64))
     within = seconds[0] % WEEK_S

@@ -1,7 +1,7 @@
 """Files from elsewhere, which may be anything: pipes, devices, far too large, or no text at all.
 
-What a flight names is opened if it is a regular file, or a link to one, and is read with a limit,
-so that nothing waits for ever or fills the memory before somebody has looked at it.
+What a flight names is opened only if it is a regular file, or a link to one, and read with a
+limit, so that nothing can block the program or fill the memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def is_sound(value: float) -> bool:
 
 
 def require_file(path: Path, toml_key: str) -> None:
-    """Refuse what is no regular file.
+    """Refuse what is not a regular file.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def require_file(path: Path, toml_key: str) -> None:
     """
     if is_file(path):
         return
-    problem = "is no regular file" if os.path.lexists(path) else "does not exist"
+    problem = "is not a regular file" if os.path.lexists(path) else "does not exist"
     raise KgcpError(f"{path}: {problem}; flight.toml names it under {toml_key}")
 
 
@@ -56,7 +56,7 @@ def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
     Raises
     ------
     KgcpError
-        If it is no regular file, cannot be read or is larger.
+        If it is not a regular file, cannot be read or is larger.
     """
     require_file(path, toml_key)
     try:
@@ -68,8 +68,8 @@ def read_bytes(path: Path, toml_key: str, most: int = MOST_BYTES) -> bytes:
         raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
     if size > most or len(data) > room:
         raise KgcpError(
-            f"{path}: has {max(size, len(data))} bytes or more, and what {toml_key} names has at"
-            f" most {most}; name the right file"
+            f"{path}: has at least {max(size, len(data))} bytes, more than the {most} allowed for"
+            f" {toml_key}; name the right file"
         )
     return data
 
@@ -80,7 +80,7 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
     Raises
     ------
     KgcpError
-        Naming the line: if it is no regular file, cannot be read, or is no text.
+        Naming the line: if it is not a regular file, cannot be read, or is not text.
     """
     require_file(path, toml_key)
     try:
@@ -88,7 +88,7 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
             yield from _bounded_lines(path, stream)
     except UnicodeDecodeError as error:
         raise KgcpError(
-            f"{path}: is no text in UTF-8 ({error.reason}); save it as UTF-8"
+            f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8"
         ) from error
     except OSError as error:
         raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
@@ -99,5 +99,7 @@ def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
     while line := stream.readline(_LONGEST_LINE):
         number += 1
         if len(line) == _LONGEST_LINE or "\0" in line:
-            raise KgcpError(f"{path}, line {number}: is no line of text; name a text file")
+            raise KgcpError(
+                f"{path}, line {number}: is not a valid text line (binary file?); name a text file"
+            )
         yield line

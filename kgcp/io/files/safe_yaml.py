@@ -23,7 +23,7 @@ class _Loader(_SAFE):  # type: ignore[misc, valid-type]  # a class that is chose
     def construct_matrix(self, node: yaml.Node) -> object:
         """Return a matrix's rows, columns and data."""
         if not isinstance(node, yaml.MappingNode):
-            raise yaml.YAMLError("a matrix that is no mapping")
+            raise yaml.YAMLError("a matrix that is not a mapping")
         return self.construct_mapping(node, deep=True)
 
 
@@ -36,7 +36,7 @@ def load_yaml(text: str) -> object:
     Raises
     ------
     ValueError
-        If it is none, or too large or deep to be looked at.
+        If it is not YAML, or too large or too deep to parse.
     """
     opened = sum(1 for _ in islice(_OPENING.finditer(text), _MOST_OPENED))
     if len(text) > _MOST_CHARACTERS or opened == _MOST_OPENED:

@@ -7,50 +7,92 @@ import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
 # expat fetches nothing, and declarations of entities, which may multiply, are refused below.
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
 from kgcp.errors import KgcpError
-from kgcp.io.files.safe_read import is_sound, read_bytes
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.safe_read import is_sound, read_bytes, require_file
 
 _ENTITY = re.compile(r"<!\s*ENTITY")
+_HEAD = 4096
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ForeignFile:
-    """A file whose format its content tells.
+    """A file whose format its content tells; each part is read when it is first asked for.
 
     Attributes
     ----------
     path : Path
         Where it lies.
-    text : str
-        Its content, decoded as UTF-8; what is none, as in images, is replaced.
-    document : object
-        What it holds if it is JSON; else None.
-    root : Element or None
-        The root of its elements if it is XML.
+    toml_key : str
+        Where flight.toml names it, for messages.
     """
 
     path: Path
-    text: str
-    document: object
-    root: ET.Element | None
+    toml_key: str
 
-    @classmethod
-    def read(cls, path: Path, toml_key: str) -> Self:
-        """Read a file that flight.toml names under `toml_key`.
+    @cached_property
+    def head(self) -> bytes:
+        """The first bytes, enough to recognise a format.
+
+        Raises
+        ------
+        KgcpError
+            If it is not a regular file or cannot be read.
+        """
+        require_file(self.path, self.toml_key)
+        try:
+            with self.path.open("rb") as stream:
+                return stream.read(_HEAD)
+        except OSError as error:
+            raise KgcpError(f"{self.path}: {error.strerror}; make it readable") from error
+
+    @property
+    def first_line(self) -> str:
+        """The first line that is neither blank nor a comment (#); empty if it is not text."""
+        if b"\0" in self.head:
+            return ""
+        rows = self.head.decode("utf-8-sig", errors="replace").splitlines()
+        return next((row for row in rows if row.strip() and not row.startswith("#")), "")
+
+    @cached_property
+    def text(self) -> str:
+        """The content as UTF-8; bytes that are not, as in images, are replaced.
 
         Raises
         ------
         KgcpError
             If it cannot be read.
         """
-        text = read_bytes(path, toml_key).decode("utf-8-sig", errors="replace")
-        return cls(path, text, _json(text), _xml(text))
+        return read_bytes(self.path, self.toml_key).decode("utf-8-sig", errors="replace")
+
+    @cached_property
+    def document(self) -> object:
+        """The content if it is JSON; else None."""
+        if self.text.lstrip()[:1] not in ("{", "["):
+            return None
+        try:
+            return json.loads(self.text)
+        except (ValueError, RecursionError):
+            return None
+
+    @cached_property
+    def root(self) -> ET.Element | None:
+        """The root of the elements if it is XML; else None."""
+        if self.text.lstrip()[:1] != "<" or _ENTITY.search(self.text):
+            return None
+        try:
+            return ET.fromstring(self.text)  # noqa: S314 - see the import
+        except (ET.ParseError, ValueError):
+            return None
 
     @property
     def rows(self) -> tuple[tuple[int, str], ...]:
@@ -59,8 +101,12 @@ class ForeignFile:
         stripped = ((number, line.strip()) for number, line in lines)
         return tuple((number, line) for number, line in stripped if line and line[0] != "#")
 
-    def error(self, where: str, problem: str, remedy: str) -> KgcpError:
-        """Return the error for one place of the file, to be raised."""
+    def error(self, problem: str, remedy: str = "export it again") -> KgcpError:
+        """Return the error for the file as a whole, to be raised."""
+        return self.error_at("", problem, remedy)
+
+    def error_at(self, where: str, problem: str, remedy: str = "export it again") -> KgcpError:
+        """Return the error for one place in the file, to be raised; "" is the whole file."""
         return KgcpError(f"{self.path}{f', {where}' if where else ''}: {problem}; {remedy}")
 
     def numbers(self, text: str | None, count: int, where: str) -> tuple[float, ...]:
@@ -74,7 +120,7 @@ class ForeignFile:
             found = " ".join(words) or "nothing"
             shown = found if len(found) <= 60 else f"{found[:57]}..."
             kind = "a finite number" if count == 1 else f"{count} finite numbers"
-            raise self.error(where, f"holds {shown!r} instead of {kind}", "export it again")
+            raise self.error_at(where, f"holds {shown!r} instead of {kind}")
         return values
 
 
@@ -84,10 +130,8 @@ class JsonObject:
 
     Attributes
     ----------
-    file : ForeignFile
     where : str
-        Its place, for messages.
-    values : mapping
+        Its place in the file, for messages.
     """
 
     file: ForeignFile
@@ -96,17 +140,21 @@ class JsonObject:
 
     @classmethod
     def of(cls, file: ForeignFile, where: str, value: object) -> Self:
-        """Return the object, or raise `KgcpError` if the value is none."""
+        """Return the object, or raise `KgcpError` if the value is not one."""
         if not isinstance(value, dict):
-            raise file.error(where, "is no JSON object", "export it again")
+            raise file.error_at(where, "is not a JSON object")
         return cls(file, where, value)
+
+    def error(self, problem: str, remedy: str = "export it again") -> KgcpError:
+        """Return the error for this object, to be raised."""
+        return self.file.error_at(self.where, problem, remedy)
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
     def __getitem__(self, key: str) -> object:
         if key not in self.values:
-            raise self.file.error(self.where, f"has no {key!r}", "export it again")
+            raise self.error(f"has no {key!r}")
         return self.values[key]
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -119,16 +167,14 @@ class JsonObject:
         """Return a list of `count` finite numbers."""
         value = self[key]
         if not isinstance(value, list) or len(value) != count:
-            raise self.file.error(
-                self.where, f"{key!r} is no list of {count} numbers", "export it again"
-            )
+            raise self.error(f"{key!r} is not a list of {count} numbers")
         return tuple(self._finite(key, element) for element in value)
 
     def text(self, key: str) -> str:
         """Return a text or a whole number as text: ids are either."""
         value = self[key]
         if isinstance(value, bool) or not isinstance(value, str | int):
-            raise self.file.error(self.where, f"{key!r} is no text", "export it again")
+            raise self.error(f"{key!r} is not a text")
         return str(value)
 
     def child(self, key: str) -> JsonObject:
@@ -139,7 +185,7 @@ class JsonObject:
         """Return a list of objects."""
         value = self[key]
         if not isinstance(value, Sequence) or isinstance(value, str):
-            raise self.file.error(self.where, f"{key!r} is no list", "export it again")
+            raise self.error(f"{key!r} is not a list")
         return tuple(
             JsonObject.of(self.file, f"{self.where} {key}[{index}]".strip(), element)
             for index, element in enumerate(value)
@@ -147,25 +193,10 @@ class JsonObject:
 
     def _finite(self, key: str, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not is_sound(value):
-            raise self.file.error(
-                self.where, f"{key!r} is {reprlib.repr(value)}, no finite number", "export it again"
-            )
+            raise self.error(f"{key!r} is {reprlib.repr(value)}, not a finite number")
         return float(value)
 
 
-def _json(text: str) -> object:
-    if text.lstrip()[:1] not in ("{", "["):
-        return None
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-
-
-def _xml(text: str) -> ET.Element | None:
-    if text.lstrip()[:1] != "<" or _ENTITY.search(text):
-        return None
-    try:
-        return ET.fromstring(text)  # noqa: S314 - see the import
-    except (ET.ParseError, ValueError):
-        return None
+def vectors(objects: Sequence[JsonObject], key: str) -> FloatArray:
+    """Return the lists of three numbers (n, 3) that n objects have under a key."""
+    return np.array([each.vector(key, 3) for each in objects]).reshape(-1, 3)

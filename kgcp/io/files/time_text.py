@@ -11,7 +11,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _SECOND = timedelta(seconds=1)
 _EARLIEST_S = datetime(1, 1, 3, tzinfo=UTC).timestamp()
 _LATEST_S = datetime(9999, 12, 29, tzinfo=UTC).timestamp()
-_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+"""A decimal number, written out: neither nan nor inf, no underscores."""
 _REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
 
 
@@ -21,8 +22,8 @@ def parse_time(text: str) -> float:
     Parameters
     ----------
     text : str
-        ISO 8601 with `Z` or an offset, or Unix seconds. A time without a zone is refused: it is
-        not UTC unless somebody says so.
+        ISO 8601 with `Z` or an offset, or Unix seconds. Times without a time zone are
+        rejected: UTC is never assumed.
 
     Returns
     -------
@@ -35,15 +36,15 @@ def parse_time(text: str) -> float:
         For anything else, with the text that was found.
     """
     text = text.strip()
-    if _NUMBER.fullmatch(text):
-        return _in_calendar(float(text), f"{text} is no date when read as Unix seconds")
+    if NUMBER.fullmatch(text):
+        return _in_calendar(float(text), f"{text} is out of range as Unix seconds")
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         raise SettingError("time", f"{text!r} is not a time", _REMEDY) from None
     if moment.tzinfo is None:
         raise SettingError("time", f"{text!r} names no time zone", _REMEDY)
-    return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is no date of a flight")
+    return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is out of range")
 
 
 def format_time(unix_s: float) -> str:

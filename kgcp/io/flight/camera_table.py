@@ -41,25 +41,22 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
     KgcpError
         Naming file, key and remedy.
     """
-    response = table.choice("response", tuple(Response)) if "response" in table else "unknown"
-    readout_s = table.number("readout_s", 0.0)
-    moment = "middle"
-    if "time_reference" in table:
-        moment = table.choice("time_reference", tuple(TimeReference))
+    response = table.optional("response", lambda key: table.choice(key, Response))
+    moment = table.optional("time_reference", lambda key: table.choice(key, TimeReference))
     camera = _file_camera(table, folder) if "file" in table else _inline_camera(table)
     with table.located():
         return replace(
             camera,
-            response=Response(response),
-            readout_s=readout_s,
-            time_reference=TimeReference(moment),
+            response=response or Response.UNKNOWN,
+            readout_s=table.number("readout_s", 0.0),
+            time_reference=moment or TimeReference.MIDDLE,
         )
 
 
 def _inline_camera(table: TomlTable) -> Camera:
     for key in ("format", "camera"):
         if key in table:
-            raise table.error(key, "stands without a file", "give file, too, or delete it")
+            raise table.error(key, "needs a file", "give file as well, or delete it")
     width, height = table.integer("width"), table.integer("height")
     values = {
         key: table.number(key, None if key in _NEEDED else 0.0) for key in CALIBRATION_PARAMETERS
@@ -71,12 +68,13 @@ def _inline_camera(table: TomlTable) -> Camera:
 def _file_camera(table: TomlTable, folder: Path) -> Camera:
     for key in CALIBRATION_PARAMETERS:
         if key in table:
-            raise table.error(key, "stands beside a calibration file", "delete one of the two")
-    width = table.integer("width") if "width" in table else None
-    height = table.integer("height") if "height" in table else None
-    form = table.choice("format", tuple(FORMATS)) if "format" in table else None
-    camera = table.text("camera") if "camera" in table else None
-    return read_calibration(table.existing_file("file", folder), (width, height), form, camera)
+            raise table.error(key, "is given beside a calibration file", "delete one of the two")
+    return read_calibration(
+        table.existing_file("file", folder),
+        (table.optional("width", table.integer), table.optional("height", table.integer)),
+        table.optional("format", lambda key: table.choice(key, FORMATS.names)),
+        table.optional("camera", table.text),
+    )
 
 
 def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | None:
@@ -85,13 +83,13 @@ def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | Non
     Raises
     ------
     KgcpError
-        Naming file, key and remedy: for negative deviations, a matrix that is no covariance, or
-        both of them.
+        Naming file, key and remedy: for negative deviations, a matrix that is not a
+        covariance, or both of them.
     """
     deviations = [key for key in DEVIATION_KEYS if key in table]
     if "cov" in table or "cov_of" in table:
         if deviations:
-            raise table.error(deviations[0], "stands beside cov", "delete one of the two")
+            raise table.error(deviations[0], "is given beside cov", "delete one of the two")
         numbers, names = np.array(table.numbers("cov")), table.texts("cov_of")
         size = len(names)
         cov = numbers.reshape(size, size) if numbers.size == size * size else numbers
@@ -109,9 +107,8 @@ def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | Non
 
 def read_plumb_sd_deg(table: TomlTable) -> float | None:
     """Return how plumb the optical axis is [deg]; None where the table says nothing about it."""
-    if "plumb_sd_deg" not in table:
-        return None
-    sd_deg = table.number("plumb_sd_deg")
+    sd_deg = table.optional("plumb_sd_deg", table.number)
     with table.located():
-        require_range("plumb_sd_deg", sd_deg, 0.0, 45.0, unit="deg")
+        if sd_deg is not None:
+            require_range("plumb_sd_deg", sd_deg, 0.0, 45.0, unit="deg")
     return sd_deg

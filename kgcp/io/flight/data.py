@@ -24,7 +24,6 @@ class FlightData:
 
     Parameters
     ----------
-    flight : Flight
     frames : sequence of str
         Its frames, by which the images of the poses' file are known.
     """
@@ -35,12 +34,14 @@ class FlightData:
     @property
     def has_reference(self) -> bool:
         """Whether flight.toml names reference poses that exist."""
-        return self._flight.reference_file is not None and self._flight.reference_file.exists()
+        reference = self._flight.reference
+        return reference is not None and reference.file.exists()
 
     def has_position_of(self, target: Target) -> bool:
         """Tell whether there is what a target's position is made from."""
-        file = self._flight.trajectory_file
-        is_placed = target.position_m is not None or (file is not None and file.exists())
+        vehicle = self._flight.vehicle
+        is_driven = vehicle is not None and vehicle.trajectory_file.exists()
+        is_placed = target.position_m is not None or is_driven
         return self._flight.crs is not None and is_placed
 
     @cached_property
@@ -53,13 +54,13 @@ class FlightData:
             If flight.toml names none; else as `read_reference_poses`.
         """
         flight = self._flight
-        if flight.reference_file is None:
+        if flight.reference is None:
             raise KgcpError(
                 f"{flight.folder / 'flight.toml'}: has no [reference]; give poses ="
                 " 'reference.csv' with the camera's poses from an adjustment"
             )
         return read_reference_poses(
-            flight.reference_file, flight.reference_notation, crs=flight.crs, frames=self._frames
+            flight.reference.file, flight.reference.notation, crs=flight.crs, frames=self._frames
         )
 
     @cached_property
@@ -78,10 +79,8 @@ class FlightData:
                 f"{flight.folder / 'flight.toml'}: has no crs; name that of the coordinates,"
                 ' for example crs = "EPSG:25831"'
             )
-        trajectory = None
-        if flight.trajectory_file is not None and flight.trajectory_notation is not None:
-            trajectory = read_trajectory(
-                flight.trajectory_file, flight.crs, flight.trajectory_notation
-            )
-        settings = flight.vehicle or VehicleSettings()
+        trajectory, settings = None, VehicleSettings()
+        if (vehicle := flight.vehicle) is not None:
+            trajectory = read_trajectory(vehicle.trajectory_file, flight.crs, vehicle.notation)
+            settings = vehicle.settings
         return Whereabouts.of(flight.crs, flight.targets, trajectory, settings)

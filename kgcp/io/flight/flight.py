@@ -20,11 +20,10 @@ from kgcp.io.flight.camera_table import (
 )
 from kgcp.io.flight.target_table import read_targets
 from kgcp.io.flight.toml_table import TomlTable
-from kgcp.io.flight.vehicle_table import read_vehicle
-from kgcp.io.formats.frame_times import TimesFormat
-from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
-from kgcp.io.formats.trajectories.records import TrajectoryNotation
-from kgcp.settings import VehicleSettings
+from kgcp.io.flight.vehicle_table import Vehicle, read_vehicle
+from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
+from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
+from kgcp.io.formats.orientations.records import PoseNotation
 from kgcp.targets.layout import Target
 
 REFERENCE_KEYS = ("poses", "format", "crs", "offset")
@@ -32,31 +31,33 @@ REFERENCE_KEYS = ("poses", "format", "crs", "offset")
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format")
 _MOST_BYTES = 1 << 18
+_TOML_REMEDY = "correct that line"
+# What tomllib says of frequent mistakes, and what to do.
+_TOML_HINTS = (
+    ("Cannot declare", "name each table once, and head every target [[target]]"),
+    ("Unescaped '\\'", "write / instead of \\ in paths"),
+    ("Expected newline or end of document", f"{_TOML_REMEDY}: decimals take a point, texts quotes"),
+)
 # tomllib takes the square of the number of a key's parts.
 _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')[ \t]*+\.[ \t]*+){50}"""
 )
 
 
-def read_reference(flight: TomlTable, folder: Path) -> tuple[Path | None, PoseNotation]:
-    """Return the file of the reference poses, if there is one, and how to understand it.
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The camera's poses from an adjustment.
 
-    It is not looked for until a command needs it.
-
-    Raises
-    ------
-    KgcpError
-        If a key is unknown, missing or of the wrong type.
+    Attributes
+    ----------
+    file : Path
+        It is not looked for until a command needs it.
+    notation : PoseNotation
+        How the file is to be understood.
     """
-    if "reference" not in flight:
-        return None, PoseNotation()
-    table = flight.table("reference", REFERENCE_KEYS)
-    notation = PoseNotation(
-        form=PoseFormat(table.choice("format", tuple(PoseFormat))) if "format" in table else None,
-        crs=table.text("crs") if "crs" in table else None,
-        offset_file=table.existing_file("offset", folder) if "offset" in table else None,
-    )
-    return folder / table.text("poses"), notation
+
+    file: Path
+    notation: PoseNotation
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +75,9 @@ class Flight:
     frames_folder : Path
         Where the images lie.
     times_file : Path or None
-        Frame times; None: EXIF says when.
-    times_format : TimesFormat or None
+        Frame times; None: EXIF gives them.
+    times_format : str or None
         Of that file; None: its content tells.
-    camera : Camera
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
     plumb_sd_deg : float or None
@@ -85,15 +85,6 @@ class Flight:
         horizontal axis, in frames without reference attitude [deg]; None: not known.
     targets : tuple of Target
         In the order of the file.
-    vehicle : VehicleSettings or None
-    trajectory_file : Path or None
-        Of the vehicle; it is not looked for until a command needs it.
-    trajectory_notation : TrajectoryNotation or None
-        How that file is to be understood.
-    reference_file : Path or None
-        Reference poses of the camera; it is not looked for until a command needs it.
-    reference_notation : PoseNotation
-        How that file is to be understood.
     toml_text : str
         flight.toml as it was read.
     """
@@ -103,16 +94,13 @@ class Flight:
     crs: str | None
     frames_folder: Path
     times_file: Path | None
-    times_format: TimesFormat | None
+    times_format: str | None
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
-    vehicle: VehicleSettings | None
-    trajectory_file: Path | None
-    trajectory_notation: TrajectoryNotation | None
-    reference_file: Path | None
-    reference_notation: PoseNotation
+    vehicle: Vehicle | None
+    reference: Reference | None
     toml_text: str
 
 
@@ -130,16 +118,13 @@ def read_flight(folder: Path) -> Flight:
     frames_folder, times_file, times_format = _read_frames(table, folder)
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
-    reference_file, reference_notation = read_reference(table, folder)
     plumb_sd_deg = read_plumb_sd_deg(camera)
     if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
-        raise camera.error(
-            "plumb_sd_deg", "stands without [vehicle] level_sd_deg", "give both or none"
-        )
+        raise camera.error("plumb_sd_deg", "needs [vehicle] level_sd_deg", "give both or none")
     return Flight(
         folder=folder,
-        name=table.name("name") if "name" in table else _name_of(folder),
-        crs=table.text("crs") if "crs" in table else None,
+        name=table.optional("name", table.name) or _name_of(folder),
+        crs=table.optional("crs", table.text),
         frames_folder=frames_folder,
         times_file=times_file,
         times_format=times_format,
@@ -147,11 +132,8 @@ def read_flight(folder: Path) -> Flight:
         calibration_covariance=read_calibration_covariance(camera),
         plumb_sd_deg=plumb_sd_deg,
         targets=read_targets(table),
-        vehicle=None if vehicle is None else vehicle.settings,
-        trajectory_file=None if vehicle is None else vehicle.trajectory_file,
-        trajectory_notation=None if vehicle is None else vehicle.notation,
-        reference_file=reference_file,
-        reference_notation=reference_notation,
+        vehicle=vehicle,
+        reference=_read_reference(table, folder),
         toml_text=text,
     )
 
@@ -189,41 +171,49 @@ def _name_of(folder: Path) -> str:
 
 def _read_toml(path: Path) -> tuple[TomlTable, str]:
     """Return the whole file as a table, and as text."""
-    text = _read_text(path)
+    if not is_file(path):
+        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
+    try:
+        text = read_bytes(path, "FLIGHT", _MOST_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
     if _LONG_KEY.search(text):
         raise KgcpError(f"{path}: has a key of very many parts; delete it")
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise KgcpError(f"{path}: is not TOML: {error}; correct that line") from error
+        remedy = next((hint for word, hint in _TOML_HINTS if word in str(error)), _TOML_REMEDY)
+        raise KgcpError(f"{path}: is not TOML: {error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
-        raise KgcpError(f"{path}: is not TOML that can be read ({error}); write it anew") from error
+        raise KgcpError(f"{path}: is not readable TOML ({error}); rewrite it") from error
     return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
 
 
-def _read_text(path: Path) -> str:
-    if not is_file(path):
-        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
-    data = read_bytes(path, "FLIGHT", _MOST_BYTES)
-    try:
-        return data.decode("utf-8-sig").replace("\r\n", "\n")
-    except UnicodeDecodeError as error:
-        raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
-
-
-def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, TimesFormat | None]:
+def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, str | None]:
     """Return the frames' folder, the times file and its format, all but the last by default."""
     table = flight.table("frames", FRAMES_KEYS, required=False)
-    name = table.text("folder") if "folder" in table else "frames"
+    name = table.optional("folder", table.text) or "frames"
     if not is_folder(folder / name):
         raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
     default = folder / "frames.csv"
     times = default if is_file(default) else None
     if "times" in table:
         times = table.existing_file("times", folder)
-    times_format = None
-    if "times_format" in table:
-        if times is None:
-            raise table.error("times_format", "stands without a file", "give times, too")
-        times_format = TimesFormat(table.choice("times_format", list(TimesFormat)))
+    times_format = table.optional(
+        "times_format", lambda key: table.choice(key, TIMES_FORMATS.names)
+    )
+    if times_format is not None and times is None:
+        raise table.error("times_format", "needs a file", "give times as well")
     return folder / name, times, times_format
+
+
+def _read_reference(flight: TomlTable, folder: Path) -> Reference | None:
+    if "reference" not in flight:
+        return None
+    table = flight.table("reference", REFERENCE_KEYS)
+    notation = PoseNotation(
+        form=table.optional("format", lambda key: table.choice(key, POSE_FORMATS.names)),
+        crs=table.optional("crs", table.text),
+        offset_file=table.optional("offset", lambda key: table.existing_file(key, folder)),
+    )
+    return Reference(folder / table.text("poses"), notation)

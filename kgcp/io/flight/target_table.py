@@ -45,7 +45,7 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
     for table in replicas:
         if table.text("replica_of") not in names:
             problem = f"{table.text('replica_of')!r} is not the name of a plate"
-            remedy = f"name one of {', '.join(names)}" if names else "describe the plate, too"
+            remedy = f"name one of {', '.join(names)}" if names else "describe the plate as well"
             raise table.error("replica_of", problem, remedy)
     targets = tuple(_read_target(table, replicas) for table in plates)
     with flight.located():
@@ -63,7 +63,7 @@ def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -
 def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
     ring = _read_ring(table)
     if "sd_position_m" in table and "position_m" not in table:
-        raise table.error("sd_position_m", "stands without position_m", "give both or none")
+        raise table.error("sd_position_m", "needs position_m", "give both or none")
     sd_position_m = table.vector("sd_position_m", (0.0, 0.0, 0.0))
     if min(sd_position_m) < 0.0:
         raise table.error("sd_position_m", "is negative", "give standard deviations in metres")

@@ -1,17 +1,22 @@
-"""Typed access to the tables of a TOML file; whatever is wrong is named by file, table and key."""
+"""Typed access to the tables of a TOML file; errors name file, table and key."""
 
 from __future__ import annotations
 
 import difflib
+import os
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
+from typing import TypeVar
 
 from kgcp.errors import KgcpError, SettingError
 from kgcp.io.files.safe_read import LARGEST, is_file
+
+Value = TypeVar("Value")
+Word = TypeVar("Word", bound=str)
 
 _TYPE_NAMES = {
     bool: "a boolean",
@@ -84,21 +89,28 @@ class TomlTable:
         """Return what something is called: one line that may stand in any table or page."""
         value = self.text(key)
         if len(value) > _LONGEST_NAME or any(map(_is_control, value)):
-            problem = f"{value[:20]!r} is no name"
-            remedy = f"give at most {_LONGEST_NAME} characters on one line, none of control"
+            problem = f"{value[:20]!r} is not a name"
+            remedy = (
+                f"give at most {_LONGEST_NAME} characters on one line, without control characters"
+            )
             raise self.error(key, problem, remedy)
         return value
 
-    def choice(self, key: str, words: Sequence[str]) -> str:
-        """Return one of the given words."""
-        word = self.text(key)
-        if word not in words:
-            listed = ", ".join(f'"{choice}"' for choice in words)
-            raise self.error(key, f"{word!r} is not known", f"give one of {listed}")
-        return word
+    def optional(self, key: str, read: Callable[[str], Value]) -> Value | None:
+        """Return what a method of this table reads under a key; None where the key is absent."""
+        return read(key) if key in self else None
+
+    def choice(self, key: str, words: Iterable[Word]) -> Word:
+        """Return one of the given words: texts, or the members of a `StrEnum`."""
+        text = self.text(key)
+        for word in words:
+            if word == text:
+                return word
+        listed = ", ".join(f'"{word}"' for word in words)
+        raise self.error(key, f"{text!r} is not known", f"give one of {listed}")
 
     def integer(self, key: str) -> int:
-        """Return a whole number; booleans are none."""
+        """Return a whole number; booleans are refused."""
         value = self._required(key, "give it as a whole number")
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._wrong_type(key, value, "a whole number")
@@ -107,16 +119,16 @@ class TomlTable:
         return value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Return a finite number, or the default where the key is absent; booleans are none."""
+        """Return a finite number, or the default where the key is absent; booleans are refused."""
         if default is not None and key not in self:
             return default
         return self._finite(key, self._required(key, "give it as a number"))
 
-    def numbers(self, key: str) -> tuple[float, ...]:
-        """Return a list of finite numbers."""
-        value = self._required(key, "give it as a list of numbers, [0, 43, 78]")
+    def numbers(self, key: str, example: str = "[0, 43, 78]") -> tuple[float, ...]:
+        """Return a list of finite numbers; the example is for messages."""
+        value = self._required(key, f"give it as a list of numbers, {example}")
         if not isinstance(value, list):
-            raise self._wrong_type(key, value, "a list of numbers, [0, 43, 78]")
+            raise self._wrong_type(key, value, f"a list of numbers, {example}")
         return tuple(self._finite(key, element) for element in value)
 
     def texts(self, key: str) -> tuple[str, ...]:
@@ -137,25 +149,30 @@ class TomlTable:
         try:
             return date.fromisoformat(value if isinstance(value, str) else "")
         except ValueError:
-            raise self.error(key, f"{value!r} is no date", "give it as 2026-05-04") from None
+            raise self.error(key, f"{value!r} is not a date", "give it as 2026-05-04") from None
 
     def existing_file(self, key: str, folder: Path) -> Path:
         """Return a file that lies in the folder or below it."""
         path = folder / self.text(key)
         if not is_file(path):
+            if os.path.lexists(path):
+                raise self.error(key, f"{self.text(key)!r} is not a regular file", "name a file")
             raise self.error(key, f"{self.text(key)!r} does not exist", "create or correct it")
         return path
 
     def vector(
-        self, key: str, default: tuple[float, float, float] | None = None
+        self,
+        key: str,
+        default: tuple[float, float, float] | None = None,
+        example: str = "[x, y, z]",
     ) -> tuple[float, float, float]:
         """Return a list of exactly three finite numbers, or the default."""
         if default is not None and key not in self:
             return default
-        values = self.numbers(key)
+        values = self.numbers(key, example)
         if len(values) != 3:
             problem = f"has {len(values)} numbers instead of 3"
-            raise self.error(key, problem, "give it as [x, y, z]")
+            raise self.error(key, problem, f"give it as {example}")
         return values[0], values[1], values[2]
 
     def table(self, key: str, known: Sequence[str], *, required: bool = True) -> TomlTable:

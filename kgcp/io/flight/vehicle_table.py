@@ -7,7 +7,8 @@ from pathlib import Path
 
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.toml_table import TomlTable
-from kgcp.io.formats.trajectories.records import TrajectoryFormat, TrajectoryNotation, Wander
+from kgcp.io.formats.trajectories import FORMATS
+from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
 from kgcp.settings import VehicleSettings
 
 VEHICLE_KEYS = (
@@ -37,7 +38,6 @@ class Vehicle:
 
     Attributes
     ----------
-    settings : VehicleSettings
     trajectory_file : Path
         It is not looked for until a command needs it.
     notation : TrajectoryNotation
@@ -63,31 +63,26 @@ def read_vehicle(flight: TomlTable, folder: Path) -> Vehicle | None:
     table = flight.table("vehicle", VEHICLE_KEYS)
     with table.located():
         settings = VehicleSettings(
-            lever_arm_m=table.vector("lever_arm_m"),  # a forgotten one would be metres
+            # Without a default: of a forgotten one the points would be off by metres.
+            lever_arm_m=table.vector("lever_arm_m", example="[forward, right, down]"),
             sd_lever_arm_m=table.vector("sd_lever_arm_m", (0.0, 0.0, 0.0)),
             mount_deg=table.number("mount_deg", 0.0),
             sd_time_s=table.number("sd_time_s", 0.0),
             time_offset_s=table.number("time_offset_s", 0.0),
-            level_sd_deg=table.number("level_sd_deg") if "level_sd_deg" in table else None,
+            level_sd_deg=table.optional("level_sd_deg", table.number),
             correlation_s=table.number("correlation_s", 60.0),
         )
-    return Vehicle(settings, folder / table.text("trajectory"), _read_notation(table, folder))
-
-
-def _read_notation(table: TomlTable, folder: Path) -> TrajectoryNotation:
-    return TrajectoryNotation(
-        format=TrajectoryFormat(table.choice("format", list(TrajectoryFormat)))
-        if "format" in table
-        else None,
-        crs=table.text("crs") if "crs" in table else None,
-        time_system=TimeSystem(table.choice("time_system", list(TimeSystem)))
-        if "time_system" in table
-        else None,
-        first_day=table.day("date") if "date" in table else None,
-        accuracies_file=folder / table.text("accuracies") if "accuracies" in table else None,
-        wander=Wander(table.choice("wander", list(Wander))) if "wander" in table else None,
+    accuracies = table.optional("accuracies", table.text)
+    notation = TrajectoryNotation(
+        format=table.optional("format", lambda key: table.choice(key, FORMATS.names)),
+        crs=table.optional("crs", table.text),
+        time_system=table.optional("time_system", lambda key: table.choice(key, TimeSystem)),
+        first_day=table.optional("date", table.day),
+        accuracies_file=None if accuracies is None else folder / accuracies,
+        wander=table.optional("wander", lambda key: table.choice(key, Wander)),
         course_sd_deg=_read_course(table),
     )
+    return Vehicle(settings, folder / table.text("trajectory"), notation)
 
 
 def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
@@ -102,7 +97,7 @@ def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
     if "attitude" not in table:
         return None
     table.choice("attitude", [_COURSE])
-    deviations = table.vector("sd_attitude_deg")
+    deviations = table.vector("sd_attitude_deg", example="[roll, pitch, heading]")
     if min(deviations) < 0.0 or max(deviations) > 180.0:
         raise table.error(
             "sd_attitude_deg", f"{list(deviations)} is out of range", "give values of 0 to 180 deg"

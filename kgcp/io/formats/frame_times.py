@@ -3,45 +3,37 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from enum import StrEnum
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.csv_columns import read_csv_columns
 from kgcp.io.files.gps_time import clock_from_week, unix_from_gps, unwrap_week
-from kgcp.io.files.safe_read import is_file, read_lines
-from kgcp.io.files.time_text import is_in_calendar
+from kgcp.io.files.safe_read import read_lines
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.files.time_text import is_in_calendar, parse_time
+from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution, read_solution
-from kgcp.io.images.frames import read_frame_times
 
-_HEAD = 4096
 # Number, GPS seconds of the week, [week]; positions and their deviations follow.
 _MARK = re.compile(r"(\d{1,9})\s+(\d{1,9}(?:\.\d*)?)\s+\[\s*(\d{1,9})\s*\](?:\s|$)")
 _LAST_NUMBER = re.compile(r"(.*?)(\d+)\D*")
 
 
-class TimesFormat(StrEnum):
-    """A notation of frame times, by its name in flight.toml."""
-
-    CSV = "csv"
-    MRK = "mrk"
-    RTKLIB = "rtklib"
-
-
 def read_times(
-    path: Path, frames: Sequence[str], times_format: TimesFormat | None = None
+    path: Path, frames: Sequence[str], times_format: str | None = None
 ) -> dict[str, float]:
-    """Read the times of frames, in any of the formats of docs/conventions.md.
+    """Read the times of frames, in one of the `FORMATS` of docs/conventions.md.
 
     Parameters
     ----------
-    path : Path
     frames : sequence of str
         Names of all frames, sorted.
-    times_format : TimesFormat or None
-        None: the content tells.
+    times_format : str or None
+        Name of the format; None: the content tells.
 
     Returns
     -------
@@ -52,64 +44,71 @@ def read_times(
     Raises
     ------
     KgcpError
-        Naming file and line: it is missing or wrong, or its marks cannot be told to frames.
+        Naming file and line: it is missing or wrong, or its marks cannot be assigned to frames.
     """
-    kind = times_format or recognise(path)
-    if kind is TimesFormat.CSV:
-        return read_frame_times(path)
-    if kind is TimesFormat.MRK:
-        times = _join_by_number(path, _read_marks(path), frames)
-    else:
-        times = _join_by_order(path, frames)
+    file = ForeignFile(path, "[frames] times")
+    times = FORMATS.reader(file, times_format)(file, frames)
     if not all(map(is_in_calendar, times.values())):
-        raise KgcpError(f"{path}: has weeks that no calendar has; give the file of this flight")
+        raise file.error("GPS week out of range", "give the file of this flight")
     return times
 
 
-def recognise(path: Path) -> TimesFormat:
-    """Tell the format of frame times by the content; what is no other is CSV."""
-    if not is_file(path):
-        return TimesFormat.CSV  # whose reader says what is wrong
-    with path.open("rb") as stream:
-        head = stream.read(_HEAD)
-    if _MARK.match(head.decode("utf-8-sig", errors="replace").lstrip()):
-        return TimesFormat.MRK
-    return TimesFormat.RTKLIB if looks_like_solution(head) else TimesFormat.CSV
+def _read_csv(file: ForeignFile, _frames: Sequence[str]) -> dict[str, float]:
+    """Return the columns frame and time; times are mid-exposure, in the notations of `parse_time`.
+
+    Frames are named as `kgcp.io.images.frames.list_frames` does.
+    """
+    columns = read_csv_columns(file.path, ("frame", "time"), (), (), file.toml_key)
+    times = {}
+    rows = zip(columns.lines, columns.frames(), columns.texts["time"], strict=True)
+    for line, frame, text in rows:
+        try:
+            times[frame] = parse_time(text)
+        except SettingError as error:
+            raise KgcpError(f"{file.path}, line {line}: {error}") from None
+    return times
 
 
-def _read_marks(path: Path) -> dict[int, float]:
-    """Return Unix times by the numbers of DJI's marks.
+def _looks_like_marks(file: ForeignFile) -> bool:
+    return _MARK.match(file.head.decode("utf-8-sig", errors="replace").lstrip()) is not None
+
+
+def _read_marks(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
+    """Return the times of DJI's marks by frame: a mark's number is the last one in a frame's name.
 
     Their positions are the antenna's, and the offsets to the sensor beside it (north, east and
     **down**, mm) are of the drone: a vehicle's target needs neither.
     """
-    numbers, clocks = [], []
+    path = file.path
+    clocks: dict[int, FloatArray] = {}
     first_lines: dict[int, int] = {}
-    for line, row in enumerate(read_lines(path, "[frames] times"), start=1):
+    for line, row in enumerate(read_lines(path, file.toml_key), start=1):
         if not row.strip():
             continue
         match = _MARK.match(row.strip())
         if match is None:
-            raise KgcpError(
-                f"{path}, line {line}: does not begin with number, GPS seconds and [week];"
-                " repair the line"
+            raise file.error_at(
+                f"line {line}",
+                "does not begin with number, GPS seconds and [week]",
+                "repair the line",
             )
         number = int(match[1])
-        if number in first_lines:
-            raise KgcpError(
-                f"{path}, line {line}: number {number} stands in line {first_lines[number]}, too;"
-                " give the marks of one flight"
+        if first_lines.setdefault(number, line) != line:
+            raise file.error_at(
+                f"line {line}",
+                f"number {number} stands in line {first_lines[number]} too",
+                "give the marks of one flight",
             )
-        first_lines[number] = line
-        numbers.append(number)
-        clocks.append(clock_from_week(np.array(float(match[3])), np.array(float(match[2]))))
-    if not numbers:
-        raise KgcpError(f"{path}: holds no marks; give the Timestamp.MRK of this flight")
-    times = unix_from_gps(unwrap_week(np.array(clocks)))
-    return dict(zip(numbers, times.tolist(), strict=True))
+        clocks[number] = clock_from_week(np.array(float(match[3])), np.array(float(match[2])))
+    if not clocks:
+        raise file.error("holds no marks", "give the Timestamp.MRK of this flight")
+    unix_s = unix_from_gps(unwrap_week(np.array([*clocks.values()]))).tolist()
+    return _join_by_number(file, dict(zip(clocks, unix_s, strict=True)), frames)
 
 
-def _join_by_number(path: Path, marks: dict[int, float], frames: Sequence[str]) -> dict[str, float]:
+def _join_by_number(
+    file: ForeignFile, marks: dict[int, float], frames: Sequence[str]
+) -> dict[str, float]:
     times = {}
     owners: dict[int, tuple[str, str]] = {}
     for frame in frames:
@@ -120,30 +119,44 @@ def _join_by_number(path: Path, marks: dict[int, float], frames: Sequence[str]) 
         before = str(PurePosixPath(frame).parent / match[1])
         other, other_before = owners.setdefault(number, (frame, before))
         if before != other_before:
-            raise KgcpError(
-                f"{path}: its number {number} may be that of {other!r} or of {frame!r}; give the"
-                " frames of one flight, or frames.csv"
+            raise file.error(
+                f"its number {number} may be that of {other!r} or of {frame!r}",
+                "give the frames of one flight, or frames.csv",
             )
         times[frame] = marks[number]
     if not times:
-        raise KgcpError(
-            f"{path}: none of its {len(marks)} numbers is the last number in the name of a frame"
-            f" ({frames[0]!r}, …); give the marks of this flight, or frames.csv"
+        raise file.error(
+            f"none of its {len(marks)} numbers is the last number in the name of a frame"
+            f" ({frames[0]!r}, …)",
+            "give the marks of this flight, or frames.csv",
         )
     spare = {str(number): time for number, time in marks.items() if number not in owners}
     return {**spare, **times}
 
 
-def _join_by_order(path: Path, frames: Sequence[str]) -> dict[str, float]:
-    solution = read_solution(path, "[frames] times")
+def _read_events(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
+    """Return the times of RTKLIB's events by frame, in their order: events have no names."""
+    solution = read_solution(file)
     if len(solution.time_s) != len(frames):
-        raise KgcpError(
-            f"{path}: has {len(solution.time_s)} events for {len(frames)} frames, and nothing tells"
-            " which belong together (RTKLIB keeps one event per epoch of observations and loses"
-            " the others); add or remove frames that differ, or give frames.csv"
+        raise file.error(
+            f"has {len(solution.time_s)} events for {len(frames)} frames, and nothing tells which"
+            " belong together (RTKLIB keeps one event per epoch of observations and loses the"
+            " others)",
+            "add or remove frames that differ, or give frames.csv",
         )
     backwards = np.flatnonzero(np.diff(solution.time_s) <= 0.0)
     if backwards.size:
-        line = solution.lines[int(backwards[0]) + 1]
-        raise KgcpError(f"{path}, line {line}: its event is not later than that before; sort them")
+        where = f"line {solution.lines[int(backwards[0]) + 1]}"
+        raise file.error_at(where, "its event is not later than the one before", "sort them")
     return dict(zip(frames, solution.time_s.tolist(), strict=True))
+
+
+FORMATS: Registry[Callable[[ForeignFile, Sequence[str]], dict[str, float]]] = Registry(
+    "a file of frame times",
+    "give a CSV file with the columns frame and time",
+    {
+        "mrk": (_looks_like_marks, _read_marks),
+        "rtklib": (looks_like_solution, _read_events),
+        "csv": (lambda _: True, _read_csv),  # whose reader says what is wrong with the file
+    },
+)

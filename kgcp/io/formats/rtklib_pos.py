@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem, clock_from_week, unix_from_clock, unwrap_week
 from kgcp.io.files.safe_read import LARGEST, read_lines
+from kgcp.io.files.sniff import ForeignFile
 
 _COLUMNS = re.compile(r"%\s*(GPST|UTC|JST)\b(.*)")
 _NAME = re.compile(r"([A-Za-z][\w-]*)(?:\(([^()]*)\))?")
@@ -29,7 +29,6 @@ class Solution:
 
     Attributes
     ----------
-    path : Path
     lines : tuple of int
         Line of each row in the file, from 1.
     time_s : (n,) array
@@ -37,7 +36,7 @@ class Solution:
     columns : mapping of (n,) arrays
         By the header's names without units, angles in degrees: `latitude`, `x-ecef`, `sdn`, ….
     datum, heights : str
-        As the header has them, `WGS84` and `ellipsoidal`; empty where it has neither.
+        From the header, `WGS84` and `ellipsoidal`; empty where it has neither.
     """
 
     path: Path
@@ -48,44 +47,40 @@ class Solution:
     heights: str
 
 
-def looks_like_solution(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a solution, with or without its header."""
-    text = head.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
+def looks_like_solution(file: ForeignFile) -> bool:
+    """Return whether a file is a solution, with or without its header."""
+    text = file.head.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
     return text.startswith("%") or _DATE.match(text) is not None
 
 
-def read_solution(path: Path, toml_key: str) -> Solution:
-    """Read the rows of a solution file, which flight.toml names under a key, by its own header.
+def read_solution(file: ForeignFile) -> Solution:
+    """Read the rows of a solution file by its own header.
 
     Raises
     ------
     KgcpError
         Naming the line: no header, a row that is too short, or a cell that is not a number.
     """
-    rows = _rows(path, toml_key)
+    lines = enumerate(read_lines(file.path, file.toml_key), start=1)
+    rows = [(number, row.strip()) for number, row in lines if row.strip()]
     header = next((match for _, row in rows if (match := _COLUMNS.match(row))), None)
     if header is None:
-        raise KgcpError(
-            f"{path}: lacks the header line '% GPST …' that says what its columns are;"
-            " write the solution with its header (out-outhead = on)"
+        raise file.error(
+            "lacks the header line '% GPST …' that names its columns",
+            "write the solution with its header (out-outhead = on)",
         )
     names, places, width = _layout(header[2])
     data = [(line, row) for line, row in rows if not row.startswith("%")]
-    clocks, cells = _split(path, data, width)
+    clocks, cells = _split(file, data, width)
     kind = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
     return Solution(
-        path,
+        file.path,
         tuple(line for line, _ in data),
         _unix(clocks, header[1]),
         {name: _column(cells, *place) for name, place in zip(names, places, strict=True)},
         kind[1] if kind else "",
         kind[2] if kind else "",
     )
-
-
-def _rows(path: Path, toml_key: str) -> list[tuple[int, str]]:
-    lines = enumerate(read_lines(path, toml_key), start=1)
-    return [(number, row.strip()) for number, row in lines if row.strip()]
 
 
 def _layout(header: str) -> tuple[list[str], list[tuple[int, int]], int]:
@@ -100,7 +95,7 @@ def _layout(header: str) -> tuple[list[str], list[tuple[int, int]], int]:
 
 
 def _split(
-    path: Path, data: Sequence[tuple[int, str]], width: int
+    file: ForeignFile, data: Sequence[tuple[int, str]], width: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return clock times (n,) and cells (n, width); what stands in further cells is dropped."""
     separator = next((mark for mark in ",;\t" if data and mark in data[0][1]), None)
@@ -115,14 +110,15 @@ def _split(
                 week, seconds, *texts = _cells(row, separator)
                 weeks[index], clocks[index] = int(week), float(seconds)
             if len(texts) < width:
-                raise KgcpError(
-                    f"{path}, line {line}: has {len(texts)} cells after the time, the header names"
-                    f" {width}; repair the line"
+                raise file.error_at(
+                    f"line {line}",
+                    f"has {len(texts)} cells after the time, the header names {width}",
+                    "repair the line",
                 )
             cells[index] = [float(text) for text in texts[:width]]
         except (ValueError, OverflowError) as error:
-            raise KgcpError(
-                f"{path}, line {line}: is not a time and numbers ({error}); repair the line"
+            raise file.error_at(
+                f"line {line}", f"is not a time and numbers ({error})", "repair the line"
             ) from error
     in_weeks = ~np.isnan(weeks)
     if in_weeks.any():
@@ -130,7 +126,7 @@ def _split(
     lost = np.flatnonzero(~(np.abs(np.column_stack((clocks, cells))) < LARGEST).all(axis=1))
     if lost.size:
         line = data[lost[0]][0]
-        raise KgcpError(f"{path}, line {line}: holds a number that is not finite; delete it")
+        raise file.error_at(f"line {line}", "holds a number that is not finite", "delete it")
     return unwrap_week(clocks) if in_weeks.any() else clocks, cells
 
 

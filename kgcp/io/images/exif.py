@@ -48,7 +48,7 @@ def read_exif(path: Path) -> Exif:
 
     The time is DateTimeOriginal with SubSecTimeOriginal, a decimal fraction ("05" is 0.05 s), and
     OffsetTimeOriginal. Where that is absent, OffsetTime serves, which is DateTime's, if DateTime
-    is the same moment (in a file that nobody changed). Without an offset it is the local time of
+    is the same moment (in an unedited file). Without an offset it is the local time of
     an unknown place and is left out. So are the GPS stamps: they are UTC, but of the receiver's
     last fix and mostly in whole seconds, in which a vehicle goes metres.
 

@@ -1,8 +1,7 @@
-"""Frames: their names, their grey values and their times. The EXIF orientation is never applied."""
+"""Frames: their names and their grey values. The EXIF orientation is never applied."""
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 import sys
@@ -14,15 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from kgcp.errors import KgcpError, Reason, Rejection, SettingError
+from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.safe_read import is_file, is_folder, read_lines
-from kgcp.io.files.time_text import parse_time
+from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.header import image_size, is_cut_png, upright
 
-__all__ = ["Exif", "list_frames", "read_exif", "read_frame_times", "read_grey"]
+__all__ = ["Exif", "list_frames", "read_exif", "read_grey"]
 
 FRAME_SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
@@ -111,12 +109,14 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
 def _encoded(path: Path, camera: Camera) -> bytes:
     """Return the content of an image file, once its header says that it may be a frame."""
     if os.path.lexists(path) and not is_file(path):  # opening a pipe would wait for ever
-        raise Rejection(Reason.DECODE_FAILED, "is no regular file")
+        raise Rejection(Reason.DECODE_FAILED, "is not a regular file")
     try:
         with path.open("rb") as stream:
             found, size = image_size(stream), os.fstat(stream.fileno()).st_size
             if found is None:
-                raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that begin like no image")
+                raise Rejection(
+                    Reason.DECODE_FAILED, f"{size} bytes that do not begin like an image"
+                )
             _require_size(*found, camera)
             most = _MOST_BYTES_PER_PIXEL * camera.width * camera.height + _MOST_METADATA_BYTES
             if size > most:
@@ -148,7 +148,7 @@ def _decode(encoded: bytes) -> GreyArray:
     with _collected_stderr() as messages, suppress(cv2.error):
         grey = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), _RAW_GREY)
     if grey is None:
-        raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are no whole image")
+        raise Rejection(Reason.DECODE_FAILED, f"{size} bytes that are not a complete image")
     for message in messages:
         if message.startswith(_GUESSED_PIXELS):
             raise Rejection(Reason.DECODE_FAILED, message)
@@ -174,51 +174,3 @@ def _collected_stderr() -> Iterator[list[str]]:
             os.close(stderr)
             sink.seek(0)
             messages += sink.read().decode(errors="replace").splitlines()
-
-
-def read_frame_times(path: Path) -> dict[str, float]:
-    """Read the times of frames from a CSV file with the columns frame and time.
-
-    Parameters
-    ----------
-    path : Path
-        Further columns are passed over. Frames are named as `list_frames` does; times are
-        mid-exposure, in the notations of `parse_time`.
-
-    Returns
-    -------
-    dict of float
-        Unix seconds (UTC) by frame.
-
-    Raises
-    ------
-    KgcpError
-        For a missing file or column, a bad time or a frame named twice, with the line's number.
-    """
-    reader = csv.DictReader(read_lines(path, "[frames] times"))
-    try:
-        missing = {"frame", "time"} - set(reader.fieldnames or ())
-        if missing:
-            raise KgcpError(
-                f"{path}: has no column {' and '.join(sorted(missing))};"
-                " start it with the line 'frame,time'"
-            )
-        return _collect_times(path, reader)
-    except csv.Error as error:
-        raise KgcpError(f"{path}: is not CSV in UTF-8 ({error}); export it again") from error
-
-
-def _collect_times(path: Path, reader: csv.DictReader[str]) -> dict[str, float]:
-    times: dict[str, float] = {}
-    for row in reader:
-        line = f"{path}:{reader.line_num}"
-        frame, time = (row["frame"] or "").replace("\\", "/"), row["time"]
-        if not frame or time is None:
-            raise KgcpError(f"{line}: lacks a frame or a time; complete or delete the line")
-        if frame in times:
-            raise KgcpError(f"{line}: frame {frame!r} is named a second time; delete one line")
-        try:
-            times[frame] = parse_time(time)
-        except SettingError as error:
-            raise KgcpError(f"{line}: {error}") from None
-    return times

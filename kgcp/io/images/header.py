@@ -34,7 +34,7 @@ class _Layout:
 
     @classmethod
     def of(cls, head: bytes) -> _Layout | None:
-        """Return that of a file that begins with `head`; None where it is no TIFF."""
+        """Return that of a file that begins with `head`; None where it is not a TIFF."""
         order = {b"II": "<", b"MM": ">"}.get(head[:2])
         if order is None or len(head) < 16:
             return None
@@ -66,7 +66,7 @@ class _Entry:
 def image_size(stream: BinaryIO) -> tuple[int, int] | None:
     """Return width and height [px] of the first image in a file.
 
-    None, if it is of no format that a frame may have, or its header is damaged.
+    None if a frame may not have its format, or its header is damaged.
     """
     layout = _Layout.of(stream.read(16))
     if layout is not None:
@@ -123,7 +123,7 @@ def is_greedy(stream: BinaryIO) -> bool:
 def is_cut_png(data: bytes) -> bool:
     """Return whether this is a PNG of which a chunk goes beyond the end, or that has none.
 
-    Some decoders make room for what a chunk says to be long, before they see that it is not there.
+    Some decoders allocate the length that a chunk declares before they find the file shorter.
     """
     place, kind = len(_PNG_START), b""
     if data[:place] != _PNG_START:

@@ -42,7 +42,7 @@ class StoredFolder:
         return replace(self, below=f"{self.below}/{name}".strip("/"))
 
     def __str__(self) -> str:
-        """Name it without keys and options, which are nobody's business."""
+        """Name it without keys and options, which belong in no message."""
         parts = urlsplit(self.url)
         place = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
         return f"{place}/{self.below}" if self.below else place
@@ -70,7 +70,9 @@ class StoredFolder:
         named = [(info.path[len(path) :].strip("/"), info) for info in found]
         for name, _ in named:
             if {"", ".", ".."} & set(name.split("/")) or "\\" in name:
-                raise KgcpError(f"{self}: the name {name!r} is no path below it; rename the object")
+                raise KgcpError(
+                    f"{self}: the name {name!r} is not a path below it; rename the object"
+                )
         return [each for each in named if not is_deep or each[1].type == FileType.File]
 
     def tree(self, passed_over: Sequence[str]) -> Iterator[str]:
@@ -165,13 +167,12 @@ class StoredFolder:
             yield
         except FileNotFoundError as error:
             raise KgcpError(
-                f"{self}: does not exist; correct the URL, or put it there and give the same"
-                " command again"
+                f"{self}: does not exist; correct the URL, or put it there and repeat the command"
             ) from error
         except OSError as error:
             raise KgcpError(
-                f"{self}: {what} ({_line(error)}); see URL, keys and network, and give the same"
-                " command again"
+                f"{self}: {what} ({_line(error)}); see URL, keys and network, and repeat the"
+                " command"
             ) from error
 
 
@@ -181,7 +182,7 @@ def parsed_url(text: str) -> Path | StoredFolder:
     Raises
     ------
     KgcpError
-        If it is no URL that Arrow can open.
+        If Arrow cannot open it.
     """
     if "://" not in text:
         return Path(text)
@@ -190,8 +191,7 @@ def parsed_url(text: str) -> Path | StoredFolder:
         return Path(parts.path)
     if parts.scheme not in _KNOWN or not parts.netloc:
         raise KgcpError(
-            f"{text}: is no place that kgcp knows; give a folder, or s3://bucket/folder,"
-            " gs://bucket/folder"
+            f"{text}: unsupported location; use a folder, s3://bucket/folder or gs://bucket/folder"
         )
     return StoredFolder(text)
 
@@ -256,7 +256,7 @@ def at_hand(folder: Path | StoredFolder, name: str) -> Iterator[Path]:
     Raises
     ------
     KgcpError
-        If an object cannot be read: it is no frame's fault.
+        If an object cannot be read; that is not a `Rejection` of the frame.
     """
     if isinstance(folder, Path):
         yield folder / name

@@ -49,7 +49,7 @@ def test_a_format_writes_the_files_it_declares(
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_no_points_are_an_error(make_points: Factory, tmp_path: Path, name: str) -> None:
-    with pytest.raises(KgcpError, match="no point is left"):
+    with pytest.raises(KgcpError, match="no points left"):
         export(make_points(kgcps=()), name, tmp_path)
     assert not [*tmp_path.iterdir()]
 

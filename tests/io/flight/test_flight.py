@@ -99,18 +99,20 @@ def test_every_value_arrives_in_its_record(write: Write) -> None:
     assert (flight.name, flight.crs, flight.toml_text) == ("odd angles", "EPSG:25831", FLIGHT)
     assert flight.frames_folder == folder / "pictures"
     assert flight.times_file == folder / "times.csv"
-    assert flight.trajectory_file == folder / "car.csv"
-    assert flight.reference_file == folder / "aat.csv"
+    assert flight.vehicle is not None
+    assert flight.vehicle.trajectory_file == folder / "car.csv"
+    assert flight.reference is not None
+    assert flight.reference.file == folder / "aat.csv"
     camera = flight.camera
     assert (camera.width, camera.height, camera.fx, camera.fy) == (1601, 1203, 2300.0, 2304.0)
     assert (camera.cx, camera.cy) == (803.2, 594.6)
     assert (camera.k1, camera.k2, camera.k6) == (-0.06, 0.0, 0.001)
     assert (camera.response, camera.readout_s) == (Response.LINEAR, 0.01)
     assert flight.vehicle is not None
-    assert flight.vehicle.lever_arm_m == (-0.8, 0.15, -1.95)
-    assert flight.vehicle.mount_deg == 12.5
-    assert flight.vehicle.time_offset_s == -0.25
-    assert (flight.plumb_sd_deg, flight.vehicle.level_sd_deg) == (8.0, 1.5)
+    assert flight.vehicle.settings.lever_arm_m == (-0.8, 0.15, -1.95)
+    assert flight.vehicle.settings.mount_deg == 12.5
+    assert flight.vehicle.settings.time_offset_s == -0.25
+    assert (flight.plumb_sd_deg, flight.vehicle.settings.level_sd_deg) == (8.0, 1.5)
     assert flight.calibration_covariance is not None
     assert np.diag(flight.calibration_covariance.cov) == pytest.approx([0.25, *[0] * 10, 4e-8])
 
@@ -147,7 +149,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
     assert flight.name == tmp_path.name
     assert flight.frames_folder == tmp_path / "frames"
     assert flight.times_file is None
-    assert (flight.crs, flight.vehicle, flight.reference_file) == (None, None, None)
+    assert (flight.crs, flight.vehicle, flight.reference) == (None, None, None)
     (tmp_path / "frames.csv").touch()
     assert read_flight(folder).times_file == tmp_path / "frames.csv"
 
@@ -198,9 +200,9 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ("scale = 0.2", "scale = 0.6", "A-inner scale: 0.6 is out of range"),
         ("sd_time_s = 0.001", "sd_time_s = -1", r"\[vehicle\] sd_time_s: -1 s is out of range"),
         ("0.01, 0.01, 0.02", "0, 0, -1", "post sd_position_m: is negative"),
-        ("position_m = [346937.1, 4582508.6, 122]\n", "", "sd_position_m: stands without"),
+        ("position_m = [346937.1, 4582508.6, 122]\n", "", "sd_position_m: needs position_m"),
         ("sd_fx = 0.5", "sd_fx = -0.5", r"\[camera\] sd_fx: -0.5 is out of range; give"),
-        ("sd_fx = 0.5", "cov = [1]", r"\[camera\] sd_k6: stands beside cov; delete"),
+        ("sd_fx = 0.5", "cov = [1]", r"\[camera\] sd_k6: is given beside cov; delete"),
         ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]", r"\[camera\] cov_of: is missing; give"),
         ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov_of = ["fx"]', r"\[camera\] cov: is missing; give"),
         ("sd_fx = 0.5\nsd_k6 = 2e-4", "cov = [1]\ncov_of = [1]", "cov_of: is a number; give a"),
@@ -209,7 +211,7 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         ("sd_fx = 0.5\nsd_k6 = 2e-4", 'cov = [-1]\ncov_of = ["fx"]', "cov: is not a covariance"),
         ("plumb_sd_deg = 8", "plumb_sd_deg = 80", r"\[camera\] plumb_sd_deg: 80 deg is out of"),
         ("level_sd_deg = 1.5", "level_sd_deg = 0", r"\[vehicle\] level_sd_deg: 0 deg is out of"),
-        ("level_sd_deg = 1.5\n", "", r"plumb_sd_deg: stands without \[vehicle\] level_sd_deg;"),
+        ("level_sd_deg = 1.5\n", "", r"plumb_sd_deg: needs \[vehicle\] level_sd_deg;"),
         # targets that do not go together
         ("[10, 80, 150, 250, 290]", "[30, 73, 108, 210]", "'A' and 'A-inner' are rotations"),
         ('name = "post"', 'name = "A"', "name: 'A' is the name of two targets"),
@@ -218,9 +220,13 @@ def test_what_may_be_left_out_has_the_folder_s_defaults(tmp_path: Path, write: W
         # files
         ('"pictures"', '"photos"', r"\[frames\] folder: 'photos' is not a folder; create"),
         ('"times.csv"', '"time.csv"', r"\[frames\] times: 'time.csv' does not exist; create"),
+        ('"times.csv"', '"pictures"', r"times: 'pictures' is not a regular file; name a file"),
         # syntax
         ("[reference]", "[reference", r"is not TOML: .*line 57.*; correct that line"),
         ("fy = 2304\n", "fy = 2304\nfx = 1\n", "is not TOML: .*line 13"),
+        ("fy = 2304\n", "fy = 2304,0\n", "is not TOML: .*line 12.*; .* decimals take a point"),
+        ("[reference]", "[vehicle]\n[reference]", "is not TOML: .*twice.*; name each table once"),
+        ('"car.csv"', r'"data\car.csv"', "is not TOML: .*; write / instead of"),
     ],
 )  # fmt: skip
 def test_a_bad_value_is_one_line_with_file_key_and_remedy(
@@ -233,6 +239,13 @@ def test_a_bad_value_is_one_line_with_file_key_and_remedy(
     assert text.startswith(f"{folder / 'flight.toml'}: ")
     assert "\n" not in text
     assert ";" in text, "the remedy follows a semicolon"
+
+
+def test_a_calibration_file_is_a_file(write: Write) -> None:
+    inline = FLIGHT[FLIGHT.index("[camera]") : FLIGHT.index("[[target]]")]
+    folder = write(FLIGHT.replace(inline, '[camera]\nfile = "pictures"\n\n', 1))
+    with pytest.raises(KgcpError, match=r"\[camera\] file: 'pictures' is not a regular file; name"):
+        read_flight(folder)
 
 
 def test_a_flight_needs_a_target(write: Write) -> None:
@@ -284,5 +297,5 @@ def test_numbers_survive_the_file(
     flight = read_flight(write(text))
     assert flight.vehicle is not None
     assert (flight.camera.fx, flight.camera.k1) == (fx, k1)
-    assert flight.vehicle.lever_arm_m == lever_m
+    assert flight.vehicle.settings.lever_arm_m == lever_m
     assert flight.targets[0].ring.code_deg == tuple(code)

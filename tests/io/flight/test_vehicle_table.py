@@ -10,8 +10,7 @@ from kgcp.errors import KgcpError
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import Vehicle, read_vehicle
-from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation
-from kgcp.io.formats.trajectories.records import Wander
+from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
 
 NEEDED = 'trajectory = "v.out"\nlever_arm_m = [1, 2, 3]\n'
 
@@ -38,7 +37,7 @@ def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
     )
     assert vehicle is not None
     assert vehicle.notation == TrajectoryNotation(
-        format=TrajectoryFormat.SBET,
+        format="sbet",
         crs="EPSG:7912",
         time_system=TimeSystem.GPS,
         first_day=date(2026, 5, 4),
@@ -51,11 +50,11 @@ def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ('format = "SBET"', 'format: \'SBET\' is not known; give one of "csv", "sbet"'),
+        ('format = "SBET"', 'format: \'SBET\' is not known; give one of "sbet", "rtklib"'),
         ('time_system = "local"', 'give one of "gps", "utc"'),
-        ('date = "4.5.2026"', "date: '4.5.2026' is no date; give it as 2026-05-04"),
-        ("date = 2026-05-04T09:30:00Z", "is no date"),
-        ("date = 20260504", "is no date"),
+        ('date = "4.5.2026"', "date: '4.5.2026' is not a date; give it as 2026-05-04"),
+        ("date = 2026-05-04T09:30:00Z", "is not a date"),
+        ("date = 20260504", "is not a date"),
         ('attitude = "course"', "sd_attitude_deg: is missing"),
         ("sd_attitude_deg = [2, 2, 3]", "attitude: is missing"),
         ('attitude = "level"\nsd_attitude_deg = [2, 2, 3]', "attitude: 'level' is not known"),
@@ -70,3 +69,10 @@ def test_what_is_wrong_is_named_by_its_key(tmp_path: Path, lines: str, words: st
     assert message.startswith("flight.toml: [vehicle] ")
     assert words in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("line", ["", "lever_arm_m = 3", "lever_arm_m = [1, 2]"])
+def test_a_lever_arm_is_asked_for_by_its_axes(line: str) -> None:
+    values = tomllib.loads(f'[vehicle]\ntrajectory = "v.out"\n{line}')
+    with pytest.raises(KgcpError, match=r"lever_arm_m: .*; give .*\[forward, right, down\]"):
+        read_vehicle(TomlTable("flight.toml:", values, ("vehicle",)), Path())

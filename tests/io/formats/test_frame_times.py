@@ -8,7 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from kgcp.errors import KgcpError
-from kgcp.io.formats.frame_times import TimesFormat, read_times, recognise
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.frame_times import FORMATS, read_times
 
 # The third line is that of the format's description, of Thursday 2023-06-01. V is positive down.
 TAIL = (
@@ -27,6 +28,10 @@ def write(folder: Path, *lines: str, name: str = "DJI_Timestamp.MRK") -> Path:
     path = folder / name
     path.write_bytes("\r\n".join(lines).encode())
     return path
+
+
+def recognised(path: Path) -> str:
+    return FORMATS.recognised(ForeignFile(path, "[frames] times"))
 
 
 def test_marks_are_gps_times_joined_by_number(tmp_path: Path) -> None:
@@ -81,7 +86,7 @@ def test_marks_go_over_saturday_midnight(tmp_path: Path, week: str) -> None:
     ("lines", "words"),
     [
         ((MARKS[0], "2\t400372.4"), "line 2: does not begin with number, GPS seconds"),
-        ((MARKS[0], "", MARKS[0]), "line 3: number 1 stands in line 1, too"),
+        ((MARKS[0], "", MARKS[0]), "line 3: number 1 stands in line 1 too"),
         ((MARKS[0].replace("1\t", "7\t", 1),), "none of its 1 numbers is the last number"),
     ],
 )
@@ -123,21 +128,21 @@ def test_a_lost_event_leaves_no_guess(tmp_path: Path) -> None:
 
 def test_formats_are_recognised_or_named(tmp_path: Path) -> None:
     table = write(tmp_path, "frame,time", "a.jpg,2.5", name="frames.csv")
-    assert recognise(table) is TimesFormat.CSV
+    assert recognised(table) == "csv"
     assert read_times(table, ["a.jpg"]) == {"a.jpg": 2.5}
     marks = write(tmp_path, *MARKS, name="times.txt")
-    assert recognise(marks) is TimesFormat.MRK
-    assert recognise(write(tmp_path, *HEADER, name="e.txt")) is TimesFormat.RTKLIB
+    assert recognised(marks) == "mrk"
+    assert recognised(write(tmp_path, *HEADER, name="e.txt")) == "rtklib"
     with pytest.raises(KgcpError, match=r"frames\.csv, line 1: does not begin with number"):
-        read_times(table, ["a.jpg"], TimesFormat.MRK)
+        read_times(table, ["a.jpg"], "mrk")
     with pytest.raises(KgcpError, match=r"times\.txt: lacks the header line"):
-        read_times(marks, FRAMES, TimesFormat.RTKLIB)
-    with pytest.raises(KgcpError, match=r"times\.txt: has no column frame and time"):
-        read_times(marks, FRAMES, TimesFormat.CSV)
+        read_times(marks, FRAMES, "rtklib")
+    with pytest.raises(KgcpError, match=r"times\.txt, line 1: lacks the columns frame, time"):
+        read_times(marks, FRAMES, "csv")
     with pytest.raises(KgcpError, match=r"gone: does not exist; .*\[frames\] times"):
         read_times(tmp_path / "gone", FRAMES)
     with pytest.raises(KgcpError, match=r"gone: does not exist; .*\[frames\] times"):
-        read_times(tmp_path / "gone", FRAMES, TimesFormat.MRK)
+        read_times(tmp_path / "gone", FRAMES, "mrk")
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
@@ -156,3 +161,39 @@ def test_written_marks_read_back(tmp_path: Path, seconds: list[int]) -> None:
     week_s = datetime(2023, 5, 28, tzinfo=UTC).timestamp() - 18.0
     for frame, micro in zip(frames, seconds, strict=True):
         assert times[frame] == pytest.approx(week_s + micro * 1e-6, abs=1e-6)
+
+
+def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "\ufeffframe,note,time",
+        "a.jpg,,1970-01-01T00:00:01.5Z",
+        "",
+        '"b,c\\d.jpg","x, y",2.25',
+        name="frames.csv",
+    )
+    assert read_times(path, ()) == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "frames.csv: is empty; its first line must name frame, time"),
+        ("frame;time\na.jpg;1\n", "line 1: its cells are separated by ';'; save it with commas"),
+        ("frame,when\na.jpg,1\n", "line 1: lacks the columns time"),
+        ("frame,time\na.jpg,1\na.jpg,2\n", r"line 3: frame 'a.jpg' stands in line 2 too"),
+        ("frame,time\na.jpg\n", "line 2: has 1 cells, the first line has 2"),
+        ("frame,time\n,1\n", "line 2: names no frame"),
+        ("frame,time\na.jpg,\n", "line 2: time: '' is not a time"),
+        ("frame,time\na.jpg,2026-05-04T09:30:05\n", "line 2: .* no time zone"),
+        (b"frame,time\n\xe9.jpg,1\n", "is not text in UTF-8"),
+    ],
+)
+def test_a_bad_table_is_an_error_with_its_line(
+    tmp_path: Path, content: str | bytes, words: str
+) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(KgcpError, match=words) as caught:
+        read_times(path, ())
+    assert "\n" not in str(caught.value)

@@ -14,7 +14,7 @@ from PIL import Image
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.io.images.frames import list_frames, read_frame_times, read_grey
+from kgcp.io.images.frames import list_frames, read_grey
 
 WIDTH, HEIGHT = 320, 200
 CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=400.0, fy=401.0, cx=160.0, cy=99.0)
@@ -196,44 +196,3 @@ except Rejection as rejection:
         caught = rejection(path)
         assert caught.reason is Reason.WRONG_SIZE
         assert caught.detail == f"{shape[1]} x {shape[0]} px, the camera has {WIDTH} x {HEIGHT}"
-
-
-class TestFrameTimes:
-    def write(self, folder: Path, content: str | bytes) -> Path:
-        path = folder / "frames.csv"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    def test_reads_both_notations_and_passes_over_the_rest(self, tmp_path: Path) -> None:
-        path = self.write(
-            tmp_path,
-            "\ufeffframe,note,time\r\n"
-            "a.jpg,,1970-01-01T00:00:01.5Z\r\n"
-            '\r\n"b,c\\d.jpg","x, y",2.25\r\n',
-        )
-        assert read_frame_times(path) == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
-
-    @pytest.mark.parametrize(
-        ("content", "words"),
-        [
-            ("", "frames.csv: has no column frame and time"),
-            ("frame;time\na.jpg;1\n", "has no column frame and time"),
-            ("frame,when\na.jpg,1\n", "has no column time"),
-            ("frame,time\na.jpg,1\na.jpg,2\n", r"frames.csv:3: frame 'a.jpg' is named a second"),
-            ("frame,time\na.jpg\n", r"frames.csv:2: lacks a frame or a time"),
-            ("frame,time\n,1\n", r"frames.csv:2: lacks a frame or a time"),
-            ("frame,time\na.jpg,\n", r"frames.csv:2: time: '' is not a time"),
-            ("frame,time\na.jpg,2026-05-04T09:30:05\n", r"frames.csv:2: .* no time zone"),
-            (b"frame,time\n\xe9.jpg,1\n", "no text in UTF-8"),
-        ],
-    )
-    def test_a_bad_file_is_an_error_with_its_line(
-        self, tmp_path: Path, content: str | bytes, words: str
-    ) -> None:
-        with pytest.raises(KgcpError, match=words) as caught:
-            read_frame_times(self.write(tmp_path, content))
-        assert "\n" not in str(caught.value)
-
-    def test_a_missing_file_is_an_error(self, tmp_path: Path) -> None:
-        with pytest.raises(KgcpError, match=r"does not exist; .* \[frames\] times"):
-            read_frame_times(tmp_path / "frames.csv")

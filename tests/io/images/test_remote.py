@@ -165,7 +165,7 @@ def test_no_name_leads_out_of_a_folder(bucket: FileSystem, endpoint: str, query:
     assert bucket is not None
     client = boto3.client("s3", endpoint_url=f"http://{endpoint}", region_name="us-east-1")
     client.put_object(Bucket="flights", Key="bad/frames/..\\..\\out.png", Body=b"")
-    with pytest.raises(KgcpError, match="is no path below it; rename the object"):
+    with pytest.raises(KgcpError, match="is not a path below it; rename the object"):
         frames_below(StoredFolder(f"s3://flights/bad{query}", "frames"))
     client.put_object(
         Bucket="flights", Key="out/flight.toml", Body=b'[frames]\nfolder = "../one/frames"'
@@ -180,7 +180,7 @@ def test_no_name_leads_out_of_a_folder(bucket: FileSystem, endpoint: str, query:
     [
         ("s3://flights/two{query}", "s3://flights/two/flight.toml: does not exist; correct the"),
         ("s3://flights/one?zone=3", "s3://flights/one: Unexpected query parameter in S3 URI"),
-        ("ftp://flights/one", "ftp://flights/one: is no place that kgcp knows; give a folder"),
+        ("ftp://flights/one", "ftp://flights/one: unsupported location; use a folder"),
     ],
 )
 @pytest.mark.usefixtures("bucket")

@@ -6,27 +6,30 @@ the cameras in it, and has one line in `FORMATS`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from importlib import import_module
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 
 from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.calibrations import colmap, dji, metashape, opencv, opensfm, opf, pix4d, ros
 from kgcp.io.formats.calibrations.entry import Entry
+from kgcp.io.formats.registry import Registry
 
-FORMATS: Mapping[str, str] = {
-    "opf": "kgcp.io.formats.calibrations.opf",
-    "opensfm": "kgcp.io.formats.calibrations.opensfm",
-    "metashape": "kgcp.io.formats.calibrations.metashape",
-    "dji": "kgcp.io.formats.calibrations.dji",
-    "pix4d": "kgcp.io.formats.calibrations.pix4d",
-    "colmap": "kgcp.io.formats.calibrations.colmap",
-    "opencv": "kgcp.io.formats.calibrations.opencv",
-    "ros": "kgcp.io.formats.calibrations.ros",
-}
-"""Name in flight.toml → module, in the order in which they are tried."""
+FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
+    "a calibration",
+    "convert it or write the values to [camera]",
+    {
+        "opf": (opf.matches, opf.entries),
+        "opensfm": (opensfm.matches, opensfm.entries),
+        "metashape": (metashape.matches, metashape.entries),
+        "dji": (dji.matches, dji.entries),
+        "pix4d": (pix4d.matches, pix4d.entries),
+        "colmap": (colmap.matches, colmap.entries),
+        "opencv": (opencv.matches, opencv.entries),
+        "ros": (ros.matches, ros.entries),
+    },
+)
 
 
 def read_calibration(
@@ -35,17 +38,15 @@ def read_calibration(
     form: str | None = None,
     camera: str | None = None,
 ) -> Camera:
-    """Read a calibration file.
+    """Read a calibration file of one of the `FORMATS`; docs/conventions.md has their conversions.
 
     Parameters
     ----------
-    path : Path
-        A file of one of the `FORMATS`; docs/conventions.md has their conversions.
     stated_size : tuple of int or None
         Width and height [px] that flight.toml gives beside the file: needed where the file is
         silent, else they must agree.
     form : str or None
-        One of `FORMATS`; None: the content tells.
+        Name of the format; None: the content tells.
     camera : str or None
         Name of the camera where the file has several.
 
@@ -55,9 +56,8 @@ def read_calibration(
         If the file is missing, is of no known format, lacks the size or the camera, or holds a
         model that `Camera` cannot represent exactly; it names the term.
     """
-    file = ForeignFile.read(path, "[camera] file")
-    entries = _module(file, form).entries(file)
-    entry = _chosen(file, entries, camera)
+    file = ForeignFile(path, "[camera] file")
+    entry = _chosen(file, FORMATS.reader(file, form)(file), camera)
     width, height = _agreed_size(file, entry, stated_size)
     try:
         return entry.convert(width, height)
@@ -65,36 +65,20 @@ def read_calibration(
         raise KgcpError(f"{path}: {error}") from None
 
 
-def _module(file: ForeignFile, form: str | None) -> ModuleType:
-    if form is not None:
-        return import_module(FORMATS[form])
-    for name in FORMATS.values():
-        module = import_module(name)
-        if module.matches(file):
-            return module
-    raise file.error(
-        "",
-        f"is no calibration of a known format ({', '.join(sorted(FORMATS))})",
-        "convert it or write the values to [camera]",
-    )
-
-
 def _chosen(file: ForeignFile, entries: Sequence[Entry], camera: str | None) -> Entry:
     """Return the camera of that name, or the only one."""
     if not entries:
-        raise file.error("", "holds no camera", "export the calibration again")
+        raise file.error("holds no camera", "export the calibration again")
     names = list(dict.fromkeys(entry.name for entry in entries))
     if camera is None:
         if len(entries) == 1:
             return entries[0]
-        raise file.error(
-            "", f"holds the cameras {_listed(names)}", "choose one with [camera] camera"
-        )
+        raise file.error(f"holds the cameras {_listed(names)}", "choose one with [camera] camera")
     chosen = [entry for entry in entries if entry.name == camera]
     if len(chosen) != 1:
         count = "several cameras" if chosen else "no camera"
         raise file.error(
-            "", f"holds {count} {camera!r}, but {_listed(names)}", "correct [camera] camera"
+            f"holds {count} {camera!r}, but {_listed(names)}", "correct [camera] camera"
         )
     return chosen[0]
 
@@ -110,15 +94,14 @@ def _agreed_size(
     width, height = stated
     if entry.size is None:
         if width is None or height is None:
-            raise file.error("", "has no image size", "add width and height to [camera]")
+            raise file.error("has no image size", "add width and height to [camera]")
         return width, height
     found_width, found_height = entry.size
     if min(entry.size) < 1:
-        raise file.error("", f"is for {found_width} x {found_height} px", "export it again")
+        raise file.error(f"is for {found_width} x {found_height} px")
     size = (width or found_width, height or found_height)
     if size != entry.size and not (entry.is_relative and _same_shape(size, entry.size)):
         raise file.error(
-            "",
             f"is for {found_width} x {found_height} px, but [camera] says {size[0]} x {size[1]}",
             "use the calibration of this frame size",
         )

@@ -25,7 +25,7 @@ _LINE = re.compile(r"\d+\s+[A-Z][A-Z_0-9]+\s+\d{1,9}\s+\d{1,9}(\s+\S+)+")
 
 
 def matches(file: ForeignFile) -> bool:
-    """Whether the first line that is no comment describes a camera."""
+    """Whether the first line that is not a comment describes a camera."""
     rows = file.rows
     return bool(rows) and _LINE.fullmatch(rows[0][1]) is not None
 
@@ -43,7 +43,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
 
 def _entry(file: ForeignFile, line: int, row: str) -> Entry:
     if _LINE.fullmatch(row) is None:
-        raise file.error(
+        raise file.error_at(
             f"line {line}", "is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS", "repair the line"
         )
     name, model, width, height, *params = row.split()

@@ -31,15 +31,14 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If there are no nine numbers, or the image is dewarped already.
+        If there are not nine numbers, or the image is dewarped already.
     """
     found = _TAG.search(file.text) or _BARE.fullmatch(file.text.strip())
     if found is None:
-        raise file.error("", "has no DewarpData", "name an image as the camera wrote it")
+        raise file.error("has no DewarpData", "name an image as the camera wrote it")
     flag = _FLAG.search(file.text)
     if flag is not None and flag[1].strip("0"):
         raise file.error(
-            "",
             "is dewarped already (DewarpFlag), so that its DewarpData describes another image",
             "switch dewarping off in the camera, or calibrate these images",
         )
@@ -55,6 +54,6 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
 
 
 def _image_size(file: ForeignFile) -> tuple[int, int] | None:
-    """Return width and height of the image [px]; None where the file is none."""
+    """Return width and height of the image [px]; None where the file is not an image."""
     with file.path.open("rb") as stream:
         return image_size(stream)

@@ -59,9 +59,9 @@ def camera_of(width: int, height: int, values: Mapping[str, float]) -> Camera:
 
 def unsupported(file: ForeignFile, where: str, term: str) -> KgcpError:
     """Return the error for a model, or a term of it, that `Camera` cannot represent."""
-    return file.error(
+    return file.error_at(
         where,
-        f"has {term}, which kgcp has not",
+        f"has {term}, which kgcp does not support",
         "calibrate with OpenCV's k1 k2 p1 p2 k3 or rational model",
     )
 

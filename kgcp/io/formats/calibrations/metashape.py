@@ -40,10 +40,10 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If the file is no XML.
+        If the file is not XML.
     """
     if file.root is None:
-        raise file.error("", "is no XML", "export it from Metashape again")
+        raise file.error("is not XML", "export it from Metashape again")
     if file.root.tag == "calibration":
         return (_entry(file, "", file.root),)
     found: list[Entry] = []
@@ -84,7 +84,7 @@ def _camera(file: ForeignFile, where: str, element: Element, width: int, height:
         return 0.0 if text is None else file.numbers(text, 1, f"{where} {key}")[0]
 
     if element.find("f") is None:
-        raise file.error(
+        raise file.error_at(
             where, "has no <f>, as in files of old PhotoScan", "export it from Metashape again"
         )
     refuse_terms(

@@ -33,7 +33,7 @@ _WIDTH_KEYS = ("imagewidth", "width")
 _HEIGHT_KEYS = ("imageheight", "height")
 
 _MOST_NUMBERS = 100  # in a matrix
-_PROBLEM, _REMEDY = "is no OpenCV FileStorage of a camera", "write it again with OpenCV"
+_PROBLEM, _REMEDY = "is not an OpenCV FileStorage of a camera", "write it again with OpenCV"
 
 # Numbers of coefficients that OpenCV writes for its models; beyond 8 they must be zero.
 _COUNTS = (0, 4, 5, 8, 12, 14)
@@ -60,11 +60,11 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         coefficients = _matrix(nodes, _DISTORTION_KEYS)
         width, height = _number(nodes, _WIDTH_KEYS), _number(nodes, _HEIGHT_KEYS)
     except (TypeError, ValueError, LookupError, OverflowError) as error:
-        raise file.error("", _PROBLEM, _REMEDY) from error
+        raise file.error(_PROBLEM, _REMEDY) from error
     if is_fisheye:
         raise unsupported(file, "", "a fisheye model")
     if matrix is None:
-        raise file.error("", "has no camera_matrix", "add it or write the values to [camera]")
+        raise file.error("has no camera_matrix", "add it or write the values to [camera]")
     size = (int(width), int(height)) if width and height else None
     flat = [] if coefficients is None else [value for row in coefficients for value in row]
     return (matrix_entry(file, "", size, matrix, flat),)
@@ -83,9 +83,9 @@ def _nodes(file: ForeignFile) -> Mapping[object, object]:
     try:
         nodes = load_yaml(rest if head.startswith("%YAML") else file.text)
     except ValueError as error:
-        raise file.error("", f"{_PROBLEM} ({error})", _REMEDY) from error
+        raise file.error(f"{_PROBLEM} ({error})", _REMEDY) from error
     if not isinstance(nodes, dict):
-        raise file.error("", _PROBLEM, _REMEDY)
+        raise file.error(_PROBLEM, _REMEDY)
     return nodes
 
 
@@ -106,7 +106,7 @@ def matrix_entry(
     Raises
     ------
     KgcpError
-        If it is no pinhole camera with Brown-Conrady distortion.
+        If it is not a pinhole camera with Brown-Conrady distortion.
     """
     _check_model(file, matrix, coefficients)
     padding = [0.0] * (8 - len(coefficients))
@@ -150,10 +150,10 @@ def _check_model(
     file: ForeignFile, matrix: Sequence[Sequence[float]], coefficients: Sequence[float]
 ) -> None:
     if [len(row) for row in matrix] != [3, 3, 3]:
-        raise file.error("", "the camera matrix is not 3 x 3", "calibrate again")
+        raise file.error("the camera matrix is not 3 x 3", "calibrate again")
     (_, skew, _), (zero, *_), last = matrix
     if [zero, *last] != [0.0, 0.0, 0.0, 1.0]:
-        raise file.error("", "the camera matrix is none of a pinhole camera", "calibrate again")
+        raise file.error("the camera matrix is not that of a pinhole camera", "calibrate again")
     if skew:
         raise unsupported(file, "", f"a skew of {skew:g}")
     if len(coefficients) not in _COUNTS:

@@ -39,7 +39,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If the file is no such JSON.
+        If the file is not such JSON.
     """
     if isinstance(file.document, list):
         parts = [JsonObject.of(file, f"[{i}]", v) for i, v in enumerate(file.document)]

@@ -26,7 +26,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If the file is no such JSON.
+        If the file is not such JSON.
     """
     sensors = JsonObject.of(file, "", file.document).children("sensors")
     return tuple(

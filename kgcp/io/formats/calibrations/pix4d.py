@@ -52,7 +52,7 @@ def _image_entries(file: ForeignFile) -> tuple[Entry, ...]:
     rows = file.rows[head + 1 :]
     if head < 0 or not rows or len(rows) % _BLOCK_LINES:
         raise file.error(
-            "", "is not made of blocks of ten lines per image", "export it from Pix4D again"
+            "is not made of blocks of ten lines per image", "export it from Pix4D again"
         )
     found: dict[tuple[tuple[int, int], _Parameters], str] = {}
     for start in range(0, len(rows), _BLOCK_LINES):
@@ -84,10 +84,10 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
     where = f"camera {name!r}"
     sensor = _SENSOR.search(block)
     if sensor is None:
-        raise file.error(where, "does not say its sensor width", "export it from Pix4D again")
+        raise file.error_at(where, "does not say its sensor width", "export it from Pix4D again")
     width_mm, height_mm = file.numbers(f"{sensor[1]} {sensor[2]}", 2, where)
     if min(width_mm, height_mm) <= 0.0:
-        raise file.error(where, "has a sensor of no size", "export it from Pix4D again")
+        raise file.error_at(where, "has a sensor of zero size", "export it from Pix4D again")
     values = dict(re.findall(r"^[^\S\n]*([A-Z]\w*)[^\S\n]+(\S+)[^\S\n]*$", block, re.MULTILINE))
 
     def number(key: str) -> float:
@@ -97,7 +97,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
         """Return it for frames of this size [px]."""
         per_mm = width / width_mm
         if abs(height - per_mm * height_mm) > 1.0:
-            raise file.error(
+            raise file.error_at(
                 where,
                 f"has a sensor of {width_mm:g} x {height_mm:g} mm, which is not of the shape of"
                 f" {width} x {height} px",

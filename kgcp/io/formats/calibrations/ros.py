@@ -25,7 +25,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     Raises
     ------
     KgcpError
-        If it is no camera_info, or of a model that `Camera` has not.
+        If it is not a camera_info, or its model is not one of `Camera`.
     """
     try:
         info = load_yaml(file.text)
@@ -36,7 +36,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         flat = [float(value) for value in info["camera_matrix"]["data"]]
         coefficients = [float(value) for value in info["distortion_coefficients"]["data"]]
     except (LookupError, TypeError, ValueError, OverflowError) as error:
-        raise file.error("", f"is no camera_info of ROS ({error})", "write it again") from error
+        raise file.error(f"is not a camera_info of ROS ({error})", "write it again") from error
     if model not in _MODELS:
         raise unsupported(file, "", f"the distortion model {reprlib.repr(model)}")
     return (

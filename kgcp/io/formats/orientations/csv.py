@@ -5,7 +5,7 @@ from __future__ import annotations
 from kgcp.geometry.attitude import rotation_from_opk
 from kgcp.io.files.csv_columns import read_csv_columns
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.orientations.source import SourcePoses
+from kgcp.io.formats.orientations.records import SourcePoses
 
 _POSITION = ("x", "y", "z")
 _ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
@@ -15,8 +15,7 @@ _SD_ANGLE = ("sd_angle_deg",)
 
 def matches(file: ForeignFile) -> bool:
     """Whether the first line names columns."""
-    first = next((line for line in file.text.splitlines() if line.strip()), "")
-    return "," in first and file.document is None and file.root is None
+    return "," in file.first_line and file.document is None and file.root is None
 
 
 def poses(file: ForeignFile) -> SourcePoses:
@@ -31,21 +30,15 @@ def poses(file: ForeignFile) -> SourcePoses:
         Naming the line: missing columns, values that are not finite, a frame twice.
     """
     columns = read_csv_columns(
-        file.path, "frame", (*_POSITION, *_ANGLES), (*_SD_POSITION, *_SD_ANGLE), "[reference] poses"
+        file.path,
+        ("frame",),
+        (*_POSITION, *_ANGLES),
+        (*_SD_POSITION, *_SD_ANGLE),
+        file.toml_key,
     )
-    frames = tuple(key.replace("\\", "/") for key in columns.keys)
-    first_lines: dict[str, int] = {}
-    for line, frame in zip(columns.lines, frames, strict=True):
-        if frame in first_lines:
-            raise file.error(
-                f"line {line}",
-                f"frame {frame!r} stands in line {first_lines[frame]} too",
-                "keep one of them",
-            )
-        first_lines[frame] = line
     sd_angle = columns.deviations(_SD_ANGLE)
     return SourcePoses(
-        names=frames,
+        names=columns.frames(),
         position=columns.block(_POSITION),
         frame_from_photo=rotation_from_opk(columns.block(_ANGLES)),
         sd_position_m=columns.deviations(_SD_POSITION),

@@ -13,8 +13,12 @@ from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
 from kgcp.georef.crs import FARTHEST, FLIGHT_TOML, geographic_of, parse_crs
 from kgcp.georef.local_frame import MapChange, MapFrame
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.orientations.notation import PoseNotation
-from kgcp.io.formats.orientations.source import SourcePoses, from_geocentric, from_level
+from kgcp.io.formats.orientations.records import (
+    PoseNotation,
+    SourcePoses,
+    from_geocentric,
+    from_level,
+)
 
 REFERENCE_CRS = "flight.toml: [reference] crs"
 _REMEDY = "align it to a map and give [reference] crs, that of its coordinates"
@@ -45,9 +49,9 @@ def on_the_map(
     Raises
     ------
     KgcpError
-        If nothing says of which map the coordinates are, flight.toml says so of a file that says
-        it itself, no exact way leads from there to the flight's CRS, or a pose comes to lie far
-        from the Earth's surface.
+        If the coordinates are in no known map, flight.toml names one for a file that names
+        its own, no exact way leads from there to the flight's CRS, or a pose lies far from
+        the Earth's surface.
     """
     placed = _placed(file, _shifted(file, source, notation), notation.crs)
     if placed.crs is not None and not _is_same(placed.crs, crs):
@@ -55,9 +59,9 @@ def on_the_map(
         placed = _moved(file, placed, MapFrame.at(placed.crs, placed.position[0], where), crs)
     high = np.flatnonzero(np.abs(placed.position[:, 2]) > FARTHEST)
     if high.size:
-        raise file.error(
+        raise file.error_at(
             f"pose of {source.names[high[0]]!r}",
-            f"comes to lie at a height of {placed.position[high[0], 2]:.0f}",
+            f"has a height of {placed.position[high[0], 2]:.0f}",
             "correct [reference] crs, that of the file's coordinates",
         )
     return ReferencePoses(
@@ -73,9 +77,12 @@ def _shifted(file: ForeignFile, source: SourcePoses, notation: PoseNotation) -> 
     if notation.offset_file is None:
         return source
     if source.crs is not None:
-        raise file.error("", "says itself where it is", "delete [reference] offset")
+        raise file.error("is georeferenced already", "delete [reference] offset")
     if notation.crs is None and (source.level or source.unreferenced):
-        raise file.error("", "is in no map to which an offset leads", "give [reference] crs, too")
+        raise file.error(
+            "is not in map coordinates, to which an offset could lead",
+            "give [reference] crs as well",
+        )
     return replace(source, position=source.position + read_offset(notation.offset_file))
 
 
@@ -87,14 +94,14 @@ def read_offset(path: Path) -> FloatArray:
     Raises
     ------
     KgcpError
-        If there is no such line.
+        If there is none.
     """
-    file = ForeignFile.read(path, "[reference] offset")
+    file = ForeignFile(path, "[reference] offset")
     for _, row in file.rows:
         words = row.replace(",", " ").split()
         if len(words) in (2, 3) and all(map(_is_number, words)):
             return np.array([*map(float, words), 0.0][:3])
-    raise file.error("", "has no line of two or three numbers", "give the project's offset file")
+    raise file.error("has no line of two or three numbers", "give the project's offset file")
 
 
 def _is_number(word: str) -> bool:
@@ -108,10 +115,10 @@ def _placed(file: ForeignFile, source: SourcePoses, stated: str | None) -> Sourc
     """Return the poses with the CRS of their coordinates; None: the flight's."""
     if stated is not None:
         if source.crs is not None:
-            raise file.error("", "says itself of which CRS it is", "delete [reference] crs")
+            raise file.error("names its CRS already", "delete [reference] crs")
         return _stated(source, stated)
     if source.unreferenced is not None and source.crs is None:
-        raise file.error("", source.unreferenced, _REMEDY)
+        raise file.error(source.unreferenced, _REMEDY)
     if source.level is not None:
         return from_level(source.names, source.position, source.frame_from_photo, source.level)
     return source
@@ -143,7 +150,6 @@ def _moved(file: ForeignFile, source: SourcePoses, here: MapFrame, crs: str | No
     """Bring poses from their map, that of `here`, to the flight's."""
     if crs is None:
         raise file.error(
-            "",
             "has coordinates of its own CRS, but flight.toml has none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )

@@ -16,12 +16,12 @@ import numpy as np
 from pyproj.exceptions import CRSError
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO
 from kgcp.georef.crs import crs_of
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.orientations.source import (
+from kgcp.io.formats.orientations.records import (
     SourcePoses,
     from_geocentric,
-    photo_rotation,
     require_rotation,
 )
 
@@ -44,26 +44,47 @@ def poses(file: ForeignFile) -> SourcePoses:
     Raises
     ------
     KgcpError
-        If the file is no such XML, has several chunks, or numbers are missing.
+        If the file is not such XML, has several chunks, or numbers are missing.
     """
     chunks = [] if file.root is None else file.root.findall("chunk")
     if len(chunks) != 1:
-        raise file.error("", f"holds {len(chunks)} chunks instead of one", "export one chunk")
-    worlds = _Worlds.of(file, chunks[0])
-    aligned = [
-        (camera, matrix)
-        for camera in chunks[0].iterfind("cameras//camera")
-        if (matrix := camera.findtext("transform")) is not None
-    ]
-    names = tuple(camera.get("label") or "" for camera, _ in aligned)
-    placed = [worlds.place(camera, matrix) for camera, matrix in aligned]
-    position = np.array([position for position, _ in placed]).reshape(-1, 3)
-    rotation = np.array([rotation for _, rotation in placed]).reshape(-1, 3, 3)
-    geodetic = _geodetic(file, chunks[0])
-    if all(worlds.is_referenced(camera) for camera, _ in aligned) and geodetic is not None:
-        return from_geocentric(names, position, rotation, geodetic)
-    why = "is in local coordinates" if geodetic is None else "has cameras in chunks of no reference"
-    return SourcePoses(names, position, rotation, unreferenced=why)
+        raise file.error(f"holds {len(chunks)} chunks instead of one", "export one chunk")
+    chunk = chunks[0]
+    chunk_to_world = _similarity(file, chunk)
+    to_world = {
+        component.get("id", ""): _similarity(file, component) or chunk_to_world
+        for component in chunk.iterfind("components/component")
+    }
+    names, centres, rotations = [], [], []
+    is_in_world = True
+    for camera in chunk.iterfind("cameras//camera"):
+        text = camera.findtext("transform")
+        if text is None:
+            continue
+        where = f"camera {camera.get('label')!r}"
+        matrix = np.array(file.numbers(text, 16, f"{where} transform")).reshape(4, 4)
+        require_rotation(file, where, matrix[:3, :3])
+        centre, rotation = matrix[:3, 3], matrix[:3, :3] @ CAMERA_FROM_PHOTO
+        way = to_world.get(camera.get("component_id", ""), chunk_to_world)
+        if way is None:
+            is_in_world = False
+        else:
+            centre = way.scale * way.rotation @ centre + way.translation
+            rotation = way.rotation @ rotation
+        names.append(camera.get("label") or "")
+        centres.append(centre)
+        rotations.append(rotation)
+    position = np.array(centres).reshape(-1, 3)
+    frame_from_photo = np.array(rotations).reshape(-1, 3, 3)
+    geodetic = _geodetic(file, chunk)
+    if is_in_world and geodetic is not None:
+        return from_geocentric(tuple(names), position, frame_from_photo, geodetic)
+    why = (
+        "is in local coordinates"
+        if geodetic is None
+        else "has cameras without a transform to the world"
+    )
+    return SourcePoses(tuple(names), position, frame_from_photo, unreferenced=why)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,50 +96,6 @@ class _Similarity:
     translation: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Worlds:
-    """The ways from a chunk to the world, of its components and of itself."""
-
-    file: ForeignFile
-    components: dict[str, _Similarity]
-    chunk: _Similarity | None
-
-    @classmethod
-    def of(cls, file: ForeignFile, chunk: Element) -> _Worlds:
-        """Read the transforms of a chunk and of its components.
-
-        Raises
-        ------
-        KgcpError
-            Naming the transform whose numbers are missing.
-        """
-        components = {}
-        for component in chunk.iterfind("components/component"):
-            similarity = _similarity(file, component)
-            if similarity is not None:
-                components[component.get("id", "")] = similarity
-        return cls(file, components, _similarity(file, chunk))
-
-    def is_referenced(self, camera: Element) -> bool:
-        """Whether a camera has a way to the world."""
-        return self._way(camera) is not None
-
-    def place(self, camera: Element, matrix_text: str) -> tuple[FloatArray, FloatArray]:
-        """Return centre (3,) and rotation (3, 3) ← photo in the world, or else in the chunk."""
-        where = f"camera {camera.get('label')!r}"
-        numbers = self.file.numbers(matrix_text, 16, f"{where} transform")
-        matrix = np.array(numbers).reshape(4, 4)
-        rotation = photo_rotation(self.file, where, matrix[:3, :3])
-        way = self._way(camera)
-        if way is None:
-            return matrix[:3, 3], rotation
-        centre = way.scale * way.rotation @ matrix[:3, 3] + way.translation
-        return centre, way.rotation @ rotation
-
-    def _way(self, camera: Element) -> _Similarity | None:
-        return self.components.get(camera.get("component_id", ""), self.chunk)
-
-
 def _similarity(file: ForeignFile, parent: Element) -> _Similarity | None:
     element = parent.find("transform")
     if element is None or element.find("translation") is None:
@@ -128,7 +105,7 @@ def _similarity(file: ForeignFile, parent: Element) -> _Similarity | None:
     translation = file.numbers(element.findtext("translation"), 3, f"{where} translation")
     (scale,) = file.numbers(element.findtext("scale") or "1", 1, f"{where} scale")
     if scale <= 0.0:
-        raise file.error(where, f"has the scale {scale:g}", "export it again")
+        raise file.error_at(where, f"has the scale {scale:g}")
     matrix = np.array(rotation).reshape(3, 3)
     require_rotation(file, where, matrix)
     return _Similarity(scale, matrix, np.array(translation))
@@ -142,9 +119,9 @@ def _geodetic(file: ForeignFile, chunk: Element) -> str | None:
     try:
         crs = crs_of(text)
     except CRSError as error:
-        raise file.error(
+        raise file.error_at(
             "chunk reference",
-            f"is no CRS that pyproj reads ({text[:40]!r})",
+            f"is not a CRS that pyproj reads ({text[:40]!r})",
             "export it in another",
         ) from error
     geodetic = crs.geodetic_crs

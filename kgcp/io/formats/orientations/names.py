@@ -40,7 +40,7 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
         frame = _frame_of(file, name.replace("\\", "/"), known, by_name)
         if frame in owners:
             raise file.error(
-                "", f"images {owners[frame]!r} and {name!r} are both {frame!r}", "keep one of them"
+                f"images {owners[frame]!r} and {name!r} are both {frame!r}", "keep one of them"
             )
         owners[frame] = name
     return tuple(owners)
@@ -54,7 +54,6 @@ def _frame_of(file: ForeignFile, name: str, frames: set[str], by_name: dict[str,
         fitting = [one for one in fitting if _ends_alike(name, one)] or fitting
     if len(fitting) > 1:
         raise file.error(
-            "",
             f"image {name!r} may be {fitting[0]!r} or {fitting[1]!r}",
             "rename the frames so that their names differ",
         )

@@ -2,8 +2,8 @@
 
 By opendm/shots.py: a point of WGS 84 per image, with the properties `rotation`, axis times angle
 from the axes of the UTM grid to the camera (x right, y down, z forward), and `translation`, which
-is no translation but the projection centre in UTM. Which zone that is, is not said: it is the one
-in which the point has these coordinates.
+is not a translation but the projection centre in UTM. The zone is not stated: it is the one in
+which the point has these coordinates.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.files.sniff import ForeignFile, JsonObject
-from kgcp.io.formats.orientations.source import SourcePoses, photo_rotation
+from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
 _ZONE_TOLERANCE_M = 0.05
 
@@ -35,23 +35,19 @@ def poses(file: ForeignFile) -> SourcePoses:
     Raises
     ------
     KgcpError
-        Naming the feature that lacks something; or if the translations are of no UTM zone.
+        Naming the feature that lacks something; or if the translations fit no UTM zone.
     """
     features = JsonObject.of(file, "", file.document).children("features")
     properties = [feature.child("properties") for feature in features]
-    rotvec = np.array([one.vector("rotation", 3) for one in properties]).reshape(-1, 3)
-    centre = np.array([one.vector("translation", 3) for one in properties]).reshape(-1, 3)
-    points = [feature.child("geometry").vector("coordinates", 3) for feature in features]
-    grid_from_camera = np.swapaxes(Rotation.from_rotvec(rotvec).as_matrix(), 1, 2)
-    turned = [
-        photo_rotation(file, one.where, matrix)
-        for one, matrix in zip(properties, grid_from_camera, strict=True)
-    ]
+    centre = vectors(properties, "translation")
+    points = vectors([feature.child("geometry") for feature in features], "coordinates")
+    rotation = Rotation.from_rotvec(vectors(properties, "rotation")).as_matrix()
+    places = [each.where for each in properties]
     return SourcePoses(
-        tuple(one.text("filename") for one in properties),
+        tuple(each.text("filename") for each in properties),
         centre,
-        np.array(turned).reshape(-1, 3, 3),
-        crs=_zone(file, np.array(points).reshape(-1, 3), centre),
+        photo_rotations(file, places, np.swapaxes(rotation, 1, 2)),
+        crs=_zone(file, points, centre),
     )
 
 
@@ -67,7 +63,6 @@ def _zone(file: ForeignFile, points: FloatArray, centre: FloatArray) -> str:
             if np.all(np.abs(found - centre[:, :2]) < _ZONE_TOLERANCE_M):
                 return crs
     raise file.error(
-        "",
-        f"has translations of no UTM zone about {longitude[0]:.4f}, {latitude[0]:.4f}",
+        f"has translations that fit no UTM zone near {longitude[0]:.4f}, {latitude[0]:.4f}",
         "give the reconstruction.topocentric.json of the same project",
     )

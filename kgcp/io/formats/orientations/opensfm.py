@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.georef.crs import WGS84_3D
 from kgcp.georef.local_frame import MapFrame
-from kgcp.io.files.sniff import ForeignFile, JsonObject
-from kgcp.io.formats.orientations.source import SourcePoses, photo_rotation
+from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
 _TOPOCENTRIC = "reconstruction.topocentric.json"
 _REFERENCE = "reference_lla.json"
@@ -48,18 +48,13 @@ def poses(file: ForeignFile) -> SourcePoses:
     parts = [JsonObject.of(file, f"[{index}]", part) for index, part in enumerate(document)]
     groups = [part.child("shots") for part in parts]
     shots = [group.child(name) for group in groups for name in group.values]
-    rotvec = np.array([shot.vector("rotation", 3) for shot in shots]).reshape(-1, 3)
-    shift = np.array([shot.vector("translation", 3) for shot in shots]).reshape(-1, 3)
-    world_from_camera = np.swapaxes(Rotation.from_rotvec(rotvec).as_matrix(), 1, 2)
-    turned = [
-        photo_rotation(file, shot.where, matrix)
-        for shot, matrix in zip(shots, world_from_camera, strict=True)
-    ]
+    rotation = Rotation.from_rotvec(vectors(shots, "rotation")).as_matrix()
+    world_from_camera = np.swapaxes(rotation, 1, 2)
     level = _level(file, parts)
     return SourcePoses(
         tuple(name for group in groups for name in group.values),
-        -np.einsum("nij,nj->ni", world_from_camera, shift),
-        np.array(turned).reshape(-1, 3, 3),
+        -np.einsum("nij,nj->ni", world_from_camera, vectors(shots, "translation")),
+        photo_rotations(file, [shot.where for shot in shots], world_from_camera),
         level=level,
         unreferenced=_unreferenced(file, level),
     )
@@ -72,16 +67,16 @@ def _unreferenced(file: ForeignFile, level: MapFrame | None) -> str | None:
 
 
 def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> MapFrame | None:
-    """Return the frame over the reference; None where there is none."""
+    """Return the frame over the reference; None without one."""
     references = [part.child("reference_lla") for part in parts if part.values.get("reference_lla")]
     beside = file.path.parent / _REFERENCE
     if not references and beside.is_file():
-        other = ForeignFile.read(beside, "[reference] poses")
+        other = ForeignFile(beside, "[reference] poses")
         references = [JsonObject.of(other, "", other.document)]
     origins = {_lla(reference) for reference in references}
     if len(origins) > 1:
         raise file.error(
-            "", "holds reconstructions of different reference_lla", "keep those of one of them"
+            "holds reconstructions of different reference_lla", "keep those of one of them"
         )
     return MapFrame.at(WGS84_3D, np.array(origins.pop())) if origins else None
 

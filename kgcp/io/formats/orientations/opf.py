@@ -20,8 +20,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import rotation_from_opk
 from kgcp.georef.crs import crs_of
 from kgcp.io.files.safe_read import is_file
-from kgcp.io.files.sniff import ForeignFile, JsonObject
-from kgcp.io.formats.orientations.source import SourcePoses
+from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.formats.orientations.records import SourcePoses
 
 _CAMERAS = "calibrated-cameras"
 _SCENE = "scene-reference-frame"
@@ -48,18 +48,14 @@ def poses(file: ForeignFile) -> SourcePoses:
     names = _names(JsonObject.of(*_part(file, _LIST)))
     for camera in cameras:
         if camera.text("id") not in names:
-            raise camera.file.error(
-                camera.where, "has an id that the camera list lacks", "export the project again"
-            )
+            raise camera.error("has an id that the camera list lacks", "export the project again")
     scene = _Scene.of(JsonObject.of(*_part(file, _SCENE)))
-    position = np.array([camera.vector("position", 3) for camera in cameras]).reshape(-1, 3)
-    opk = np.array([camera.vector("orientation_deg", 3) for camera in cameras]).reshape(-1, 3)
     return SourcePoses(
         tuple(names[camera.text("id")] for camera in cameras),
-        scene.map_from_canonical(position),
-        rotation_from_opk(opk),
+        scene.map_from_canonical(vectors(cameras, "position")),
+        rotation_from_opk(vectors(cameras, "orientation_deg")),
         crs=scene.crs,
-        unreferenced="is in a scene of no map",
+        unreferenced="is in a scene without a map",
     )
 
 
@@ -79,11 +75,11 @@ def _part(file: ForeignFile, kind: str) -> tuple[ForeignFile, str, object]:
         path = _resource(file, kind)
     if not is_file(path):
         raise file.error(
-            "", f"needs {path}, which does not exist", f"name the project, an .opf, in {_KEY}"
+            f"needs {path}, which does not exist", f"name the project, an .opf, in {_KEY}"
         )
-    part = ForeignFile.read(path, _KEY)
+    part = ForeignFile(path, _KEY)
     if _kind(part) != kind:
-        raise part.error("", f"is no {kind} of OPF", "export the project again")
+        raise part.error(f"is not a {kind} of OPF", "export the project again")
     return part, "", part.document
 
 
@@ -92,7 +88,7 @@ def _resource(project: ForeignFile, kind: str) -> Path:
         for resource in item.children("resources"):
             if resource.text("format") == f"application/opf-{kind}+json":
                 return project.path.parent / unquote(urlsplit(resource.text("uri")).path)
-    raise project.error("", f"names no {kind}", "export the calibrated project again")
+    raise project.error(f"names no {kind}", "export the calibrated project again")
 
 
 def _names(cameras: JsonObject) -> dict[str, str]:
@@ -105,10 +101,10 @@ def _names(cameras: JsonObject) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """The way from the canonical frame to the map; crs None: to a frame that is no map.
+    """The way from the canonical frame to the map; crs None: to a frame that is not a map.
 
     Heights z of the base become (z + geoid_height) · height_factor: ellipsoidal and in metres
-    where the CRS has none of its own, or OPF gives it a constant geoid.
+    where the CRS does not define its own, or OPF gives it a constant geoid.
     """
 
     crs: str | None
@@ -128,12 +124,10 @@ class _Scene:
             axes that OPF's swapping does not bring into the order x, y.
         """
         transform, said = scene.child("base_to_canonical"), scene.child("crs")
-        shift, scale = (
-            np.array(transform.vector("shift", 3)),
-            np.array(transform.vector("scale", 3)),
-        )
+        shift = np.array(transform.vector("shift", 3))
+        scale = np.array(transform.vector("scale", 3))
         if not np.all(scale > 0.0):
-            raise scene.file.error(transform.where, "has no positive scale", "export it again")
+            raise transform.error("has no positive scale")
         swaps = transform["swap_xy"] is True
         if swaps:
             scale = scale[[1, 0, 2]]
@@ -157,18 +151,16 @@ class _Scene:
 
 
 def _parsed(said: JsonObject) -> CRS | None:
-    """Return the CRS; None where it is of no place on the Earth."""
+    """Return the CRS; None where it is not on the Earth."""
     text = said.text("definition")
     try:
         crs = crs_of(text)
     except CRSError as error:
-        raise said.file.error(
-            said.where, f"is no CRS that pyproj reads ({text[:40]!r})", "export it again"
-        ) from error
+        raise said.error(f"is not a CRS that pyproj reads ({text[:40]!r})") from error
     if crs.geodetic_crs is None:
         return None
     if not crs.is_projected:
-        raise said.file.error(said.where, f"{crs.name!r} is not projected", "export it again")
+        raise said.error(f"{crs.name!r} is not projected")
     return crs
 
 
@@ -177,8 +169,7 @@ def _check_axes(said: JsonObject, crs: CRS, *, swaps: bool) -> None:
     directions = [axis.direction for axis in crs.axis_info[:2]]
     swapped = {"north east": True, "east north": False, "west south": False}
     if swapped.get(" ".join(directions)) is not swaps:
-        raise said.file.error(
-            said.where,
+        raise said.error(
             f"has the axes {' and '.join(directions)} with swap_xy {str(swaps).lower()}",
             "export the project in a CRS of easting and northing",
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from kgcp.geometry.attitude import rotation_from_opk
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.orientations.source import SourcePoses
+from kgcp.io.formats.orientations.records import SourcePoses
 
 _HEAD = re.compile(r"imageName\s+X\s+Y\s+Z\s+Omega\s+Phi\s+Kappa\b")
 

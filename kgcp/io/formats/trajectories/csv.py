@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
 from kgcp.io.formats.trajectories.times import times_from_texts
 
@@ -14,7 +13,12 @@ _SD_POSITION = tuple(f"sd_{name}" for name in _POSITION)
 _SD_ATTITUDE = tuple(f"sd_{name}" for name in _ATTITUDE)
 
 
-def read_csv(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
+def matches(file: ForeignFile) -> bool:
+    """Whether the first line has several cells."""
+    return "," in file.first_line
+
+
+def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
     """Read a trajectory from a CSV file by docs/conventions.md.
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
@@ -27,14 +31,15 @@ def read_csv(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epoch
     """
     with_attitude = notation.course_sd_deg is None
     columns = read_csv_columns(
-        path,
-        "time",
+        file.path,
+        ("time",),
         (*_POSITION, *_ATTITUDE) if with_attitude else _POSITION,
         (*_SD_POSITION, *_SD_ATTITUDE),
-        "[vehicle] trajectory",
+        file.toml_key,
     )
-    time_s = times_from_texts(path, columns.lines, columns.keys, notation)
-    check_times(path, time_s, lambda row: f"line {columns.lines[row]} ({columns.keys[row]})")
+    times = columns.texts["time"]
+    time_s = times_from_texts(file.path, columns.lines, times, notation)
+    check_times(file.path, time_s, lambda row: f"line {columns.lines[row]} ({times[row]})")
     return Epochs(
         time_s=time_s,
         crs=notation.crs or flight_crs,

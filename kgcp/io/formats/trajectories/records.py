@@ -1,4 +1,4 @@
-"""A trajectory as its file has it, and what flight.toml says about the file."""
+"""What a reader of trajectories is told by flight.toml, and what it returns: the file's epochs."""
 
 from __future__ import annotations
 
@@ -15,15 +15,6 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem
 
 
-class TrajectoryFormat(StrEnum):
-    """A notation of trajectories, by its name in flight.toml."""
-
-    CSV = "csv"
-    SBET = "sbet"
-    RTKLIB = "rtklib"
-    TUM = "tum"
-
-
 class Wander(StrEnum):
     """What makes the true heading of the heading and the wander angle of an SBET record."""
 
@@ -38,12 +29,12 @@ class TrajectoryNotation:
 
     Attributes
     ----------
-    format : TrajectoryFormat or None
-        None: the content tells.
+    format : str or None
+        Its name; None: the content tells.
     crs : str or None
         Of the file's positions, for pyproj; None: the format's default.
     time_system : TimeSystem or None
-        Of the file's times; None: as the format has it.
+        Of the file's times; None: the format's default.
     first_day : date or None
         When the trajectory begins, by its own clock; given, the file's numbers are seconds of the
         week.
@@ -56,7 +47,7 @@ class TrajectoryNotation:
         deviations of roll, pitch and heading; None: the file has the attitude.
     """
 
-    format: TrajectoryFormat | None = None
+    format: str | None = None
     crs: str | None = None
     time_system: TimeSystem | None = None
     first_day: date | None = None

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import WGS84_3D
+from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.rtklib_pos import Solution, read_solution
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
 
 GEOCENTRIC = "EPSG:4978"
+_AS_HEIGHTS = "write the solution as latitude, longitude and height (out-solformat = llh)"
 # Of each kind of solution: its columns in the order x, y, z, their deviations, and the roots of
 # the covariances xy, yz, zx.
 _GEODETIC = (("longitude", "latitude", "height"), ("sde", "sdn", "sdu"), ("sdne", "sdun", "sdeu"))
 _ECEF = (("x-ecef", "y-ecef", "z-ecef"), ("sdx", "sdy", "sdz"), ("sdxy", "sdyz", "sdzx"))
 
 
-def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
+def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> Epochs:
     """Read a solution file; it has no attitude.
 
     Raises
@@ -28,21 +28,18 @@ def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
         As `kgcp.io.formats.rtklib_pos.read_solution`, and for vectors from a base, heights above a
         geoid or a datum that the file does not define.
     """
-    solution = read_solution(path, "[vehicle] trajectory")
-    check_times(path, solution.time_s, lambda row: f"line {solution.lines[row]}")
+    solution = read_solution(file)
+    check_times(file.path, solution.time_s, lambda row: f"line {solution.lines[row]}")
     if "e-baseline" in solution.columns:
-        raise KgcpError(
-            f"{path}: holds vectors from a base whose place it does not tell; write the solution"
-            " as latitude, longitude and height (out-solformat = llh)"
+        raise file.error(
+            "holds vectors from a base whose position it does not give",
+            _AS_HEIGHTS,
         )
     geocentric = "x-ecef" in solution.columns
     position, deviations, roots = _ECEF if geocentric else _GEODETIC
     lacking = [name for name in position if name not in solution.columns]
     if lacking:
-        raise KgcpError(
-            f"{path}: its header names no {', '.join(lacking)}; write the solution as latitude,"
-            " longitude and height (out-solformat = llh)"
-        )
+        raise file.error(f"its header lacks {', '.join(lacking)}", _AS_HEIGHTS)
     if notation.crs is None and not geocentric:
         _check_heights(solution)
     cov = None
@@ -61,9 +58,9 @@ def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
 def _check_heights(solution: Solution) -> None:
     if (solution.datum.upper(), solution.heights) == ("WGS84", "ellipsoidal"):
         return
-    found = f"{solution.datum}/{solution.heights}" if solution.datum else "nothing"
+    found = f"{solution.datum}/{solution.heights}" if solution.datum else "unknown"
     raise KgcpError(
-        f"{solution.path}: its header says {found} of datum and heights, not WGS84/ellipsoidal;"
+        f"{solution.path}: its header gives datum and heights as {found}, not WGS84/ellipsoidal;"
         " write ellipsoidal heights (out-height = ellipsoidal), or name the file's CRS with its"
         " heights under [vehicle] crs in flight.toml"
     )
@@ -76,7 +73,7 @@ def _block(solution: Solution, names: tuple[str, ...]) -> FloatArray:
 def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
     """Return covariances (n, 3, 3) of deviations (n, 3) and signed roots of xy, yz, zx (n, 3).
 
-    RTKLIB writes sign(c)·√|c| of a covariance c. Rounding to 0.1 mm can make a matrix that is no
+    RTKLIB writes sign(c)·√|c| of a covariance c. Rounding to 0.1 mm can make a matrix that is not a
     covariance: its negative eigenvalues become 0.
     """
     cov = np.zeros((len(deviations), 3, 3))

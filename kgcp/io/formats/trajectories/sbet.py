@@ -11,6 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import WGS84_3D
 from kgcp.io.files.gps_time import unwrap_week
 from kgcp.io.files.safe_read import LARGEST, read_bytes
+from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, Wander, check_times
 from kgcp.io.formats.trajectories.times import times_from_week
 
@@ -22,11 +23,12 @@ _MAX_WANDER_RAD = 1e-6
 _TINY = 1e-12  # zeros, and what other bytes are as doubles
 
 
-def looks_like_sbet(head: bytes, size: int) -> bool:
-    """Return whether a file of `size` bytes that begins with `head` can be one of records."""
-    if size % (_RECORD * _DOUBLE) or len(head) < _RECORD * _DOUBLE:
+def matches(file: ForeignFile) -> bool:
+    """Whether the size is that of whole records, and the first holds possible values."""
+    record = _RECORD * _DOUBLE
+    if len(file.head) < record or file.path.stat().st_size % record:
         return False
-    values = np.frombuffer(head, dtype="<f8", count=_RECORD)
+    values = np.frombuffer(file.head, dtype="<f8", count=_RECORD)
     if not np.isfinite(values).all():
         return False
     seconds, latitude, longitude, height = values[:4]
@@ -35,7 +37,7 @@ def looks_like_sbet(head: bytes, size: int) -> bool:
     return bool(sound and on_earth)
 
 
-def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
+def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> Epochs:
     """Read records of 17 little-endian doubles: seconds of the week, radians, metres.
 
     Deviations are those of the smrmsg file that flight.toml names, if it does.
@@ -46,7 +48,8 @@ def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
         If the file is cut or holds impossible values, flight.toml lacks the day or the time
         system, or does not say what the wander angle means where it is not zero.
     """
-    records = _read_records(path, _RECORD, "trajectory")
+    path = file.path
+    records = _read_records(path, _RECORD, file.toml_key)
     _check_values(path, records)
     seconds = records[:, 0]
     time_s = times_from_week(path, seconds, notation)
@@ -64,13 +67,13 @@ def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
     )
 
 
-def _read_records(path: Path, columns: int, key: str) -> FloatArray:
-    data = read_bytes(path, f"[vehicle] {key}", _MOST_BYTES)
+def _read_records(path: Path, columns: int, toml_key: str) -> FloatArray:
+    data = read_bytes(path, toml_key, _MOST_BYTES)
     size = columns * _DOUBLE
     if not data or len(data) % size:
         raise KgcpError(
-            f"{path}: has {len(data)} bytes, which are no whole records of {size} bytes;"
-            " the file is cut or of another format: export it again"
+            f"{path}: has {len(data)} bytes, not a multiple of {size} bytes per record;"
+            " it is cut or of another format: export it again"
         )
     records: FloatArray = np.frombuffer(data, dtype="<f8").reshape(-1, columns).astype(float)
     return records
@@ -84,8 +87,8 @@ def _check_values(path: Path, records: FloatArray) -> None:
         time, latitude, longitude, height = records[wrong[0], :4]
         raise KgcpError(
             f"{path}, record {wrong[0] + 1}: time {time:g}, latitude {latitude:g} rad, longitude"
-            f" {longitude:g} rad, height {height:g} m cannot be; the file is damaged or of another"
-            " format: export it again"
+            f" {longitude:g} rad, height {height:g} m is impossible; the file is damaged or of"
+            " another format: export it again"
         )
 
 
@@ -105,7 +108,7 @@ def _attitude_deg(path: Path, records: FloatArray, wander: Wander | None) -> Flo
 
 def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return deviations of east, north, up [m] and roll, pitch, heading [deg] at these seconds."""
-    records = _read_records(path, _ACCURACY, "accuracies")
+    records = _read_records(path, _ACCURACY, "[vehicle] accuracies")
     own, wanted = unwrap_week(records[:, 0]), unwrap_week(seconds)
     steps = np.diff(own)
     if len(own) < 2 or steps.min() <= 0.0:
@@ -118,6 +121,8 @@ def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, Float
         )
     deviations = records[:, [2, 1, 3, 7, 8, 9]]
     if not np.isfinite(deviations).all() or deviations.min() < 0.0:
-        raise KgcpError(f"{path}: holds deviations that are not finite or below 0; export it again")
+        raise KgcpError(
+            f"{path}: holds standard deviations that are negative or not finite; export it again"
+        )
     at_epochs = np.column_stack([np.interp(wanted, own, column) for column in deviations.T])
     return at_epochs[:, :3], at_epochs[:, 3:] / 60.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from datetime import date, datetime
 from pathlib import Path
@@ -12,10 +11,8 @@ import numpy as np
 from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem, clock_from_date, unix_from_clock, weekday
-from kgcp.io.files.time_text import parse_time
+from kgcp.io.files.time_text import NUMBER, parse_time
 from kgcp.io.formats.trajectories.records import TrajectoryNotation
-
-_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def times_from_texts(
@@ -73,7 +70,7 @@ def _named(day: date) -> str:
 
 def _numbers(path: Path, lines: Sequence[int], texts: Sequence[str]) -> FloatArray:
     for line, text in zip(lines, texts, strict=True):
-        if not _NUMBER.fullmatch(text):
+        if not NUMBER.fullmatch(text):
             raise KgcpError(
                 f"{path}, line {line}: time {text!r} is not seconds of the week, as [vehicle] date"
                 " says; delete date from flight.toml, or write seconds"
@@ -82,11 +79,11 @@ def _numbers(path: Path, lines: Sequence[int], texts: Sequence[str]) -> FloatArr
 
 
 def _clock_time(text: str, system: TimeSystem | None, where: str) -> float:
-    if system is not None and not _NUMBER.fullmatch(text):
+    if system is not None and not NUMBER.fullmatch(text):
         try:
             zone = datetime.fromisoformat(text).tzinfo
         except ValueError:
-            zone = None  # what is wrong with it is said below
+            zone = None  # `parse_time` below reports what is wrong
         if zone is None:
             text = f"{text}Z"
         elif system is TimeSystem.GPS:

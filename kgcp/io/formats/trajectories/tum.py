@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import level_axes_ecef, map_axes_ecef
 from kgcp.georef.trajectory import ENU_FROM_NED
 from kgcp.io.files.safe_read import is_sound, read_lines
+from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
 from kgcp.io.formats.trajectories.times import times_from_texts
 
@@ -19,7 +20,12 @@ _CELLS = 8
 _MAX_NORM_ERROR = 1e-3
 
 
-def read_tum(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
+def matches(file: ForeignFile) -> bool:
+    """Whether the first line has eight cells."""
+    return len(file.first_line.split()) == _CELLS
+
+
+def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
     """Read poses R(map ← body), t in the map, of a body with x forward, y right, z down.
 
     Raises
@@ -28,7 +34,8 @@ def read_tum(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epoch
         Naming the line: not eight numbers, no unit quaternion, times that do not ascend; or if
         the vehicle drives on its roof, as it does where body axes are x forward, y left, z up.
     """
-    lines, texts, numbers = _read_rows(path)
+    path = file.path
+    lines, texts, numbers = _read_rows(file)
     time_s = times_from_texts(path, lines, texts, notation)
     check_times(path, time_s, lambda row: f"line {lines[row]}")
     crs = notation.crs or flight_crs
@@ -47,9 +54,9 @@ def read_tum(path: Path, notation: TrajectoryNotation, flight_crs: str) -> Epoch
     return Epochs(time_s, crs, position, attitude_deg)
 
 
-def _read_rows(path: Path) -> tuple[list[int], list[str], FloatArray]:
+def _read_rows(file: ForeignFile) -> tuple[list[int], list[str], FloatArray]:
     lines, texts, numbers = [], [], []
-    for line, row in enumerate(read_lines(path, "[vehicle] trajectory"), start=1):
+    for line, row in enumerate(read_lines(file.path, file.toml_key), start=1):
         cells = row.split()
         if not cells or cells[0].startswith("#"):
             continue
@@ -58,9 +65,10 @@ def _read_rows(path: Path) -> tuple[list[int], list[str], FloatArray]:
         except ValueError:
             values = []
         if len(values) != _CELLS or not all(map(is_sound, values)):
-            raise KgcpError(
-                f"{path}, line {line}: is not the eight numbers timestamp tx ty tz qx qy qz qw;"
-                " repair the line"
+            raise file.error_at(
+                f"line {line}",
+                "is not the eight numbers timestamp tx ty tz qx qy qz qw",
+                "repair the line",
             )
         lines.append(line)
         texts.append(cells[0])

@@ -67,7 +67,9 @@ def test_colmap_cameras_project_as_pycolmap_does(
 )
 def test_colmap_s_other_models_are_refused_by_name(tmp_path: Path, model: str, count: int) -> None:
     path = write(tmp_path, "cameras.txt", f"1 {model} 1600 1100 {' '.join(['800'] * count)}\n")
-    with pytest.raises(KgcpError, match=rf"line 1: has the model {model}, which kgcp has not"):
+    with pytest.raises(
+        KgcpError, match=rf"line 1: has the model {model}, which kgcp does not support"
+    ):
         read_calibration(path, SILENT)
 
 
@@ -174,5 +176,7 @@ def test_a_reconstruction_is_a_file_of_cameras(tmp_path: Path) -> None:
 @pytest.mark.parametrize("model", ["fisheye", "fisheye_opencv", "dual", "spherical", "fisheye62"])
 def test_opensfm_s_other_models_are_refused_by_name(tmp_path: Path, model: str) -> None:
     path = write(tmp_path, "cameras.json", {"x": {**BROWN, "projection_type": model}})
-    with pytest.raises(KgcpError, match=rf"x: has the projection_type '{model}', which kgcp has"):
+    with pytest.raises(
+        KgcpError, match=rf"x: has the projection_type '{model}', which kgcp does not support"
+    ):
         read_calibration(path, SILENT)

@@ -103,11 +103,15 @@ def test_metashape_documents_give_the_adjusted_calibration_of_a_sensor(
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("<b1>8.25</b1>", "<b1>8.25</b1><b2>0.31</b2>", "has B2 = 0.31, which kgcp has not"),
-        ("<k3>", "<k4>-1e-3</k4><k3>", "has K4 = -0.001, which kgcp has not"),
-        ("<p1>", "<p3>-2e-5</p3><p1>", "has P3 = -2e-05, which kgcp has not"),
-        ("<p1>", "<p4>0.5</p4><p1>", "has P4 = 0.5, which kgcp has not"),
-        (">frame<", ">fisheye<", "has the projection 'fisheye', which kgcp has not"),
+        (
+            "<b1>8.25</b1>",
+            "<b1>8.25</b1><b2>0.31</b2>",
+            "has B2 = 0.31, which kgcp does not support",
+        ),
+        ("<k3>", "<k4>-1e-3</k4><k3>", "has K4 = -0.001, which kgcp does not support"),
+        ("<p1>", "<p3>-2e-5</p3><p1>", "has P3 = -2e-05, which kgcp does not support"),
+        ("<p1>", "<p4>0.5</p4><p1>", "has P4 = 0.5, which kgcp does not support"),
+        (">frame<", ">fisheye<", "has the projection 'fisheye', which kgcp does not support"),
         (
             "<f>1702.25</f>",
             "<fx>1702</fx><fy>1702</fy>",
@@ -178,5 +182,5 @@ def test_a_photo_of_dji_brings_its_calibration_and_size(
     with pytest.raises(KgcpError, match="is dewarped already"):
         read_calibration(path, SILENT)
     Image.new("L", (WIDTH, HEIGHT), 90).save(path, "JPEG")
-    with pytest.raises(KgcpError, match="is no calibration of a known format"):
+    with pytest.raises(KgcpError, match="is not a calibration of a known format"):
         read_calibration(path, SILENT)

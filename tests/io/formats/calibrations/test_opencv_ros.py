@@ -109,22 +109,22 @@ def test_the_size_may_stand_beside_a_silent_file_and_must_agree(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("", "is no calibration of a known format"),
-        ("just words", "is no calibration of a known format"),
-        ("[1, 2]", "is no calibration of a known format"),
-        ("a: [1", "is no calibration of a known format"),
-        ("%YAML:1.0\n---\ncamera_matrix: [1,2\n", "is no OpenCV FileStorage"),
-        ("<?xml version='1.0'?><opencv_storage>", "is no OpenCV FileStorage"),
+        ("", "is not a calibration of a known format"),
+        ("just words", "is not a calibration of a known format"),
+        ("[1, 2]", "is not a calibration of a known format"),
+        ("a: [1", "is not a calibration of a known format"),
+        ("%YAML:1.0\n---\ncamera_matrix: [1,2\n", "is not an OpenCV FileStorage"),
+        ("<?xml version='1.0'?><opencv_storage>", "is not an OpenCV FileStorage"),
         ("%YAML:1.0\n---\nimage_width: 3\n", "has no camera_matrix; add it"),
         ("%YAML:1.0\n---\nfisheye_model: 1\nimage_width: 3\n", "has a fisheye model"),
         (ROS.replace("plumb_bob", "equidistant"), "distortion model 'equidistant'"),
         (ROS.replace("2300.5, 0,", "2300.5, 2,"), "a skew of 2"),
         (ROS.replace("2300.5, 0,", "-2300.5, 0,"), "fx: -2300.5 px is out of range"),
-        (ROS.replace("0, 0, 1]\ndist", "0, 0, 2]\ndist"), "none of a pinhole camera"),
+        (ROS.replace("0, 0, 1]\ndist", "0, 0, 2]\ndist"), "not that of a pinhole camera"),
         (ROS.replace(", 594.75, 0, 0, 1]", "]"), "is not 3 x 3"),
         (ROS.replace(", 0.011]", ", 0.011, 1]"), "6 distortion coefficients"),
         (ROS.replace("0.011]", ".nan]"), "k3: is not a finite number"),
-        (ROS.replace("image_width: 1600\n", ""), "is no camera_info of ROS \\('image_width'\\)"),
+        (ROS.replace("image_width: 1600\n", ""), "is not a camera_info of ROS \\('image_width'\\)"),
     ],
 )
 def test_other_files_and_models_are_refused(tmp_path: Path, content: str, words: str) -> None:
@@ -138,7 +138,7 @@ def test_other_files_and_models_are_refused(tmp_path: Path, content: str, words:
 
 def test_thin_prism_terms_are_refused(tmp_path: Path) -> None:
     path = opencv_file(tmp_path / "camera.yml", [*RATIONAL, 0.0, 0.001, 0.0, 0.0])
-    with pytest.raises(KgcpError, match=r"has thin-prism s2 = 0\.001, which kgcp has not"):
+    with pytest.raises(KgcpError, match=r"has thin-prism s2 = 0\.001, which kgcp does not support"):
         read_calibration(path, SILENT)
 
 
@@ -155,7 +155,9 @@ def test_flight_toml_names_the_file_and_adds_what_it_lacks(tmp_path: Path) -> No
     camera = read_flight(tmp_path).camera
     assert (camera.fx, camera.k3, camera.response) == (2300.5, 0.011, Response.SRGB)
     toml.write_text(flight + "fx = 2300\n" + target)
-    with pytest.raises(KgcpError, match=r"\[camera\] fx: stands beside a calibration file; delete"):
+    with pytest.raises(
+        KgcpError, match=r"\[camera\] fx: is given beside a calibration file; delete"
+    ):
         read_flight(tmp_path)
     toml.write_text(flight.replace("camera.yml", "none.yml") + target)
     with pytest.raises(KgcpError, match=r"\[camera\] file: 'none.yml' does not exist; create"):

@@ -168,5 +168,5 @@ def test_pix4d_s_cam_is_in_millimetres_of_the_sensor_that_it_states(
 
 def test_inpho_s_cam_is_refused(tmp_path: Path) -> None:
     text = "#Focal Length (mm) assuming a sensor width of 12.8x8.8mm\n#Image size 1600x1100 pixel\n"
-    with pytest.raises(KgcpError, match="is no calibration of a known format"):
+    with pytest.raises(KgcpError, match="is not a calibration of a known format"):
         read_calibration(write(tmp_path, "inpho.cam", text + "FOCAL 13.6\n"), (WIDTH, HEIGHT))

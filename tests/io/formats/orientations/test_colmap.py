@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.records import PoseNotation
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -122,9 +122,13 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "notation", "words"),
     [
-        ("1 1 0 0 0 1 2 3 1 a.JPG\n\n", None, "is in a world of COLMAP's, which is no map; align"),
+        (
+            "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
+            None,
+            "is in COLMAP's own coordinates, which are not those of a map; align",
+        ),
         ("1 1 0 0 0 1 2 3 1 a.JPG\nb\nc\n", UTM, "line 3: is not IMAGE_ID QW QX QY QZ"),
-        ("1 0 0 0 0 1 2 3 1 a.JPG\n\n", UTM, "line 1: has a quaternion of zeros"),
+        ("1 0 0 0 0 1 2 3 1 a.JPG\n\n", UTM, "line 1: has an invalid quaternion"),
         ("1 1 0 0 0 1 2 e 1 a.JPG\n\n", UTM, "line 1: holds '1 1 0 0 0 1 2 e' instead of 8"),
         (
             "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
@@ -139,7 +143,7 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
         (
             "1 1 0 0 0 -4001 -2 -4900001 1 a.JPG\n\n",  # a grid's coordinates, cut by their offset
             PoseNotation(crs="EPSG:4978"),
-            r"pose of 'a.JPG': comes to lie at a height of -\d{7}; correct \[reference\] crs",
+            r"pose of 'a.JPG': has a height of -\d{7}; correct \[reference\] crs",
         ),
     ],
 )

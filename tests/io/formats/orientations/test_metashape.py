@@ -14,7 +14,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.records import PoseNotation
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -71,7 +71,7 @@ def test_metashape_s_world_is_geocentric_whatever_the_chunk_s_crs(
     poses = read_reference_poses(path, crs="EPSG:32631", frames=[f"b/{name}" for name in NAMES])
     assert poses.frames == tuple(f"b/{name}" for name in NAMES)  # labels lack the extension
     check(poses, truth["utm"], truth["utm_from_photo"])
-    with pytest.raises(KgcpError, match=r"says itself of which CRS it is; delete \[reference\]"):
+    with pytest.raises(KgcpError, match=r"names its CRS already; delete \[reference\]"):
         read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")
 
 
@@ -86,7 +86,7 @@ def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
     poses = read_reference_poses(path, stated, crs="EPSG:32631")
     check(poses, truth["utm"], truth["utm_from_photo"])
     path.write_text(metashape_document(truth, GEOGRAPHIC, in_component=True, with_world=False))
-    with pytest.raises(KgcpError, match="has cameras in chunks of no reference; align"):
+    with pytest.raises(KgcpError, match="has cameras without a transform to the world; align"):
         read_reference_poses(path, crs="EPSG:32631")
 
 
@@ -94,7 +94,7 @@ def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
     ("old", "new", "words"),
     [
         ("<scale>12.354</scale>", "<scale>big</scale>", "component 4 transform scale: holds 'big'"),
-        ("GEOGCS[", "GEOGRAPH[", "chunk reference: is no CRS that pyproj reads"),
+        ("GEOGCS[", "GEOGRAPH[", "chunk reference: is not a CRS that pyproj reads"),
         ("</document>", "<chunk/></document>", "holds 2 chunks instead of one; export one chunk"),
         (" 0 0 0 1</transform>", "</transform>", "transform: holds '.*' instead of 16 finite"),
     ],
@@ -117,5 +117,5 @@ def test_a_mirrored_camera_is_refused(tmp_path: Path) -> None:
         '<document><chunk><cameras><camera label="a"><transform>'
         "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"
     )
-    with pytest.raises(KgcpError, match="camera 'a': has a rotation matrix that is none"):
+    with pytest.raises(KgcpError, match="camera 'a': has a matrix that is not a rotation"):
         read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")

@@ -16,7 +16,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
+from kgcp.io.formats.orientations.records import PoseNotation
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -101,7 +101,7 @@ def test_opendronemap_s_overwritten_file_is_utm_less_an_offset(
     check(read_reference_poses(original, crs="EPSG:32631"), truth["utm"], truth["utm_from_photo"])
     offset = tmp_path / "coords.txt"
     offset.write_text("WGS84 UTM 31N\n299000.0 4585000.0\n12.5 7.5 512.25\n")
-    notation = PoseNotation(PoseFormat.OPENSFM, "EPSG:32631", offset)
+    notation = PoseNotation("opensfm", "EPSG:32631", offset)
     check(
         read_reference_poses(path, notation, crs="EPSG:32631"),
         truth["utm"],
@@ -113,8 +113,8 @@ def test_opendronemap_s_overwritten_file_is_utm_less_an_offset(
     ("shot", "words"),
     [
         ({"rotation": [0, 0, 0]}, r"\[0\] shots a.JPG: has no 'translation'"),
-        ({"rotation": [0, 0], "translation": [1, 2, 3]}, "'rotation' is no list of 3 numbers"),
-        ({"rotation": [0, 0, "1"], "translation": [1, 2, 3]}, "'rotation' is '1', no finite"),
+        ({"rotation": [0, 0], "translation": [1, 2, 3]}, "'rotation' is not a list of 3 numbers"),
+        ({"rotation": [0, 0, "1"], "translation": [1, 2, 3]}, "'rotation' is '1', not a finite"),
     ],
 )
 def test_an_incomplete_shot_is_named(tmp_path: Path, shot: Part, words: str) -> None:
@@ -161,7 +161,7 @@ def test_shots_are_centres_in_the_utm_zone_that_fits(
     )
     collection["features"][3]["properties"]["translation"][0] += 0.2
     path.write_text(json.dumps(collection))
-    with pytest.raises(KgcpError, match=r"has translations of no UTM zone about 0\.6"):
+    with pytest.raises(KgcpError, match=r"has translations that fit no UTM zone near 0\.6"):
         read_reference_poses(path, crs="EPSG:32631")
 
 

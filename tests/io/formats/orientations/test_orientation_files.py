@@ -12,8 +12,8 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseFormat, PoseNotation
+from kgcp.io.formats.orientations import FORMATS, read_reference_poses
+from kgcp.io.formats.orientations.records import PoseNotation
 
 SAMPLES: dict[str, Any] = {
     "csv": "frame,x,y,z,omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0\n",
@@ -53,7 +53,7 @@ OPF_PARTS: dict[str, dict[str, object]] = {
 
 
 def test_every_format_has_a_sample() -> None:
-    assert SAMPLES.keys() == set(PoseFormat)
+    assert SAMPLES.keys() == set(FORMATS.names)
 
 
 @pytest.mark.parametrize("form", sorted(SAMPLES))
@@ -65,7 +65,7 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
         kind = {"format": f"application/opf-{name.replace('_', '-')}+json"}
         (tmp_path / f"{name}.json").write_text(json.dumps({**part, **kind}))
     stated = "EPSG:32631" if form in {"colmap", "metashape", "opensfm"} else None
-    named = read_reference_poses(path, PoseNotation(PoseFormat(form), stated), crs="EPSG:32631")
+    named = read_reference_poses(path, PoseNotation(form, stated), crs="EPSG:32631")
     found = read_reference_poses(path, PoseNotation(None, stated), crs="EPSG:32631")
     assert found.frames == named.frames == ("a.jpg",)
     np.testing.assert_array_equal(found.position_map, named.position_map)
@@ -75,7 +75,9 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
 def test_a_file_of_no_format_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "poses"
     path.write_text(content)
-    with pytest.raises(KgcpError, match=r"poses: holds no reference poses of a known format \(col"):
+    with pytest.raises(
+        KgcpError, match=r"poses: is not a file of reference poses of a known format \(col"
+    ):
         read_reference_poses(path)
 
 
@@ -143,7 +145,7 @@ def test_a_missing_grid_is_named(tmp_path: Path) -> None:
         read_reference_poses(path)
 
 
-@pytest.mark.parametrize("form", sorted(PoseFormat))
+@pytest.mark.parametrize("form", sorted(FORMATS.names))
 @pytest.mark.parametrize(
     "content", ["", "no such thing\n", "[1, 2]", "{}", "<a/>", "\x00\x01", "a,b\n1,2\n", "[]"]
 )
@@ -153,7 +155,7 @@ def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
     path = tmp_path / "poses"
     path.write_text(content)
     with pytest.raises(KgcpError) as caught:
-        read_reference_poses(path, PoseNotation(PoseFormat(form)), crs="EPSG:32631")
+        read_reference_poses(path, PoseNotation(form), crs="EPSG:32631")
     assert str(caught.value).startswith(f"{path}")
     assert "\n" not in str(caught.value)
 

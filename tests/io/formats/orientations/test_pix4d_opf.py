@@ -19,7 +19,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.notation import PoseNotation
+from kgcp.io.formats.orientations.records import PoseNotation
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -194,7 +194,7 @@ def test_opf_says_what_it_lacks(tmp_path: Path, truth: Truth) -> None:
         scene_of(site, np.ones(3), np.zeros(3), swap=False),
         str(tmp_path / "scene_reference_frame.json"),
     )
-    with pytest.raises(KgcpError, match=r"is in a scene of no map; align it to a map and give"):
+    with pytest.raises(KgcpError, match=r"is in a scene without a map; align it to a map and give"):
         read_reference_poses(path, crs="EPSG:32631")
     stated = read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")
     np.testing.assert_allclose(stated.position_map, truth["utm"], rtol=0, atol=1e-9)

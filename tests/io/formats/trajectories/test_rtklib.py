@@ -14,8 +14,9 @@ from pyproj import Proj
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem
-from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
-from kgcp.io.formats.trajectories.rtklib import read_rtklib
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.trajectories import read_trajectory, rtklib
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation
 
 COURSE = TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0))
 KIND = "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp)\n"
@@ -43,6 +44,10 @@ CELLS = tuple(
     )
 )
 FIRST_S = datetime(2015, 6, 1, tzinfo=UTC).timestamp() - 16.0  # 16 s until the end of June 2015
+
+
+def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
+    return rtklib.read(ForeignFile(path, "[vehicle] trajectory"), notation, "EPSG:4979")
 
 
 def write(folder: Path, rows: tuple[str, ...], names: str = NAMES, clock: str = "GPST") -> Path:
@@ -232,7 +237,7 @@ def test_covariances_survive_the_rounding_to_tenths_of_a_millimetre(
             ),
             ("vectors from a base", "out-solformat = llh"),
         ),
-        (calendar_rows(), NAMES.replace("height(m)", "alt(m)"), ("no height",)),
+        (calendar_rows(), NAMES.replace("height(m)", "alt(m)"), ("lacks height",)),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(
@@ -259,7 +264,9 @@ def test_heights_of_an_unknown_geoid_and_other_datums_are_refused(
 ) -> None:
     path = write(tmp_path, calendar_rows())
     path.write_text(path.read_text().replace("WGS84/ellipsoidal", kind))
-    with pytest.raises(KgcpError, match=f"{kind} .*out-height = ellipsoidal.*\\[vehicle\\] crs"):
+    with pytest.raises(
+        KgcpError, match=f"as {kind}, .*out-height = ellipsoidal.*\\[vehicle\\] crs"
+    ):
         read_rtklib(path, COURSE)
     named = TrajectoryNotation(crs="EPSG:4301", course_sd_deg=(1.0, 1.0, 1.0))
     assert read_rtklib(path, named).crs == "EPSG:4301"
@@ -268,6 +275,6 @@ def test_heights_of_an_unknown_geoid_and_other_datums_are_refused(
 def test_without_attitude_nothing_is_guessed(tmp_path: Path) -> None:
     path = write(tmp_path, calendar_rows())
     with pytest.raises(KgcpError, match=r'no attitude.*attitude = "course" and sd_attitude_deg'):
-        read_trajectory(path, "EPSG:25834", TrajectoryNotation(format=TrajectoryFormat.RTKLIB))
+        read_trajectory(path, "EPSG:25834", TrajectoryNotation(format="rtklib"))
     with pytest.raises(KgcpError, match=r"\[vehicle\] time_system: has no meaning .* rtklib"):
         read_trajectory(path, "EPSG:25834", TrajectoryNotation(time_system=TimeSystem.GPS))

@@ -13,12 +13,9 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.files.gps_time import TimeSystem
-from kgcp.io.formats.trajectories import (
-    TrajectoryFormat,
-    TrajectoryNotation,
-    read_trajectory,
-    recognise,
-)
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.trajectories import FORMATS, read_trajectory
+from kgcp.io.formats.trajectories.records import TrajectoryNotation
 
 _CRS = "EPSG:25832"
 _HEADER = "time,x,y,z,roll_deg,pitch_deg,heading_deg"
@@ -101,7 +98,7 @@ def test_a_missing_file_names_the_key_that_asked_for_it(tmp_path: Path) -> None:
 def test_binary_rubbish_is_an_error_not_a_traceback(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.csv"
     path.write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF")
-    with pytest.raises(KgcpError, match="none of the known formats"):
+    with pytest.raises(KgcpError, match="is not a trajectory of a known format"):
         read_trajectory(path, _CRS)
 
 
@@ -227,31 +224,31 @@ def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ("\ufefftime,x\n", TrajectoryFormat.CSV),
-        ("% program : RTKLIB\n", TrajectoryFormat.RTKLIB),
-        ("\n%  GPST  latitude(deg)\n", TrajectoryFormat.RTKLIB),
-        ("2015/06/01 00:00:00.000   47.48 19.05\n", TrajectoryFormat.RTKLIB),
-        ("# x\n\n1 2 3 4 5 6 7 8\n", TrajectoryFormat.TUM),
-        (struct.pack("<17d", 5.0, 0.7, 0.03, 99.0, *[0.0] * 13), TrajectoryFormat.SBET),
+        ("\ufefftime,x\n", "csv"),
+        ("% program : RTKLIB\n", "rtklib"),
+        ("\n%  GPST  latitude(deg)\n", "rtklib"),
+        ("2015/06/01 00:00:00.000   47.48 19.05\n", "rtklib"),
+        ("# x\n\n1 2 3 4 5 6 7 8\n", "tum"),
+        (struct.pack("<17d", 5.0, 0.7, 0.03, 99.0, *[0.0] * 13), "sbet"),
     ],
 )
 def test_formats_are_recognised_by_content(
-    tmp_path: Path, content: str | bytes, expected: TrajectoryFormat
+    tmp_path: Path, content: str | bytes, expected: str
 ) -> None:
     path = tmp_path / "vehicle"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    assert recognise(path) is expected
+    assert FORMATS.recognised(ForeignFile(path, "")) == expected
 
 
 def test_the_format_may_be_named_instead(tmp_path: Path) -> None:
     path = _write(tmp_path, "1 2 3", "4 5 6")
-    with pytest.raises(KgcpError, match="none of the known formats"):
+    with pytest.raises(KgcpError, match="is not a trajectory of a known format"):
         read_trajectory(path, _CRS)
     for kind, words in (
-        (TrajectoryFormat.CSV, "lacks the columns"),
-        (TrajectoryFormat.TUM, "line 1: is not the eight numbers"),
-        (TrajectoryFormat.RTKLIB, "lacks the header line"),
-        (TrajectoryFormat.SBET, "12 bytes, which are no whole records of 136"),
+        ("csv", "lacks the columns"),
+        ("tum", "line 1: is not the eight numbers"),
+        ("rtklib", "lacks the header line"),
+        ("sbet", "12 bytes, not a multiple of 136"),
     ):
         with pytest.raises(KgcpError, match=words):
             read_trajectory(path, _CRS, TrajectoryNotation(format=kind))
@@ -260,26 +257,26 @@ def test_the_format_may_be_named_instead(tmp_path: Path) -> None:
 
 
 # Two epochs on the meridian of zone 32, 0.5 s and 1e-5 degrees apart, heading north.
-_SAME_PLACES: dict[TrajectoryFormat, tuple[bytes, TrajectoryNotation]] = {
-    TrajectoryFormat.CSV: (
+_SAME_PLACES: dict[str, tuple[bytes, TrajectoryNotation]] = {
+    "csv": (
         f"{_HEADER}\n1777887000,9,45,100,0,0,0\n1777887000.5,9,45.00001,100,0,0,0\n".encode(),
         TrajectoryNotation(crs="EPSG:4979"),
     ),
-    TrajectoryFormat.SBET: (
+    "sbet": (
         b"".join(
             struct.pack("<17d", second, np.radians(lat), np.radians(9.0), 100.0, *[0.0] * 13)
             for second, lat in ((120618.0, 45.0), (120618.5, 45.00001))
         ),
         TrajectoryNotation(time_system=TimeSystem.GPS, first_day=date(2026, 5, 4)),
     ),
-    TrajectoryFormat.RTKLIB: (
+    "rtklib": (
         (
             b"% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  GPST latitude(deg) longitude(deg)"
             b" height(m) Q\n2417 120618.0 45.0 9.0 100.0 1\n2417 120618.5 45.00001 9.0 100.0 1\n"
         ),
         TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0)),
     ),
-    TrajectoryFormat.TUM: (
+    "tum": (
         "".join(
             f"{time} 9 {lat} 100 {np.sqrt(0.5)} {np.sqrt(0.5)} 0 0\n"
             for time, lat in ((1777887000.0, 45.0), (1777887000.5, 45.00001))
@@ -289,10 +286,8 @@ _SAME_PLACES: dict[TrajectoryFormat, tuple[bytes, TrajectoryNotation]] = {
 }
 
 
-@pytest.mark.parametrize("kind", TrajectoryFormat)
-def test_all_formats_say_the_same_recognised_or_named(
-    tmp_path: Path, kind: TrajectoryFormat
-) -> None:
+@pytest.mark.parametrize("kind", FORMATS.names)
+def test_all_formats_say_the_same_recognised_or_named(tmp_path: Path, kind: str) -> None:
     content, notation = _SAME_PLACES[kind]
     path = tmp_path / "vehicle"
     path.write_bytes(content)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import KgcpError
 from kgcp.georef.trajectory import body_to_ned
 from kgcp.io.files.gps_time import TimeSystem
-from kgcp.io.formats.trajectories import TrajectoryFormat, TrajectoryNotation, read_trajectory
+from kgcp.io.formats.trajectories import read_trajectory
+from kgcp.io.formats.trajectories.records import TrajectoryNotation
 
 CRS = "EPSG:25831"
 ORIGIN = (430606.1, 4583523.0, 120.0)  # 2.17 E, 41.4 N: grid north 0.55 degrees west of true north
@@ -129,7 +130,7 @@ def test_other_clocks_and_the_course(tmp_path: Path) -> None:
     positions = [(ORIGIN[0] + 5.0 * k, ORIGIN[1], ORIGIN[2]) for k in range(4)]
     rows = [row(f"{123400 + k}.5", NORTH, position) for k, position in enumerate(positions)]
     notation = TrajectoryNotation(
-        format=TrajectoryFormat.TUM,
+        format="tum",
         time_system=TimeSystem.GPS,
         first_day=date(2026, 5, 4),
         course_sd_deg=(2.0, 2.0, 3.0),
@@ -150,7 +151,7 @@ def test_other_clocks_and_the_course(tmp_path: Path) -> None:
         ((row("0", NORTH), row("x", NORTH)), ("line 2", "eight numbers")),
         ((row("0", NORTH), row("1", (np.nan, 0.0, 0.0, 1.0))), ("line 2", "eight numbers")),
         ((row("1", NORTH), "# turned", row("0", NORTH)), ("line 3", "before", "line 1")),
-        ((row("1777887005250", NORTH), row("1777887005251", NORTH)), ("line 1", "no date")),
+        ((row("1777887005250", NORTH), row("1777887005251", NORTH)), ("line 1", "out of range")),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(

@@ -1,8 +1,10 @@
-"""What a reader of poses returns: the poses of a file, in the file's own frame."""
+"""What a reader of poses is told by flight.toml, and what it returns: poses in the file's frame."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +14,26 @@ from kgcp.georef.local_frame import MapFrame
 from kgcp.io.files.sniff import ForeignFile
 
 _MAX_DISTORTION = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNotation:
+    """The keys of [reference] about its file.
+
+    Attributes
+    ----------
+    form : str or None
+        Name of the format; None: the content tells.
+    crs : str or None
+        Of the file's coordinates, for pyproj, where the file does not give it; None: the flight's,
+        or the format's default.
+    offset_file : Path or None
+        Holds what was subtracted from the file's coordinates; None: nothing was.
+    """
+
+    form: str | None = None
+    crs: str | None = None
+    offset_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +54,7 @@ class SourcePoses:
     level : MapFrame or None
         Where the file's frame is east, north, up in metres over a point that it names.
     unreferenced : str or None
-        Why the coordinates are of no map, unless flight.toml says of which; None: they are of the
+        Why the coordinates belong to no map unless flight.toml names one; None: they are in the
         flight's.
     sd_position_m : (n, 3) array or None
         Standard deviations along the map's axes [m]; None: not given.
@@ -53,29 +75,27 @@ class SourcePoses:
     has_our_names: bool = False
 
 
-def photo_rotation(file: ForeignFile, where: str, frame_from_camera: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) frame ← photo of one frame ← camera (y down, z forward).
+def photo_rotations(
+    file: ForeignFile, places: Sequence[str], frame_from_camera: FloatArray
+) -> FloatArray:
+    """Return the rotations (n, 3, 3) frame ← photo of n frame ← camera (y down, z forward).
 
     Raises
     ------
     KgcpError
-        If the matrix is no rotation.
+        Naming the place of a matrix that is not a rotation.
     """
-    require_rotation(file, where, frame_from_camera)
-    rotation: FloatArray = frame_from_camera @ CAMERA_FROM_PHOTO
-    return rotation
+    for place, matrix in zip(places, frame_from_camera, strict=True):
+        require_rotation(file, place, matrix)
+    rotations: FloatArray = frame_from_camera @ CAMERA_FROM_PHOTO
+    return rotations
 
 
 def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:
-    """Refuse a matrix (3, 3) that is no rotation.
-
-    Raises
-    ------
-    KgcpError
-    """
+    """Refuse a matrix (3, 3) that is not a rotation with a `KgcpError`."""
     departure = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not departure < _MAX_DISTORTION or np.linalg.det(matrix) < 0.0:
-        raise file.error(where, "has a rotation matrix that is none", "export it again")
+        raise file.error_at(where, "has a matrix that is not a rotation")
 
 
 def from_geocentric(
@@ -85,10 +105,8 @@ def from_geocentric(
 
     Parameters
     ----------
-    names : tuple of str
     ecef_m : (n, 3) array
         Projection centres [m].
-    ecef_from_photo : (n, 3, 3) array
     geodetic : str
         Three-dimensional geographic CRS of the same datum.
     """
@@ -104,10 +122,8 @@ def from_level(
 
     Parameters
     ----------
-    names : tuple of str
     enu_m : (n, 3) array
         Projection centres in the ENU frame [m].
-    enu_from_photo : (n, 3, 3) array
     frame : MapFrame
         Of a geographic CRS.
     """

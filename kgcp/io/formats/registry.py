@@ -1,0 +1,72 @@
+"""Formats of one kind of file: how each is recognised by its content, and who reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from kgcp.io.files.sniff import ForeignFile
+
+Read = TypeVar("Read")
+"""Of a function that reads a file of some format."""
+
+_OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsheet or archive"}
+
+
+@dataclass(frozen=True, slots=True)
+class Registry(Generic[Read]):
+    """The formats that a file of one kind may have.
+
+    Attributes
+    ----------
+    kind : str
+        What a file of these formats is, for messages: "a calibration".
+    remedy : str
+        What to do with a file of another format.
+    formats : mapping
+        Name in flight.toml → whether a file is of this format, and its reader. They are tried in
+        this order: the most specific first.
+    """
+
+    kind: str
+    remedy: str
+    formats: Mapping[str, tuple[Callable[[ForeignFile], bool], Read]]
+
+    @property
+    def names(self) -> Iterable[str]:
+        """What flight.toml calls the formats."""
+        return self.formats.keys()
+
+    def reader(self, file: ForeignFile, name: str | None = None) -> Read:
+        """Return the reader of a format by its name; None: by the file's content.
+
+        Raises
+        ------
+        KgcpError
+            If the content is of no known format.
+        """
+        name = self.recognised(file) if name is None else name
+        return self.formats[name][1]
+
+    def recognised(self, file: ForeignFile) -> str:
+        """Return the name of a file's format.
+
+        Raises
+        ------
+        KgcpError
+            If it is of none of these.
+        """
+        for name, (matches, _) in self.formats.items():
+            if matches(file):
+                return name
+        for start, text in _OTHER_TEXTS.items():
+            if file.head.startswith(start):
+                raise file.error(f"is {text}, not {self.kind}", "save it as text in UTF-8")
+        if "csv" in self.formats and ";" in file.first_line:
+            raise file.error(
+                f"is not {self.kind} of a known format: ';' separates its cells",
+                "save it with commas between the cells and points in the numbers",
+            )
+        known = ", ".join(sorted(self.formats))
+        raise file.error(f"is not {self.kind} of a known format ({known})", self.remedy)
