@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -14,13 +15,10 @@ from kgcp.io.flight.camera_table import CAMERA_KEYS
 from kgcp.io.flight.flight import FRAMES_KEYS, REFERENCE_KEYS
 from kgcp.io.flight.target_table import PLATE_KEYS, REPLICA_KEYS
 from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
-from kgcp.io.tables.columns import (
-    BIAS_COLUMNS,
-    CONSISTENCY_COLUMNS,
-    DETECTION_COLUMNS,
-    KGCP_COLUMNS,
-    Column,
-)
+from kgcp.io.tables.columns import Column
+from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
+from kgcp.io.tables.detections import DETECTION_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS, KGCP_COLUMNS
 from tests.test_layers import LAYERS, MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +55,7 @@ def first_column(text: str) -> list[str]:
     ],
 )
 def test_exactly_the_columns_that_exist_are_documented(
-    heading: str, columns: tuple[Column, ...]
+    heading: str, columns: tuple[Column[Any], ...]
 ) -> None:
     documented = first_column(section(heading))
     assert len(documented) == len(set(documented))

@@ -16,7 +16,7 @@ import pandas as pd
 
 from benchmarks.accuracy.bands import join_truth, read_truth, summarise, table_lines
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.tables.parquet import read_detections
+from kgcp.io.tables.detections import read_detections
 from kgcp.pipeline.detect import detect_flight
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings, Method

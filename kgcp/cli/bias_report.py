@@ -44,7 +44,7 @@ def command(
     """
     from kgcp.io.flight.data import FlightData
     from kgcp.io.flight.flight import read_flight
-    from kgcp.io.tables.sightings import read_attempts, read_settings
+    from kgcp.io.tables.detections import read_attempts, read_settings
     from kgcp.pipeline.workspace import DETECTIONS, workplace
     from kgcp.quality.bias_study import study_bias
     from kgcp.report.plotting import load_matplotlib

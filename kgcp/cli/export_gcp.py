@@ -91,9 +91,8 @@ def command(
     from kgcp.io.exporters.points import MapPoints
     from kgcp.io.exporters.write import not_renewed
     from kgcp.io.flight.flight import read_flight
-    from kgcp.io.tables.columns import KGCP_COLUMNS
     from kgcp.io.tables.consistency import write_consistency
-    from kgcp.io.tables.gcps import kgcp_row
+    from kgcp.io.tables.gcps import KGCP_COLUMNS, kgcp_row
     from kgcp.io.tables.parquet import write_table
     from kgcp.io.tables.provenance import provenance
     from kgcp.pipeline.export import prepare

@@ -14,8 +14,7 @@ from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
-from kgcp.io.tables.columns import BIAS_COLUMNS
-from kgcp.io.tables.gcps import bias_row
+from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import provenance
 from kgcp.pipeline.execution.signals import stops_held

@@ -15,8 +15,8 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.images.remote import StoredFolder, frames_below
-from kgcp.io.tables.columns import DETECTION_COLUMNS, SCHEMA_VERSION, Row
-from kgcp.io.tables.detections import detection_rows
+from kgcp.io.tables.columns import SCHEMA_VERSION, Row
+from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import versions, write_run_record
 from kgcp.measurement.guided import Expectation

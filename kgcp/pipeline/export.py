@@ -15,7 +15,7 @@ from kgcp.georef.selection import Selection, select
 from kgcp.georef.target_positions import Carrier
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.tables.sightings import read_attempts
+from kgcp.io.tables.detections import read_attempts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.quality.consistency import Consistency, study_consistency
 

@@ -15,7 +15,10 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import MapFrame
-from kgcp.io.tables.columns import CONSISTENCY_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, time_cell
+from kgcp.io.tables.columns import time_cell
+from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
+from kgcp.io.tables.detections import DETECTION_COLUMNS
+from kgcp.io.tables.gcps import KGCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
 
 _TOML = """\

@@ -17,7 +17,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
-from kgcp.io.tables.columns import BIAS_COLUMNS, DETECTION_COLUMNS, KGCP_COLUMNS, time_cell
+from kgcp.io.tables.columns import time_cell
+from kgcp.io.tables.detections import DETECTION_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS, KGCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
 from kgcp.report.bias.reexposure import Reexposed
 

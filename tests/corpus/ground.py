@@ -22,7 +22,8 @@ from PIL import Image
 from kgcp.cli import main
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
-from kgcp.io.tables.columns import DETECTION_COLUMNS, time_cell
+from kgcp.io.tables.columns import time_cell
+from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import write_table
 
 WIDTH, HEIGHT = 64, 48

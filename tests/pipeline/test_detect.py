@@ -15,7 +15,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.tables.columns import DETECTION_COLUMNS
+from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.detect import detect_flight
 from kgcp.pipeline.frame_task import Debug

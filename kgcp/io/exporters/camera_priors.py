@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from itertools import combinations
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.camera_priors import opk_covs, opk_deg
-from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, decimals, deviations, upper
+from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, covariance_cells, decimals
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
 COLUMNS = (
@@ -61,16 +60,8 @@ def files(points: MapPoints) -> Mapping[str, str]:
     for prior, opk, cov in every:
         angles = (decimals(angle, DEGREE_DECIMALS) for angle in opk)
         xyz = points.xyz(prior.position_map)
-        writer.writerow((prior.frame, *xyz, *angles, *_covariance(cov), points.crs))
+        writer.writerow((prior.frame, *xyz, *angles, *covariance_cells(cov, 6, 9), points.crs))
     return {
         "camera_priors/camera_priors.csv": stream.getvalue(),
         "camera_priors/HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights),
     }
-
-
-def _covariance(cov: FloatArray | None) -> tuple[str, ...]:
-    """Return deviations, then the covariances above the diagonal, row by row."""
-    if cov is None:
-        return ("",) * 21
-    values = (*deviations(cov), *upper(cov, 1))
-    return tuple(f"{value:.9g}" for value in values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -22,75 +23,61 @@ class Format:
     description: str
 
 
+def _in_folder(folder: str, names: str, description: str) -> Format:
+    """Return a format whose files have a folder of their own."""
+    files = re.sub(r"(\[?)(\S+)", rf"\1{folder}/\2", names).split()
+    return Format(tuple(files), description)
+
+
 FORMATS: Mapping[str, Format] = {
     "csv": Format(("kgcps.csv",), "all that kgcp knows about every point"),
     "odm": Format(
         ("gcp_list.txt", "odm/HOWTO.txt", "[odm/geo.txt]"),
         "OpenDroneMap: points; camera positions",
     ),
-    "opensfm": Format(
-        (
-            "opensfm/ground_control_points.json",
-            "opensfm/HOWTO.txt",
-            "[opensfm/exif_overrides.json]",
-        ),
+    "opensfm": _in_folder(
+        "opensfm",
+        "ground_control_points.json HOWTO.txt [exif_overrides.json]",
         "OpenSfM: points in WGS 84; camera positions",
     ),
-    "metashape": Format(
-        (
-            "metashape/markers.csv",
-            "metashape/markers.xml",
-            "metashape/scale_bars.csv",
-            "metashape/add_scale_bars.py",
-            "metashape/HOWTO.txt",
-            "[metashape/cameras.csv]",
-        ),
+    "metashape": _in_folder(
+        "metashape",
+        "markers.csv markers.xml scale_bars.csv add_scale_bars.py HOWTO.txt [cameras.csv]",
         "Agisoft Metashape: markers with accuracies, distances as scale bars; cameras",
     ),
-    "pix4d": Format(
-        ("pix4d/gcps.csv", "pix4d/marks.csv", "pix4d/HOWTO.txt", "[pix4d/checkpoints.csv]"),
+    "pix4d": _in_folder(
+        "pix4d",
+        "gcps.csv marks.csv HOWTO.txt [checkpoints.csv]",
         "Pix4D: points and marks with accuracies",
     ),
-    "opf": Format(
-        (
-            "opf/project.opf",
-            "opf/camera_list.json",
-            "opf/input_control_points.json",
-            "opf/HOWTO.txt",
-        ),
+    "opf": _in_folder(
+        "opf",
+        "project.opf camera_list.json input_control_points.json HOWTO.txt",
         "Open Photogrammetry Format: points and marks with standard deviations",
     ),
-    "micmac": Format(
-        ("micmac/gcps.xml", "micmac/marks.xml", "micmac/HOWTO.txt"),
+    "micmac": _in_folder(
+        "micmac",
+        "gcps.xml marks.xml HOWTO.txt",
         "MicMac v1: points and marks with uncertainties, in a local frame",
     ),
-    "mmvii": Format(
-        (
-            "mmvii/MesGCP-kgcp.xml",
-            "mmvii/CurSysCo.xml",
-            "mmvii/MesIm-*.xml",
-            "mmvii/kgcp.obs",
-            "mmvii/HOWTO.txt",
-        ),
+    "mmvii": _in_folder(
+        "mmvii",
+        "MesGCP-kgcp.xml CurSysCo.xml MesIm-*.xml kgcp.obs HOWTO.txt",
         "MMVII: points and marks with covariances, distances, in a local frame",
     ),
-    "colmap": Format(
-        (
-            "colmap/pose_priors.csv",
-            "colmap/reference.txt",
-            "colmap/add_pose_priors.py",
-            "colmap/HOWTO.txt",
-        ),
+    "colmap": _in_folder(
+        "colmap",
+        "pose_priors.csv reference.txt add_pose_priors.py HOWTO.txt",
         "COLMAP: camera positions with covariances, in a local frame",
     ),
-    "camera-priors": Format(
-        ("camera_priors/camera_priors.csv", "camera_priors/HOWTO.txt"),
+    "camera-priors": _in_folder(
+        "camera_priors",
+        "camera_priors.csv HOWTO.txt",
         "position and attitude of the camera with their covariance",
     ),
-    "geojson": Format(("geojson/kgcps.geojson", "geojson/HOWTO.txt"), "a map in WGS 84"),
-    "geopackage": Format(
-        ("geopackage/kgcps.gpkg", "geopackage/HOWTO.txt"),
-        "a map in the CRS of the points",
+    "geojson": _in_folder("geojson", "kgcps.geojson HOWTO.txt", "a map in WGS 84"),
+    "geopackage": _in_folder(
+        "geopackage", "kgcps.gpkg HOWTO.txt", "a map in the CRS of the points"
     ),
 }
 """By the name on the command line."""

@@ -26,7 +26,6 @@ class LocalPoints:
 
     Attributes
     ----------
-    frame : MapFrame
     origin_map : (3,) array
         The frame's origin in the map.
     position_m : (n, 3) array

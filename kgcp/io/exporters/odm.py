@@ -138,7 +138,7 @@ def _header(text: str, crs: CRS) -> str:
             return text
         raise KgcpError(
             f"{FILE_NAME}: crs {text!r} has no EPSG code, which ODM needs;"
-            " give crs in flight.toml as 'EPSG:code' or a PROJ string, or leave out --format odm"
+            " give crs in flight.toml as 'EPSG:code' or a PROJ string, or leave out the format odm"
         )
     utm = _WGS84_UTM.fullmatch(str(code))
     if utm is None:

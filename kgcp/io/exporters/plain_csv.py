@@ -6,8 +6,7 @@ import csv
 import io
 from collections.abc import Mapping
 
-from kgcp.geometry.arrays import FloatArray
-from kgcp.io.exporters.points import METRE_DECIMALS, MapPoints, decimals, deviations, pixel, upper
+from kgcp.io.exporters.points import METRE_DECIMALS, MapPoints, covariance_cells, decimals, pixel
 from kgcp.io.files.time_text import format_time
 
 COLUMNS = (
@@ -32,27 +31,19 @@ def files(points: MapPoints) -> Mapping[str, str]:
                 *(point.id, point.frame, point.target),
                 "" if point.time_s is None else format_time(point.time_s),
                 *points.xyz(point.position_map),
-                *_covariance(point.cov_m2, 3),
+                *covariance_cells(point.cov_m2, 3, 6),
                 *pixel(point),
-                *_covariance(point.centre_cov_px2, 2),
+                *covariance_cells(point.centre_cov_px2, 2, 6),
                 decimals(point.distance_m, METRE_DECIMALS),
                 _text(point.sd_distance_m),
                 _text(point.sd_common_distance_m),
-                *_covariance(point.cov_common_m2, 3),
+                *covariance_cells(point.cov_common_m2, 3, 6),
                 "check" if point.is_checkpoint else "control",
                 "" if point.flag is None else point.flag.value,
                 points.crs,
             )
         )
     return {"kgcps.csv": stream.getvalue()}
-
-
-def _covariance(cov: FloatArray | None, size: int) -> tuple[str, ...]:
-    """Return deviations, then the covariances above the diagonal, row by row."""
-    if cov is None:
-        return ("",) * (size * (size + 1) // 2)
-    values = (*deviations(cov), *upper(cov, 1))
-    return tuple(_text(float(value)) for value in values)
 
 
 def _text(value: float | None) -> str:

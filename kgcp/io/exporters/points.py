@@ -13,11 +13,10 @@ import numpy as np
 from pyproj import CRS
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.gcp import Kgcp
-from kgcp.georef.trajectory import IndexArray
 
 METRE_DECIMALS = 7  # points that differ never look the same
 DEGREE_DECIMALS = 12
@@ -35,8 +34,6 @@ class MapPoints:
     ----------
     crs : str
         Of the points and the priors.
-    kgcps : tuple of Kgcp
-    camera : Camera
     priors : tuple of CameraPrior
         Of the frames for which there is one.
     """
@@ -165,7 +162,6 @@ def image_names(
 
     Parameters
     ----------
-    frames : iterable of str
     where : str
         What an error names: the format.
     refused : str
@@ -225,7 +221,7 @@ def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
     if point.centre_cov_px2 is None:
         raise KgcpError(
             f"{where}: the image point of {point.id} has no standard deviations, which the format"
-            " needs; run 'kgcp detect' with --method model or leave this format out"
+            " needs; detect with the method model, or leave this format out"
         )
     return point.centre_cov_px2
 
@@ -247,6 +243,13 @@ def upper(cov: FloatArray, above: int = 0) -> FloatArray:
 def _upper_indices(size: int, above: int) -> tuple[IndexArray, IndexArray]:
     rows, columns = np.triu_indices(size, k=above)
     return rows, columns
+
+
+def covariance_cells(cov: FloatArray | None, size: int, digits: int) -> tuple[str, ...]:
+    """Return deviations, then the covariances above the diagonal, row by row; empty for None."""
+    if cov is None:
+        return ("",) * (size * (size + 1) // 2)
+    return tuple(f"{value:.{digits}g}" for value in (*deviations(cov), *upper(cov, 1)))
 
 
 def deviations(cov: FloatArray) -> FloatArray:

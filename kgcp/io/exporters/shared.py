@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
 from kgcp.georef.gcp import Kgcp
 from kgcp.io.files.time_text import format_time
+from kgcp.io.tables.columns import ColumnType
+from kgcp.io.tables.gcps import KGCP_COLUMNS
 
+_COLUMNS = {column.name: column for column in KGCP_COLUMNS}
+_NAMES = (
+    *("id", "frame", "target", "time", "role", "x", "y", "z", "sd_x", "sd_y", "sd_z"),
+    *("x_px", "y_px", "distance_m", "sd_distance_m"),
+)
 ATTRIBUTES: Mapping[str, str] = {
-    **dict.fromkeys(("id", "frame", "target", "time", "role"), "TEXT"),
-    **dict.fromkeys(("x", "y", "z", "sd_x", "sd_y", "sd_z", "x_px", "y_px"), "DOUBLE"),
-    **dict.fromkeys(("distance_m", "sd_distance_m"), "DOUBLE"),
+    name: "DOUBLE" if _COLUMNS[name].type is ColumnType.NUMBER else "TEXT" for name in _NAMES
 }
 """Names and their types in SQL, in order."""
 
@@ -28,26 +31,10 @@ is another one, put the new calibration into flight.toml and begin again with kg
 """
 
 
-def attributes(point: Kgcp) -> dict[str, str | float | None]:
-    """Return the attributes of a point; None where unknown."""
-    sds = [None] * 3 if point.cov_m2 is None else np.sqrt(np.diag(point.cov_m2)).tolist()
-    x, y, z = point.position_map.tolist()
-    x_px, y_px = point.centre_px.tolist()
-    return {
-        "id": point.id,
-        "frame": point.frame,
-        "target": point.target,
-        "time": None if point.time_s is None else format_time(point.time_s),
-        "role": "check" if point.is_checkpoint else "control",
-        "x": x,
-        "y": y,
-        "z": z,
-        **dict(zip(("sd_x", "sd_y", "sd_z"), sds, strict=True)),
-        "x_px": x_px,
-        "y_px": y_px,
-        "distance_m": point.distance_m,
-        "sd_distance_m": point.sd_distance_m,
-    }
+def attributes(point: Kgcp) -> dict[str, object]:
+    """Return the attributes of a point, as in `kgcps.parquet`; None where unknown."""
+    cells = {name: _COLUMNS[name].get(point) for name in _NAMES}
+    return {**cells, "time": None if point.time_s is None else format_time(point.time_s)}
 
 
 def focal_length_note(kgcps: Iterable[Kgcp]) -> str:

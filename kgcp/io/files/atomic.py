@@ -52,7 +52,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         with whole_file(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
-        raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+        raise KgcpError(f"{path}: cannot be written ({error}); choose another folder") from error
 
 
 def write_all(contents: Mapping[Path, bytes]) -> None:

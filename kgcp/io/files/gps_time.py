@@ -63,13 +63,6 @@ def unix_from_gps(clock_s: FloatArray) -> FloatArray:
     return unix_s
 
 
-def gps_from_unix(unix_s: FloatArray) -> FloatArray:
-    """Return GPS clock times of Unix times (UTC), of any shape [s]."""
-    unix_s = np.asarray(unix_s, dtype=np.float64)
-    clock_s: FloatArray = unix_s + np.searchsorted(_LEAPS_UTC_S, unix_s, side="right")
-    return clock_s
-
-
 def unix_from_clock(clock_s: FloatArray, system: TimeSystem) -> FloatArray:
     """Return Unix times (UTC) of the clock times of a time system [s]."""
     return unix_from_gps(clock_s) if system is TimeSystem.GPS else np.asarray(clock_s, float)

@@ -33,7 +33,7 @@ def locked(path: Path) -> Iterator[None]:
         descriptor = _open_locked(path)
     except OSError as error:
         raise KgcpError(
-            f"{path.parent}: cannot be written ({error}); choose another --out"
+            f"{path.parent}: cannot be written ({error}); choose another folder"
         ) from error
     try:
         yield
@@ -57,7 +57,7 @@ def _open_locked(path: Path) -> int:
             os.close(descriptor)
             raise KgcpError(
                 f"{path.parent}: another kgcp is writing here (process {holder}); wait for its"
-                " end, or choose another --out"
+                " end, or choose another folder"
             ) from None
         except BaseException:
             os.close(descriptor)

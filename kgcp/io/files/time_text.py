@@ -47,10 +47,14 @@ def parse_time(text: str) -> float:
     return _in_calendar((moment - _EPOCH) / _SECOND, f"{text!r} is out of range")
 
 
+def date_of(unix_s: float) -> datetime:
+    """Return Unix seconds as a UTC date, rounded to the microsecond."""
+    return _EPOCH + timedelta(microseconds=round(unix_s * 1e6))
+
+
 def format_time(unix_s: float) -> str:
     """Write Unix seconds as ISO 8601 in UTC with microseconds and `Z`."""
-    moment = _EPOCH + timedelta(microseconds=round(unix_s * 1e6))
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return date_of(unix_s).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def is_in_calendar(unix_s: float) -> bool:

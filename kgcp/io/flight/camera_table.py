@@ -17,19 +17,9 @@ from kgcp.settings import require_range
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
 DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
 CAMERA_KEYS = (
-    "file",
-    "format",
-    "camera",
-    "width",
-    "height",
-    *CALIBRATION_PARAMETERS,
-    *DEVIATION_KEYS,
-    "cov_of",
-    "cov",
-    "plumb_sd_deg",
-    "response",
-    "readout_s",
-    "time_reference",
+    *("file", "format", "camera", "width", "height", *CALIBRATION_PARAMETERS),
+    *(*DEVIATION_KEYS, "cov_of", "cov", "plumb_sd_deg"),
+    *("response", "readout_s", "time_reference"),
 )
 
 

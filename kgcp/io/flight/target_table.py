@@ -11,16 +11,10 @@ from kgcp.io.flight.toml_table import TomlTable
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets
 
+_DIAMETERS = ("outer_diameter_m", "inner_diameter_m", "code_diameter_m", "dot_diameter_m")
 PLATE_KEYS = (
-    "name",
-    "outer_diameter_m",
-    "inner_diameter_m",
-    "code_diameter_m",
-    "dot_diameter_m",
-    "code_deg",
-    "sd_outer_diameter_m",
-    "position_m",
-    "sd_position_m",
+    *("name", *_DIAMETERS, "code_deg", "sd_outer_diameter_m"),
+    *("position_m", "sd_position_m"),
 )
 _MOST_TARGETS = 200  # each is compared with every other
 REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
@@ -61,7 +55,13 @@ def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -
 
 
 def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
-    ring = _read_ring(table)
+    with table.located():
+        ring = Ring(
+            name=table.name("name"),
+            code_deg=table.numbers("code_deg"),
+            sd_outer_diameter_m=table.number("sd_outer_diameter_m", 0.0),
+            **{key: table.number(key) for key in _DIAMETERS},
+        )
     if "sd_position_m" in table and "position_m" not in table:
         raise table.error("sd_position_m", "needs position_m", "give both or none")
     sd_position_m = table.vector("sd_position_m", (0.0, 0.0, 0.0))
@@ -70,22 +70,9 @@ def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
     return Target(
         ring=ring,
         replicas=tuple(_read_replicas(ring, replicas)),
-        position_m=table.vector("position_m") if "position_m" in table else None,
+        position_m=table.optional("position_m", table.vector),
         sd_position_m=sd_position_m,
     )
-
-
-def _read_ring(table: TomlTable) -> Ring:
-    with table.located():
-        return Ring(
-            name=table.name("name"),
-            outer_diameter_m=table.number("outer_diameter_m"),
-            inner_diameter_m=table.number("inner_diameter_m"),
-            code_diameter_m=table.number("code_diameter_m"),
-            dot_diameter_m=table.number("dot_diameter_m"),
-            code_deg=table.numbers("code_deg"),
-            sd_outer_diameter_m=table.number("sd_outer_diameter_m", 0.0),
-        )
 
 
 def _read_replicas(plate: Ring, tables: Sequence[TomlTable]) -> Iterator[Ring]:
@@ -112,33 +99,24 @@ def write_target_tables(targets: Sequence[Target], folder: Path) -> Path:
 
 def target_lines(target: Target) -> Iterator[str]:
     """Yield the lines of a target's tables, its replicas after it; each begins with a gap."""
-    yield from _ring_lines(target.ring)
-    if target.ring.sd_outer_diameter_m:
-        yield f"sd_outer_diameter_m = {target.ring.sd_outer_diameter_m!r}"
+    ring = target.ring
+    yield "\n[[target]]"
+    yield f"name = {json.dumps(ring.name)}"
+    for key in _DIAMETERS:
+        yield f"{key} = {getattr(ring, key)!r}"
+    yield _code_line(ring)
+    if ring.sd_outer_diameter_m:
+        yield f"sd_outer_diameter_m = {ring.sd_outer_diameter_m!r}"
     if target.position_m is not None:
         yield f"position_m = {list(target.position_m)}"
         if any(target.sd_position_m):
             yield f"sd_position_m = {list(target.sd_position_m)}"
     for replica in target.replicas:
-        yield from _replica_lines(replica, target.ring)
-
-
-def _ring_lines(ring: Ring) -> Iterator[str]:
-    yield "\n[[target]]"
-    yield f"name = {json.dumps(ring.name)}"
-    yield f"outer_diameter_m = {ring.outer_diameter_m!r}"
-    yield f"inner_diameter_m = {ring.inner_diameter_m!r}"
-    yield f"code_diameter_m = {ring.code_diameter_m!r}"
-    yield f"dot_diameter_m = {ring.dot_diameter_m!r}"
-    yield _code_line(ring)
-
-
-def _replica_lines(replica: Ring, ring: Ring) -> Iterator[str]:
-    yield "\n[[target]]"
-    yield f"name = {json.dumps(replica.name)}"
-    yield f"replica_of = {json.dumps(ring.name)}"
-    yield f"scale = {replica.outer_diameter_m / ring.outer_diameter_m:.12g}"
-    yield _code_line(replica)
+        yield "\n[[target]]"
+        yield f"name = {json.dumps(replica.name)}"
+        yield f"replica_of = {json.dumps(ring.name)}"
+        yield f"scale = {replica.outer_diameter_m / ring.outer_diameter_m:.12g}"
+        yield _code_line(replica)
 
 
 def _code_line(ring: Ring) -> str:

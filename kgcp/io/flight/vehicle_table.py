@@ -12,22 +12,9 @@ from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
 from kgcp.settings import VehicleSettings
 
 VEHICLE_KEYS = (
-    "trajectory",
-    "format",
-    "crs",
-    "time_system",
-    "date",
-    "accuracies",
-    "wander",
-    "attitude",
-    "sd_attitude_deg",
-    "lever_arm_m",
-    "sd_lever_arm_m",
-    "mount_deg",
-    "sd_time_s",
-    "time_offset_s",
-    "level_sd_deg",
-    "correlation_s",
+    *("trajectory", "format", "crs", "time_system", "date", "accuracies", "wander"),
+    *("attitude", "sd_attitude_deg", "lever_arm_m", "sd_lever_arm_m", "mount_deg"),
+    *("sd_time_s", "time_offset_s", "level_sd_deg", "correlation_s"),
 )
 _COURSE = "course"
 

@@ -69,35 +69,43 @@ def read_solution(file: ForeignFile) -> Solution:
             "lacks the header line '% GPST …' that names its columns",
             "write the solution with its header (out-outhead = on)",
         )
-    names, places, width = _layout(header[2])
+    names = _NAME.findall(header[2])
+    width = sum(3 if unit == _SEXAGESIMAL else 1 for _, unit in names)
     data = [(line, row) for line, row in rows if not row.startswith("%")]
     clocks, cells = _split(file, data, width)
+    # Time systems by the manual's appendix B: GPS time, UTC or Japan's, which is UTC + 9 h.
+    system = TimeSystem.GPS if header[1] == "GPST" else TimeSystem.UTC
+    time_s = unix_from_clock(clocks, system) - (_JST_AHEAD_S if header[1] == "JST" else 0.0)
     kind = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
     return Solution(
         file.path,
         tuple(line for line, _ in data),
-        _unix(clocks, header[1]),
-        {name: _column(cells, *place) for name, place in zip(names, places, strict=True)},
+        time_s,
+        _columns(names, cells),
         kind[1] if kind else "",
         kind[2] if kind else "",
     )
 
 
-def _layout(header: str) -> tuple[list[str], list[tuple[int, int]], int]:
-    """Return names of columns, first cell and number of cells of each, and the sum of these."""
-    names, places, cell = [], [], 0
-    for name, unit in _NAME.findall(header):
-        cells = 3 if unit == _SEXAGESIMAL else 1
-        names.append(name)
-        places.append((cell, cells))
-        cell += cells
-    return names, places, cell
+def _columns(names: Sequence[tuple[str, str]], cells: FloatArray) -> dict[str, FloatArray]:
+    """Return cells (n, width) by name; degrees, minutes, seconds have one sign, at the degrees."""
+    columns, first = {}, 0
+    for name, unit in names:
+        if unit == _SEXAGESIMAL:
+            degrees, minutes, seconds = cells[:, first : first + 3].T
+            angle = np.abs(degrees) + minutes / 60.0 + seconds / 3600.0
+            columns[name] = np.copysign(angle, degrees)
+            first += 3
+        else:
+            columns[name] = cells[:, first]
+            first += 1
+    return columns
 
 
 def _split(
     file: ForeignFile, data: Sequence[tuple[int, str]], width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return clock times (n,) and cells (n, width); what stands in further cells is dropped."""
+    """Return clock times (n,) and cells (n, width); further cells are dropped."""
     separator = next((mark for mark in ",;\t" if data and mark in data[0][1]), None)
     clocks, cells = np.empty(len(data)), np.empty((len(data), width))
     weeks = np.full(len(data), np.nan)
@@ -105,9 +113,9 @@ def _split(
         try:
             if match := _DATE.match(row):
                 clocks[index], rest = _calendar(match), row[match.end() :]
-                texts = _cells(rest.removeprefix(separator or ""), separator)
+                texts = rest.removeprefix(separator or "").split(separator)
             else:
-                week, seconds, *texts = _cells(row, separator)
+                week, seconds, *texts = row.split(separator)
                 weeks[index], clocks[index] = int(week), float(seconds)
             if len(texts) < width:
                 raise file.error_at(
@@ -130,26 +138,7 @@ def _split(
     return unwrap_week(clocks) if in_weeks.any() else clocks, cells
 
 
-def _cells(text: str, separator: str | None) -> list[str]:
-    return [cell.strip() for cell in text.split(separator)]
-
-
 def _calendar(match: re.Match[str]) -> float:
     year, month, day, hour, minute = (int(match[group]) for group in range(1, 6))
     midnight = datetime(year, month, day, tzinfo=UTC).timestamp()
     return midnight + 3600.0 * hour + 60.0 * minute + float(match[6])
-
-
-def _unix(clock_s: FloatArray, name: str) -> FloatArray:
-    if name == "GPST":
-        return unix_from_clock(clock_s, TimeSystem.GPS)
-    return clock_s - (_JST_AHEAD_S if name == "JST" else 0.0)
-
-
-def _column(cells: FloatArray, first: int, count: int) -> FloatArray:
-    """Return the values of one column; degrees, minutes, seconds have one sign, at the degrees."""
-    if count == 1:
-        return cells[:, first]
-    degrees, minutes, seconds = cells[:, first : first + count].T
-    angle: FloatArray = np.copysign(np.abs(degrees) + minutes / 60.0 + seconds / 3600.0, degrees)
-    return angle

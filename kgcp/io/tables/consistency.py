@@ -7,15 +7,30 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from kgcp.io.files.atomic import write_bytes
-from kgcp.io.tables.columns import CONSISTENCY_COLUMNS, Row, time_cell
+from kgcp.io.tables.columns import BOOLEAN, NUMBER, TEXT, TIME, Column, row_of, sd_cell, time_cell
 from kgcp.io.tables.parquet import write_table
 from kgcp.quality.advice import advice, rms_m
 from kgcp.quality.consistency import Consistency, Discrepancy
 
 _AXES = ("along", "across", "up")
+
+
+CONSISTENCY_COLUMNS: tuple[Column[Discrepancy], ...] = (
+    Column("frame", TEXT, lambda found: found.frame),
+    Column("target", TEXT, lambda found: found.target),
+    Column("time", TIME, lambda found: time_cell(found.time_s)),
+    Column("along_m", NUMBER, lambda found: float(found.offset_m[0])),
+    Column("across_m", NUMBER, lambda found: float(found.offset_m[1])),
+    Column("up_m", NUMBER, lambda found: float(found.offset_m[2])),
+    Column("sd_along_m", NUMBER, lambda found: sd_cell(found.cov_m2, 0)),
+    Column("sd_across_m", NUMBER, lambda found: sd_cell(found.cov_m2, 1)),
+    Column("sd_up_m", NUMBER, lambda found: sd_cell(found.cov_m2, 2)),
+    Column("residual_along_m", NUMBER, lambda found: float(found.residual_m[0])),
+    Column("residual_across_m", NUMBER, lambda found: float(found.residual_m[1])),
+    Column("residual_up_m", NUMBER, lambda found: float(found.residual_m[2])),
+    Column("outlier", BOOLEAN, lambda found: found.is_outlier),
+)
 
 
 def write_consistency(
@@ -31,7 +46,8 @@ def write_consistency(
     summary, table = folder / "consistency.json", folder / "consistency.parquet"
     text = json.dumps(_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(summary, f"{text}\n".encode())
-    write_table(table, CONSISTENCY_COLUMNS, map(_row, found.discrepancies), metadata)
+    rows = (row_of(CONSISTENCY_COLUMNS, one) for one in found.discrepancies)
+    write_table(table, CONSISTENCY_COLUMNS, rows, metadata)
     return summary, table
 
 
@@ -50,20 +66,3 @@ def _summary(found: Consistency) -> dict[str, object]:
         "correlation_s": found.correlation_s,
         "advice": advice(found),
     }
-
-
-def _row(one: Discrepancy) -> Row:
-    deviations = np.sqrt(np.diag(one.cov_m2)).tolist()
-    return {
-        "frame": one.frame,
-        "target": one.target,
-        "time": time_cell(one.time_s),
-        **_by_axis("{}_m", one.offset_m.tolist()),
-        **_by_axis("sd_{}_m", deviations),
-        **_by_axis("residual_{}_m", one.residual_m.tolist()),
-        "outlier": one.is_outlier,
-    }
-
-
-def _by_axis(pattern: str, values: list[float]) -> Row:
-    return {pattern.format(axis): value for axis, value in zip(_AXES, values, strict=True)}

@@ -1,26 +1,57 @@
-"""From one frame's result to its rows in `detections.parquet`."""
+"""`detections.parquet`: rows from the results of frames, and back to records for what follows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+from scipy.spatial.transform import Rotation
 
-from kgcp.errors import Status
+from kgcp.errors import KgcpError, Status
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+from kgcp.georef.sighting import Sighting
+from kgcp.io.files.safe_read import is_file
 from kgcp.io.images.frames import Exif
-from kgcp.io.tables.columns import DETECTION_COLUMNS, Row, time_cell
+from kgcp.io.tables.columns import (
+    BOOLEAN,
+    INTEGER,
+    NUMBER,
+    NUMBERS,
+    TEXT,
+    TIME,
+    Column,
+    Row,
+    matrix_cell,
+    row_of,
+    sd_cell,
+    time_cell,
+)
+from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.records import (
-    Appearance,
+    Alternative,
     CommonUncertainty,
     Miss,
     Observation,
     Outcome,
     Uncertainty,
 )
+from kgcp.quality.bias_study import Attempt, Exposure
+from kgcp.settings import DetectSettings, Method
+from kgcp.targets.layout import Target
 
-_NULL_ROW: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
+_Cells = Mapping[Hashable, object]
+_MEASURED = Status.MEASURED.value
+_Part = TypeVar("_Part")
+_Record = tuple["FrameResult", Outcome]
+_Get = Callable[[_Record], object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,102 +76,237 @@ class FrameResult:
     outcomes: tuple[Outcome, ...]
 
 
+def _frame(get: Callable[[FrameResult], object]) -> _Get:
+    return lambda record: get(record[0])
+
+
+def _outcome(
+    of_observation: Callable[[Observation], object], of_miss: Callable[[Miss], object]
+) -> _Get:
+    def get(record: _Record) -> object:
+        outcome = record[1]
+        return of_miss(outcome) if isinstance(outcome, Miss) else of_observation(outcome)
+
+    return get
+
+
+def _measured(get: Callable[[Observation], object]) -> _Get:
+    return _outcome(get, lambda _: None)
+
+
+def _part(part: Callable[[Observation], _Part | None], get: Callable[[_Part], object]) -> _Get:
+    """Get from a part of an observation; null where the method does not estimate it."""
+
+    def of_observation(observation: Observation) -> object:
+        value = part(observation)
+        return None if value is None else get(value)
+
+    return _measured(of_observation)
+
+
+def _uncertainty(get: Callable[[Uncertainty], object]) -> _Get:
+    return _part(lambda seen: seen.uncertainty, get)
+
+
+def _common(get: Callable[[CommonUncertainty], object]) -> _Get:
+    return _part(lambda seen: seen.common, get)
+
+
+def _alternative(get: Callable[[Alternative], object]) -> _Get:
+    return _part(lambda seen: seen.alternative, get)
+
+
+@lru_cache(maxsize=2)
+def _quaternion(pose: Pose) -> list[float]:
+    quaternion: list[float] = pose.quaternion_wxyz.tolist()
+    return quaternion
+
+
+DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
+    Column("frame", TEXT, _frame(lambda result: result.frame)),
+    Column("target", TEXT, lambda record: record[1].target),
+    Column("time", TIME, _frame(lambda result: time_cell(result.time_s))),
+    Column("instance", INTEGER, _outcome(lambda seen: seen.instance, lambda _: 0)),
+    Column("status", TEXT, _outcome(lambda _: _MEASURED, lambda miss: miss.reason.status.value)),
+    Column("reason", TEXT, _outcome(lambda _: "", lambda miss: miss.reason.value)),
+    Column("detail", TEXT, _outcome(lambda _: "", lambda miss: miss.detail)),
+    Column("candidates", INTEGER, _outcome(lambda _: 0, lambda miss: miss.candidates)),
+    Column("guided", BOOLEAN, _outcome(lambda seen: seen.is_guided, lambda _: False)),
+    Column("scale_used", TEXT, _outcome(lambda seen: seen.ring, lambda _: "")),
+    Column("x_px", NUMBER, _measured(lambda seen: float(seen.centre_px[0]))),
+    Column("y_px", NUMBER, _measured(lambda seen: float(seen.centre_px[1]))),
+    Column("sd_x_px", NUMBER, _uncertainty(lambda sds: sd_cell(sds.centre_cov_px2, 0))),
+    Column("sd_y_px", NUMBER, _uncertainty(lambda sds: sd_cell(sds.centre_cov_px2, 1))),
+    Column("cov_xy_px2", NUMBER, _uncertainty(lambda sds: float(sds.centre_cov_px2[0, 1]))),
+    Column("distance_m", NUMBER, _measured(lambda seen: seen.pose.distance_m)),
+    Column("sd_distance_m", NUMBER, _uncertainty(lambda sds: sds.sd_distance_m)),
+    Column("tx_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[0]))),
+    Column("ty_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[1]))),
+    Column("tz_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[2]))),
+    Column("qw", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[0])),
+    Column("qx", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[1])),
+    Column("qy", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[2])),
+    Column("qz", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[3])),
+    Column("roll_deg", NUMBER, _measured(lambda seen: seen.pose.roll_deg)),
+    Column("pitch_deg", NUMBER, _measured(lambda seen: seen.pose.pitch_deg)),
+    Column("heading_deg", NUMBER, _measured(lambda seen: seen.heading_deg)),
+    Column("sd_roll_deg", NUMBER, _uncertainty(lambda sds: sds.sd_roll_deg)),
+    Column("sd_pitch_deg", NUMBER, _uncertainty(lambda sds: sds.sd_pitch_deg)),
+    Column("sd_heading_deg", NUMBER, _uncertainty(lambda sds: sds.sd_heading_deg)),
+    Column("pose_cov", NUMBERS, _uncertainty(lambda sds: matrix_cell(sds.pose_cov))),
+    Column("alt_qw", NUMBER, _alternative(lambda other: _quaternion(other.pose)[0])),
+    Column("alt_qx", NUMBER, _alternative(lambda other: _quaternion(other.pose)[1])),
+    Column("alt_qy", NUMBER, _alternative(lambda other: _quaternion(other.pose)[2])),
+    Column("alt_qz", NUMBER, _alternative(lambda other: _quaternion(other.pose)[3])),
+    Column("ambiguity", NUMBER, _alternative(lambda other: other.ambiguity)),
+    Column("sd_common_distance_m", NUMBER, _common(lambda common: common.sd_distance_m)),
+    Column("sd_common_direction_mrad", NUMBER, _common(lambda common: common.sd_direction_mrad)),
+    Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
+    Column("score", NUMBER, lambda record: record[1].score),
+    Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
+    Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),
+    Column("edge_shift_px", NUMBER, _measured(lambda seen: seen.appearance.edge_shift_px)),
+    Column("black", NUMBER, _measured(lambda seen: seen.appearance.black)),
+    Column("white", NUMBER, _measured(lambda seen: seen.appearance.white)),
+    Column("saturated", NUMBER, _measured(lambda seen: seen.appearance.saturated)),
+    Column("exposure_time_s", NUMBER, _frame(lambda result: result.exif.exposure_time_s)),
+    Column("iso", NUMBER, _frame(lambda result: result.exif.iso)),
+    Column("f_number", NUMBER, _frame(lambda result: result.exif.f_number)),
+)
+
+
 def detection_rows(result: FrameResult) -> list[Row]:
     """Return the rows of one frame, one per target and instance, by target and instance."""
-    shared = {
-        "frame": result.frame,
-        "time": time_cell(result.time_s),
-        "exposure_time_s": result.exif.exposure_time_s,
-        "iso": result.exif.iso,
-        "f_number": result.exif.f_number,
-    }
-    rows: list[tuple[tuple[str, int], Row]] = []
-    for outcome in result.outcomes:
-        cells = _miss_cells(outcome) if isinstance(outcome, Miss) else _measured_cells(outcome)
-        instance = 0 if isinstance(outcome, Miss) else outcome.instance
-        key = {"target": outcome.target, "instance": instance}
-        rows.append(((outcome.target, instance), {**_NULL_ROW, **shared, **key, **cells}))
-    return [row for _, row in sorted(rows, key=lambda pair: pair[0])]
+
+    def place(outcome: Outcome) -> tuple[str, int]:
+        return outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance
+
+    outcomes = sorted(result.outcomes, key=place)
+    return [row_of(DETECTION_COLUMNS, (result, outcome)) for outcome in outcomes]
 
 
-def _miss_cells(miss: Miss) -> Mapping[str, object]:
-    return {
-        "status": miss.reason.status.value,
-        "reason": miss.reason.value,
-        "detail": miss.detail,
-        "candidates": miss.candidates,
-        "guided": False,
-        "scale_used": "",
-        "score": miss.score,
-    }
+def read_detections(path: Path) -> pd.DataFrame:
+    """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
+    if not is_file(path):
+        raise KgcpError(f"{path}: does not exist; run 'kgcp detect' on this flight first")
+    return read_table(path, DETECTION_COLUMNS)
 
 
-def _measured_cells(seen: Observation) -> Mapping[str, object]:
-    return {
-        "status": Status.MEASURED.value,
-        "reason": "",
-        "detail": "",
-        "candidates": 0,
-        "guided": seen.is_guided,
-        "scale_used": seen.ring,
-        "x_px": float(seen.centre_px[0]),
-        "y_px": float(seen.centre_px[1]),
-        "distance_m": seen.pose.distance_m,
-        **_named(("tx_m", "ty_m", "tz_m"), seen.pose.translation_m),
-        **_named(("qw", "qx", "qy", "qz"), seen.pose.quaternion_wxyz),
-        "roll_deg": seen.pose.roll_deg,
-        "pitch_deg": seen.pose.pitch_deg,
-        "heading_deg": seen.heading_deg,
-        "score": seen.score,
-        **_appearance_cells(seen.appearance),
-        **({} if seen.uncertainty is None else _uncertainty_cells(seen.uncertainty)),
-        **({} if seen.common is None else _common_cells(seen.common)),
-        **_alternative_cells(seen),
-    }
+def read_attempts(path: Path, targets: Sequence[Target]) -> list[Attempt]:
+    """Read the detections of a flight, without unreadable frames, in the frames' order.
+
+    A frame is numbered by its place among all frames, unreadable ones included, so that the
+    numbers do not depend on what was found.
+
+    Raises
+    ------
+    KgcpError
+        If the table is missing or unreadable, or names a target that flight.toml does not have.
+    """
+    table = read_detections(path)
+    strange = sorted(set(table["target"]) - {target.name for target in targets})
+    if strange:
+        raise KgcpError(
+            f"{path}: has target {strange[0]!r}, which flight.toml does not;"
+            " run 'kgcp detect' on this flight again"
+        )
+    numbers = {frame: number for number, frame in enumerate(sorted(set(table["frame"])), start=1)}
+    readable = table[table["status"] != Status.UNREADABLE.value]
+    ordered = readable.sort_values(["frame", "target", "instance"])
+    return [_attempt(row, numbers[row["frame"]]) for row in ordered.to_dict("records")]
 
 
-def _appearance_cells(appearance: Appearance) -> Mapping[str, object]:
-    return {
-        "radius_px": appearance.radius_px,
-        "blur_px": appearance.blur_px,
-        "edge_shift_px": appearance.edge_shift_px,
-        "black": appearance.black,
-        "white": appearance.white,
-        "saturated": appearance.saturated,
-    }
+def read_settings(path: Path) -> DetectSettings:
+    """Read the settings that a table of detections was made with; the defaults for what it lacks.
+
+    Raises
+    ------
+    KgcpError
+        If the table does not tell them in this version's words.
+    """
+    text = (pq.read_schema(path).metadata or {}).get(b"kgcp.settings", b"{}")
+    try:
+        values = json.loads(text)
+        known = {field.name for field in fields(DetectSettings)} & values.keys()
+        settings = DetectSettings(**{name: values[name] for name in known})
+        return replace(settings, method=Method(settings.method))
+    except (AttributeError, TypeError, ValueError, RecursionError) as error:
+        raise KgcpError(
+            f"{path}: its settings are not of this version of kgcp ({error});"
+            " run 'kgcp detect' on this flight again"
+        ) from error
 
 
-def _uncertainty_cells(uncertainty: Uncertainty) -> Mapping[str, object]:
-    centre = uncertainty.centre_cov_px2
-    return {
-        "sd_x_px": float(np.sqrt(centre[0, 0])),
-        "sd_y_px": float(np.sqrt(centre[1, 1])),
-        "cov_xy_px2": float(centre[0, 1]),
-        "sd_distance_m": uncertainty.sd_distance_m,
-        "sd_roll_deg": uncertainty.sd_roll_deg,
-        "sd_pitch_deg": uncertainty.sd_pitch_deg,
-        "sd_heading_deg": uncertainty.sd_heading_deg,
-        "pose_cov": uncertainty.pose_cov.ravel().tolist(),
-    }
+def _attempt(row: _Cells, number: int) -> Attempt:
+    time = row["time"]
+    time_s = time.timestamp() if isinstance(time, pd.Timestamp) else None
+    measured = row["status"] == _MEASURED
+    return Attempt(
+        frame=str(row["frame"]),
+        target=str(row["target"]),
+        time_s=time_s,
+        sighting=_sighting(row, number, time_s) if measured else None,
+        exposure=Exposure(**{field.name: _number(row, field.name) for field in fields(Exposure)}),
+    )
 
 
-def _common_cells(common: CommonUncertainty) -> Mapping[str, object]:
-    return {
-        "sd_common_distance_m": common.sd_distance_m,
-        "sd_common_direction_mrad": common.sd_direction_mrad,
-        "common_pose_cov": common.pose_cov.ravel().tolist(),
-    }
+def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
+    sd_x, sd_y, cov_xy = (_number(row, name) for name in ("sd_x_px", "sd_y_px", "cov_xy_px2"))
+    cov = None
+    if sd_x is not None and sd_y is not None:
+        cov_xy = cov_xy or 0.0
+        cov = np.array([[sd_x**2, cov_xy], [cov_xy, sd_y**2]])
+    return Sighting(
+        frame=str(row["frame"]),
+        number=number,
+        target=str(row["target"]),
+        instance=int(str(row["instance"])),
+        time_s=time_s,
+        centre_px=np.array([_known(row, "x_px"), _known(row, "y_px")]),
+        centre_cov_px2=cov,
+        distance_m=_known(row, "distance_m"),
+        sd_distance_m=_number(row, "sd_distance_m"),
+        sd_common_distance_m=_number(row, "sd_common_distance_m"),
+        pose=_pose(row),
+        pose_cov=_square(row, "pose_cov", 6),
+        score=_number(row, "score"),
+        ambiguity=_number(row, "ambiguity"),
+        common_pose_cov=_square(row, "common_pose_cov", 6),
+    )
 
 
-def _alternative_cells(seen: Observation) -> Mapping[str, object]:
-    if seen.alternative is None:
-        return {}
-    names = ("alt_qw", "alt_qx", "alt_qy", "alt_qz")
-    return {
-        **_named(names, seen.alternative.pose.quaternion_wxyz),
-        "ambiguity": seen.alternative.ambiguity,
-    }
+def _pose(row: _Cells) -> Pose | None:
+    translation = [_number(row, name) for name in ("tx_m", "ty_m", "tz_m")]
+    quaternion = [_number(row, name) for name in ("qw", "qx", "qy", "qz")]
+    if None in translation or None in quaternion:
+        return None
+    components = np.array(quaternion, float)
+    if not np.linalg.norm(components) > 0.5:  # written ones have the norm 1
+        raise KgcpError(
+            f"detections of {row['frame']!r}: invalid quaternion (norm ≈ 0);"
+            " run 'kgcp detect' on this flight again"
+        )
+    rotation = Rotation.from_quat(components, scalar_first=True)
+    return Pose(rotation.as_matrix(), np.array(translation, float))
 
 
-def _named(names: tuple[str, ...], values: FloatArray) -> dict[str, object]:
-    return {name: float(value) for name, value in zip(names, values, strict=True)}
+def _square(row: _Cells, name: str, size: int) -> FloatArray | None:
+    value = row[name]
+    if not isinstance(value, np.ndarray) or value.size != size * size:
+        return None
+    return value.astype(np.float64).reshape(size, size)
+
+
+def _number(row: _Cells, name: str) -> float | None:
+    value = row[name]
+    return float(value) if isinstance(value, float) and np.isfinite(value) else None
+
+
+def _known(row: _Cells, name: str) -> float:
+    value = _number(row, name)
+    if value is None:
+        raise KgcpError(
+            f"detections of {row['frame']!r}: {name} is empty in a measured row;"
+            " run 'kgcp detect' on this flight again"
+        )
+    return value

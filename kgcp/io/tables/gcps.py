@@ -1,68 +1,98 @@
-"""KGCPs and comparisons as rows of `kgcps.parquet` and `bias.parquet`."""
+"""Columns of `kgcps.parquet`, from KGCPs, and of `bias.parquet`, from comparisons."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 
-import numpy as np
-
-from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.gcp import Kgcp
-from kgcp.io.tables.columns import Row, time_cell
-from kgcp.quality.bias_study import Comparison, Exposure, edge_distances
+from kgcp.georef.sighting import Sighting
+from kgcp.io.tables.columns import (
+    NUMBER,
+    NUMBERS,
+    TEXT,
+    TIME,
+    Column,
+    Row,
+    matrix_cell,
+    row_of,
+    sd_cell,
+    time_cell,
+)
+from kgcp.quality.bias_study import Comparison, EdgeDistances, Exposure, edge_distances
 from kgcp.settings import Method
 
-_EXPOSURE = tuple(field.name for field in fields(Exposure))
+KGCP_COLUMNS: tuple[Column[Kgcp], ...] = (
+    Column("id", TEXT, lambda point: point.id),
+    Column("frame", TEXT, lambda point: point.frame),
+    Column("target", TEXT, lambda point: point.target),
+    Column("time", TIME, lambda point: time_cell(point.time_s)),
+    Column("x", NUMBER, lambda point: float(point.position_map[0])),
+    Column("y", NUMBER, lambda point: float(point.position_map[1])),
+    Column("z", NUMBER, lambda point: float(point.position_map[2])),
+    Column("sd_x", NUMBER, lambda point: sd_cell(point.cov_m2, 0)),
+    Column("sd_y", NUMBER, lambda point: sd_cell(point.cov_m2, 1)),
+    Column("sd_z", NUMBER, lambda point: sd_cell(point.cov_m2, 2)),
+    Column("cov", NUMBERS, lambda point: matrix_cell(point.cov_m2)),
+    Column("cov_common", NUMBERS, lambda point: matrix_cell(point.cov_common_m2)),
+    Column("common_effects", NUMBERS, lambda point: matrix_cell(point.common_m)),
+    Column("x_px", NUMBER, lambda point: float(point.centre_px[0])),
+    Column("y_px", NUMBER, lambda point: float(point.centre_px[1])),
+    Column("sd_x_px", NUMBER, lambda point: sd_cell(point.centre_cov_px2, 0)),
+    Column("sd_y_px", NUMBER, lambda point: sd_cell(point.centre_cov_px2, 1)),
+    Column("distance_m", NUMBER, lambda point: point.distance_m),
+    Column("sd_distance_m", NUMBER, lambda point: point.sd_distance_m),
+    Column("sd_common_distance_m", NUMBER, lambda point: point.sd_common_distance_m),
+    Column("role", TEXT, lambda point: "check" if point.is_checkpoint else "control"),
+    Column("flag", TEXT, lambda point: "" if point.flag is None else point.flag.value),
+)
+
+
+_Compared = tuple[Comparison, Method]  # and by which method it was measured
+_Get = Callable[[_Compared], object]
+
+
+def _comparison(get: Callable[[Comparison], object]) -> _Get:
+    return lambda compared: get(compared[0])
+
+
+def _sighting(get: Callable[[Sighting], object]) -> _Get:
+    return _comparison(lambda one: one.attempt.sighting and get(one.attempt.sighting))
+
+
+def _edges(get: Callable[[EdgeDistances], float]) -> _Get:
+    def of_comparison(compared: _Compared) -> float | None:
+        edges = edge_distances(compared[0], compared[1])
+        return None if edges is None else get(edges)
+
+    return of_comparison
+
+
+def _exposure(name: str) -> _Get:
+    return _comparison(lambda one: getattr(one.attempt.exposure, name))
+
+
+BIAS_COLUMNS: tuple[Column[_Compared], ...] = (
+    Column("frame", TEXT, _comparison(lambda one: one.attempt.frame)),
+    Column("target", TEXT, _comparison(lambda one: one.attempt.target)),
+    Column("time", TIME, _comparison(lambda one: time_cell(one.attempt.time_s))),
+    Column("distance_m", NUMBER, _sighting(lambda seen: seen.distance_m)),
+    Column("sd_distance_m", NUMBER, _sighting(lambda seen: seen.sd_distance_m)),
+    Column("one_edge_distance_m", NUMBER, _edges(lambda edges: edges.one_m)),
+    Column("two_edge_distance_m", NUMBER, _edges(lambda edges: edges.two_m)),
+    Column("reference_distance_m", NUMBER, _comparison(lambda one: one.reference_distance_m)),
+    Column("sd_reference_distance_m", NUMBER, _comparison(lambda one: one.sds and one.sds.total_m)),
+    Column("residual_m", NUMBER, _comparison(lambda one: one.residual_m)),
+    Column("residual_percent", NUMBER, _comparison(lambda one: one.residual_percent)),
+    *(Column(field.name, NUMBER, _exposure(field.name)) for field in fields(Exposure)),
+)
 
 
 def kgcp_row(point: Kgcp) -> Row:
     """Return the row of one KGCP."""
-    return {
-        "id": point.id,
-        "frame": point.frame,
-        "target": point.target,
-        "time": time_cell(point.time_s),
-        **dict(zip("xyz", point.position_map.tolist(), strict=True)),
-        **_deviations(("sd_x", "sd_y", "sd_z"), point.cov_m2),
-        "cov": _flat(point.cov_m2),
-        "cov_common": _flat(point.cov_common_m2),
-        "common_effects": _flat(point.common_m),
-        "x_px": float(point.centre_px[0]),
-        "y_px": float(point.centre_px[1]),
-        **_deviations(("sd_x_px", "sd_y_px"), point.centre_cov_px2),
-        "distance_m": point.distance_m,
-        "sd_distance_m": point.sd_distance_m,
-        "sd_common_distance_m": point.sd_common_distance_m,
-        "role": "check" if point.is_checkpoint else "control",
-        "flag": "" if point.flag is None else point.flag.value,
-    }
+    return row_of(KGCP_COLUMNS, point)
 
 
 def bias_row(measured: Comparison, method: Method) -> Row:
     """Return the row of one comparison that has a residual, measured by some method."""
-    seen = measured.attempt.sighting
-    edges = edge_distances(measured, method)
-    return {
-        "frame": measured.attempt.frame,
-        "target": measured.attempt.target,
-        "time": time_cell(measured.attempt.time_s),
-        "distance_m": None if seen is None else seen.distance_m,
-        "sd_distance_m": None if seen is None else seen.sd_distance_m,
-        "one_edge_distance_m": None if edges is None else edges.one_m,
-        "two_edge_distance_m": None if edges is None else edges.two_m,
-        "reference_distance_m": measured.reference_distance_m,
-        "sd_reference_distance_m": None if measured.sds is None else measured.sds.total_m,
-        "residual_m": measured.residual_m,
-        "residual_percent": measured.residual_percent,
-        **{name: getattr(measured.attempt.exposure, name) for name in _EXPOSURE},
-    }
-
-
-def _flat(matrix: FloatArray | None) -> list[float] | None:
-    return None if matrix is None else matrix.ravel().tolist()
-
-
-def _deviations(names: tuple[str, ...], cov: FloatArray | None) -> dict[str, float | None]:
-    if cov is None:
-        return dict.fromkeys(names)
-    return {name: float(sd) for name, sd in zip(names, np.sqrt(np.diag(cov)), strict=True)}
+    return row_of(BIAS_COLUMNS, (measured, method))

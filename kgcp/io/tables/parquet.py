@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import whole_file
 from kgcp.io.files.safe_read import is_file
-from kgcp.io.tables.columns import DETECTION_COLUMNS, Column, ColumnType, Row
-
-if TYPE_CHECKING:
-    import pandas as pd
+from kgcp.io.tables.columns import Column, ColumnType, Row
 
 _ARROW_TYPES = {
     ColumnType.TEXT: pa.string(),
@@ -27,11 +25,11 @@ _ARROW_TYPES = {
     ColumnType.NUMBERS: pa.list_(pa.float64()),
 }
 _KEYS = ("frame", "target", "instance", "status")  # no row is without
-_ROWS_PER_GROUP = 4096  # of the file's row groups: so many are in memory at once
+_ROWS_PER_GROUP = 4096  # of the file's row groups: this many are in memory at once
 
 
 def write_table(
-    path: Path, columns: Sequence[Column], rows: Iterable[Row], metadata: Mapping[str, str]
+    path: Path, columns: Sequence[Column[Any]], rows: Iterable[Row], metadata: Mapping[str, str]
 ) -> None:
     """Write rows as Parquet under `path`, by a temporary name and a rename.
 
@@ -64,7 +62,7 @@ def write_table(
                 group = chain((row,), islice(remaining, _ROWS_PER_GROUP - 1))
                 writer.write_table(_table(schema, group))
     except OSError as error:
-        raise KgcpError(f"{path}: cannot be written ({error}); choose another --out") from error
+        raise KgcpError(f"{path}: cannot be written ({error}); choose another folder") from error
 
 
 def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:
@@ -77,7 +75,7 @@ def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:
     return pa.table(cells, schema=schema)
 
 
-def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
+def read_table(path: Path, columns: Sequence[Column[Any]]) -> pd.DataFrame:
     """Read a table that `write_table` wrote.
 
     Raises
@@ -102,24 +100,14 @@ def read_table(path: Path, columns: Sequence[Column]) -> pd.DataFrame:
     return frame
 
 
-def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column]) -> None:
+def _check_columns(path: Path, table: pa.Table, columns: Sequence[Column[Any]]) -> None:
     """Refuse columns of other types than are written, and gaps among keys."""
     for column in columns:
         places = table.schema.get_all_field_indices(column.name)
         found = table.schema.field(places[0]).type
         wanted = _ARROW_TYPES[column.type]
         if len(places) > 1 or found != wanted:
-            problem = "is there twice" if len(places) > 1 else f"is of {found}, not {wanted}"
+            problem = "occurs twice" if len(places) > 1 else f"is of {found}, not {wanted}"
             raise KgcpError(f"{path}: the column {column.name} {problem}; remake it with kgcp")
         if column.name in _KEYS and table.column(column.name).null_count:
             raise KgcpError(f"{path}: the column {column.name} has gaps; remake it with kgcp")
-
-
-def read_detections(path: Path) -> pd.DataFrame:
-    """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
-    if not is_file(path):
-        raise KgcpError(
-            f"{path}: does not exist; run 'kgcp detect' on this flight first, or name with"
-            " --detections what it wrote elsewhere"
-        )
-    return read_table(path, DETECTION_COLUMNS)

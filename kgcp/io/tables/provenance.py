@@ -49,7 +49,6 @@ def write_run_record(path: Path, record: Mapping[str, object]) -> None:
 
     Parameters
     ----------
-    path : Path
     record : mapping
         What the run has to say: settings, counts, times.
 

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.tables.columns import BIAS_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS
 from kgcp.quality.bias_study import Comparison
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.report.bias import wording

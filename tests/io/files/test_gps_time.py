@@ -9,18 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kgcp.errors import KgcpWarning
+from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import (
+    _LEAPS_UTC_S,
     LEAPS_KNOWN_UNTIL,
     WEEK_S,
     TimeSystem,
     clock_from_date,
     clock_from_week,
-    gps_from_unix,
     unix_from_clock,
     unix_from_gps,
     unwrap_week,
     weekday,
 )
+
+
+def gps_from_unix(unix_s: FloatArray) -> FloatArray:
+    return unix_s + np.searchsorted(_LEAPS_UTC_S, unix_s, side="right")
 
 
 def utc(year: int, month: int, day: int, hour: int = 0, minute: int = 0, second: int = 0) -> float:

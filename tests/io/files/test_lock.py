@@ -58,7 +58,7 @@ def test_a_lock_that_cannot_be_made_is_a_line(kind: str, tmp_path: Path) -> None
     else:
         out.mkdir()
         (out / "lock").symlink_to(elsewhere)
-    text = r"out: cannot be written .*; choose another --out"
+    text = r"out: cannot be written .*; choose another folder"
     with pytest.raises(KgcpError, match=text), locked(out / "lock"):
         pass
     assert elsewhere.read_text(encoding="utf-8") == "precious"

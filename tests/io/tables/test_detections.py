@@ -13,9 +13,13 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import Reason
 from kgcp.geometry.pose import Pose
 from kgcp.io.images.exif import Exif
-from kgcp.io.tables.columns import DETECTION_COLUMNS
-from kgcp.io.tables.detections import FrameResult, detection_rows
-from kgcp.io.tables.parquet import read_detections, write_table
+from kgcp.io.tables.detections import (
+    DETECTION_COLUMNS,
+    FrameResult,
+    detection_rows,
+    read_detections,
+)
+from kgcp.io.tables.parquet import write_table
 from kgcp.measurement.records import (
     Alternative,
     Appearance,

@@ -13,14 +13,15 @@ import pytest
 
 from kgcp.errors import KgcpError
 from kgcp.io.tables.columns import Column, ColumnType, Row, time_cell
-from kgcp.io.tables.parquet import read_detections, read_table, write_table
+from kgcp.io.tables.detections import read_detections
+from kgcp.io.tables.parquet import read_table, write_table
 
-COLUMNS = (
-    Column("name", ColumnType.TEXT, ""),
-    Column("count", ColumnType.INTEGER, ""),
-    Column("value_m", ColumnType.NUMBER, ""),
-    Column("time", ColumnType.TIME, ""),
-    Column("cov", ColumnType.NUMBERS, ""),
+COLUMNS: tuple[Column[Row], ...] = (
+    Column("name", ColumnType.TEXT, str),
+    Column("count", ColumnType.INTEGER, str),
+    Column("value_m", ColumnType.NUMBER, str),
+    Column("time", ColumnType.TIME, str),
+    Column("cov", ColumnType.NUMBERS, str),
 )
 MOMENT = datetime(2026, 6, 16, 8, 15, 0, 123457, UTC)
 ROWS: tuple[Row, ...] = (
@@ -96,7 +97,7 @@ def test_rows_that_fail_half_way_leave_the_old_table(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_is_a_known_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(KgcpError, match=r"cannot be written .* choose another --out") as caught:
+    with pytest.raises(KgcpError, match=r"cannot be written .* choose another folder") as caught:
         write_table(tmp_path / "file" / "t.parquet", COLUMNS, ROWS, {})
     one_line(caught.value)
 

@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Sighting
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.tables.columns import BIAS_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS
 from kgcp.pipeline.bias_report import FIGURE_FILES, write_report
 from kgcp.quality.bias_study import Attempt, BiasStudy, Comparison, Exposure, ReferenceSds
 from kgcp.settings import DetectSettings

@@ -49,9 +49,8 @@ def _entry(file: ForeignFile, line: int, row: str) -> Entry:
     name, model, width, height, *params = row.split()
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         if model not in _MODELS:
-            raise unsupported(file, f"line {line}", f"the model {model}")
+            raise unsupported(file, f"the model {model}", f"line {line}")
         keys = _MODELS[model]
         numbers = file.numbers(" ".join(params), len(keys), f"line {line}")
         values = dict(zip(keys, numbers, strict=True))

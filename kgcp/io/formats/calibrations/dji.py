@@ -46,7 +46,6 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = file.numbers(numbers, 9, "DewarpData")
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         x, y = 0.5 * (width - 1) + cx, 0.5 * (height - 1) + cy
         return Camera(width, height, fx, fy, x, y, k1, k2, p1, p2, k3)
 

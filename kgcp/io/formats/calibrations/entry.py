@@ -57,7 +57,7 @@ def camera_of(width: int, height: int, values: Mapping[str, float]) -> Camera:
     )
 
 
-def unsupported(file: ForeignFile, where: str, term: str) -> KgcpError:
+def unsupported(file: ForeignFile, term: str, where: str = "") -> KgcpError:
     """Return the error for a model, or a term of it, that `Camera` cannot represent."""
     return file.error_at(
         where,
@@ -72,4 +72,4 @@ def refuse_terms(
     """Raise `KgcpError` for the first of these terms that is not zero."""
     for name, value in zip(names, values, strict=True):
         if value != 0.0:
-            raise unsupported(file, where, f"{name} = {value:g}")
+            raise unsupported(file, f"{name} = {value:g}", where)

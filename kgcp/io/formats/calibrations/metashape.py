@@ -68,7 +68,6 @@ def _entry(file: ForeignFile, name: str, element: Element) -> Entry:
     size = file.numbers(f"{width or ''} {height or ''}", 2, f"{where} size")
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         return _camera(file, where, element, width, height)
 
     return Entry(name, (int(size[0]), int(size[1])), convert)
@@ -77,7 +76,7 @@ def _entry(file: ForeignFile, name: str, element: Element) -> Entry:
 def _camera(file: ForeignFile, where: str, element: Element, width: int, height: int) -> Camera:
     projection = element.findtext("projection") or element.get("type") or "frame"
     if projection != "frame":
-        raise unsupported(file, where, f"the projection {projection!r}")
+        raise unsupported(file, f"the projection {projection!r}", where)
 
     def number(key: str) -> float:
         text = element.findtext(key)

@@ -20,14 +20,8 @@ if TYPE_CHECKING:
 # How OpenCV's own samples and users' scripts name the values, in small letters without "_".
 _MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "k", "m1", "mtx")
 _DISTORTION_KEYS = (
-    "distortioncoefficients",
-    "distortioncoeffs",
-    "distcoeffs",
-    "distcoeff",
-    "distortion",
-    "dist",
-    "d",
-    "d1",
+    *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff"),
+    *("distortion", "dist", "d", "d1"),
 )
 _WIDTH_KEYS = ("imagewidth", "width")
 _HEIGHT_KEYS = ("imageheight", "height")
@@ -62,7 +56,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     except (TypeError, ValueError, LookupError, OverflowError) as error:
         raise file.error(_PROBLEM, _REMEDY) from error
     if is_fisheye:
-        raise unsupported(file, "", "a fisheye model")
+        raise unsupported(file, "a fisheye model")
     if matrix is None:
         raise file.error("has no camera_matrix", "add it or write the values to [camera]")
     size = (int(width), int(height)) if width and height else None
@@ -108,13 +102,21 @@ def matrix_entry(
     KgcpError
         If it is not a pinhole camera with Brown-Conrady distortion.
     """
-    _check_model(file, matrix, coefficients)
+    if [len(row) for row in matrix] != [3, 3, 3]:
+        raise file.error("the camera matrix is not 3 x 3", "calibrate again")
+    (fx, skew, cx), (zero, fy, cy), last = matrix
+    if [zero, *last] != [0.0, 0.0, 0.0, 1.0]:
+        raise file.error("the camera matrix is not that of a pinhole camera", "calibrate again")
+    if skew:
+        raise unsupported(file, f"a skew of {skew:g}")
+    if len(coefficients) not in _COUNTS:
+        raise unsupported(file, f"{len(coefficients)} distortion coefficients")
+    rest = coefficients[8:]
+    refuse_terms(file, "", _REST[: len(rest)], rest)
     padding = [0.0] * (8 - len(coefficients))
     k1, k2, p1, p2, k3, k4, k5, k6 = [*coefficients[:8], *padding]
-    (fx, _, cx), (_, fy, cy), _ = matrix
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         return Camera(width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6)
 
     return Entry(name, size, convert)
@@ -144,19 +146,3 @@ def _finite(node: object) -> float:
     if not isinstance(node, int | float | str) or not is_sound(float(node)):
         raise ValueError("no finite number")
     return float(node)
-
-
-def _check_model(
-    file: ForeignFile, matrix: Sequence[Sequence[float]], coefficients: Sequence[float]
-) -> None:
-    if [len(row) for row in matrix] != [3, 3, 3]:
-        raise file.error("the camera matrix is not 3 x 3", "calibrate again")
-    (_, skew, _), (zero, *_), last = matrix
-    if [zero, *last] != [0.0, 0.0, 0.0, 1.0]:
-        raise file.error("the camera matrix is not that of a pinhole camera", "calibrate again")
-    if skew:
-        raise unsupported(file, "", f"a skew of {skew:g}")
-    if len(coefficients) not in _COUNTS:
-        raise unsupported(file, "", f"{len(coefficients)} distortion coefficients")
-    rest = coefficients[8:]
-    refuse_terms(file, "", _REST[: len(rest)], rest)

@@ -69,11 +69,10 @@ class _Normalised:
     camera: JsonObject
 
     def convert(self, width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         camera = self.camera
         model = camera.text("projection_type")
         if model not in _TERMS:
-            raise unsupported(camera.file, camera.where, f"the projection_type {model!r}")
+            raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)
         longer = max(width, height)
         terms = {term: camera.number(term, 0.0) for term in _TERMS[model]}
         x, y, cx, cy = self._matrix(model)

@@ -52,7 +52,7 @@ class _Sensor:
         internals = self.sensor.child("internals")
         model = internals.text("type")
         if model != "perspective":
-            raise unsupported(internals.file, internals.where, f"the type {model!r}")
+            raise unsupported(internals.file, f"the type {model!r}", internals.where)
         focal = internals.number("focal_length_px")
         cx, cy = internals.vector("principal_point_px", 2)
         k1, k2, k3 = internals.vector("radial_distortion", 3)

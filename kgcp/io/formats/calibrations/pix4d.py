@@ -76,7 +76,7 @@ def _image_block(
         for count, (number, row) in zip(counts, rows[1:6], strict=True)
     )
     if skew:
-        raise unsupported(file, f"line {rows[1][0]}", f"a skew of {skew:g}")
+        raise unsupported(file, f"a skew of {skew:g}", f"line {rows[1][0]}")
     return name, (int(width), int(height)), (fx, fy, cx, cy, *radial, *tangential)
 
 
@@ -94,7 +94,6 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
         return file.numbers(values.get(key), 1, f"{where} {key}")[0]
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         per_mm = width / width_mm
         if abs(height - per_mm * height_mm) > 1.0:
             raise file.error_at(
@@ -114,7 +113,6 @@ def _converter(*parameters: float) -> Callable[[int, int], Camera]:
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
 
     def convert(width: int, height: int) -> Camera:
-        """Return it for frames of this size [px]."""
         x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
         return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 

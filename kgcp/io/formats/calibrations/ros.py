@@ -38,7 +38,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise file.error(f"is not a camera_info of ROS ({error})", "write it again") from error
     if model not in _MODELS:
-        raise unsupported(file, "", f"the distortion model {reprlib.repr(model)}")
+        raise unsupported(file, f"the distortion model {reprlib.repr(model)}")
     return (
         matrix_entry(
             file,
