@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtrc, stdtr
+from scipy.special import fdtrc
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.quality.exposure_effects import QUANTITIES, Residuals, varies
-from kgcp.quality.robust_gls import Fit, fit
+from kgcp.quality.exposure_effects import QUANTITIES, DistanceResiduals, varies
+from kgcp.quality.robust_gls import RegressionFit, fit, separable, two_sided
 
 SIGNIFICANT = 0.01
 """Largest probability, corrected for the number of terms, of what is called significant."""
@@ -69,7 +68,7 @@ class Regression:
     scatter : float
         Of what is left, over its deviations as they were stated; 1 where these are true.
     correlation_s : float
-        As in `Fit`.
+        As in `RegressionFit`.
     exposure_share : float
         Of the variance that scale and offset leave, what the terms of exposure explain,
         corrected for their number; 0 without any.
@@ -106,7 +105,7 @@ class Regression:
         return any(term.is_significant for term in self.exposure_terms)
 
 
-def regress(data: Residuals) -> Regression | None:
+def regress(data: DistanceResiduals) -> Regression | None:
     """Separate the causes of residuals; None for too few, or for distances that do not vary.
 
     Edges displaced by ε px change a distance by D ε / R, R being the ring's radius in px: which
@@ -117,13 +116,14 @@ def regress(data: Residuals) -> Regression | None:
     if len(data.residual_m) < MIN_COUNT or not varies(data.residual_m):
         return None
     columns, used = _columns(data)
-    weight = 1.0 / np.sqrt(data.noise.white + data.noise.lasting)
-    names, tangled = _separable(columns, used, weight, int(np.count_nonzero(used)) // _PER_TERM)
+    weight = 1.0 / np.sqrt(data.errors.total)
+    names = _names_told_apart(columns, used, weight, int(np.count_nonzero(used)) // _PER_TERM)
     if "offset_m" not in names:
         return None
+    tangled = tuple(name for name in columns if name not in names)
     found = _fit(data, columns, names, used)
     curved = {**columns, _CURVED: data.distance_m / data.radius_px**2}
-    more, _ = _separable(curved, used, weight, len(used))
+    more = _names_told_apart(curved, used, weight, len(used))
     if set(more) >= {*names, _CURVED} and used.sum() > _PER_TERM * (len(names) + 1):
         other = _fit(data, curved, [*names, _CURVED], used)
         if _terms([*names, _CURVED], other)[-1].is_significant:
@@ -131,7 +131,7 @@ def regress(data: Residuals) -> Regression | None:
     return _regression(data, columns, names, tangled, used, found)
 
 
-def _columns(data: Residuals) -> tuple[dict[str, FloatArray], BoolArray]:
+def _columns(data: DistanceResiduals) -> tuple[dict[str, FloatArray], BoolArray]:
     """Return the columns of all terms that vary, and the rows that have all of them."""
     per_px = data.distance_m / data.radius_px
     columns = {"scale": data.distance_m, "offset_m": np.ones_like(data.distance_m)}
@@ -147,43 +147,25 @@ def _columns(data: Residuals) -> tuple[dict[str, FloatArray], BoolArray]:
     return columns, used
 
 
-def _separable(
+def _names_told_apart(
     columns: dict[str, FloatArray], used: BoolArray, weight: FloatArray, most: int
-) -> tuple[list[str], tuple[str, ...]]:
-    """Return the terms that can be told apart, at most so many, and those that cannot."""
-    names: list[str] = []
-    tangled = []
-    for name, column in columns.items():
-        rows = np.column_stack([columns[other] for other in (*names, name)])[used]
-        rows = rows * weight[used, None]
-        limit = _DISTANCE_LIKE if name in {"offset_m", _CURVED} else _MAX_INFLATION
-        if len(names) >= max(2, most) or _inflation(rows) > limit or not column[used].any():
-            tangled.append(name)
-        else:
-            names.append(name)
-    return names, tuple(tangled)
-
-
-def _inflation(rows: FloatArray) -> float:
-    """Return by how much the other columns inflate the variance of the last (n, p) one."""
-    if rows.shape[1] == 1:
-        return 1.0
-    size = np.linalg.norm(rows, axis=0)
-    if not size.all():
-        return math.inf
-    unit = rows / size
-    rest = unit[:, -1] - unit[:, :-1] @ np.linalg.lstsq(unit[:, :-1], unit[:, -1], rcond=None)[0]
-    return 1.0 / max(float(rest @ rest), 1e-12)
+) -> list[str]:
+    """Return the names of the terms that can be told apart, at most so many."""
+    rows = np.column_stack(list(columns.values()))[used] * weight[used, None]
+    names = list(columns)
+    limits = [_DISTANCE_LIKE if name in {"offset_m", _CURVED} else _MAX_INFLATION for name in names]
+    active, _ = separable(rows.T @ rows, np.flatnonzero(rows.any(axis=0)).tolist(), limits)
+    return [names[index] for index in active[: max(2, most)]]
 
 
 def _fit(
-    data: Residuals, columns: dict[str, FloatArray], names: Sequence[str], used: BoolArray
-) -> Fit:
+    data: DistanceResiduals, columns: dict[str, FloatArray], names: Sequence[str], used: BoolArray
+) -> RegressionFit:
     design = np.column_stack([columns[name] for name in names])[used]
-    return fit(design, data.residual_m[used], data.noise.kept(used))
+    return fit(design, data.residual_m[used], data.errors.kept(used))
 
 
-def _terms(names: Sequence[str], found: Fit) -> tuple[Term, ...]:
+def _terms(names: Sequence[str], found: RegressionFit) -> tuple[Term, ...]:
     chances = [
         two_sided(float(value / sd), found.freedom)
         for value, sd in zip(found.values, found.sds, strict=True)
@@ -194,11 +176,6 @@ def _terms(names: Sequence[str], found: Fit) -> tuple[Term, ...]:
             names, found.values, found.sds, holm(chances), strict=True
         )
     )
-
-
-def two_sided(t: float, freedom: int) -> float:
-    """Return the probability of a Student's t beyond ± t by chance."""
-    return float(2.0 * stdtr(freedom, -abs(t)))
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
@@ -213,12 +190,12 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 
 def _regression(
-    data: Residuals,
+    data: DistanceResiduals,
     columns: dict[str, FloatArray],
     names: list[str],
     tangled: tuple[str, ...],
     used: BoolArray,
-    found: Fit,
+    found: RegressionFit,
 ) -> Regression:
     outlier = np.zeros(len(used), dtype=bool)
     outlier[used] = found.outlier
@@ -226,7 +203,7 @@ def _regression(
     design = np.column_stack([columns[name] for name in names])
     share, probability = _share_of_exposure(names, found)
     left = data.residual_m - design @ found.values
-    unit = left / np.sqrt(data.noise.white + data.noise.lasting)
+    unit = left / np.sqrt(data.errors.total)
     return Regression(
         terms=_terms(names, found),
         tangled=tangled,
@@ -245,7 +222,7 @@ def _without_exposure(names: Sequence[str]) -> list[int]:
     return [index for index, name in enumerate(names) if index < 2 or name == _CURVED]
 
 
-def _share_of_exposure(names: Sequence[str], found: Fit) -> tuple[float, float | None]:
+def _share_of_exposure(names: Sequence[str], found: RegressionFit) -> tuple[float, float | None]:
     others = _without_exposure(names)
     extra = len(names) - len(others)
     if not extra:

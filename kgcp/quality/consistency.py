@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,12 +15,13 @@ from kgcp.georef.exterior_orientation import Views
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Place, Whereabouts
 from kgcp.quality.consistency_equations import Meeting, System
-from kgcp.quality.corrections import Estimate, estimate, find_outliers
-from kgcp.quality.robust_gls import whiten
+from kgcp.quality.corrections import LIMITS, Estimate, estimate
+from kgcp.quality.robust_gls import ErrorModel, find_outliers, weighted_products
 from kgcp.settings import VehicleSettings
 
 MIN_POINTS = 10
 _CORRELATIONS_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+_FLOOR_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,14 +110,20 @@ def study_consistency(
     if len(meetings) < MIN_POINTS or whereabouts.carrier is None:
         return None
     views = Views.of(poses, whereabouts.frame)
-    system = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
-    outlier = find_outliers(system.design, system.offset, system.fading + system.white)
+    equations = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
+    outlier = find_outliers(
+        -equations.design,
+        equations.offset,
+        equations.fading + equations.white,
+        limits=LIMITS,
+        least_scale=1.0,
+    )
     if np.count_nonzero(~outlier) < MIN_POINTS:
         return None
-    found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), system, ~outlier)
+    found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), equations, ~outlier)
     settings = whereabouts.carrier.settings
     return Consistency(
-        _discrepancies(meetings, system, outlier, found, settings.time_offset_s),
+        _discrepancies(meetings, equations, outlier, found, settings.time_offset_s),
         found,
         correlation_s,
         _stated_sd(settings),
@@ -128,25 +136,24 @@ def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
     return {"time_offset_s": settings.sd_time_s, **of_arm}
 
 
-def _adjust(time_s: FloatArray, system: System, kept: BoolArray) -> tuple[Estimate, float]:
+def _adjust(time_s: FloatArray, equations: System, kept: BoolArray) -> tuple[Estimate, float]:
     """Return the corrections by the points that are kept, and the likeliest correlation time.
 
     A time that is believed but wrong would weigh neighbouring frames against each other as if
     their trajectory were far better, or worse, than it is.
     """
     columns = np.concatenate(
-        (system.design, system.offset[:, :, None], system.common[:, :, None]), axis=2
+        (equations.design, equations.offset[:, :, None], equations.common[:, :, None]), axis=2
     )[kept]
-    every = whiten(
-        time_s[kept], system.fading[kept], system.white[kept], np.array(_CORRELATIONS_S), columns
-    )
+    fading = equations.fading + _FLOOR_M2 * np.eye(3)
+    errors = ErrorModel(equations.white, fading, time_s).kept(kept)
     trials = []
-    for correlation_s, whitened, log_det in zip(_CORRELATIONS_S, *every, strict=True):
-        rows = whitened.reshape(-1, columns.shape[2])
-        found = estimate(rows, has_deviations=system.has_deviations)
+    for correlation_s in _CORRELATIONS_S:
+        products, log_det = weighted_products(columns, errors, correlation_s)
+        found = estimate(products, 3 * len(columns), has_sds=equations.has_sds)
         misfit = found.chi2_after
-        if not system.has_deviations:  # the likeliest scale is part of the likelihood
-            misfit = len(rows) * float(np.log(misfit))
+        if not equations.has_sds:  # the likeliest scale is part of the likelihood
+            misfit = 3 * len(columns) * math.log(misfit)
         trials.append((misfit + log_det, correlation_s, found))
     _, correlation_s, found = min(trials, key=lambda trial: trial[0])
     return found, correlation_s
@@ -178,15 +185,16 @@ def _meet(
 
 def _discrepancies(
     meetings: Sequence[Meeting],
-    system: System,
+    equations: System,
     outlier: BoolArray,
     found: Estimate,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
-    residual = system.offset + system.design @ found.values
-    cov = system.track @ (system.fading + system.white) @ np.swapaxes(system.track, 1, 2)
-    offset_m = np.einsum("nij,nj->ni", system.track, system.offset)
-    residual_m = np.einsum("nij,nj->ni", system.track, residual)
+    residual = equations.offset + equations.design @ found.values
+    track = equations.track
+    cov = track @ (equations.fading + equations.white) @ np.swapaxes(track, 1, 2)
+    offset_m = np.einsum("nij,nj->ni", track, equations.offset)
+    residual_m = np.einsum("nij,nj->ni", track, residual)
     return tuple(
         Discrepancy(
             one.seen.frame,

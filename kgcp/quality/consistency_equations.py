@@ -64,7 +64,7 @@ class System:
         Covariance by the trajectory, and by all that is independent from frame to frame [m²].
     common : (n, 3) array
         What one deviation of calibration and diameter, by way of the distance, adds to it [m].
-    has_deviations : bool
+    has_sds : bool
         Whether trajectory and reference poses have deviations.
     track : (n, 3, 3) array
         Along the track, across it to the right and up, as rows.
@@ -75,7 +75,7 @@ class System:
     fading: FloatArray
     white: FloatArray
     common: FloatArray
-    has_deviations: bool
+    has_sds: bool
     track: FloatArray
 
     @classmethod

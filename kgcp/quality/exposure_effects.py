@@ -10,7 +10,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.bias_study import Comparison
-from kgcp.quality.robust_gls import Noise
+from kgcp.quality.robust_gls import ErrorModel
 
 ROUNDING = 1e-9  # a quantity that varies by less does not vary
 # Of what has no stated deviations: the scatter sets the scale then, these only the proportions.
@@ -65,7 +65,7 @@ QUANTITIES = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Residuals:
+class DistanceResiduals:
     """Residuals of n distances, with all that may explain them, in the order of time.
 
     Attributes
@@ -74,7 +74,7 @@ class Residuals:
         Reference distance, and the radius in the image that gave the measured one.
     residual_m : (n,) array
         Measured minus reference distance.
-    noise : Noise
+    errors : ErrorModel
         Of the residuals [m²].
     exposure : mapping of str to (n,) array
         The columns of `QUANTITIES` by name; NaN where a frame has none.
@@ -83,7 +83,7 @@ class Residuals:
     distance_m: FloatArray
     radius_px: FloatArray
     residual_m: FloatArray
-    noise: Noise
+    errors: ErrorModel
     exposure: dict[str, FloatArray]
 
     @classmethod
@@ -113,7 +113,7 @@ class Residuals:
             distance_m=distance,
             radius_px=radius,
             residual_m=measured_m - distance,
-            noise=_noise(compared, _UNSTATED_EDGE_PX * distance / radius),
+            errors=_error_model(compared, _UNSTATED_EDGE_PX * distance / radius),
             exposure={
                 quantity.name: np.array(
                     [getattr(one.attempt.exposure, quantity.name) for one in compared],
@@ -142,7 +142,7 @@ def varies(values: FloatArray) -> bool:
     return len(values) > 1 and float(np.ptp(values)) > ROUNDING
 
 
-def _noise(compared: Sequence[Comparison], unstated_m: FloatArray) -> Noise:
+def _error_model(compared: Sequence[Comparison], unstated_m: FloatArray) -> ErrorModel:
     seen = [one.attempt.sighting for one in compared]
     measured = np.array(
         [
@@ -155,5 +155,5 @@ def _noise(compared: Sequence[Comparison], unstated_m: FloatArray) -> Noise:
     times = np.array([one.attempt.time_s for one in compared], dtype=np.float64)
     if not np.isfinite(times).all():  # nobody knows which are neighbours
         times = np.arange(float(len(pose)))
-        return Noise(measured**2 + pose**2 + place**2, np.zeros_like(pose), times)
-    return Noise(measured**2 + pose**2, place**2, times)
+        return ErrorModel(measured**2 + pose**2 + place**2, np.zeros_like(pose), times)
+    return ErrorModel(measured**2 + pose**2, place**2, times)

@@ -9,8 +9,7 @@ from typing import Self
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.bias_causes import two_sided
-from kgcp.quality.robust_gls import Noise, fit
+from kgcp.quality.robust_gls import ErrorModel, fit, two_sided
 
 _Z_95 = 1.959963984540054
 _MIN_IN_WINDOW = 3
@@ -144,8 +143,8 @@ def fit_slope(
     weight = sd**-2.0
     middle = float(weight @ x / weight.sum())
     design = np.column_stack((np.ones_like(x), x - middle))
-    noise = Noise(sd**2, np.zeros_like(x), np.arange(float(len(x))))
-    found = fit(design, y, noise, is_robust=is_robust)
+    errors = ErrorModel(sd**2, np.zeros_like(x), np.arange(float(len(x))))
+    found = fit(design, y, errors, is_robust=is_robust)
     kept = ~found.outlier
     if np.ptp(x[kept]) == 0.0 or not found.sds.all():
         return None

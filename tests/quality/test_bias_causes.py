@@ -8,8 +8,8 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.quality.bias_causes import Regression, regress
 from kgcp.quality.bias_study import BiasStudy, edge_distances
-from kgcp.quality.exposure_effects import QUANTITIES, Residuals, in_time
-from kgcp.quality.robust_gls import Noise
+from kgcp.quality.exposure_effects import QUANTITIES, DistanceResiduals, in_time
+from kgcp.quality.robust_gls import ErrorModel
 from kgcp.settings import Method
 
 Fly = Callable[..., BiasStudy]
@@ -30,7 +30,7 @@ def by(study: BiasStudy, edges: int | None = None) -> Regression:
         measured.append({None: reported, 1: found.one_m, 2: found.two_m}[edges])
         radii.append(found.one_px)
     radius = np.array(radii) if edges == 1 else None
-    regression = regress(Residuals.of(compared, np.array(measured), radius))
+    regression = regress(DistanceResiduals.of(compared, np.array(measured), radius))
     assert regression is not None
     return regression
 
@@ -88,11 +88,11 @@ def test_a_large_error_is_significant(fly: Fly) -> None:
 
 def plain(
     distance_m: FloatArray, residual_m: FloatArray, sd_m: float, **exposure: FloatArray
-) -> Residuals:
+) -> DistanceResiduals:
     n = len(distance_m)
-    noise = Noise(np.full(n, sd_m**2), np.zeros(n), np.arange(float(n)))
+    noise = ErrorModel(np.full(n, sd_m**2), np.zeros(n), np.arange(float(n)))
     missing = {quantity.name: np.full(n, np.nan) for quantity in QUANTITIES}
-    return Residuals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
+    return DistanceResiduals(distance_m, 1000.0 / distance_m, residual_m, noise, missing | exposure)
 
 
 def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:

@@ -20,7 +20,6 @@ from kgcp.georef.trajectory import ENU_FROM_NED, Trajectory, body_to_ned
 from kgcp.quality.advice import advice
 from kgcp.quality.consistency import Consistency, study_consistency
 from kgcp.quality.corrections import UNKNOWNS
-from kgcp.quality.robust_gls import whiten
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -49,7 +48,7 @@ class Flight:
     boresight_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
     is_straight: bool = False
     wrong: tuple[int, ...] = ()
-    has_deviations: bool = True
+    has_sds: bool = True
     settings: VehicleSettings = _SETTINGS
 
     def vehicle(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -99,7 +98,7 @@ class Flight:
         ]
         poses = _reference(names, self.drone(time_s), spin @ _turns(self.boresight_rad), rng)
         trajectory = self._trajectory(rng)
-        if not self.has_deviations:
+        if not self.has_sds:
             trajectory = replace(trajectory, sd_position_m=None)
             poses = replace(poses, sd_position_m=None, sd_angle_deg=None)
         whereabouts = Whereabouts.of(_CRS, [_TARGET], trajectory, self.settings)
@@ -316,7 +315,7 @@ def test_the_trajectorys_correlation_time_is_found_to_within_its_neighbours() ->
 
 
 def test_without_deviations_the_residuals_set_the_scale() -> None:
-    flight = Flight(has_deviations=False, time_offset_s=0.025)
+    flight = Flight(has_sds=False, time_offset_s=0.025)
     truth = np.array([0.025, *[0.0] * 7])
     tables = np.array([_corrections(replace(flight, seed=k).study()) for k in range(6)])
     standardised = (tables[:, :, 0] - truth) / tables[:, :, 1]
@@ -325,29 +324,3 @@ def test_without_deviations_the_residuals_set_the_scale() -> None:
 
 def test_a_few_frames_are_not_enough() -> None:
     assert Flight(frames=9).study_if_enough() is None
-
-
-def test_whitening_is_the_inverse_root_of_the_full_covariance() -> None:
-    rng = np.random.default_rng(0)
-    n, tau = 7, 3.0
-    time_s = np.cumsum(rng.uniform(0.2, 4.0, n))
-    half = rng.standard_normal((n, 3, 3))
-    fading, white = half @ np.swapaxes(half, 1, 2), np.tile(np.diag([0.5, 1.0, 2.0]), (n, 1, 1))
-    columns = rng.standard_normal((n, 3, 4))
-    factors = np.linalg.cholesky(fading)
-    full = np.zeros((3 * n, 3 * n))
-    for i in range(n):
-        for j in range(n):
-            share = math.exp(-abs(time_s[i] - time_s[j]) / tau) * factors[i] @ factors[j].T
-            full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = share + (white[i] if i == j else 0.0)
-    both, log_det = whiten(time_s, fading, white, np.array([tau, 0.0]), columns)
-    whitened, white_only = both.reshape(2, 3 * n, 4)
-    flat = columns.reshape(3 * n, 4)
-    np.testing.assert_allclose(
-        whitened.T @ whitened, flat.T @ np.linalg.solve(full, flat), rtol=1e-8
-    )
-    own = np.zeros_like(full)
-    for i in range(n):
-        own[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = fading[i] + white[i]
-    np.testing.assert_allclose(white_only.T @ white_only, flat.T @ np.linalg.solve(own, flat))
-    np.testing.assert_allclose(log_det, [np.linalg.slogdet(cov)[1] for cov in (full, own)])

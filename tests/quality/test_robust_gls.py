@@ -6,8 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.bias_causes import holm, two_sided
-from kgcp.quality.robust_gls import Noise, find_outliers, fit
+from kgcp.quality.bias_causes import holm
+from kgcp.quality.robust_gls import (
+    ErrorModel,
+    find_outliers,
+    fit,
+    separable,
+    two_sided,
+    weighted_products,
+)
 from kgcp.quality.statistics import fit_slope
 
 
@@ -22,7 +29,7 @@ def test_independent_noise_gives_ordinary_least_squares() -> None:
     design = np.column_stack((np.ones(80), rng.normal(size=80)))
     sd = rng.uniform(0.5, 2.0, 80)
     observed = design @ [3.0, -2.0] + sd * rng.standard_normal(80)
-    found = fit(design, observed, Noise(sd**2, np.zeros(80), np.arange(80.0)))
+    found = fit(design, observed, ErrorModel(sd**2, np.zeros(80), np.arange(80.0)))
     rows, right = design / sd[:, None], observed / sd
     expected, rest, *_ = np.linalg.lstsq(rows, right, rcond=None)
     np.testing.assert_allclose(found.values, expected, rtol=1e-10)
@@ -43,8 +50,8 @@ def test_deviations_are_those_of_the_scatter_where_errors_last() -> None:
         lasting = 0.015 * markov(rng, time_s, 20.0)
         observed = 0.001 * x + 0.03 + own * rng.standard_normal(70) + lasting
         design = np.column_stack((x, np.ones(70)))
-        noise = Noise((3.0 * own) ** 2, np.full(70, 0.045**2), time_s)  # stated 3 times too large
-        found = fit(design, observed, noise)
+        stated = ErrorModel((3.0 * own) ** 2, np.full(70, 0.045**2), time_s)  # 3 times too large
+        found = fit(design, observed, stated)
         errors.append((found.values - [0.001, 0.03]) / found.sds)
     scatter = np.std(errors, axis=0)
     assert np.all((scatter > 0.8) & (scatter < 1.3))
@@ -55,24 +62,48 @@ def test_lasting_errors_are_told_from_others() -> None:
     rng = np.random.default_rng(7)
     time_s = np.arange(300.0)
     one, ones = np.ones((300, 1)), np.ones(300)
-    noise = Noise(ones, ones, time_s)
+    noise = ErrorModel(ones, ones, time_s)
     found = fit(one, 3.0 * markov(rng, time_s, 30.0) + rng.standard_normal(300), noise)
     assert 10.0 <= found.correlation_s <= 100.0
     assert fit(one, rng.standard_normal(300), noise).correlation_s == 0.0
 
 
-def test_the_weighting_is_that_of_the_full_covariance() -> None:
-    from kgcp.quality.robust_gls import _correlated
-
+@pytest.mark.parametrize("dimension", [1, 3])
+@pytest.mark.parametrize("tau_s", [0.0, 7.0])
+def test_the_weighting_is_that_of_the_full_covariance(dimension: int, tau_s: float) -> None:
     rng = np.random.default_rng(3)
-    time_s = np.cumsum(rng.uniform(0.2, 4.0, 25))
-    noise = Noise(rng.uniform(0.5, 2.0, 25), rng.uniform(0.5, 2.0, 25), time_s)
-    columns = rng.normal(size=(25, 3))
-    fading = np.exp(-np.abs(time_s[:, None] - time_s) / 7.0)
-    cov = np.diag(noise.white) + 0.3 * np.sqrt(np.outer(noise.lasting, noise.lasting)) * fading
-    moments, log_det = _correlated(columns, noise, 7.0, 0.3)
-    np.testing.assert_allclose(moments, columns.T @ np.linalg.solve(cov, columns), atol=1e-12)
-    assert log_det == pytest.approx(np.linalg.slogdet(cov)[1], abs=1e-10)
+    n = 25
+    time_s = np.cumsum(rng.uniform(0.2, 4.0, n))
+    lasting, white = (
+        half @ np.swapaxes(half, 1, 2) for half in rng.normal(size=(2, n, dimension, dimension))
+    )
+    white += 0.1 * np.eye(dimension)
+    columns = rng.normal(size=(n, dimension, 4))
+    correlation = np.eye(n)
+    if tau_s:
+        correlation = np.exp(-np.abs(time_s[:, None] - time_s) / tau_s)
+    factor = np.linalg.cholesky(lasting)
+    cov = np.einsum("ij,iab,jcb->iajc", correlation, factor, factor)
+    cov[np.arange(n), :, np.arange(n)] += white
+    cov = cov.reshape(n * dimension, -1)
+    flat = columns.reshape(n * dimension, 4)
+    products, log_det = weighted_products(columns, ErrorModel(white, lasting, time_s), tau_s)
+    np.testing.assert_allclose(products, flat.T @ np.linalg.solve(cov, flat), rtol=1e-8, atol=1e-9)
+    assert log_det == pytest.approx(np.linalg.slogdet(cov)[1], abs=1e-8)
+    if dimension == 1:
+        scalars = ErrorModel(white.ravel(), lasting.ravel(), time_s)
+        np.testing.assert_array_equal(weighted_products(columns, scalars, tau_s)[0], products)
+
+
+def test_of_unknowns_that_look_alike_the_last_is_given_up() -> None:
+    rng = np.random.default_rng(11)
+    design = rng.normal(size=(50, 4))
+    design[:, 2] = design[:, 0] - 2.0 * design[:, 1] + 1e-4 * rng.normal(size=50)
+    active, groups = separable(design.T @ design, [0, 1, 2, 3], [100.0] * 4)
+    assert active == [0, 1, 3]
+    assert groups == [frozenset({0, 1, 2})]
+    assert separable(design.T @ design, [2, 3], [100.0] * 4) == ([2, 3], [])
+    assert separable(design.T @ design, range(4), [1e12] * 4) == ([0, 1, 2, 3], [])
 
 
 def test_outliers_do_not_decide() -> None:
@@ -81,9 +112,9 @@ def test_outliers_do_not_decide() -> None:
     observed = 0.02 + 0.001 * x + 0.003 * rng.standard_normal(60)
     observed[[3, 20, 21, 44, 50, 59]] += [5.0, -2.0, 0.4, 9.0, 9.0, 9.0]
     design = np.column_stack((x, np.ones(60)))
-    outlier = find_outliers(design, observed, np.full(60, 0.01**2))
+    outlier = find_outliers(design[:, None, :], observed[:, None], np.full(60, 0.01**2))
     assert np.flatnonzero(outlier).tolist() == [3, 20, 21, 44, 50, 59]
-    found = fit(design, observed, Noise(np.full(60, 1e-4), np.zeros(60), np.arange(60.0)))
+    found = fit(design, observed, ErrorModel(np.full(60, 1e-4), np.zeros(60), np.arange(60.0)))
     assert np.all(np.abs(found.values - [0.001, 0.02]) < 3.0 * found.sds)
     assert found.sds[1] < 0.002
 

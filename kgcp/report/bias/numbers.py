@@ -11,7 +11,14 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.quality.bias_causes import Regression, regress
 from kgcp.quality.bias_study import BiasStudy, Comparison, edge_distances
-from kgcp.quality.exposure_effects import QUANTITIES, ROUNDING, Quantity, Residuals, in_time, varies
+from kgcp.quality.exposure_effects import (
+    QUANTITIES,
+    ROUNDING,
+    Quantity,
+    DistanceResiduals,
+    in_time,
+    varies,
+)
 from kgcp.quality.statistics import Slope, Spread, fit_slope
 from kgcp.report.bias.ranges import (
     DetectionRate,
@@ -56,7 +63,7 @@ class EdgeNumbers:
     rows : (m,) array of int
         Of the measurements that have both.
     one_m, two_m : (m,) array
-        Residuals [m].
+        DistanceResiduals [m].
     one_percent, two_percent : Spread
         Of the residuals [%].
     regression : Regression or None
@@ -79,7 +86,7 @@ class BiasNumbers:
     ----------
     compared : tuple of Comparison
         The n trusted measurements, in time.
-    data : Residuals
+    data : DistanceResiduals
         Theirs.
     residual_percent : (n,) array
         Of the reference distance.
@@ -116,7 +123,7 @@ class BiasNumbers:
     """
 
     compared: tuple[Comparison, ...]
-    data: Residuals
+    data: DistanceResiduals
     residual_percent: FloatArray
     explained_percent: FloatArray
     sd_m: FloatArray
@@ -151,14 +158,14 @@ class BiasNumbers:
 
     @property
     def standardised_residuals(self) -> FloatArray:
-        """Residuals (n,) over their reported deviations; NaN where there is none."""
+        """DistanceResiduals (n,) over their reported deviations; NaN where there is none."""
         return self.data.residual_m / self.sd_m
 
 
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
     """Reduce a study to its numbers; at least one trusted measurement is needed."""
     compared = in_time(study.trusted)
-    data = Residuals.of(compared, _measured_m(compared))
+    data = DistanceResiduals.of(compared, _measured_m(compared))
     percent = 100.0 * data.residual_m / data.distance_m
     regression = regress(data)
     explained = np.zeros_like(percent)
@@ -217,7 +224,7 @@ def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | No
         return None
     with_both = [compared[row] for row in rows.tolist()]
     one_m, two_m, one_px = np.array([astuple(pair) for pair in pairs if pair is not None]).T
-    by_one = Residuals.of(with_both, one_m, one_px)
+    by_one = DistanceResiduals.of(with_both, one_m, one_px)
     return EdgeNumbers(
         rows=rows,
         one_m=by_one.residual_m,
@@ -228,8 +235,8 @@ def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | No
     )
 
 
-def _influences(data: Residuals, percent: FloatArray) -> tuple[Influence, ...]:
-    sd_percent = 100.0 * np.sqrt(data.noise.white + data.noise.lasting) / data.distance_m
+def _influences(data: DistanceResiduals, percent: FloatArray) -> tuple[Influence, ...]:
+    sd_percent = 100.0 * np.sqrt(data.errors.total) / data.distance_m
     shift = data.exposure["edge_shift_px"]
     influences = []
     for quantity in QUANTITIES:

@@ -139,9 +139,9 @@ def _closeup(one: Closeup) -> Json:
 
 def deviations_of(numbers: BiasNumbers) -> FloatArray:
     """Return what scale and offset leave of the errors (n,), over its standard deviation."""
-    noise = numbers.data.noise
+    errors = numbers.data.errors
     left = numbers.residual_percent - numbers.explained_percent
-    sd = 100.0 * np.sqrt(noise.white + noise.lasting) / numbers.data.distance_m
+    sd = 100.0 * np.sqrt(errors.total) / numbers.data.distance_m
     return np.asarray(left / sd)
 
 
