@@ -181,7 +181,7 @@ class Rejection(Exception):  # noqa: N818 - not an error: the outcome of one fra
     reason : Reason
         The word of the registry.
     detail : str
-        The numbers behind it, for the log and the debugging picture.
+        The numbers behind it, for the log and the contact sheet.
     """
 
     def __init__(self, reason: Reason, detail: str = "") -> None:

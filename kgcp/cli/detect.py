@@ -66,24 +66,17 @@ _DEFAULTS = DetectSettings()
     help="Search again, more closely, where other frames or reference poses predict a target.",
 )
 @click.option(
-    "--debug",
-    type=click.Path(file_okay=False, path_type=Path),
-    metavar="DIR",
-    help="Write one picture per frame to DIR, with every candidate ring and why it was rejected.",
-)
-@click.option(
-    "--debug-frames",
-    metavar="PATTERN",
-    default="*",
-    show_default=True,
-    help="Limit --debug to these frames, for example 'east/*_01?.jpg'.",
-)
-@click.option(
     "--overlay",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
     help="Write a contact sheet to DIR/index.html: every ring with its fitted contours, residuals"
     " and values.",
+)
+@click.option(
+    "--all-candidates",
+    is_flag=True,
+    help="With --overlay: also show the rings that were compared with a target and dropped, and"
+    " why.",
 )
 @click.option(
     "--restart",
@@ -123,11 +116,10 @@ def command(
     min_radius: float,
     min_score: float,
     false_alarm: float,
-    debug: Path | None,
-    debug_frames: str,
     frame_timeout: float,
     *,
     overlay: Path | None,
+    all_candidates: bool,
     scheduler: str | None,
     is_guided: bool,
     is_restart: bool,
@@ -147,9 +139,10 @@ def command(
     """
     if scheduler is not None and jobs == 0:
         raise click.UsageError("--jobs 0 and --scheduler exclude each other; give one of them")
+    if all_candidates and overlay is None:
+        raise click.UsageError("--all-candidates needs a contact sheet: give --overlay DIR, too")
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.detect import detect_flight
-    from kgcp.pipeline.frame_task import Debug
     from kgcp.pipeline.workspace import workplace
 
     settings = DetectSettings(
@@ -167,8 +160,8 @@ def command(
                 *(the_flight, settings, place.out),
                 jobs=jobs,
                 watcher=log,
-                debug=None if debug is None else Debug(debug, debug_frames),
                 overlay=overlay,
+                all_candidates=all_candidates,
                 is_restart=is_restart,
                 frame_timeout_s=frame_timeout,
                 is_profiled=is_profiled,

@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.errors import KgcpError, Rejection
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
@@ -17,10 +20,10 @@ from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import provenance
+from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import stops_held
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.quality.bias_study import BiasStudy
-from kgcp.report.bias.closeups import SPREAD, Closeup, closeup, evenly, largest
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -32,13 +35,15 @@ from kgcp.report.bias.figures import (
     one_edge_against_two,
     standardised_histogram,
 )
-from kgcp.report.bias.numbers import BiasNumbers, bias_numbers
-from kgcp.report.bias.page import Content, deviations_of, frames_of, render_page
+from kgcp.report.bias.numbers import SPREAD, BiasNumbers, bias_numbers, evenly
+from kgcp.report.bias.page import Content, render_page
 from kgcp.report.bias.reexposure import Reexposed, measure_again
 from kgcp.report.bias.summary import Json, finite, summary_of
-from kgcp.report.bias.verdict import Verdict, judge
+from kgcp.report.bias.verdict import Verdict, assess
+from kgcp.report.ring_picture import RingView, draw_closeup
 from kgcp.report.style import Picture
 from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Ring
 
 FIGURE_FILES = {
     "error": "bias_error.png",
@@ -79,12 +84,10 @@ def write_report(
 
     Parameters
     ----------
-    study : BiasStudy
     flight : Flight
         Its frames, where they are, give the close-ups.
     settings : DetectSettings
         Of the detections, to measure frames again.
-    folder : Path
     reexpose : int
         How many frames to measure again, with darker and brighter grey values.
     stored_frames : StoredFolder, optional
@@ -125,11 +128,10 @@ def _content(
     reexpose: int,
 ) -> Content:
     numbers = bias_numbers(study)
-    deviations = deviations_of(numbers)
-    spread, worst = evenly(numbers.data.distance_m, SPREAD), largest(deviations)
+    shown = [*evenly(numbers.data.distance_m, SPREAD), *numbers.worst]
     again = evenly(numbers.data.distance_m, reexpose)
-    closeups, reexposed = _look(numbers, flight, frames, settings, [*spread, *worst], again)
-    verdict = judge(numbers, reexposed)
+    closeups, reexposed = _look(numbers, flight, frames, settings, shown, again)
+    verdict = assess(numbers, reexposed)
     return Content(
         name=flight.name,
         numbers=numbers,
@@ -137,10 +139,8 @@ def _content(
         pictures=_pictures(numbers, flight, reexposed),
         rows=[bias_row(one, study.method) for one in numbers.compared],
         closeups=closeups,
-        worst=worst,
-        deviations=deviations,
         reexposed=reexposed,
-        summary=summary_of(numbers, verdict, reexposed, frames_of(numbers.compared)),
+        summary=summary_of(numbers, verdict, reexposed),
     )
 
 
@@ -151,14 +151,13 @@ def _look(
     settings: DetectSettings,
     shown: list[int],
     again: list[int],
-) -> tuple[list[Closeup], list[Reexposed]]:
+) -> tuple[dict[int, tuple[bytes, tuple[FloatArray, ...]]], list[Reexposed]]:
     """Make close-ups of some rows and measure some again, as far as their frames are there."""
-    closeups: list[Closeup] = []
+    closeups = {}
     reexposed: list[Reexposed] = []
     targets = {target.name: target for target in flight.targets}
     for row in dict.fromkeys([*shown, *again]):
-        one = numbers.compared[row]
-        seen = one.attempt.sighting
+        seen = numbers.compared[row].attempt.sighting
         if seen is None:
             continue
         try:
@@ -167,14 +166,24 @@ def _look(
         except (Rejection, KgcpError):
             continue  # the page says of which frames there is no close-up
         target, radius = targets[seen.target], float(numbers.data.radius_px[row])
-        if row in shown and (picture := closeup(grey, flight.camera, target, seen, row)):
-            closeups.append(picture)
+        if row in shown and seen.pose is not None:
+            view = _view(flight.camera, target.ring, seen.pose, seen.centre_px)
+            closeups[row] = draw_closeup(grey, view)
         if row in again:
             with stops_held():
                 reexposed += measure_again(
                     grey, flight.camera, target, settings, seen.centre_px, radius, row
                 )
     return closeups, reexposed
+
+
+def _view(camera: Camera, ring: Ring, pose: Pose, centre_px: FloatArray) -> RingView:
+    """Return a ring with both circles and the centre by its pose."""
+    diameters_m = (ring.outer_diameter_m, ring.inner_diameter_m)
+    circles = [contour_px(camera, pose, 0.5 * diameter_m) for diameter_m in diameters_m]
+    radius_px = 0.5 * float(np.ptp(circles[0], axis=0).max())
+    centre = camera.project(pose.transform(np.zeros((1, 3))))
+    return RingView(centre_px, radius_px, (*circles, centre))
 
 
 def _pictures(
@@ -191,17 +200,7 @@ def _pictures(
         pictures["reexposure"] = change_by_reexposure(reexposed)
     if numbers.standardised is not None:
         pictures["standardised"] = standardised_histogram(numbers)
-    pictures["time"] = _in_time(numbers)
-    centre = np.array(
-        [one.attempt.sighting.centre_px for one in numbers.compared if one.attempt.sighting]
-    )
-    pictures["image"] = error_over_image(numbers, centre, flight.camera)
+    pictures["time"] = error_in_time(numbers)
+    pictures["image"] = error_over_image(numbers, flight.camera)
     pictures["map"] = flight_map(numbers)
     return pictures
-
-
-def _in_time(numbers: BiasNumbers) -> Picture:
-    times = np.array([one.attempt.time_s for one in numbers.compared], dtype=np.float64)
-    if not np.isfinite(times).all():
-        return error_in_time(numbers, np.arange(float(len(times))), "frame, in order")
-    return error_in_time(numbers, (times - times[0]) / 60.0, "time since the first [min]")

@@ -25,7 +25,7 @@ from kgcp.pipeline.detection_run import Looks, Watcher
 from kgcp.pipeline.execution.executor import Crew, hired
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_task import Debug, FrameNote, FrameTask
+from kgcp.pipeline.frame_task import FrameNote, FrameTask
 from kgcp.pipeline.guidance import expectations, with_expectations
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import Stopwatch, SurveySummary, Tally
@@ -53,8 +53,8 @@ def detect_flight(
     *,
     jobs: int | None,
     watcher: Watcher | None = None,
-    debug: Debug | None = None,
     overlay: Path | None = None,
+    all_candidates: bool = False,
     is_restart: bool = False,
     frame_timeout_s: float = FRAME_TIMEOUT_S,
     is_profiled: bool = False,
@@ -77,10 +77,10 @@ def detect_flight(
         cores, or as the scheduler has threads. The table does not depend on it.
     watcher : Watcher, optional
         Who is told how the work goes.
-    debug : Debug, optional
-        Pictures to draw.
     overlay : Path, optional
         Folder of a contact sheet of all rings, to be made after the table.
+    all_candidates : bool
+        Whether the contact sheet also shows rings that were compared with a target's and dropped.
     is_restart : bool
         Whether to begin anew, whatever an interrupted run has left.
     frame_timeout_s : float
@@ -89,7 +89,7 @@ def detect_flight(
         Whether to measure what the workers spend their time on, at the price of some.
     scheduler : str, optional
         Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
-        frames, and the folder of pictures, where they are seen here.
+        frames where they are seen here.
     stored_frames : StoredFolder, optional
         Where the frames are, if not in the flight's folder.
 
@@ -101,7 +101,8 @@ def detect_flight(
     """
     stopwatch = Stopwatch()
     if scheduler is not None:
-        flight, debug = _seen_from_elsewhere(flight, debug)
+        # as the folder is called in whatever folder another process works
+        flight = replace(flight, frames_folder=flight.frames_folder.absolute())
     with stopwatch.stage("preparation"):
         frames = frames_below(stored_frames or flight.frames_folder)
         times = {}
@@ -116,7 +117,7 @@ def detect_flight(
         flight.calibration_covariance,
         flight.targets,
         settings,
-        debug,
+        keeps_dropped=overlay is not None and all_candidates,
     )
     with (
         locked(out / ".detections.lock"),
@@ -147,7 +148,7 @@ def detect_flight(
         not_drawn = 0
         if sheet is not None:
             with stopwatch.stage("overlay"):
-                not_drawn = draw_overlay(sheet, flight.name, looks, task)
+                not_drawn = draw_overlay(sheet, flight.name, looks, task, expected)
         is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
         summary = tally.summary(
             kept=looks.kept,
@@ -169,12 +170,6 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
             " choose another --overlay"
         )
     return ContactSheet(folder)
-
-
-def _seen_from_elsewhere(flight: Flight, debug: Debug | None) -> tuple[Flight, Debug | None]:
-    """Name folders as they are called in whatever folder another process works."""
-    flight = replace(flight, frames_folder=flight.frames_folder.absolute())
-    return flight, None if debug is None else replace(debug, folder=debug.folder.absolute())
 
 
 def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, float]:
@@ -211,7 +206,7 @@ def _making(task: FrameTask) -> dict[str, str]:
         "the settings": to_text(task.settings),
         "the camera": fingerprint(task.camera, task.calibration_covariance),
         "the targets": fingerprint(task.targets),
-        "what is drawn": to_text(task.debug),
+        "what is shown of dropped rings": to_text(task.keeps_dropped),
     }
 
 

@@ -4,55 +4,46 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
+from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.exif import Exif
 from kgcp.io.images.frames import read_exif, read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.detections import FrameResult
-from kgcp.measurement.frame import Examination, examine, miss_of
+from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Expectation, look_again
 from kgcp.measurement.normal_prior import NormalPrior
 from kgcp.measurement.records import Considered, Miss, Observation, Outcome, is_unreadable
 from kgcp.measurement.search.template_match import CODE_LIKE
 from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.report.debug_picture import write_debug_picture
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
-
-@dataclass(frozen=True, slots=True)
-class Debug:
-    """Which frames to draw pictures of.
-
-    Attributes
-    ----------
-    folder : Path
-        Where the pictures go.
-    pattern : str
-        With `*` and `?`, of the frames' names.
-    """
-
-    folder: Path
-    pattern: str
+_MOST_DROPPED = 24  # rings per frame that are kept to be shown: a texture may have hundreds
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTask:
-    """What a worker needs to know to examine any frame of a flight."""
+    """What a worker needs to know to examine any frame of a flight.
+
+    Attributes
+    ----------
+    keeps_dropped : bool
+        Whether the results name the rings that were compared with a target's and dropped.
+    """
 
     frames_folder: Path | StoredFolder
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     targets: tuple[Target, ...]
     settings: DetectSettings
-    debug: Debug | None = None
+    keeps_dropped: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,13 +89,15 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     place = task.frames_folder / note.frame
     exif = Exif()
     outcomes: tuple[Outcome, ...]
+    dropped: tuple[Considered, ...] = ()
     try:
         with at_hand(task.frames_folder, note.frame) as path:
             exif = read_exif(path)
             grey = read_grey(path, task.camera)
         examination = examine(grey, task.camera, task.targets, task.settings, note.prior)
         outcomes = tuple(_with_common_uncertainty(task, one) for one in examination.outcomes)
-        _draw(task, note.frame, grey, examination)
+        if task.keeps_dropped:
+            dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
@@ -114,7 +107,7 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     if time_s is not None and reference is not TimeReference.MIDDLE:
         is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
         time_s = _mid_exposure_s(time_s, exif, reference, place) if is_readable else None
-    return FrameResult(note.frame, time_s, exif, outcomes)
+    return FrameResult(note.frame, time_s, exif, outcomes, dropped)
 
 
 @single_threaded()
@@ -145,8 +138,10 @@ def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
             if seen is not None:
                 found[target.name] = seen
     outcomes = _merged(task, look, grey, found, considered)
-    _draw(task, look.note.frame, grey, Examination(outcomes, tuple(considered)), look.expected)
-    return replace(look.first, outcomes=outcomes)
+    dropped = look.first.dropped
+    if task.keeps_dropped:
+        dropped = _best_dropped((*dropped, *considered))
+    return replace(look.first, outcomes=outcomes, dropped=dropped)
 
 
 def lost_frame(task: FrameTask, note: FrameNote, reason: Reason) -> FrameResult:
@@ -193,15 +188,13 @@ def _merged(
     )
 
 
-def _draw(
-    task: FrameTask,
-    frame: str,
-    grey: GreyArray,
-    examination: Examination,
-    expected: Mapping[str, Expectation] | None = None,
-) -> None:
-    if task.debug is not None and fnmatchcase(frame, task.debug.pattern):
-        write_debug_picture(task.debug.folder, frame, grey, examination, expected)
+def _best_dropped(considered: Sequence[Considered]) -> tuple[Considered, ...]:
+    """Return the dropped rings that came farthest, one per outline."""
+    dropped = (one for one in considered if one.reason is not None)
+    best: dict[Ellipse, Considered] = {}
+    for candidate in sorted(dropped, key=lambda one: (not one.is_match, -one.score)):
+        best.setdefault(candidate.outline, candidate)
+    return tuple(best.values())[:_MOST_DROPPED]
 
 
 def _mid_exposure_s(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,24 +10,28 @@ import numpy as np
 
 from kgcp.errors import Rejection, Status
 from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
 from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.adjustment.residual_image import contours_px, residuals_of
-from kgcp.measurement.records import Miss, Observation, Outcome
+from kgcp.measurement.guided import Expectation
+from kgcp.measurement.records import Considered, Miss, Observation, Outcome
 from kgcp.pipeline.detection_run import Looks
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import FrameTask
-from kgcp.report.contact_sheet import Card, ContactSheet
-from kgcp.report.ring_picture import Pictures, Scene, draw_scene
+from kgcp.quality.number_text import minus
+from kgcp.report.contact_sheet import DROPPED, Card, ContactSheet
+from kgcp.report.ring_picture import Pictures, RingView, draw_ring
 
 _LOSSES = {Loss.DIED: "the process that drew it ended twice", Loss.LATE: "it took too long"}
+_MISSES = {Status.NOT_FOUND.value, Status.REJECTED.value}
 _TURN = np.linspace(0.0, 2.0 * np.pi, 97)
 
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """One row of the table, to be shown.
+    """One card of the sheet, to be written.
 
     Attributes
     ----------
@@ -43,8 +48,25 @@ class Sketch:
     is_lost: bool = False
 
 
-def draw_overlay(sheet: ContactSheet, flight_name: str, looks: Looks, task: FrameTask) -> int:
+def draw_overlay(
+    sheet: ContactSheet,
+    flight_name: str,
+    looks: Looks,
+    task: FrameTask,
+    expected: Mapping[int, Mapping[str, Expectation]],
+) -> int:
     """Draw the last result of every frame, and write the page.
+
+    Workers draw; this process writes their pictures as they come, and keeps only the cards' texts.
+
+    Parameters
+    ----------
+    sheet : ContactSheet
+    flight_name : str
+    looks : Looks
+    task : FrameTask
+    expected : mapping of mappings
+        Where targets must be, by row and target: added to what is said of misses.
 
     Returns
     -------
@@ -56,139 +78,164 @@ def draw_overlay(sheet: ContactSheet, flight_name: str, looks: Looks, task: Fram
     KgcpError
         If the sheet cannot be written.
     """
-    drawn: dict[int, list[Card]] = {}
+    cards: dict[int, list[Card]] = {}
     lost = 0
     for row, result, made in looks.through(partial(sketch_frame, task)):
         sketches = _lost(result, _LOSSES[made]) if isinstance(made, Loss) else made
         lost += sum(sketch.is_lost for sketch in sketches)
-        drawn[row] = [
-            _placed(sheet, sketch, f"{row + 1:06d}-{place}")
-            for place, sketch in enumerate(sketches)
-        ]
-    sheet.finish(flight_name, [card for row in sorted(drawn) for card in drawn[row]])
+        cards[row] = []
+        for place, sketch in enumerate(sketches):
+            card = _with_expectation(sketch.card, expected.get(row, {}))
+            if sketch.pictures is not None:
+                stem = f"{row + 1:06d}-{place}"
+                sheet.add(stem, sketch.pictures)
+                card = replace(card, stem=stem)
+            cards[row].append(card)
+    sheet.finish(flight_name, [card for row in sorted(cards) for card in cards[row]])
     return lost
 
 
-def _placed(sheet: ContactSheet, sketch: Sketch, stem: str) -> Card:
-    if sketch.pictures is None:
-        return sketch.card
-    sheet.add(stem, sketch.pictures)
-    return replace(sketch.card, stem=stem)
+def _with_expectation(card: Card, expected: Mapping[str, Expectation]) -> Card:
+    """Add to the card of a miss where its target must have been."""
+    if card.target not in expected or card.status not in _MISSES:
+        return card
+    return replace(card, text=_joined(card.text, str(expected[card.target])))
 
 
 def sketch_frame(task: FrameTask, result: FrameResult) -> list[Sketch]:
-    """Read a frame again and draw all rings of its result, in the order of the table's rows."""
-    if not any(map(_has_place, result.outcomes)):
-        return [Sketch(_card(result.frame, one)) for one in _in_order(result)]
+    """Read a frame again and draw all rings of its result, in the order of the table's rows.
+
+    Rings that were dropped follow, those that came farthest first.
+    """
+    rings = _rings(result)
+    if not any(_has_place(ring) for ring in rings):
+        return [Sketch(_card(result.frame, ring)) for ring in rings]
     try:
         with at_hand(task.frames_folder, result.frame) as path:
             grey = read_grey(path, task.camera)
     except Rejection as rejection:
         return _lost(result, str(rejection))
-    return [_sketch(task, grey, result.frame, outcome) for outcome in _in_order(result)]
+    return [_sketch(task, grey, result.frame, ring) for ring in rings]
 
 
-def _in_order(result: FrameResult) -> list[Outcome]:
-    return sorted(
+def _rings(result: FrameResult) -> list[Outcome | Considered]:
+    """Return what has a card: all outcomes, and dropped rings that are not the best of a miss."""
+    outcomes = sorted(
         result.outcomes, key=lambda one: (one.target, 0 if isinstance(one, Miss) else one.instance)
     )
+    shown = {one.outline for one in outcomes if isinstance(one, Miss)}
+    return [*outcomes, *(one for one in result.dropped if one.outline not in shown)]
 
 
-def _has_place(outcome: Outcome) -> bool:
-    return isinstance(outcome, Observation) or outcome.outline is not None
+def _has_place(ring: Outcome | Considered) -> bool:
+    return isinstance(ring, Observation) or ring.outline is not None
 
 
 def _lost(result: FrameResult, why: str) -> list[Sketch]:
     return [
-        Sketch(_card(result.frame, one, note=f"not drawn: {why}"), is_lost=True)
-        if _has_place(one)
-        else Sketch(_card(result.frame, one))
-        for one in _in_order(result)
+        Sketch(_card(result.frame, ring, note=f"not drawn: {why}"), is_lost=True)
+        if _has_place(ring)
+        else Sketch(_card(result.frame, ring))
+        for ring in _rings(result)
     ]
 
 
-def _sketch(task: FrameTask, grey: GreyArray, frame: str, outcome: Outcome) -> Sketch:
-    if isinstance(outcome, Miss):
-        card = _card(frame, outcome)
-        outline = outcome.outline
-        if outline is None:
-            return Sketch(card)
-        scene = Scene(outline.centre, outline.a, (outline.points(_TURN),), None)
-        return Sketch(card, draw_scene(grey, scene))
-    target = next(one for one in task.targets if one.name == outcome.target)
-    appearance = outcome.appearance
+def _sketch(task: FrameTask, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
+    if not isinstance(ring, Observation):
+        pictures = None if ring.outline is None else draw_ring(grey, _outlined(ring.outline))
+        return Sketch(_card(frame, ring), pictures)
+    target = next(one for one in task.targets if one.name == ring.target)
+    appearance = ring.appearance
     note, residuals = "", None
     try:
-        residuals = residuals_of(grey, task.camera, target, outcome.pose, appearance.blur_px)
+        residuals = residuals_of(grey, task.camera, target, ring.pose, appearance.blur_px)
     except Rejection as rejection:
         note = f"no residuals: {rejection}"
-    curves = tuple(contours_px(task.camera, target, outcome.pose))
-    scene = Scene(outcome.centre_px, appearance.radius_px, curves, residuals)
-    noise = None if residuals is None else 100.0 * residuals.edge_noise
-    return Sketch(_card(frame, outcome, noise, note), draw_scene(grey, scene))
+    curves = tuple(contours_px(task.camera, target, ring.pose))
+    view = RingView(ring.centre_px, appearance.radius_px, curves, residuals)
+    share = None if residuals is None else 100.0 * residuals.edge_noise
+    return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
+
+
+def _outlined(outline: Ellipse) -> RingView:
+    return RingView(outline.centre, outline.a, (outline.points(_TURN),))
 
 
 def _card(
-    frame: str, outcome: Outcome, residual_percent: float | None = None, note: str = ""
+    frame: str,
+    ring: Outcome | Considered,
+    residual_percent: float | None = None,
+    note: str = "",
 ) -> Card:
-    if isinstance(outcome, Miss):
-        return Card(
-            frame=frame,
-            target=outcome.target,
-            instance=0,
-            status=outcome.reason.status.value,
-            reason=outcome.reason.value,
-            headline=outcome.reason.value,
-            text=_joined(outcome.detail, note),
-            radius_px=None if outcome.outline is None else outcome.outline.a,
-        )
-    distance_m, known = outcome.pose.distance_m, outcome.uncertainty
-    sd = "" if known is None else f" ± {1e3 * known.sd_distance_m:.1f} mm"
+    if isinstance(ring, Observation):
+        return _measured_card(frame, ring, residual_percent, note)
+    reason = ring.reason.value if ring.reason else ""
+    if isinstance(ring, Miss):
+        status, texts = ring.reason.status.value, [ring.detail]
+    else:
+        outline = ring.outline
+        where = f"ring at ({outline.x:.0f}, {outline.y:.0f}), radius {outline.mean_radius:.1f} px"
+        status, texts = DROPPED, [f"compared with {ring.ring}", where, ring.detail]
+        if "score" not in ring.detail:
+            texts.append(f"score {ring.score:.2f}")
     return Card(
         frame=frame,
-        target=outcome.target,
-        instance=outcome.instance,
+        target=ring.target,
+        instance=0,
+        status=status,
+        reason=reason,
+        headline=reason,
+        text=_joined(*texts, note),
+        radius_px=None if ring.outline is None else ring.outline.a,
+    )
+
+
+def _measured_card(
+    frame: str, seen: Observation, residual_percent: float | None, note: str
+) -> Card:
+    distance_m, spread = seen.pose.distance_m, seen.uncertainty
+    sd = "" if spread is None else f" ± {1e3 * spread.sd_distance_m:.1f} mm"
+    return Card(
+        frame=frame,
+        target=seen.target,
+        instance=seen.instance,
         status=Status.MEASURED.value,
         reason="",
         headline=f"{distance_m:.3f} m{sd}",
-        text=_joined(*_values(outcome, residual_percent), note),
+        text=_joined(*_values(seen, residual_percent), note),
         distance_m=distance_m,
-        sd_percent=None if known is None else 100.0 * known.sd_distance_m / distance_m,
-        radius_px=outcome.appearance.radius_px,
+        sd_percent=None if spread is None else 100.0 * spread.sd_distance_m / distance_m,
+        radius_px=seen.appearance.radius_px,
         residual_percent=residual_percent,
     )
 
 
 def _values(seen: Observation, residual_percent: float | None) -> list[str]:
-    """Say the values in few words; those that are not known are left out."""
-    look, known = seen.appearance, seen.uncertainty
+    """Return the values in few words; those that are not known are left out."""
+    look, spread = seen.appearance, seen.uncertainty
     x, y = seen.centre_px
-    sd = "" if known is None else f" ± {np.sqrt(np.diag(known.centre_cov_px2).max()):.3f}"
+    sd = "" if spread is None else f" ± {np.sqrt(np.diag(spread.centre_cov_px2).max()):.3f}"
     texts = [f"centre ({x:.2f}, {y:.2f}){sd} px", f"radius {look.radius_px:.1f} px"]
     if seen.ring != seen.target:
         texts.append(f"by {seen.ring}")
     if seen.is_guided:
         texts.append("second look")
     angles = (seen.pose.roll_deg, seen.pose.pitch_deg, seen.heading_deg)
-    texts.append("roll {}°, pitch {}°, heading {}°".format(*(_signed(one, 1) for one in angles)))
+    roll, pitch, heading = (minus(f"{angle:.1f}") for angle in angles)
+    texts.append(f"roll {roll}°, pitch {pitch}°, heading {heading}°")
     if seen.alternative is not None:
         ambiguity = seen.alternative.ambiguity
         texts.append(f"ambiguity {ambiguity:.{1 if ambiguity < 100.0 else 0}f}")
     if look.blur_px is not None:
         texts.append(f"blur {look.blur_px:.2f} px")
     if look.edge_shift_px is not None:
-        texts.append(f"edge shift {_signed(look.edge_shift_px, 2)} px")
+        texts.append(f"edge shift {minus(f'{look.edge_shift_px:.2f}')} px")
     texts.append(f"levels {look.black:.2f} … {look.white:.2f}")
     texts.append(f"clipped {100.0 * look.saturated:.0f}\xa0%")
     texts.append(f"score {seen.score:.2f}")
     if residual_percent is not None:
         texts.append(f"residuals {residual_percent:.1f}\xa0%")
     return texts
-
-
-def _signed(value: float, digits: int) -> str:
-    rounded = round(value, digits) + 0.0  # −0.00 would look like a finding
-    return f"{rounded:.{digits}f}".replace("-", "−")
 
 
 def _joined(*texts: str) -> str:

@@ -8,8 +8,9 @@ import numpy as np
 
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.corrections import Correction
+from kgcp.quality.number_text import amount
 
-_TANGLED_CHI2 = 3.0  # of χ² over its degrees of freedom: disagreement without a single culprit
+_UNEXPLAINED = 3.0  # χ² over its degrees of freedom: disagreement without a single culprit
 _FARTHEST_M = 100.0  # what a second and some metres of lever arm make of a vehicle's place
 _AXES = {"forward": 0, "right": 1, "down": 2}
 
@@ -17,8 +18,8 @@ _AXES = {"forward": 0, "right": 1, "down": 2}
 def advice(found: Consistency) -> tuple[str, ...]:
     """Return one line per correction that is due; none where all is well.
 
-    It is due where it is more than chance, and more than what flight.toml itself calls uncertain.
-    Where maps or clocks do not belong together, none of them means anything.
+    A correction is due where it is more than chance, and more than what flight.toml itself calls
+    uncertain. Where maps or clocks do not belong together, corrections mean nothing.
     """
     distance_m = math.hypot(*rms_m(found))
     strange = [
@@ -33,11 +34,11 @@ def advice(found: Consistency) -> tuple[str, ...]:
         and abs(correction.value or 0.0) > found.stated_sd.get(correction.name, 0.0)
     ]
     factor = found.estimate.variance_factor
-    if factor > _TANGLED_CHI2:
+    if factor > _UNEXPLAINED:
         lines.append(
-            f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their deviations"
-            " say, whatever is corrected: look at consistency.parquet for when, and check sd_x …"
-            " of trajectory and reference poses"
+            f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their standard"
+            " deviations say, whatever is corrected: look at consistency.parquet for when, and"
+            " check sd_x … of trajectory and reference poses"
         )
     return tuple(lines)
 
@@ -67,23 +68,16 @@ def _line(correction: Correction) -> str:
 
 def _remedy(correction: Correction) -> str:
     quantity, _, unit = correction.name.rpartition("_")
-    amount = _amount(correction, unit)
+    change = f"{amount(correction.value or 0.0, correction.sd)} {unit}"
     if quantity == "time_offset":
-        return f"add {amount} to [vehicle] time_offset_s in flight.toml"
+        return f"add {change} to [vehicle] time_offset_s in flight.toml"
     if quantity == "readout":
-        return f"add {amount} to [camera] readout_s in flight.toml"
+        return f"add {change} to [camera] readout_s in flight.toml"
     if quantity.startswith("lever_arm_"):
         axis = quantity.removeprefix("lever_arm_")
-        return f"add {amount} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
+        return f"add {change} to [vehicle] lever_arm_m[{_AXES[axis]}] ({axis}) in flight.toml"
     axis = quantity.removeprefix("boresight_")
     return (
-        f"the images are turned by {amount} about the camera's {axis} axis against the reference"
+        f"the images are turned by {change} about the camera's {axis} axis against the reference"
         " poses: check that [reference] poses and [camera] are of the same adjustment"
     )
-
-
-def _amount(correction: Correction, unit: str) -> str:
-    """Return value ± deviation, both to the deviation's second digit."""
-    value, sd = correction.value or 0.0, correction.sd or 0.0
-    decimals = max(0, 1 - math.floor(math.log10(sd))) if sd > 0.0 else 6
-    return f"{value:.{decimals}f} ± {sd:.{decimals}f} {unit}"

@@ -18,7 +18,7 @@ SIGNIFICANT = 0.01
 MIN_COUNT = 6
 _PER_TERM = 4  # observations that every term of exposure must have
 _KNOWN_SHARE = 0.9  # of the frames that must have a quantity
-_MAX_INFLATION = 25.0  # of a term's variance by the others: a deviation five times larger
+_MAX_INFLATION = 25.0  # of a term's variance by the others: a standard deviation five times larger
 _DISTANCE_LIKE = 1000.0  # the same of what grows with distance alone, and is always looked for
 _CURVED = "edge_curvature_px2"
 
@@ -62,11 +62,11 @@ class Regression:
     tangled : tuple of str
         Quantities that vary, but so much like others that they cannot be told from them.
     count : int
-        Residuals that had a part.
+        Residuals that took part.
     used, outlier : (n,) array of bool
-        Which had, and which fit nothing.
+        Rows that have all quantities; those of them that fit nothing and were left out.
     scatter : float
-        Of what is left, over its deviations as they were stated; 1 where these are true.
+        Of the residuals over their stated standard deviations; 1 where these are true.
     correlation_s : float
         As in `RegressionFit`.
     exposure_share : float

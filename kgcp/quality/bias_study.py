@@ -46,28 +46,16 @@ class ReferenceSds:
 
     @classmethod
     def along(cls, direction: FloatArray, place: Place, views: Views, row: int) -> Self | None:
-        """Return the deviations along a line of sight: a unit vector (3,) in the ENU frame.
+        """Return those along a line of sight: a unit vector (3,) in the ENU frame.
 
-        Parameters
-        ----------
-        direction : (3,) array
-        place : Place
-            Of the target.
-        views : Views
-            Reference poses.
-        row : int
-            That of the frame.
-
-        Returns
-        -------
-        ReferenceSds or None
-            None where trajectory or poses have no deviations.
+        `row` is that of the frame among the reference poses. None where trajectory or poses have
+        no standard deviations.
         """
         if place.cov_m2 is None or views.cov_m2 is None:
             return None
         pose = float(direction @ views.cov_m2[row] @ direction)
         whole = float(direction @ place.cov_m2 @ direction)
-        common = whole  # of a target that stands still
+        common = whole  # of a static target
         if place.common_m is not None:
             common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
         return cls(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))
@@ -100,7 +88,6 @@ class Attempt:
         Mid-exposure, Unix UTC [s].
     sighting : Sighting or None
         None where the target was not measured.
-    exposure : Exposure
     """
 
     frame: str
@@ -116,7 +103,6 @@ class Comparison:
 
     Attributes
     ----------
-    attempt : Attempt
     camera_m, place_m : (3,) array
         Reference projection centre, and the target's place at that time, in the ENU frame [m].
     sds : ReferenceSds or None
@@ -175,8 +161,6 @@ class BiasStudy:
 
     Attributes
     ----------
-    method : Method
-        How the distances were measured.
     measured : tuple of Comparison
         With a residual, in the frames' order.
     chances : tuple of Comparison
@@ -221,14 +205,6 @@ def study_bias(
     ----------
     attempts : sequence of Attempt
         One per frame and target; targets never measured are left out.
-    poses : ReferencePoses
-        Of the camera.
-    whereabouts : Whereabouts
-        Of the targets.
-    camera : Camera
-        To know whether the target was in the frame.
-    targets : sequence of Target
-        Of the flight.
     method : Method
         Of the measurement.
 

@@ -37,11 +37,11 @@ class Discrepancy:
     offset_m : (3,) array
         By the vehicle minus by the camera: along the track, across it to the right, up [m].
     cov_m2 : (3, 3) array
-        Covariance by all stated deviations but those that all frames share [m²].
+        By all stated standard deviations but those that all frames share [m²].
     residual_m : (3,) array
         What the corrections leave of the offset [m].
     is_outlier : bool
-        Whether it fits no correction and had no part in them.
+        Whether it fits no correction and was left out.
     """
 
     frame: str
@@ -90,11 +90,6 @@ def study_consistency(
     ----------
     sightings : sequence of Sighting
         Without a pose or a reference pose they are passed over, and so are static targets.
-    whereabouts : Whereabouts
-        Of the flight's targets.
-    poses : ReferencePoses
-    camera : Camera
-        For the rolling shutter.
 
     Returns
     -------

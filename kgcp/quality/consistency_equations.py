@@ -18,7 +18,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Place, Ride
 
 _MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
-_UNSTATED_SD_M = 0.01  # of what has no deviations; the residuals set the scale then
+_UNSTATED_SD_M = 0.01  # of what states none; the residuals set the scale then
 _STANDING_M_S = 0.2  # below, the track is where the vehicle points
 _NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
 
@@ -29,15 +29,12 @@ class Meeting:
 
     Attributes
     ----------
-    seen : Sighting
     pose : Pose
-        Its, target → camera.
+        Of the sighting, target → camera.
     time_s : float
         When the target's row was exposed, by the frames' clock, Unix UTC [s].
     place : Place
         By the vehicle.
-    ride : Ride
-        Its.
     row : int
         Of the reference pose.
     """
@@ -63,9 +60,10 @@ class System:
     fading, white : (n, 3, 3) array
         Covariance by the trajectory, and by all that is independent from frame to frame [m²].
     common : (n, 3) array
-        What one deviation of calibration and diameter, by way of the distance, adds to it [m].
+        What one standard deviation of calibration and diameter, by way of the distance, adds to
+        it [m].
     has_sds : bool
-        Whether trajectory and reference poses have deviations.
+        Whether trajectory and reference poses have standard deviations.
     track : (n, 3, 3) array
         Along the track, across it to the right and up, as rows.
     """

@@ -13,7 +13,7 @@ from kgcp.quality.bias_study import Comparison
 from kgcp.quality.robust_gls import ErrorModel
 
 ROUNDING = 1e-9  # a quantity that varies by less does not vary
-# Of what has no stated deviations: the scatter sets the scale then, these only the proportions.
+# Without stated standard deviations the scatter sets the scale, and these only the proportions.
 _UNSTATED_EDGE_PX = 0.05
 _UNSTATED_WHITE_M, _UNSTATED_LASTING_M = 0.005, 0.01
 
@@ -75,7 +75,7 @@ class DistanceResiduals:
     residual_m : (n,) array
         Measured minus reference distance.
     errors : ErrorModel
-        Of the residuals [m²].
+        Of the residuals, in m².
     exposure : mapping of str to (n,) array
         The columns of `QUANTITIES` by name; NaN where a frame has none.
     """
@@ -97,7 +97,6 @@ class DistanceResiduals:
 
         Parameters
         ----------
-        compared : sequence of n Comparison
         measured_m : (n,) array
             Measured distances [m].
         radius_px : (n,) array, optional
@@ -153,7 +152,7 @@ def _error_model(compared: Sequence[Comparison], unstated_m: FloatArray) -> Erro
     pose = np.array([one.sds.pose_m if one.sds else _UNSTATED_WHITE_M for one in compared])
     place = np.array([one.sds.place_m if one.sds else _UNSTATED_LASTING_M for one in compared])
     times = np.array([one.attempt.time_s for one in compared], dtype=np.float64)
-    if not np.isfinite(times).all():  # nobody knows which are neighbours
+    if not np.isfinite(times).all():  # without times it is not known which are neighbours
         times = np.arange(float(len(pose)))
         return ErrorModel(measured**2 + pose**2 + place**2, np.zeros_like(pose), times)
     return ErrorModel(measured**2 + pose**2, place**2, times)

@@ -66,7 +66,7 @@ class MovingStatistics:
 
 
 def moving_statistics(x: FloatArray, y: FloatArray, window: float) -> MovingStatistics:
-    """Return mean and deviation of y (n,) within ± window/2 of x, in steps of window/10.
+    """Return mean and standard deviation of y (n,) within ± window/2 of x, by steps of window/10.
 
     n ≥ 1, all finite.
     """
@@ -106,7 +106,7 @@ class Slope:
     Attributes
     ----------
     count : int
-        Points that had a part; what is far off the line had none.
+        Points that took part; those far off the line did not.
     middle, height, value : float
     sd_height, sd_value : float
         Standard deviations, by the scatter about the line.
@@ -134,9 +134,14 @@ class Slope:
 def fit_slope(
     x: FloatArray, y: FloatArray, sd: FloatArray, *, is_robust: bool = True
 ) -> Slope | None:
-    """Fit a line to points (n,) with deviations of y known to a factor; None where x says little.
+    """Fit a line to points (n,); None where x says little.
 
-    Deviations are those of the scatter; robust, unless what is far off the others counts most.
+    Parameters
+    ----------
+    sd : (n,) array
+        Standard deviations of y but for a common factor, which is that of the scatter.
+    is_robust : bool
+        Whether to leave out points that are far off the others.
     """
     if len(x) < _MIN_COUNT or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None

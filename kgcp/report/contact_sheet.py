@@ -16,6 +16,9 @@ from kgcp.report.ring_picture import FULL_SCALE, THUMBNAIL_PX, Pictures
 
 PAGE = "index.html"
 _PICTURES, _THUMBNAILS = "pictures", "thumbnails"
+DROPPED = "candidate"
+"""Status of a card that no row of the table stands for: a ring that was compared and dropped."""
+
 _OWN_NAME = re.compile(r"\d{6,}-\d+\.jpg")
 _MARK = '<meta name="generator" content="kgcp'
 _HEAD = 2000  # characters of a page, in which the mark must be
@@ -23,12 +26,12 @@ _HEAD = 2000  # characters of a page, in which the mark must be
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What the page says of one row of the table.
+    """What the page says of one row of the table, or of a ring that was dropped.
 
     Attributes
     ----------
     frame, target, status, reason : str
-        As in the table.
+        As in the table; or the status `DROPPED`.
     instance : int
     headline, text : str
         The main value, and the others.
@@ -53,7 +56,7 @@ class Card:
 
 
 class ContactSheet:
-    """A folder that becomes a contact sheet; its page appears last, when all pictures are there.
+    """A folder that becomes a contact sheet; its page appears last, after all pictures.
 
     Parameters
     ----------
@@ -74,9 +77,7 @@ class ContactSheet:
             for name in (_PICTURES, _THUMBNAILS):
                 (folder / name).mkdir(parents=True, exist_ok=True)
             if self.page.is_file() and not _is_own(self.page):
-                raise KgcpError(
-                    f"{self.page}: is a page of something else; choose another --overlay"
-                )
+                raise KgcpError(f"{self.page}: is a page of another program; choose another folder")
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -115,7 +116,7 @@ class ContactSheet:
 
     def _unwritable(self, error: OSError) -> KgcpError:
         return KgcpError(
-            f"{self._folder}: cannot be written ({error.strerror}); choose another --overlay"
+            f"{self._folder}: cannot be written ({error.strerror}); choose another folder"
         )
 
 
@@ -125,7 +126,7 @@ def _is_own(page: Path) -> bool:
 
 
 def _render(flight_name: str, cards: Sequence[Card]) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # workers need it not
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # workers do not need it
 
     environment = Environment(
         loader=PackageLoader("kgcp.report"),
@@ -136,12 +137,14 @@ def _render(flight_name: str, cards: Sequence[Card]) -> str:
     )
     statuses = Counter(card.status for card in cards)
     reasons = Counter(card.reason for card in cards if card.reason)
+    kinds = [*(status.value for status in Status), DROPPED]
     return environment.get_template("contact_sheet.html").render(
         name=flight_name,
         version=__version__,
         cards=cards,
+        dropped=statuses[DROPPED],
         frames=len({card.frame for card in cards}),
-        statuses=[(kind.value, statuses[kind.value]) for kind in Status if statuses[kind.value]],
+        statuses=[(kind, statuses[kind]) for kind in kinds if statuses[kind]],
         reasons=sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])),
         targets=sorted({card.target for card in cards}),
         thumbnail_px=THUMBNAIL_PX,

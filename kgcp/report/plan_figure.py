@@ -6,29 +6,13 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from kgcp.errors import SettingError
 from kgcp.io.files.atomic import write_bytes
+from kgcp.report.style import BLUE, GREY, VERMILION, sheet
 from kgcp.simulation.outlook import Outlook
 
-# Okabe and Ito's palette, told apart by colour-blind readers and in grey print
-_BLUE, _VERMILION, _GREY = "#0072B2", "#D55E00", "#666666"
-_STYLE = {
-    "font.size": 11.0,
-    "font.family": "DejaVu Sans",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.8,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-    "svg.hashsalt": "kgcp",  # identifiers of the same figure are the same
-}
 _METADATA: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
@@ -57,8 +41,7 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     check_figure_name(path)
     suffix = path.suffix.lower()
     stream = io.BytesIO()
-    with style.context(["default", _STYLE]):  # whatever the user's matplotlibrc says
-        figure = Figure(figsize=(7.0, 8.0), layout="constrained")
+    with sheet(7.0, 8.0) as figure:
         distance, centre, found = figure.subplots(3, 1, sharex=True)
         figure.suptitle(title, fontsize=12)
         _draw_distance(distance, outlooks)
@@ -75,24 +58,24 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
 
 def _draw_distance(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     seen = [(o.height_m, 1e3 * o.sd_distance_m) for o in outlooks if o.sd_distance_m is not None]
-    axes.plot(*_columns(seen), "o-", color=_BLUE, label="one frame")
+    axes.plot(*_columns(seen), "o-", color=BLUE, label="one frame")
     common = [
         (o.height_m, 1e3 * o.sd_common_distance_m)
         for o in outlooks
         if o.sd_common_distance_m is not None
     ]
     if common:
-        axes.plot(*_columns(common), "s--", color=_VERMILION, label="calibration and print")
+        axes.plot(*_columns(common), "s--", color=VERMILION, label="calibration and print")
         axes.legend(loc="upper left", fontsize=10)
     axes.set_yscale("log")
-    axes.set_ylabel("σ of distance [mm]")
+    axes.set_ylabel("sd of distance [mm]")
 
 
 def _draw_centre(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     seen = [(o.height_m, o.sd_centre_px) for o in outlooks if o.sd_centre_px is not None]
-    axes.plot(*_columns(seen), "o-", color=_BLUE)
+    axes.plot(*_columns(seen), "o-", color=BLUE)
     axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("σ of centre per axis [px]")
+    axes.set_ylabel("sd of centre per axis [px]")
 
 
 def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
@@ -100,9 +83,7 @@ def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     found = [100.0 * o.found for o in outlooks]
     below = [100.0 * (o.found - o.found_low) for o in outlooks]
     above = [100.0 * (o.found_high - o.found) for o in outlooks]
-    axes.errorbar(
-        heights, found, yerr=(below, above), fmt="o", color=_BLUE, ecolor=_GREY, capsize=4
-    )
+    axes.errorbar(heights, found, yerr=(below, above), fmt="o", color=BLUE, ecolor=GREY, capsize=4)
     axes.set_ylim(0.0, 105.0)
     axes.set_ylabel("found [%]")
 

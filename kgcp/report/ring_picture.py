@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -17,8 +18,11 @@ FULL_SCALE = 0.1
 """Residuals, in shares of the contrast, that have the full colour."""
 PICTURE_PX, THUMBNAIL_PX = 400, 160
 """Width of either half of a picture, which is as high."""
+CLOSEUP_PX = 320
+"""Width and height of a close-up."""
 
-_REACH, _LEAST_REACH_PX = 1.4, 6.0  # of the outer radius
+_REACH, _CLOSEUP_REACH = 1.4, 1.7  # of the outer radius, to each side
+_LEAST_REACH_PX = 6.0
 _QUALITY = 80
 _MAGNIFIED = 2.0  # from here on pixels are shown as squares
 _PARTS = 4  # bits of a pixel that lines are drawn to
@@ -31,7 +35,7 @@ _Picture = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class RingView:
     """What is to be shown of one ring in a frame.
 
     Attributes
@@ -41,7 +45,7 @@ class Scene:
     radius_px : float
         Of its outer edge [px].
     curves : sequence of (m, 2) array
-        Fitted contours [px].
+        Contours, fitted or of the outline that was dropped [px].
     residuals : Residuals or None
         What the fit leaves; None: there is no fit.
     """
@@ -49,12 +53,12 @@ class Scene:
     centre_px: FloatArray
     radius_px: float
     curves: Sequence[FloatArray]
-    residuals: Residuals | None
+    residuals: Residuals | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """One scene as JPEG, twice as wide as high: contours on the left, residuals on the right."""
+    """One ring as JPEG, twice as wide as high: contours on the left, residuals on the right."""
 
     picture: bytes
     thumbnail: bytes
@@ -68,6 +72,13 @@ class _Cut:
     y0: int
     side: int
 
+    @classmethod
+    def around(cls, view: RingView, reach: float) -> Self:
+        """Cut so many radii to each side of the centre."""
+        reach_px = math.ceil(max(reach * view.radius_px, _LEAST_REACH_PX))
+        x, y = np.rint(view.centre_px).astype(int).tolist()
+        return cls(x - reach_px, y - reach_px, 2 * reach_px + 1)
+
     def of(self, layer: npt.NDArray[np.generic], fill: float) -> FloatArray:
         """Cut it out of a layer (height, width) of the frame; beyond that there is `fill`."""
         height, width = layer.shape
@@ -79,23 +90,42 @@ class _Cut:
             cut[down : down + part.shape[0], right : right + part.shape[1]] = part
         return cut
 
+    def placed(self, points: FloatArray, size: int) -> FloatArray:
+        """Return points of the frame from the left and upper border of a picture of a size."""
+        corner = np.array([self.x0, self.y0]) - 0.5
+        return np.asarray(size / self.side * (points - corner))
 
-def draw_scene(grey: GreyArray, scene: Scene) -> Pictures:
+
+def draw_ring(grey: GreyArray, view: RingView) -> Pictures:
     """Draw the surroundings of a ring: with its contours, and beside it the residuals.
 
     The residuals are blue where the frame is brighter than the model, orange where it is darker,
     and grey where there is no model. Where nothing was fitted, the ring is there without contours.
     """
-    reach = math.ceil(max(_REACH * scene.radius_px, _LEAST_REACH_PX))
-    x, y = np.rint(scene.centre_px).astype(int).tolist()
-    cut = _Cut(x - reach, y - reach, 2 * reach + 1)
+    cut = _Cut.around(view, _REACH)
     plain = _stretched(cut.of(grey, math.nan))
-    beside = plain if scene.residuals is None else _coloured(scene.residuals, cut)
+    beside = plain if view.residuals is None else _coloured(view.residuals, cut)
     picture, thumbnail = (
-        _encoded(np.hstack((_with_contours(_sized(plain, size), cut, scene), _sized(beside, size))))
+        _encoded(np.hstack((_with_contours(_sized(plain, size), cut, view), _sized(beside, size))))
         for size in (PICTURE_PX, THUMBNAIL_PX)
     )
     return Pictures(picture, thumbnail)
+
+
+def draw_closeup(grey: GreyArray, view: RingView) -> tuple[bytes, tuple[FloatArray, ...]]:
+    """Draw the surroundings of a ring without lines; return the curves in the picture, too.
+
+    Returns
+    -------
+    picture : bytes
+        JPEG, `CLOSEUP_PX` wide and high.
+    curves : tuple of (m, 2) array
+        From the picture's left and upper border [px].
+    """
+    cut = _Cut.around(view, _CLOSEUP_REACH)
+    picture = _sized(_stretched(cut.of(grey, math.nan)), CLOSEUP_PX)
+    curves = tuple(cut.placed(curve, CLOSEUP_PX) for curve in view.curves)
+    return _encoded(picture[:, :, 0]), curves
 
 
 def _stretched(cut: FloatArray) -> _Picture:
@@ -127,24 +157,15 @@ def _sized(picture: _Picture, size: int) -> _Picture:
     return np.asarray(cv2.resize(picture, (size, size), interpolation=way), dtype=np.uint8)
 
 
-def _with_contours(picture: _Picture, cut: _Cut, scene: Scene) -> _Picture:
-    scale = len(picture) / cut.side
-    corner = np.array([cut.x0, cut.y0]) - 0.5
-
-    def place(points: FloatArray) -> npt.NDArray[np.int32]:
-        on_picture = scale * (points - corner) - 0.5
-        return np.asarray(np.rint(on_picture * 2**_PARTS), dtype=np.int32)
-
-    colour = _DROPPED if scene.residuals is None else _FITTED
-    for curve in scene.curves:
-        cv2.polylines(picture, [place(curve)], isClosed=False, color=colour, thickness=1,
-                      lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
-    x, y = (float(c) for c in scene.centre_px)
-    arm = 0.03 * cut.side
-    for tip in ((arm, 0.0), (0.0, arm)):
-        ends = place(np.array([[x - tip[0], y - tip[1]], [x + tip[0], y + tip[1]]]))
-        cv2.polylines(picture, [ends], isClosed=False, color=_CENTRE, thickness=1,
-                      lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
+def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
+    colour = _DROPPED if view.residuals is None else _FITTED
+    arm = np.array([0.03 * cut.side, 0.0])
+    cross = [view.centre_px + np.array([-tip, tip]) for tip in (arm, arm[::-1])]
+    for lines, ink in ((view.curves, colour), (cross, _CENTRE)):
+        for line in lines:
+            points = np.rint((cut.placed(line, len(picture)) - 0.5) * 2**_PARTS).astype(np.int32)
+            cv2.polylines(picture, [points], isClosed=False, color=ink, thickness=1,
+                          lineType=cv2.LINE_AA, shift=_PARTS)  # fmt: skip
     return picture
 
 

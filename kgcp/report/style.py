@@ -1,4 +1,4 @@
-"""What all figures of the report share: style, PNG bytes, and where in it the points lie."""
+"""What all figures share: style, PNG bytes, and where in it the points lie."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 MARK_STEPS = 10_000  # of a picture's width and height
 _DPI = 150
 _FEW = 400  # points, up to which they are drawn large
-_FAR = 8.0  # robust deviations, beyond which points are drawn at the rim
+_FAR = 8.0  # robust standard deviations, beyond which points are drawn at the rim
 _STYLE = {
     "font.size": 12.0,
     "font.family": "DejaVu Sans",
@@ -32,6 +32,7 @@ _STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 10.0,
     "savefig.dpi": _DPI,
+    "svg.hashsalt": "kgcp",  # identifiers of the same figure are the same
 }
 
 
@@ -74,7 +75,7 @@ class Picture:
 
 @contextmanager
 def sheet(width_in: float, height_in: float) -> Iterator[Figure]:
-    """Yield an empty figure in the report's style, whatever the user's matplotlibrc says."""
+    """Yield an empty figure in kgcp's style, whatever the user's matplotlibrc says."""
     with style.context(["default", _STYLE]):
         yield Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
 

@@ -74,9 +74,7 @@ def detect(flight: Path, out: Path, *options: str) -> Result:
 
 
 def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> None:
-    result = detect(
-        flight, tmp_path, "--debug", str(tmp_path / "debug"), "--debug-frames", f"f_{HAZY}*"
-    )
+    result = detect(flight, tmp_path, "--overlay", str(tmp_path / "sheet"), "--all-candidates")
     assert json.loads(result.stdout)["guided"] == 1
     assert "1 of them measured in the second pass" in result.stderr
     rows = pd.read_parquet(tmp_path / "detections.parquet").set_index("frame")
@@ -86,8 +84,9 @@ def test_neighbours_lead_to_the_target_in_haze(flight: Path, tmp_path: Path) -> 
     seen = rows.loc[f"f_{HAZY}.png"]
     assert np.hypot(*(seen[["x_px", "y_px"]] - CAMERA.project(truth.translation_m))) < 0.1
     assert seen["distance_m"] == pytest.approx(truth.distance_m, rel=5e-3)
-    pictures = sorted(path.name for path in (tmp_path / "debug").iterdir())
-    assert pictures == [f"f_{HAZY}.png.guided.jpg", f"f_{HAZY}.png.jpg"]
+    page = (tmp_path / "sheet" / "index.html").read_text(encoding="utf-8")
+    assert "second look" in page
+    assert page.count('class="measured"') == FRAMES
 
 
 def test_without_the_second_look_it_is_missed_and_explained(flight: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,7 +19,6 @@ from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.detect import detect_flight
-from kgcp.pipeline.frame_task import Debug
 from kgcp.pipeline.run_summary import SurveySummary
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings
@@ -164,19 +164,34 @@ def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path
     assert detect(tiny, tmp_path / "out", missing).guide_problem is None
 
 
-def test_pictures_are_drawn_of_the_frames_asked_for(tiny: Path, tmp_path: Path) -> None:
-    debug = Debug(tmp_path / "debug", "frame_00[01]*")
-    detect_flight(
-        *(read_flight(tiny), DetectSettings(), tmp_path / "out"),
-        jobs=2,
-        debug=debug,
-    )
-    pictures = sorted(path.name for path in debug.folder.iterdir())
-    first = [f"frame_{index:04d}.png.jpg" for index in range(12)]
-    assert [name for name in pictures if "guided" not in name] == first
-    looked_again = [name for name in pictures if name.endswith(".guided.jpg")]
-    assert looked_again
-    assert len(looked_again) + len(first) == len(pictures)
+def test_dropped_rings_are_further_cards_of_the_sheet(tiny: Path, tmp_path: Path) -> None:
+    pages: list[str] = []
+    for jobs, all_candidates in ((0, False), (0, True), (2, True)):
+        sheet = tmp_path / f"sheet{len(pages)}"
+        detect_flight(
+            read_flight(tiny),
+            DetectSettings(),
+            tmp_path / f"out{len(pages)}",
+            jobs=jobs,
+            overlay=sheet,
+            all_candidates=all_candidates,
+        )
+        pages.append((sheet / "index.html").read_text(encoding="utf-8"))
+    outcomes, serial, parallel = pages
+    assert 'class="candidate"' not in outcomes
+    assert serial.count('class="candidate"') >= 3
+    assert re.search(r"compared with A(-inner)? · ring at \(\d+, \d+\), radius", serial)
+    assert serial == parallel
+    for kind in ("measured", "rejected", "not_found"):
+        assert serial.count(f'class="{kind}"') == outcomes.count(f'class="{kind}"')
+    pictures = [
+        {path.name: path.read_bytes() for path in (tmp_path / name / "pictures").iterdir()}
+        for name in ("sheet1", "sheet2")
+    ]
+    assert pictures[0] == pictures[1]
+    assert len(pictures[0]) == serial.count("<img ")
+    tables = [(tmp_path / f"out{run}" / "detections.parquet").read_bytes() for run in range(3)]
+    assert tables[0] == tables[1] == tables[2]
 
 
 def test_without_reference_poses_the_camera_is_plumb_or_unknown(

@@ -24,7 +24,6 @@ from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.detect import detect_flight
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import (
-    Debug,
     FrameNote,
     FrameTask,
     SecondLook,
@@ -121,7 +120,6 @@ def detect(
     folder: Path,
     watcher: Stop | None = None,
     *,
-    debug: Debug | None = None,
     is_restart: bool = False,
     min_radius_px: float = 6.0,
 ) -> SurveySummary:
@@ -129,7 +127,6 @@ def detect(
         *(read_flight(folder), DetectSettings(min_radius_px=min_radius_px), folder / "kgcp"),
         jobs=0,
         watcher=watcher,
-        debug=debug,
         is_restart=is_restart,
     )
 

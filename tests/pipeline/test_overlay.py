@@ -21,11 +21,12 @@ from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.io.images.exif import Exif
 from kgcp.io.tables.detections import FrameResult
-from kgcp.measurement.records import Miss
+from kgcp.measurement.guided import Expectation
+from kgcp.measurement.records import Considered, Miss
 from kgcp.pipeline.detection_run import Looks
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import FrameTask
-from kgcp.pipeline.overlay import draw_overlay
+from kgcp.pipeline.overlay import draw_overlay, sketch_frame
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.report.ring_picture import PICTURE_PX
 from kgcp.settings import DetectSettings
@@ -178,6 +179,31 @@ def test_the_paper_s_chain_is_drawn_too(flight: Path, tmp_path: Path) -> None:
     assert "±" not in seen
 
 
+def test_candidates_belong_to_a_sheet(flight: Path) -> None:
+    result = CliRunner().invoke(main, ["detect", str(flight), "--all-candidates"])
+    assert result.exit_code == 2
+    assert "give --overlay DIR" in result.stderr
+
+
+def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
+    """The other card is that of another place."""
+    miss = Miss("A", Reason.CUT, "ring at (20, 30)", 0.9, 1, Ellipse(20.0, 30.0, 6.0, 5.0, 0.1))
+    dropped = tuple(
+        Considered("A", "A-inner", outline, 0.4, is_match=False, reason=Reason.CODE_MISMATCH)
+        for outline in (Ellipse(20.0, 30.0, 6.0, 5.0, 0.1), Ellipse(80.0, 60.0, 9.0, 8.0, 0.1))
+    )
+    task = FrameTask(flight / "frames", CAMERA, None, (), DetectSettings())
+    result = FrameResult(EMPTY, None, Exif(), (miss,), dropped)
+    first, second = sketch_frame(task, result)
+    assert (first.card.status, first.card.reason) == ("rejected", "cut")
+    assert (second.card.status, second.card.reason) == ("candidate", "code_mismatch")
+    assert second.card.text == (
+        "compared with A-inner · ring at (80, 60), radius 8.5 px · score 0.40"
+    )
+    assert first.pictures is not None
+    assert second.pictures is not None
+
+
 class _OneLost:
     """Stands for `Looks`: its only frame ends every process that would draw it."""
 
@@ -190,6 +216,14 @@ class _OneLost:
 def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:
     sheet = ContactSheet(tmp_path / "sheet")
     task = FrameTask(tmp_path, CAMERA, None, (), DetectSettings())
-    assert draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task) == 1
+    assert draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task, {}) == 1
     (card,) = cards(tmp_path / "sheet")
     assert "ring at (20, 30) · not drawn: the process that drew it ended twice" in card
+
+
+def test_where_a_missing_target_must_be_is_said(tmp_path: Path) -> None:
+    sheet = ContactSheet(tmp_path / "sheet")
+    task = FrameTask(tmp_path, CAMERA, None, (), DetectSettings())
+    expected = {0: {"A": Expectation(np.array([20.0, 30.0]), 2.0, 6.0, 0.04, "its neighbours")}}
+    draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task, expected)
+    assert "expected by its neighbours at (20, 30) ± 2.0 px" in cards(tmp_path / "sheet")[0]

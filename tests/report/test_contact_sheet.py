@@ -89,16 +89,16 @@ def test_the_page_comes_last_and_goes_first(tmp_path: Path) -> None:
     assert left == ["000001-0.jpg", "mine.jpg"], "what another run has left is gone"
 
 
-def test_the_page_of_something_else_is_not_touched(tmp_path: Path) -> None:
+def test_the_page_of_another_program_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("<h1>mine</h1>", encoding="utf-8")
-    with pytest.raises(KgcpError, match=r"index\.html: is a page of something else; choose"):
+    with pytest.raises(KgcpError, match=r"index\.html: is a page of another program; choose"):
         ContactSheet(tmp_path)
     assert (tmp_path / "index.html").read_text(encoding="utf-8") == "<h1>mine</h1>"
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(KgcpError, match=r"cannot be written .*; choose another --overlay"):
+    with pytest.raises(KgcpError, match=r"cannot be written .*; choose another folder"):
         ContactSheet(tmp_path / "file")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.measurement.adjustment.residual_image import Residuals
-from kgcp.report.ring_picture import FULL_SCALE, PICTURE_PX, THUMBNAIL_PX, Scene, draw_scene
+from kgcp.report.ring_picture import FULL_SCALE, PICTURE_PX, THUMBNAIL_PX, RingView, draw_ring
 
 TURN = np.linspace(0.0, 2.0 * np.pi, 97)
 CENTRE = np.array([83.3, 41.8])
@@ -40,8 +40,8 @@ def residuals(value: float) -> Residuals:
 
 
 def test_contours_lie_where_they_were_fitted() -> None:
-    scene = Scene(CENTRE, RADIUS, (circle(RADIUS),), residuals(0.0))
-    seen = decoded(draw_scene(frame(), scene).picture)
+    view = RingView(CENTRE, RADIUS, (circle(RADIUS),), residuals(0.0))
+    seen = decoded(draw_ring(frame(), view).picture)
     assert seen.shape == (PICTURE_PX, 2 * PICTURE_PX, 3)
     left = seen[:, :PICTURE_PX]
     blue = left[:, :, 0] - left[:, :, 2]
@@ -66,8 +66,8 @@ def test_contours_lie_where_they_were_fitted() -> None:
     ],
 )
 def test_residuals_have_their_colours(value: float, colour: tuple[int, int, int]) -> None:
-    scene = Scene(CENTRE, RADIUS, (), residuals(value))
-    pictures = draw_scene(frame(), scene)
+    view = RingView(CENTRE, RADIUS, (), residuals(value))
+    pictures = draw_ring(frame(), view)
     for content, size in ((pictures.picture, PICTURE_PX), (pictures.thumbnail, THUMBNAIL_PX)):
         right = decoded(content)[:, size:]
         np.testing.assert_allclose(right[size // 2, size // 2], colour, atol=6)
@@ -75,7 +75,7 @@ def test_residuals_have_their_colours(value: float, colour: tuple[int, int, int]
 
 
 def test_a_dropped_ring_is_shown_twice_once_without_its_outline() -> None:
-    seen = decoded(draw_scene(frame(), Scene(CENTRE, RADIUS, (circle(RADIUS),), None)).picture)
+    seen = decoded(draw_ring(frame(), RingView(CENTRE, RADIUS, (circle(RADIUS),), None)).picture)
     left, right = seen[:, :PICTURE_PX], seen[:, PICTURE_PX:]
     assert np.ptp(left, axis=2).max() > 100
     assert np.ptp(right, axis=2).max() < 12
@@ -88,7 +88,7 @@ def test_a_dropped_ring_is_shown_twice_once_without_its_outline() -> None:
 def test_rings_of_any_size_and_place_can_be_drawn(
     centre: tuple[float, float], radius: float, dtype: type
 ) -> None:
-    scene = Scene(np.array(centre), radius, (circle(radius),), residuals(0.05))
-    pictures = draw_scene(frame(dtype), scene)
+    view = RingView(np.array(centre), radius, (circle(radius),), residuals(0.05))
+    pictures = draw_ring(frame(dtype), view)
     assert decoded(pictures.thumbnail).shape == (THUMBNAIL_PX, 2 * THUMBNAIL_PX, 3)
-    assert pictures == draw_scene(frame(dtype), scene), "the same bytes each time"
+    assert pictures == draw_ring(frame(dtype), view), "the same bytes each time"

@@ -38,6 +38,7 @@ from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.records import (
     Alternative,
     CommonUncertainty,
+    Considered,
     Miss,
     Observation,
     Outcome,
@@ -68,12 +69,15 @@ class FrameResult:
         Exposure quantities.
     outcomes : tuple of Outcome
         At least one per target, in the targets' order.
+    dropped : tuple of Considered
+        Rings that were compared with a target's and dropped, if they are to be shown.
     """
 
     frame: str
     time_s: float | None
     exif: Exif
     outcomes: tuple[Outcome, ...]
+    dropped: tuple[Considered, ...] = ()
 
 
 def _frame(get: Callable[[FrameResult], object]) -> _Get:

@@ -35,6 +35,7 @@ from kgcp.measurement.records import (
     Alternative,
     Appearance,
     CommonUncertainty,
+    Considered,
     Miss,
     Observation,
     Uncertainty,
@@ -43,7 +44,7 @@ from kgcp.measurement.records import (
 _RECORDS: dict[str, type] = {
     each.__name__: each
     for each in (
-        *(FrameResult, Exif, Observation, Miss, Pose, Ellipse),
+        *(FrameResult, Exif, Observation, Miss, Considered, Pose, Ellipse),
         *(Appearance, Uncertainty, CommonUncertainty, Alternative),
     )
 }
@@ -108,7 +109,7 @@ def _record(cells: dict[str, Any]) -> object:
     if "array" in cells:
         return np.array(cells["array"], dtype=np.float64)
     kind = _RECORDS[cells.pop("record")]
-    if kind is Miss:
+    if kind in {Miss, Considered}:
         cells["reason"] = _REASONS[cells["reason"]]
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in cells.items()})
 

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.quality.statistics import Slope, moving_statistics
-from kgcp.report.bias.numbers import BiasNumbers, EdgeNumbers, Influence
-from kgcp.report.bias.ranges import DetectionRate
+from kgcp.report.bias.numbers import BiasNumbers, DetectionRate, EdgeNumbers, Influence
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, Points, picture, scatter, sheet
 
@@ -21,11 +20,11 @@ WINDOW_M = 10.0  # of the paper's Figure 9
 _SIGNED = "PuOr"  # orange and violet: told apart whatever one's colour vision
 _BINS = [0.5 * step - 5.25 for step in range(22)]
 
-_CONFIDENCE = 1.96  # deviations: 95 %
+_CONFIDENCE = 1.96  # standard deviations: 95 %
 
 
 def error_against_distance(numbers: BiasNumbers) -> Picture:
-    """Draw the paper's Figure 9: errors with moving mean and deviation, in metres and percent."""
+    """Draw the paper's Figure 9: errors with moving mean and spread, in metres and percent."""
     distance = numbers.data.distance_m
     with sheet(7.0, 7.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
@@ -118,8 +117,8 @@ def _rates(axes: Axes, rates: Sequence[DetectionRate], centre: Sequence[float]) 
 
 
 def standardised_histogram(numbers: BiasNumbers) -> Picture:
-    """Draw residuals over their reported deviations against the normal distribution."""
-    raw = numbers.standardised_residuals
+    """Draw errors over their reported standard deviations, and the normal distribution."""
+    raw = numbers.data.residual_m / numbers.sd_m
     left = (numbers.data.residual_m - _systematic_m(numbers)) / numbers.sd_m
     with sheet(7.0, 4.0) as figure:
         axes = figure.subplots()
@@ -152,8 +151,12 @@ def _systematic_m(numbers: BiasNumbers) -> FloatArray:
     return 0.01 * numbers.explained_percent * numbers.data.distance_m
 
 
-def error_in_time(numbers: BiasNumbers, minutes: FloatArray, label: str) -> Picture:
-    """Draw errors in metres in the order of time (n,)."""
+def error_in_time(numbers: BiasNumbers) -> Picture:
+    """Draw errors in metres in time, or in the frames' order where not all have a time."""
+    time_s = np.array([one.attempt.time_s for one in numbers.compared], dtype=np.float64)
+    minutes, label = (time_s - time_s[0]) / 60.0, "time since the first [min]"
+    if not np.isfinite(time_s).all():
+        minutes, label = np.arange(float(len(time_s))), "frame, in order"
     with sheet(7.0, 3.6) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
@@ -163,8 +166,10 @@ def error_in_time(numbers: BiasNumbers, minutes: FloatArray, label: str) -> Pict
         return picture(figure, [points])
 
 
-def error_over_image(numbers: BiasNumbers, centre_px: FloatArray, camera: Camera) -> Picture:
-    """Draw errors in percent where in the image (n, 2) they were measured."""
+def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
+    """Draw errors in percent where in the image they were measured."""
+    measured = (one.attempt.sighting for one in numbers.compared)
+    centre_px = np.array([seen.centre_px for seen in measured if seen is not None])
     with sheet(7.0, 0.8 + 5.1 * min(1.4, camera.height / camera.width)) as figure:
         axes = figure.subplots()
         axes.set_aspect("equal")

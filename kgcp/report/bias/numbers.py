@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -14,20 +15,82 @@ from kgcp.quality.bias_study import BiasStudy, Comparison, edge_distances
 from kgcp.quality.exposure_effects import (
     QUANTITIES,
     ROUNDING,
-    Quantity,
     DistanceResiduals,
+    Quantity,
     in_time,
     varies,
 )
-from kgcp.quality.statistics import Slope, Spread, fit_slope
-from kgcp.report.bias.ranges import (
-    DetectionRate,
-    RangeRow,
-    range_rows,
-    rates_by_distance,
-    rates_by_radius,
-)
+from kgcp.quality.statistics import Slope, Spread, fit_slope, wilson_interval
 from kgcp.settings import Method
+
+WORST, SPREAD = 12, 24
+"""How many close-ups a report has: of the largest residuals, and evenly over the distances."""
+
+BIN_M = 10.0
+NEAR_M = 50.0  # the paper states its accuracy below and above
+_BIASED_SIGMAS = 3.0
+_RADIUS_PX, _RADII_PER_OCTAVE = 13.0, 2.0  # borders at 13 px and at every factor of √2 from there
+
+
+@dataclass(frozen=True, slots=True)
+class RangeRow:
+    """Errors of one range of reference distances.
+
+    Attributes
+    ----------
+    label : str
+        The range.
+    percent, metres : Spread
+        Of the errors [%] and [m].
+    sd_reference_percent : float or None
+        Mean standard deviation of the reference distances [%]; None where none is known.
+    """
+
+    label: str
+    percent: Spread
+    metres: Spread
+    sd_reference_percent: float | None
+
+    @property
+    def sd_mean_percent(self) -> float | None:
+        """Standard deviation of the mean error by its own noise and by the reference [%].
+
+        Errors of a trajectory and of reference poses last for many frames: averaging is not
+        trusted to lessen them.
+        """
+        own = self.percent.sd_mean
+        return None if own is None else math.hypot(own, self.sd_reference_percent or 0.0)
+
+    @property
+    def is_biased(self) -> bool:
+        """Whether the mean error stands out from noise and the reference's errors."""
+        sd = self.sd_mean_percent
+        return sd is not None and abs(self.percent.mean) > _BIASED_SIGMAS * sd
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionRate:
+    """Detections among the chances of one range, with Wilson's 95 % interval.
+
+    Attributes
+    ----------
+    low, high : float
+        Borders of the range: of distances [m] or of radii [px].
+    confidence_low, confidence_high : float
+        Of the rate, 0…1.
+    """
+
+    low: float
+    high: float
+    detected: int
+    frames: int
+    confidence_low: float
+    confidence_high: float
+
+    @property
+    def rate(self) -> float:
+        """Share of frames in which the target was found."""
+        return self.detected / self.frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +99,6 @@ class Influence:
 
     Attributes
     ----------
-    quantity : Quantity
     rows : (m,) array of int
         Of the measurements that have it.
     values : (m,) array
@@ -63,9 +125,9 @@ class EdgeNumbers:
     rows : (m,) array of int
         Of the measurements that have both.
     one_m, two_m : (m,) array
-        DistanceResiduals [m].
+        Errors [m].
     one_percent, two_percent : Spread
-        Of the residuals [%].
+        Of the errors [%].
     regression : Regression or None
         Of the distances by one edge; None, too, where these are what was measured.
     """
@@ -84,18 +146,17 @@ class BiasNumbers:
 
     Attributes
     ----------
-    compared : tuple of Comparison
-        The n trusted measurements, in time.
+    compared : tuple of n Comparison
+        The trusted measurements, in time.
     data : DistanceResiduals
         Theirs.
     residual_percent : (n,) array
-        Of the reference distance.
+        Errors in percent of the reference distance.
     explained_percent : (n,) array
-        What the regression explains of it without exposure; 0 without a regression.
+        What the regression explains of them without exposure; 0 without a regression.
     sd_m : (n,) array
-        Reported standard deviations of the residuals, of measurement and reference; NaN where
+        Reported standard deviations of the errors, of measurement and reference; NaN where
         the measurement has none.
-    total : RangeRow
     halves : tuple of RangeRow
         Below and above 50 m.
     bins : tuple of RangeRow
@@ -109,7 +170,7 @@ class BiasNumbers:
     influences : tuple of Influence
         Of the exposure quantities that vary.
     standardised : Spread or None
-        Of residuals over reported deviations.
+        Of the errors over their reported standard deviations.
     sd_reference_m : float or None
         Median standard deviation of the reference distances.
     astray : tuple of str
@@ -144,6 +205,11 @@ class BiasNumbers:
     attitudes_agree: bool
 
     @property
+    def frames(self) -> list[str]:
+        """Names of the measurements' frames."""
+        return [one.attempt.frame for one in self.compared]
+
+    @property
     def biased(self) -> tuple[RangeRow, ...]:
         """The ranges whose mean error stands out from its own noise: all, or halves of it."""
         if self.total.is_biased:
@@ -158,24 +224,39 @@ class BiasNumbers:
 
     @property
     def standardised_residuals(self) -> FloatArray:
-        """DistanceResiduals (n,) over their reported deviations; NaN where there is none."""
-        return self.data.residual_m / self.sd_m
+        """What scale and offset leave of the errors (n,), over its standard deviation."""
+        left = self.residual_percent - self.explained_percent
+        return np.asarray(left / (100.0 * np.sqrt(self.data.errors.total) / self.data.distance_m))
+
+    @property
+    def worst(self) -> list[int]:
+        """The rows of the largest standardised residuals, the largest first."""
+        return largest(self.standardised_residuals)
 
 
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
     """Reduce a study to its numbers; at least one trusted measurement is needed."""
     compared = in_time(study.trusted)
-    data = DistanceResiduals.of(compared, _measured_m(compared))
+    measured = [one.attempt.sighting for one in compared if one.attempt.sighting]
+    data = DistanceResiduals.of(compared, np.array([seen.distance_m for seen in measured]))
     percent = 100.0 * data.residual_m / data.distance_m
     regression = regress(data)
     explained = np.zeros_like(percent)
     if regression is not None:
         explained = 100.0 * regression.systematic_m / data.distance_m
     sd_reference = np.array([one.sds.total_m if one.sds else np.nan for one in compared])
-    sd = _reported_sd_m(compared)
-    total, halves, bins = range_rows(data.distance_m, data.residual_m, sd_reference)
+    sd = np.sqrt(
+        np.array([seen.sd_distance_m for seen in measured], dtype=float) ** 2
+        + np.array([seen.sd_common_distance_m or 0.0 for seen in measured]) ** 2
+        + np.nan_to_num(sd_reference) ** 2
+    )
+    total, halves, bins = _range_rows(data.distance_m, data.residual_m, sd_reference)
     detected = [study.trusts(one) for one in study.chances]
     scaled = (data.residual_m / sd)[np.isfinite(sd)]
+    stated = sd_reference[np.isfinite(sd_reference)]
+    left_out = Counter(absence.value for absence in study.absences)
+    if study.frames_without_pose:
+        left_out["no_reference_pose"] = len(study.frames_without_pose)
     return BiasNumbers(
         compared=tuple(compared),
         data=data,
@@ -191,30 +272,90 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         edges=_edges(study, compared),
         influences=_influences(data, percent - explained),
         standardised=Spread.of(scaled) if scaled.size else None,
-        sd_reference_m=_median(sd_reference[np.isfinite(sd_reference)]),
+        sd_reference_m=float(np.median(stated)) if stated.size else None,
         astray=tuple(one.attempt.frame for one in study.measured if not study.trusts(one)),
         detected=sum(detected),
         chances=len(detected),
-        left_out=_left_out(study),
+        left_out=tuple(left_out.most_common()),
         attitudes_agree=study.attitudes_agree,
     )
 
 
-def _measured_m(compared: Sequence[Comparison]) -> FloatArray:
-    return np.array([one.attempt.sighting.distance_m for one in compared if one.attempt.sighting])
+def evenly(distance_m: FloatArray, count: int) -> list[int]:
+    """Return up to `count` of the rows (n,), evenly over the ranks of the distance, near to far."""
+    ranked = np.argsort(distance_m, kind="stable")
+    places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round())
+    chosen: list[int] = ranked[places.astype(int)].tolist()
+    return chosen
 
 
-def _reported_sd_m(compared: Sequence[Comparison]) -> FloatArray:
-    """Return what measurement and reference say of their deviations, errors in common included."""
-    seen = [one.attempt.sighting for one in compared]
-    own = np.array([np.nan if one is None else one.sd_distance_m for one in seen], dtype=float)
-    common = np.array([(one and one.sd_common_distance_m) or 0.0 for one in seen])
-    reference = np.array([one.sds.total_m if one.sds else 0.0 for one in compared])
-    return np.asarray(np.sqrt(own**2 + common**2 + reference**2))
+def largest(residual: FloatArray) -> list[int]:
+    """Return the rows (n,) of the largest residuals, the largest first."""
+    chosen: list[int] = np.argsort(-np.abs(residual), kind="stable")[:WORST].tolist()
+    return chosen
 
 
-def _median(values: FloatArray) -> float | None:
-    return float(np.median(values)) if values.size else None
+def _range_rows(
+    distance_m: FloatArray, residual_m: FloatArray, sd_reference_m: FloatArray
+) -> tuple[RangeRow, tuple[RangeRow, ...], tuple[RangeRow, ...]]:
+    """Return the rows over all distances (n,), of near and far, and per 10 m.
+
+    Standard deviations of the reference are NaN where they are not known.
+    """
+
+    def row(label: str, low: float, high: float) -> RangeRow | None:
+        inside = (distance_m >= low) & (distance_m < high)
+        if not inside.any():
+            return None
+        distance, residual = distance_m[inside], residual_m[inside]
+        relative = 100.0 * sd_reference_m[inside] / distance
+        stated = relative[np.isfinite(relative)]
+        sd = float(stated.mean()) if stated.size else None
+        return RangeRow(label, Spread.of(100.0 * residual / distance), Spread.of(residual), sd)
+
+    total = row("over all distances", 0.0, math.inf)
+    if total is None:
+        raise ValueError("no distances")
+    halves = (
+        row(f"below {NEAR_M:.0f} m", 0.0, NEAR_M),
+        row(f"{NEAR_M:.0f} m and more", NEAR_M, math.inf),
+    )
+    edges = np.unique(np.floor(distance_m / BIN_M)) * BIN_M
+    bins = (row(f"{low:.0f}–{low + BIN_M:.0f} m", low, low + BIN_M) for low in edges)
+    return total, tuple(filter(None, halves)), tuple(filter(None, bins))
+
+
+def rates_by_distance(
+    distance_m: Sequence[float], detected: Sequence[bool]
+) -> tuple[DetectionRate, ...]:
+    """Count the detections per 10 m."""
+    steps = [math.floor(distance / BIN_M) for distance in distance_m]
+    return _rates(steps, detected, lambda step: BIN_M * step)
+
+
+def rates_by_radius(
+    radius_px: Sequence[float], detected: Sequence[bool]
+) -> tuple[DetectionRate, ...]:
+    """Count the detections per ring radius, in steps of a factor of √2."""
+    steps = [math.floor(_RADII_PER_OCTAVE * math.log2(radius / _RADIUS_PX)) for radius in radius_px]
+    return _rates(steps, detected, lambda step: _RADIUS_PX * 2.0 ** (step / _RADII_PER_OCTAVE))
+
+
+def _rates(
+    steps: Sequence[int], detected: Sequence[bool], border: Callable[[int], float]
+) -> tuple[DetectionRate, ...]:
+    tried = Counter(steps)
+    hits = Counter(step for step, hit in zip(steps, detected, strict=True) if hit)
+    return tuple(
+        DetectionRate(
+            border(step),
+            border(step + 1),
+            hits[step],
+            tried[step],
+            *wilson_interval(hits[step], tried[step]),
+        )
+        for step in sorted(tried)
+    )
 
 
 def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | None:
@@ -259,10 +400,3 @@ def _influences(data: DistanceResiduals, percent: FloatArray) -> tuple[Influence
             )
         )
     return tuple(influences)
-
-
-def _left_out(study: BiasStudy) -> tuple[tuple[str, int], ...]:
-    reasons = Counter(absence.value for absence in study.absences)
-    if study.frames_without_pose:
-        reasons["no_reference_pose"] = len(study.frames_without_pose)
-    return tuple(reasons.most_common())

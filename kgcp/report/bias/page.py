@@ -14,14 +14,14 @@ from markupsafe import Markup
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.tables.gcps import BIAS_COLUMNS
-from kgcp.quality.bias_study import Comparison
 from kgcp.quality.exposure_effects import QUANTITIES
+from kgcp.quality.number_text import minus
 from kgcp.report.bias import wording
-from kgcp.report.bias.closeups import Closeup
 from kgcp.report.bias.numbers import BiasNumbers
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.bias.summary import Json, finite
 from kgcp.report.bias.verdict import LIMITS, Verdict
+from kgcp.report.ring_picture import CLOSEUP_PX
 from kgcp.report.style import MARK_STEPS, Picture
 
 _DIGITS = 7  # significant, of the values in the page; bias.parquet has all
@@ -35,18 +35,12 @@ class Content:
     ----------
     name : str
         Of the flight.
-    numbers : BiasNumbers
-    verdict : Verdict
     pictures : mapping of str to Picture
         By the name of the figure; one that is missing is left out of the page.
     rows : sequence of mapping
         Of `bias.parquet`, for the measurements in time.
-    closeups : sequence of Closeup
-    worst : sequence of int
-        Rows of the largest deviations, the largest first.
-    deviations : (n,) array
-        What scale and offset leave of the errors, over its standard deviation.
-    reexposed : sequence of Reexposed
+    closeups : mapping of int to (bytes, tuple of (m, 2) array)
+        By the measurement's place in time, as `draw_closeup` returns them.
     summary : mapping
         What `bias_summary.json` holds.
     """
@@ -56,9 +50,7 @@ class Content:
     verdict: Verdict
     pictures: Mapping[str, Picture]
     rows: Sequence[Mapping[str, object]]
-    closeups: Sequence[Closeup]
-    worst: Sequence[int]
-    deviations: FloatArray
+    closeups: Mapping[int, tuple[bytes, tuple[FloatArray, ...]]]
     reexposed: Sequence[Reexposed]
     summary: Json
 
@@ -72,26 +64,25 @@ def render_page(content: Content) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["signed"] = _signed
+    environment.filters["signed"] = lambda value, digits: minus(f"{value:+.{digits}f}")
     environment.filters["fixed"] = lambda value, digits: f"{value:.{digits}f}"
-    images = {
-        name: f"data:image/png;base64,{base64.b64encode(one.png).decode('ascii')}"
-        for name, one in content.pictures.items()
-    }
     template = environment.get_template("bias_report.html")
     return template.render(
         content=content,
         numbers=content.numbers,
         verdict=content.verdict,
-        images=images,
+        images={
+            name: f"data:image/png;base64,{_base64(figure.png)}"
+            for name, figure in content.pictures.items()
+        },
         data=_embedded(_data(content)),
         limits=LIMITS,
         words=wording,
     )
 
 
-def _signed(value: float, digits: int) -> str:
-    return wording.minus(f"{value:+.{digits}f}")
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def _embedded(data: Json) -> Markup:
@@ -107,15 +98,22 @@ def _data(content: Content) -> Json:
     names = [column.name for column in BIAS_COLUMNS]
     return {
         "columns": {name: [_cell(row[name]) for row in content.rows] for name in names},
-        "deviations": [_cell(one) for one in content.deviations.tolist()],
+        "residuals": [_cell(each) for each in content.numbers.standardised_residuals.tolist()],
         "labels": {quantity.name: quantity.label for quantity in QUANTITIES},
         "steps": MARK_STEPS,
         "pictures": {
-            name: [one.rows.tolist(), one.places.ravel().tolist()]
-            for name, one in content.pictures.items()
-            if one.rows.size
+            name: [figure.rows.tolist(), figure.places.ravel().tolist()]
+            for name, figure in content.pictures.items()
+            if figure.rows.size
         },
-        "closeups": {str(one.row): _closeup(one) for one in content.closeups},
+        "closeup_px": CLOSEUP_PX,
+        "closeups": {
+            str(row): {
+                "jpeg": _base64(jpeg),
+                "circles": [np.round(curve, 1).ravel().tolist() for curve in curves],
+            }
+            for row, (jpeg, curves) in content.closeups.items()
+        },
         "summary": content.summary,
     }
 
@@ -126,25 +124,3 @@ def _cell(value: object) -> object:
     if isinstance(value, datetime):
         return value.isoformat().replace("+00:00", "Z")
     return value
-
-
-def _closeup(one: Closeup) -> Json:
-    return {
-        "width": one.width,
-        "height": one.height,
-        "jpeg": one.jpeg,
-        "circles": [np.round(circle, 1).ravel().tolist() for circle in one.circles],
-    }
-
-
-def deviations_of(numbers: BiasNumbers) -> FloatArray:
-    """Return what scale and offset leave of the errors (n,), over its standard deviation."""
-    errors = numbers.data.errors
-    left = numbers.residual_percent - numbers.explained_percent
-    sd = 100.0 * np.sqrt(errors.total) / numbers.data.distance_m
-    return np.asarray(left / sd)
-
-
-def frames_of(compared: Sequence[Comparison]) -> list[str]:
-    """Return the names of the frames."""
-    return [one.attempt.frame for one in compared]

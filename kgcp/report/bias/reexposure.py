@@ -34,9 +34,9 @@ class Reexposed:
     change_percent : float or None
         Of the distance; None: the target was not measured again.
     sd_percent : float or None
-        Standard deviation of the distance then.
+        Standard deviation of the new distance.
     saturated : float or None
-        Share of clipped pixels then.
+        Share of clipped pixels in the changed frame.
     """
 
     row: int

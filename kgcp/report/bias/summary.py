@@ -8,8 +8,7 @@ from dataclasses import asdict
 
 from kgcp.quality.bias_causes import Regression
 from kgcp.quality.statistics import Slope
-from kgcp.report.bias.numbers import BiasNumbers, EdgeNumbers, Influence
-from kgcp.report.bias.ranges import DetectionRate, RangeRow
+from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.bias.verdict import LIMITS, Verdict
 from kgcp.report.bias.wording import meaning_of
@@ -17,14 +16,14 @@ from kgcp.report.bias.wording import meaning_of
 Json = dict[str, object]
 
 
-def summary_of(
-    numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexposed], frames: Sequence[str]
-) -> Json:
-    """Return everything that `bias_summary.json` holds; `frames` are those of the rows."""
+def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexposed]) -> Json:
+    """Return everything that `bias_summary.json` holds."""
+    frames, regression, edges = numbers.frames, numbers.regression, numbers.edges
     return {
         "verdict": verdict.grade.name.lower(),
         "findings": [
-            {"grade": one.grade.name.lower(), "text": one.text} for one in verdict.findings
+            {"grade": finding.grade.name.lower(), "text": finding.text}
+            for finding in verdict.findings
         ],
         "limits": asdict(LIMITS),
         "compared": numbers.total.percent.count,
@@ -34,15 +33,36 @@ def summary_of(
         "ranges": [_range(row) for row in (*numbers.bins, *numbers.halves, numbers.total)],
         "sd_reference_m": numbers.sd_reference_m,
         "standardised": None if numbers.standardised is None else asdict(numbers.standardised),
-        "regression": None if numbers.regression is None else _regression(numbers.regression),
-        "influences": {one.quantity.name: _influence(one) for one in numbers.influences},
-        "edges": None if numbers.edges is None else _edges(numbers.edges),
+        "regression": _regression(regression),
+        "influences": {
+            influence.quantity.name: {
+                "count": len(influence.values),
+                "per": influence.quantity.per,
+                "residual_percent": _slope(influence.residual),
+                "edge_shift_px": _slope(influence.edge_shift),
+            }
+            for influence in numbers.influences
+        },
+        "edges": None
+        if edges is None
+        else {
+            "one_edge_percent": asdict(edges.one_percent),
+            "two_edges_percent": asdict(edges.two_percent),
+            "one_edge_regression": _regression(edges.regression),
+        },
         "detected": numbers.detected,
         "frames_with_target": numbers.chances,
-        "rates_by_distance_m": [_rate(rate) for rate in numbers.rates],
-        "rates_by_radius_px": [_rate(rate) for rate in numbers.radius_rates],
-        "reexposure": [_again(one, frames) for one in reexposed],
-        "outliers": _outliers(numbers, frames),
+        "rates_by_distance_m": [{**asdict(rate), "rate": rate.rate} for rate in numbers.rates],
+        "rates_by_radius_px": [
+            {**asdict(rate), "rate": rate.rate} for rate in numbers.radius_rates
+        ],
+        "reexposure": [
+            {"frame": frames[again.row], **{k: v for k, v in asdict(again).items() if k != "row"}}
+            for again in reexposed
+        ],
+        "outliers": []
+        if regression is None
+        else [frames[row] for row in regression.outlier.nonzero()[0].tolist()],
         "astray": list(numbers.astray),
         "left_out": dict(numbers.left_out),
         "attitudes_agree": numbers.attitudes_agree,
@@ -58,11 +78,9 @@ def _range(row: RangeRow) -> Json:
     }
 
 
-def _rate(rate: DetectionRate) -> Json:
-    return {**asdict(rate), "rate": rate.rate}
-
-
-def _regression(found: Regression) -> Json:
+def _regression(found: Regression | None) -> Json | None:
+    if found is None:
+        return None
     return {
         "count": found.count,
         "outliers": int(found.outlier.sum()),
@@ -84,15 +102,6 @@ def _regression(found: Regression) -> Json:
     }
 
 
-def _influence(one: Influence) -> Json:
-    return {
-        "count": len(one.values),
-        "per": one.quantity.per,
-        "residual_percent": _slope(one.residual),
-        "edge_shift_px": _slope(one.edge_shift),
-    }
-
-
 def _slope(slope: Slope | None) -> Json | None:
     if slope is None:
         return None
@@ -104,30 +113,12 @@ def _slope(slope: Slope | None) -> Json | None:
     }
 
 
-def _edges(edges: EdgeNumbers) -> Json:
-    return {
-        "one_edge_percent": asdict(edges.one_percent),
-        "two_edges_percent": asdict(edges.two_percent),
-        "one_edge_regression": None if edges.regression is None else _regression(edges.regression),
-    }
-
-
-def _again(one: Reexposed, frames: Sequence[str]) -> Json:
-    return {"frame": frames[one.row], **{k: v for k, v in asdict(one).items() if k != "row"}}
-
-
-def _outliers(numbers: BiasNumbers, frames: Sequence[str]) -> list[str]:
-    if numbers.regression is None:
-        return []
-    return [frames[row] for row in numbers.regression.outlier.nonzero()[0].tolist()]
-
-
 def finite(value: object) -> object:
     """Return a tree of numbers in which what is not a finite number is null."""
     if isinstance(value, dict):
-        return {key: finite(one) for key, one in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(one) for one in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -7,10 +7,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from kgcp.report.bias.numbers import BiasNumbers
-from kgcp.report.bias.ranges import RangeRow
+from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
-from kgcp.report.bias.wording import amount, exposure_sentence, label_of, meaning_of, value_of
+from kgcp.report.bias.wording import (
+    exposure_sentence,
+    label_of,
+    meaning_of,
+    signed_amount,
+    value_of,
+)
 
 
 class Grade(IntEnum):
@@ -28,42 +33,20 @@ class Grade(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """From where on something is a finding.
+    """From where on something is a finding."""
 
-    Attributes
-    ----------
-    min_frames : int
-        Compared frames, below which there is no verdict "good".
-    unusable_rms_percent : float
-        RMS of the residuals [%]; the paper has 1 % up to 100 m.
-    mean_percent : float
-        Size of a mean error that neither noise nor the reference explains [%].
-    scale_percent, offset_m : float
-        Size of a significant scale [%] and offset [m].
-    exposure_share : float
-        Of the variance, explained by exposure of which a term is significant.
-    reexposure_percent : float
-        RMS change of distances that are measured again darker and brighter [%].
-    standardised_low, standardised_high : float
-        Spread of the residuals, without scale and offset, over their reported deviations.
-    lost_share, unusable_lost_share : float
-        Of measurements that are astray or outliers.
-    detection_rate : float
-        Of frames with the target fully in view.
-    """
-
-    min_frames: int = 10
-    unusable_rms_percent: float = 1.0
-    mean_percent: float = 0.02
-    scale_percent: float = 0.02
-    offset_m: float = 0.01
-    exposure_share: float = 0.1
-    reexposure_percent: float = 0.1
-    standardised_low: float = 0.5
+    min_frames: int = 10  # compared: below there is no verdict "good"
+    unusable_rms_percent: float = 1.0  # of the errors; the paper has 1 % up to 100 m
+    mean_percent: float = 0.02  # a mean error that neither noise nor the reference explains
+    scale_percent: float = 0.02  # a significant scale
+    offset_m: float = 0.01  # a significant offset
+    exposure_share: float = 0.1  # of the variance, explained by exposure with a significant term
+    reexposure_percent: float = 0.1  # RMS change of distances measured again, darker and brighter
+    standardised_low: float = 0.5  # scatter of the fit's residuals over their reported sds
     standardised_high: float = 1.5
-    lost_share: float = 0.05
+    lost_share: float = 0.05  # of measurements that are misplaced or outliers
     unusable_lost_share: float = 0.3
-    detection_rate: float = 0.8
+    detection_rate: float = 0.8  # of frames with the target fully in view
 
 
 LIMITS = Limits()
@@ -104,7 +87,7 @@ class Verdict:
         return (f"{self.grade.words}.", *(finding.text for finding in self.findings))
 
 
-def judge(
+def assess(
     numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), limits: Limits = LIMITS
 ) -> Verdict:
     """Judge a flight by its numbers, and by what measuring some frames again has changed."""
@@ -112,7 +95,7 @@ def judge(
         _accuracy(numbers, limits),
         _bias(numbers, limits),
         *_causes(numbers, limits),
-        *_deviations(numbers, limits),
+        *_scatter(numbers, limits),
         *_losses(numbers, limits),
         *_reexposure(reexposed, limits),
         *_detection(numbers, limits),
@@ -160,7 +143,7 @@ def _bias(numbers: BiasNumbers, limits: Limits) -> Finding:
 
 
 def _mean(row: RangeRow) -> str:
-    return amount(row.percent.mean, row.percent.sd_mean, "%")
+    return signed_amount(row.percent.mean, row.sd_mean_percent, "%")
 
 
 def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
@@ -198,8 +181,8 @@ def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Find
     yield Finding(grade, text, "reexposure")
 
 
-def _deviations(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
-    """Say whether the reported deviations are true; what scale and offset explain left out."""
+def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+    """Say whether the reported standard deviations are true; of what scale and offset leave."""
     found = numbers.regression
     if found is None or numbers.standardised is None or numbers.sd_reference_m is None:
         return
@@ -207,15 +190,15 @@ def _deviations(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
     if spread > limits.standardised_high:
         yield Finding(
             Grade.LOOK,
-            f"Residuals scatter {spread:.1f} times as much as their reported deviations say: those"
-            " of trajectory and reference poses may be too small.",
+            f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
+            " say: those of trajectory and reference poses may be too small.",
             "standardised",
         )
     elif spread < limits.standardised_low:
         yield Finding(
             Grade.GOOD,
-            f"Residuals scatter only {spread:.2f} times as much as their reported deviations say:"
-            " those of trajectory and reference poses may be too large.",
+            f"Residuals scatter only {spread:.2f} times as much as their reported standard"
+            " deviations say: those of trajectory and reference poses may be too large.",
             "standardised",
         )
 
@@ -240,8 +223,8 @@ def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         )
     if outliers:
         parts.append(
-            f"{outliers} {_plural('outlier', outliers)}, more than five deviations off the"
-            " regression and left out of it"
+            f"{outliers} {_plural('outlier', outliers)}, more than five standard"
+            " deviations off the regression and left out of it"
         )
     yield Finding(grade, f"{'; '.join(parts)}.", "worst")
 
@@ -269,7 +252,7 @@ def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
         yield Finding(
             Grade.GOOD,
             f"The reference distance itself is known to {1000.0 * numbers.sd_reference_m:.0f} mm"
-            " (median sd).",
+            " (median standard deviation).",
             "error",
         )
     if not numbers.attitudes_agree:

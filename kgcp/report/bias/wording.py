@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
+from kgcp.quality.number_text import amount, minus
 
 _LABELS = {
     "scale": "scale",
@@ -15,19 +14,11 @@ _LABELS = {
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
 
-def amount(value: float, sd: float | None, unit: str, factor: float = 1.0) -> str:
-    """Return value ± deviation, both to the deviation's second digit."""
-    value *= factor
-    if sd is None or not sd > 0.0:
-        return f"{minus(f'{value:+.3g}')} {unit}"
-    sd *= factor
-    decimals = min(6, max(0, 1 - math.floor(math.log10(sd))))
-    return f"{minus(f'{value:+.{decimals}f}')} ± {sd:.{decimals}f} {unit}"
-
-
-def minus(number: str) -> str:
-    """Return a number in print: with a true minus, and no sign where it is zero."""
-    return number.replace("-", "−") if float(number) else number.lstrip("+-")
+def signed_amount(value: float, sd: float | None, unit: str, factor: float = 1.0) -> str:
+    """Return value ± standard deviation with sign and unit, both times a factor."""
+    text = amount(factor * value, None if sd is None else factor * sd, "+")
+    number, *others = text.split(" ", 1)
+    return " ".join((minus(number), *others, unit))
 
 
 def label_of(name: str) -> str:
@@ -36,14 +27,14 @@ def label_of(name: str) -> str:
 
 
 def value_of(term: Term) -> str:
-    """Return a term's estimate with deviation and unit."""
+    """Return a term's estimate with standard deviation and unit."""
     if term.name == "scale":
-        return amount(term.value, term.sd, "%", 100.0)
+        return signed_amount(term.value, term.sd, "%", 100.0)
     if term.name == "offset_m":
-        return amount(term.value, term.sd, "mm", 1000.0)
+        return signed_amount(term.value, term.sd, "mm", 1000.0)
     if term.name == "edge_curvature_px2":
-        return amount(term.value, term.sd, "px²")
-    return amount(term.value, term.sd, f"px per {_PER[term.name]}")
+        return signed_amount(term.value, term.sd, "px²")
+    return signed_amount(term.value, term.sd, f"px per {_PER[term.name]}")
 
 
 def meaning_of(term: Term) -> str:
@@ -71,9 +62,10 @@ def meaning_of(term: Term) -> str:
             " --method model takes into account, or sharpening."
         )
     if term.name == "edge_shift_px":
+        share = signed_amount(term.value, term.sd, "px")
         return (
-            f"Displaced edges are in the distances: {amount(term.value, term.sd, 'px')} of each"
-            " pixel of δ (1: all of it, as with one edge; 0: none)."
+            f"Displaced edges are in the distances: {share} of each pixel of δ (1: all of it, as"
+            " with one edge; 0: none)."
         )
     return f"Distances follow {_LABELS[term.name]}: the outer edge moves by {value_of(term)}."
 
@@ -85,11 +77,6 @@ def _nothing(term: Term) -> str:
         "edge_shift_px": "part of δ in the distances",
     }
     return nothing.get(term.name, f"effect of {_LABELS[term.name]}")
-
-
-def chance(term: Term) -> str:
-    """Return a term's probability."""
-    return probability_text(term.probability)
 
 
 def probability_text(probability: float) -> str:

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.io.images.exif import Exif
 from kgcp.io.tables.detections import FrameResult
@@ -20,6 +21,7 @@ from kgcp.measurement.records import (
     Alternative,
     Appearance,
     CommonUncertainty,
+    Considered,
     Miss,
     Observation,
     Uncertainty,
@@ -61,12 +63,20 @@ observations = st.builds(
     is_guided=st.booleans(),
 )
 misses = st.builds(Miss, st.text(), st.sampled_from(Reason), st.text(), maybe, st.integers(0, 99))
+candidates = st.builds(
+    Considered,
+    *(st.text(), st.text(), st.builds(Ellipse, *[numbers] * 5), numbers),
+    st.booleans(),
+    st.sampled_from(Reason),
+    st.text(),
+)
 results = st.builds(
     FrameResult,
     st.text(),
     maybe,
     st.builds(Exif, maybe, maybe, maybe, maybe),
     st.lists(observations | misses, min_size=1, max_size=3).map(tuple),
+    st.lists(candidates, max_size=2).map(tuple),
 )
 
 

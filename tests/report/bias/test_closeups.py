@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,8 +14,10 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Sighting
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.frames import read_grey
-from kgcp.report.bias.closeups import closeup, evenly, largest
+from kgcp.pipeline.bias_report import _view
+from kgcp.report.bias.numbers import evenly, largest
 from kgcp.report.bias.reexposure import GAINS, Reexposed, measure_again, reexposed
+from kgcp.report.ring_picture import CLOSEUP_PX, draw_closeup
 from kgcp.settings import DetectSettings, Method
 
 SAMPLE = Path(__file__).resolve().parents[3] / "sample_flight"
@@ -39,34 +39,19 @@ def seen_in(flight: Flight, frame: str) -> tuple[GreyArray, Sighting, float]:
 
 def test_the_fitted_circles_lie_on_the_edges_of_the_picture(flight: Flight) -> None:
     grey, seen, _ = seen_in(flight, "frame_0001.jpg")
-    made = closeup(grey, flight.camera, flight.targets[0], seen, 7)
-    assert made is not None
-    assert made.row == 7
-    encoded = np.frombuffer(base64.b64decode(made.jpeg), np.uint8)
-    picture = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    assert seen.pose is not None
+    view = _view(flight.camera, flight.targets[0].ring, seen.pose, seen.centre_px)
+    jpeg, curves = draw_closeup(grey, view)
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None
-    assert picture.shape == (made.height, made.width)
-    outer, inner, centre = made.circles
+    assert picture.shape == (CLOSEUP_PX, CLOSEUP_PX)
+    outer, inner, centre = curves
     for circle, ink_inside in ((outer, True), (inner, False)):
         radial = circle - centre
         for scale, is_ink in ((0.93, ink_inside), (1.07, not ink_inside)):
             x, y = (centre + scale * radial - 0.5).astype(np.float32).T
             values = cv2.remap(picture, x[None], y[None], cv2.INTER_LINEAR)
             assert np.mean((values < 128) == is_ink) > 0.9  # dots are near
-
-
-def test_a_target_at_the_rim_has_a_narrower_close_up(flight: Flight) -> None:
-    grey, seen, _ = seen_in(flight, "frame_0001.jpg")
-    assert closeup(grey[:, :20], flight.camera, flight.targets[0], seen, 0) is None
-    cut = closeup(grey[: int(seen.centre_px[1]) + 20], flight.camera, flight.targets[0], seen, 0)
-    assert cut is not None
-    assert cut.height < cut.width == 320
-
-
-def test_without_a_pose_there_is_no_close_up(flight: Flight) -> None:
-    grey, seen, _ = seen_in(flight, "frame_0001.jpg")
-    without = replace(seen, pose=None)
-    assert closeup(grey, flight.camera, flight.targets[0], without, 0) is None
 
 
 def again(flight: Flight, frame: str, method: Method) -> list[Reexposed]:

@@ -10,8 +10,8 @@ from kgcp.quality.bias_causes import Term
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.report.bias.numbers import BiasNumbers, bias_numbers
 from kgcp.report.bias.reexposure import Reexposed
-from kgcp.report.bias.verdict import Grade, judge
-from kgcp.report.bias.wording import amount, meaning_of
+from kgcp.report.bias.verdict import Grade, assess
+from kgcp.report.bias.wording import meaning_of, signed_amount
 
 Compare = Callable[..., Comparison]
 Study = Callable[..., BiasStudy]
@@ -50,7 +50,7 @@ def fly(compare: Compare, study: Study) -> Fly:
 
 
 def texts(numbers: BiasNumbers, grade: Grade | None = None) -> str:
-    findings = judge(numbers).findings
+    findings = assess(numbers).findings
     return "\n".join(one.text for one in findings if grade in {None, one.grade})
 
 
@@ -83,8 +83,8 @@ def test_numbers_are_those_of_the_study(compare: Compare, study: Study) -> None:
 
 def test_a_flight_that_is_as_reported_is_good(fly: Fly) -> None:
     numbers = fly()
-    assert judge(numbers).grade is Grade.GOOD
-    assert judge(numbers).sentences[0] == "Good."
+    assert assess(numbers).grade is Grade.GOOD
+    assert assess(numbers).sentences[0] == "Good."
     assert numbers.standardised is not None
     assert numbers.standardised.sd == pytest.approx(1.0, abs=0.25)
     assert "Neither is significant" in texts(numbers)
@@ -104,20 +104,22 @@ def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
 def test_what_is_significant_but_small_does_not_spoil_a_flight(fly: Fly) -> None:
     numbers = fly(lambda d: np.full_like(d, 0.004), sd_m=0.001, noise_m=0.001)
     assert "lever arm" in texts(numbers, Grade.GOOD)
-    assert judge(numbers).grade is Grade.GOOD
+    assert assess(numbers).grade is Grade.GOOD
 
 
 def test_a_flight_of_rubbish_is_not_usable(fly: Fly) -> None:
     numbers = fly(lambda d: 0.03 * d * np.sin(d))
-    assert judge(numbers).grade is Grade.UNUSABLE
-    assert judge(numbers).findings[0].grade is Grade.UNUSABLE
+    assert assess(numbers).grade is Grade.UNUSABLE
+    assert assess(numbers).findings[0].grade is Grade.UNUSABLE
 
 
-def test_deviations_that_are_too_small_are_found(fly: Fly) -> None:
-    assert "times as much as their reported deviations" in texts(fly(sd_m=0.005), Grade.LOOK)
+def test_standard_deviations_that_are_too_small_are_found(fly: Fly) -> None:
+    assert "times as much as their reported standard deviations" in texts(
+        fly(sd_m=0.005), Grade.LOOK
+    )
     too_large = fly(sd_m=0.1)
     assert "may be too large" in texts(too_large)
-    assert judge(too_large).grade is Grade.GOOD
+    assert assess(too_large).grade is Grade.GOOD
 
 
 def test_distances_that_follow_the_grey_values_are_found(fly: Fly) -> None:
@@ -125,10 +127,10 @@ def test_distances_that_follow_the_grey_values_are_found(fly: Fly) -> None:
         return [Reexposed(0, 1.6, 20.0, change, 0.01, 0.3) for change in changes]
 
     numbers = fly()
-    steady = judge(numbers, again(0.01, -0.02, None))
+    steady = assess(numbers, again(0.01, -0.02, None))
     assert steady.grade is Grade.GOOD
     assert "change by 0.016 % (RMS of 2; 1 lost)" in "\n".join(steady.sentences)
-    assert judge(numbers, again(0.5, 0.01)).grade is Grade.LOOK
+    assert assess(numbers, again(0.5, 0.01)).grade is Grade.LOOK
 
 
 def test_outliers_and_misses_are_counted(fly: Fly) -> None:
@@ -201,10 +203,10 @@ def test_reservations_are_spoken(compare: Compare, study: Study) -> None:
 
 
 def test_amounts_are_rounded_by_their_deviation() -> None:
-    assert amount(0.0010234, 0.000123, "%", 100.0) == "+0.102 ± 0.012 %"
-    assert amount(-12.34, 5.6, "mm") == "−12.3 ± 5.6 mm"
-    assert amount(-0.001, 56.0, "mm") == "0 ± 56 mm"
-    assert amount(0.5, None, "%") == "+0.5 %"
+    assert signed_amount(0.0010234, 0.000123, "%", 100.0) == "+0.102 ± 0.012 %"
+    assert signed_amount(-12.34, 5.6, "mm") == "−12.3 ± 5.6 mm"
+    assert signed_amount(-0.001, 56.0, "mm") == "0 ± 56 mm"
+    assert signed_amount(0.5, None, "%") == "+0.5 %"
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@
       ["reference", number(columns.reference_distance_m[row], 3, "m")],
       ["error", number(1000 * columns.residual_m[row], 1, "mm")],
       ["error", number(columns.residual_percent[row], 3, "%")],
-      ["left by the fit, in sd", number(data.deviations[row], 1, "")],
+      ["residual, in sd", number(data.residuals[row], 1, "")],
       ["radius", number(columns.radius_px[row], 1, "px")],
     ];
     for (const [name, label] of Object.entries(data.labels)) {
@@ -40,10 +40,10 @@
   // A close-up, with the fitted circles as lines that stay sharp.
   const drawing = (row) => {
     const seen = data.closeups[row];
-    const svg = shape("svg", { viewBox: `0 0 ${seen.width} ${seen.height}`, role: "img",
+    const svg = shape("svg", { viewBox: `0 0 ${data.closeup_px} ${data.closeup_px}`, role: "img",
       "aria-label": `Close-up of ${columns.frame[row]}` });
     svg.append(shape("image", { href: `data:image/jpeg;base64,${seen.jpeg}`,
-      width: seen.width, height: seen.height }));
+      width: data.closeup_px, height: data.closeup_px }));
     for (const circle of seen.circles) {
       if (circle.length === 2) {
         const [x, y] = circle;
@@ -70,7 +70,7 @@
       ? drawing(row)
       : element("p", { className: "note", textContent:
           "This frame has no close-up: the page holds some, spread over the distances, and those " +
-          "of the largest deviations." });
+          "of the largest residuals." });
     dialog.querySelector("h2").textContent = columns.frame[row];
     dialog.querySelector(".halves").replaceChildren(left, list);
     dialog.dataset.row = row;

@@ -1,0 +1,26 @@
+"""Numbers in print: signs, and as many digits as their standard deviations deserve."""
+
+from __future__ import annotations
+
+import math
+
+
+def minus(number: str) -> str:
+    """Return a number with a true minus, and no sign where it is zero."""
+    return number.replace("-", "−") if float(number) else number.lstrip("+-")
+
+
+def amount(value: float, sd: float | None, sign: str = "") -> str:
+    """Return value ± standard deviation, both to the second digit of the latter.
+
+    Parameters
+    ----------
+    value, sd : float
+        None or 0: the standard deviation is not known.
+    sign : str
+        As in a format: "+" prints the sign of positive values, too.
+    """
+    if sd is None or not sd > 0.0:
+        return f"{value:{sign}.3g}"
+    decimals = min(6, max(0, 1 - math.floor(math.log10(sd))))
+    return f"{value:{sign}.{decimals}f} ± {sd:.{decimals}f}"
