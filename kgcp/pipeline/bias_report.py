@@ -104,11 +104,11 @@ def write_report(
             " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
         )
     table = folder / "bias.parquet"
-    rows = (bias_row(one, study.method) for one in study.measured)
+    rows = (bias_row(pair, study.method) for pair in study.measured)
     write_table(table, BIAS_COLUMNS, rows, provenance(flight))
     frames = stored_frames or flight.frames_folder
     content = _content(study, flight, settings, frames, reexpose)
-    files = {FIGURE_FILES[name]: one.png for name, one in content.pictures.items()}
+    files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
     text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
     files["bias_summary.json"] = f"{text}\n".encode()
     files["bias_report.html"] = render_page(content).encode()
@@ -137,7 +137,7 @@ def _content(
         numbers=numbers,
         verdict=verdict,
         pictures=_pictures(numbers, flight, reexposed),
-        rows=[bias_row(one, study.method) for one in numbers.compared],
+        rows=[bias_row(pair, study.method) for pair in numbers.compared],
         closeups=closeups,
         reexposed=reexposed,
         summary=summary_of(numbers, verdict, reexposed),
@@ -157,22 +157,22 @@ def _look(
     reexposed: list[Reexposed] = []
     targets = {target.name: target for target in flight.targets}
     for row in dict.fromkeys([*shown, *again]):
-        seen = numbers.compared[row].attempt.sighting
-        if seen is None:
+        sighting = numbers.compared[row].attempt.sighting
+        if sighting is None:
             continue
         try:
-            with at_hand(frames, seen.frame) as path:
+            with at_hand(frames, sighting.frame) as path:
                 grey = read_grey(path, flight.camera)
         except (Rejection, KgcpError):
             continue  # the page says of which frames there is no close-up
-        target, radius = targets[seen.target], float(numbers.data.radius_px[row])
-        if row in shown and seen.pose is not None:
-            view = _view(flight.camera, target.ring, seen.pose, seen.centre_px)
+        target, radius = targets[sighting.target], float(numbers.data.radius_px[row])
+        if row in shown and sighting.pose is not None:
+            view = _view(flight.camera, target.ring, sighting.pose, sighting.centre_px)
             closeups[row] = draw_closeup(grey, view)
         if row in again:
             with stops_held():
                 reexposed += measure_again(
-                    grey, flight.camera, target, settings, seen.centre_px, radius, row
+                    grey, flight.camera, target, settings, sighting.centre_px, radius, row
                 )
     return closeups, reexposed
 

@@ -121,10 +121,11 @@ def sketch_frame(task: FrameTask, result: FrameResult) -> list[Sketch]:
 def _rings(result: FrameResult) -> list[Outcome | Considered]:
     """Return what has a card: all outcomes, and dropped rings that are not the best of a miss."""
     outcomes = sorted(
-        result.outcomes, key=lambda one: (one.target, 0 if isinstance(one, Miss) else one.instance)
+        result.outcomes,
+        key=lambda outcome: (outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance),
     )
-    shown = {one.outline for one in outcomes if isinstance(one, Miss)}
-    return [*outcomes, *(one for one in result.dropped if one.outline not in shown)]
+    shown = {outcome.outline for outcome in outcomes if isinstance(outcome, Miss)}
+    return [*outcomes, *(outcome for outcome in result.dropped if outcome.outline not in shown)]
 
 
 def _has_place(ring: Outcome | Considered) -> bool:
@@ -144,7 +145,7 @@ def _sketch(task: FrameTask, grey: GreyArray, frame: str, ring: Outcome | Consid
     if not isinstance(ring, Observation):
         pictures = None if ring.outline is None else draw_ring(grey, _outlined(ring.outline))
         return Sketch(_card(frame, ring), pictures)
-    target = next(one for one in task.targets if one.name == ring.target)
+    target = next(target for target in task.targets if target.name == ring.target)
     appearance = ring.appearance
     note, residuals = "", None
     try:
@@ -191,48 +192,48 @@ def _card(
 
 
 def _measured_card(
-    frame: str, seen: Observation, residual_percent: float | None, note: str
+    frame: str, observation: Observation, residual_percent: float | None, note: str
 ) -> Card:
-    distance_m, spread = seen.pose.distance_m, seen.uncertainty
+    distance_m, spread = observation.pose.distance_m, observation.uncertainty
     sd = "" if spread is None else f" ± {1e3 * spread.sd_distance_m:.1f} mm"
     return Card(
         frame=frame,
-        target=seen.target,
-        instance=seen.instance,
+        target=observation.target,
+        instance=observation.instance,
         status=Status.MEASURED.value,
         reason="",
         headline=f"{distance_m:.3f} m{sd}",
-        text=_joined(*_values(seen, residual_percent), note),
+        text=_joined(*_values(observation, residual_percent), note),
         distance_m=distance_m,
         sd_percent=None if spread is None else 100.0 * spread.sd_distance_m / distance_m,
-        radius_px=seen.appearance.radius_px,
+        radius_px=observation.appearance.radius_px,
         residual_percent=residual_percent,
     )
 
 
-def _values(seen: Observation, residual_percent: float | None) -> list[str]:
+def _values(observation: Observation, residual_percent: float | None) -> list[str]:
     """Return the values in few words; those that are not known are left out."""
-    look, spread = seen.appearance, seen.uncertainty
-    x, y = seen.centre_px
+    appearance, spread = observation.appearance, observation.uncertainty
+    x, y = observation.centre_px
     sd = "" if spread is None else f" ± {np.sqrt(np.diag(spread.centre_cov_px2).max()):.3f}"
-    texts = [f"centre ({x:.2f}, {y:.2f}){sd} px", f"radius {look.radius_px:.1f} px"]
-    if seen.ring != seen.target:
-        texts.append(f"by {seen.ring}")
-    if seen.is_guided:
+    texts = [f"centre ({x:.2f}, {y:.2f}){sd} px", f"radius {appearance.radius_px:.1f} px"]
+    if observation.ring != observation.target:
+        texts.append(f"by {observation.ring}")
+    if observation.is_guided:
         texts.append("second look")
-    angles = (seen.pose.roll_deg, seen.pose.pitch_deg, seen.heading_deg)
+    angles = (observation.pose.roll_deg, observation.pose.pitch_deg, observation.heading_deg)
     roll, pitch, heading = (minus(f"{angle:.1f}") for angle in angles)
     texts.append(f"roll {roll}°, pitch {pitch}°, heading {heading}°")
-    if seen.alternative is not None:
-        ambiguity = seen.alternative.ambiguity
+    if observation.alternative is not None:
+        ambiguity = observation.alternative.ambiguity
         texts.append(f"ambiguity {ambiguity:.{1 if ambiguity < 100.0 else 0}f}")
-    if look.blur_px is not None:
-        texts.append(f"blur {look.blur_px:.2f} px")
-    if look.edge_shift_px is not None:
-        texts.append(f"edge shift {minus(f'{look.edge_shift_px:.2f}')} px")
-    texts.append(f"levels {look.black:.2f} … {look.white:.2f}")
-    texts.append(f"clipped {100.0 * look.saturated:.0f}\xa0%")
-    texts.append(f"score {seen.score:.2f}")
+    if appearance.blur_px is not None:
+        texts.append(f"blur {appearance.blur_px:.2f} px")
+    if appearance.edge_shift_px is not None:
+        texts.append(f"edge shift {minus(f'{appearance.edge_shift_px:.2f}')} px")
+    texts.append(f"levels {appearance.black:.2f} … {appearance.white:.2f}")
+    texts.append(f"clipped {100.0 * appearance.saturated:.0f}\xa0%")
+    texts.append(f"score {observation.score:.2f}")
     if residual_percent is not None:
         texts.append(f"residuals {residual_percent:.1f}\xa0%")
     return texts

@@ -15,25 +15,27 @@ _FARTHEST_M = 100.0  # what a second and some metres of lever arm make of a vehi
 _AXES = {"forward": 0, "right": 1, "down": 2}
 
 
-def advice(found: Consistency) -> tuple[str, ...]:
+def advice(consistency: Consistency) -> tuple[str, ...]:
     """Return one line per correction that is due; none where all is well.
 
     A correction is due where it is more than chance, and more than what flight.toml itself calls
     uncertain. Where maps or clocks do not belong together, corrections mean nothing.
     """
-    distance_m = math.hypot(*rms_m(found))
+    distance_m = math.hypot(*rms_m(consistency))
     strange = [
-        one for one in found.estimate.corrections if one.is_significant and not one.is_credible
+        correction
+        for correction in consistency.estimate.corrections
+        if correction.is_significant and not correction.is_credible
     ]
     if strange or distance_m > _FARTHEST_M:
         return (_mismatch(distance_m),)
     lines = [
         _line(correction)
-        for correction in found.estimate.corrections
+        for correction in consistency.estimate.corrections
         if correction.is_significant
-        and abs(correction.value or 0.0) > found.stated_sd.get(correction.name, 0.0)
+        and abs(correction.value or 0.0) > consistency.stated_sd.get(correction.name, 0.0)
     ]
-    factor = found.estimate.variance_factor
+    factor = consistency.estimate.variance_factor
     if factor > _UNEXPLAINED:
         lines.append(
             f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their standard"
@@ -43,9 +45,15 @@ def advice(found: Consistency) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def rms_m(found: Consistency) -> tuple[float, float, float]:
+def rms_m(consistency: Consistency) -> tuple[float, float, float]:
     """Return the RMS of the offsets along, across and up, outliers left out [m]."""
-    kept = np.array([one.offset_m for one in found.discrepancies if not one.is_outlier])
+    kept = np.array(
+        [
+            discrepancy.offset_m
+            for discrepancy in consistency.discrepancies
+            if not discrepancy.is_outlier
+        ]
+    )
     along, across, up = np.sqrt(np.mean(kept**2, axis=0)).tolist()
     return along, across, up
 

@@ -121,14 +121,14 @@ def regress(data: DistanceResiduals) -> Regression | None:
     if "offset_m" not in names:
         return None
     tangled = tuple(name for name in columns if name not in names)
-    found = _fit(data, columns, names, used)
+    result = _fit(data, columns, names, used)
     curved = {**columns, _CURVED: data.distance_m / data.radius_px**2}
     more = _names_told_apart(curved, used, weight, len(used))
     if set(more) >= {*names, _CURVED} and used.sum() > _PER_TERM * (len(names) + 1):
         other = _fit(data, curved, [*names, _CURVED], used)
         if _terms([*names, _CURVED], other)[-1].is_significant:
-            names, columns, found = [*names, _CURVED], curved, other
-    return _regression(data, columns, names, tangled, used, found)
+            names, columns, result = [*names, _CURVED], curved, other
+    return _regression(data, columns, names, tangled, used, result)
 
 
 def _columns(data: DistanceResiduals) -> tuple[dict[str, FloatArray], BoolArray]:
@@ -138,11 +138,11 @@ def _columns(data: DistanceResiduals) -> tuple[dict[str, FloatArray], BoolArray]
     used = np.ones(len(data.distance_m), dtype=bool)
     for quantity in QUANTITIES:
         values = quantity.measure(data.exposure[quantity.name])
-        known = np.isfinite(values)
-        if known.mean() < _KNOWN_SHARE or not varies(values[known]):
+        present = np.isfinite(values)
+        if present.mean() < _KNOWN_SHARE or not varies(values[present]):
             continue
-        used &= known
-        zero = 0.0 if quantity.is_absolute else float(np.mean(values[known]))
+        used &= present
+        zero = 0.0 if quantity.is_absolute else float(np.mean(values[present]))
         columns[quantity.name] = (values - zero) * per_px
     return columns, used
 
@@ -165,15 +165,15 @@ def _fit(
     return fit(design, data.residual_m[used], data.errors.kept(used))
 
 
-def _terms(names: Sequence[str], found: RegressionFit) -> tuple[Term, ...]:
+def _terms(names: Sequence[str], result: RegressionFit) -> tuple[Term, ...]:
     chances = [
-        two_sided(float(value / sd), found.freedom)
-        for value, sd in zip(found.values, found.sds, strict=True)
+        two_sided(float(value / sd), result.freedom)
+        for value, sd in zip(result.values, result.sds, strict=True)
     ]
     return tuple(
         Term(name, float(value), float(sd), chance)
         for name, value, sd, chance in zip(
-            names, found.values, found.sds, holm(chances), strict=True
+            names, result.values, result.sds, holm(chances), strict=True
         )
     )
 
@@ -195,26 +195,26 @@ def _regression(
     names: list[str],
     tangled: tuple[str, ...],
     used: BoolArray,
-    found: RegressionFit,
+    result: RegressionFit,
 ) -> Regression:
     outlier = np.zeros(len(used), dtype=bool)
-    outlier[used] = found.outlier
+    outlier[used] = result.outlier
     basic = _without_exposure(names)
     design = np.column_stack([columns[name] for name in names])
-    share, probability = _share_of_exposure(names, found)
-    left = data.residual_m - design @ found.values
+    share, probability = _share_of_exposure(names, result)
+    left = data.residual_m - design @ result.values
     unit = left / np.sqrt(data.errors.total)
     return Regression(
-        terms=_terms(names, found),
+        terms=_terms(names, result),
         tangled=tangled,
         count=int(np.count_nonzero(used & ~outlier)),
         used=used,
         outlier=outlier,
-        scatter=float(np.sqrt(np.sum(unit[used & ~outlier] ** 2) / found.freedom)),
-        correlation_s=found.correlation_s,
+        scatter=float(np.sqrt(np.sum(unit[used & ~outlier] ** 2) / result.freedom)),
+        correlation_s=result.correlation_s,
         exposure_share=share,
         exposure_probability=probability,
-        systematic_m=design[:, basic] @ found.values[basic],
+        systematic_m=design[:, basic] @ result.values[basic],
     )
 
 
@@ -222,12 +222,12 @@ def _without_exposure(names: Sequence[str]) -> list[int]:
     return [index for index, name in enumerate(names) if index < 2 or name == _CURVED]
 
 
-def _share_of_exposure(names: Sequence[str], found: RegressionFit) -> tuple[float, float | None]:
+def _share_of_exposure(names: Sequence[str], result: RegressionFit) -> tuple[float, float | None]:
     others = _without_exposure(names)
     extra = len(names) - len(others)
     if not extra:
         return 0.0, None
-    without = found.chi2_of(others)
-    share = 1.0 - (found.chi2 / found.freedom) / (without / (found.freedom + extra))
-    ratio = (without - found.chi2) / extra / (found.chi2 / found.freedom)
-    return max(0.0, share), float(fdtrc(extra, found.freedom, max(0.0, ratio)))
+    without = result.chi2_of(others)
+    share = 1.0 - (result.chi2 / result.freedom) / (without / (result.freedom + extra))
+    ratio = (without - result.chi2) / extra / (result.chi2 / result.freedom)
+    return max(0.0, share), float(fdtrc(extra, result.freedom, max(0.0, ratio)))

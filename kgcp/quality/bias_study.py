@@ -128,8 +128,8 @@ class Comparison:
     @property
     def residual_m(self) -> float | None:
         """Measured minus reference distance [m]; None where nothing was measured."""
-        seen = self.attempt.sighting
-        return None if seen is None else seen.distance_m - self.reference_distance_m
+        sighting = self.attempt.sighting
+        return None if sighting is None else sighting.distance_m - self.reference_distance_m
 
     @property
     def residual_percent(self) -> float | None:
@@ -143,10 +143,10 @@ class Comparison:
 
         The limit is one radius of the ring.
         """
-        seen = self.attempt.sighting
-        if seen is None:
+        sighting = self.attempt.sighting
+        if sighting is None:
             return False
-        return not math.dist(seen.centre_px, self.expected_px) <= self.expected_radius_px
+        return not math.dist(sighting.centre_px, self.expected_px) <= self.expected_radius_px
 
     def is_whole_in(self, camera: Camera) -> bool:
         """Whether the reference puts the whole ring into the frame."""
@@ -181,14 +181,14 @@ class BiasStudy:
     frames_without_pose: tuple[str, ...]
     absences: tuple[Absence, ...]
 
-    def trusts(self, one: Comparison) -> bool:
+    def trusts(self, pair: Comparison) -> bool:
         """Whether a comparison holds a measurement, and one of this target."""
-        return one.attempt.sighting is not None and not (self.attitudes_agree and one.is_astray)
+        return pair.attempt.sighting is not None and not (self.attitudes_agree and pair.is_astray)
 
     @property
     def trusted(self) -> tuple[Comparison, ...]:
         """Measurements that statistics are made of."""
-        return tuple(one for one in self.measured if self.trusts(one))
+        return tuple(pair for pair in self.measured if self.trusts(pair))
 
 
 def study_bias(
@@ -246,14 +246,14 @@ def study_bias(
         )
         for (attempt, place, row), pixel in zip(placed, pixels, strict=True)
     ]
-    measured = tuple(one for one in compared if one.attempt.sighting is not None)
-    agree = 2 * sum(one.is_astray for one in measured) < len(measured)
+    measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
+    agree = 2 * sum(pair.is_astray for pair in measured) < len(measured)
     return BiasStudy(
         method=method,
         measured=measured,
-        chances=tuple(one for one in compared if not agree or one.is_whole_in(camera)),
+        chances=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
         attitudes_agree=agree,
-        frames_without_pose=tuple(sorted({one.frame for one in ours} - rows.keys())),
+        frames_without_pose=tuple(sorted({attempt.frame for attempt in ours} - rows.keys())),
         absences=tuple(place for place in places if isinstance(place, Absence)),
     )
 
@@ -322,19 +322,21 @@ class EdgeDistances:
     one_px: float
 
 
-def edge_distances(one: Comparison, method: Method) -> EdgeDistances | None:
+def edge_distances(pair: Comparison, method: Method) -> EdgeDistances | None:
     """Return both distances of a comparison; None where it has no measurement, or no δ.
 
     Exposure displaces the outer edge by δ towards the dark ring, from the radius R to R − δ, and
     a distance is inversely proportional to the radius. The paper's chain takes the pose from the
     outer edge; the image model has displaced edges among its unknowns.
     """
-    seen, look = one.attempt.sighting, one.attempt.exposure
-    if seen is None or look.edge_shift_px is None or look.radius_px is None:
+    sighting, exposure = pair.attempt.sighting, pair.attempt.exposure
+    if sighting is None or exposure.edge_shift_px is None or exposure.radius_px is None:
         return None
     if method is Method.PAPER:  # there the radius is that of the displaced edge
-        share = look.edge_shift_px / look.radius_px
-        return EdgeDistances(seen.distance_m, seen.distance_m / (1.0 + share), look.radius_px)
-    displaced_px = look.radius_px - look.edge_shift_px
-    one_m = seen.distance_m * look.radius_px / displaced_px
-    return EdgeDistances(one_m, seen.distance_m, displaced_px)
+        share = exposure.edge_shift_px / exposure.radius_px
+        return EdgeDistances(
+            sighting.distance_m, sighting.distance_m / (1.0 + share), exposure.radius_px
+        )
+    displaced_px = exposure.radius_px - exposure.edge_shift_px
+    one_m = sighting.distance_m * exposure.radius_px / displaced_px
+    return EdgeDistances(one_m, sighting.distance_m, displaced_px)

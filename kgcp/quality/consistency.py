@@ -115,11 +115,13 @@ def study_consistency(
     )
     if np.count_nonzero(~outlier) < MIN_POINTS:
         return None
-    found, correlation_s = _adjust(np.array([one.time_s for one in meetings]), equations, ~outlier)
+    fitted, correlation_s = _adjust(
+        np.array([meeting.time_s for meeting in meetings]), equations, ~outlier
+    )
     settings = whereabouts.carrier.settings
     return Consistency(
-        _discrepancies(meetings, equations, outlier, found, settings.time_offset_s),
-        found,
+        _discrepancies(meetings, equations, outlier, fitted, settings.time_offset_s),
+        fitted,
         correlation_s,
         _stated_sd(settings),
     )
@@ -145,13 +147,13 @@ def _adjust(time_s: FloatArray, equations: System, kept: BoolArray) -> tuple[Est
     trials = []
     for correlation_s in _CORRELATIONS_S:
         products, log_det = weighted_products(columns, errors, correlation_s)
-        found = estimate(products, 3 * len(columns), has_sds=equations.has_sds)
-        misfit = found.chi2_after
+        fitted = estimate(products, 3 * len(columns), has_sds=equations.has_sds)
+        misfit = fitted.chi2_after
         if not equations.has_sds:  # the likeliest scale is part of the likelihood
             misfit = 3 * len(columns) * math.log(misfit)
-        trials.append((misfit + log_det, correlation_s, found))
-    _, correlation_s, found = min(trials, key=lambda trial: trial[0])
-    return found, correlation_s
+        trials.append((misfit + log_det, correlation_s, fitted))
+    _, correlation_s, fitted = min(trials, key=lambda trial: trial[0])
+    return fitted, correlation_s
 
 
 def _meet(
@@ -162,43 +164,45 @@ def _meet(
 ) -> list[Meeting]:
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     moving = [
-        seen
-        for seen in sightings
-        if not seen.instance and seen.target not in whereabouts.static and seen.frame in rows
+        sighting
+        for sighting in sightings
+        if not sighting.instance
+        and sighting.target not in whereabouts.static
+        and sighting.frame in rows
     ]
     if not moving:
         return []
-    times = [seen.row_time_s(camera) for seen in moving]
-    places = whereabouts.places([seen.target for seen in moving], times)
+    times = [sighting.row_time_s(camera) for sighting in moving]
+    places = whereabouts.places([sighting.target for sighting in moving], times)
     meetings = [
-        Meeting(seen, seen.pose, time_s, place, place.ride, rows[seen.frame])
-        for seen, time_s, place in zip(moving, times, places, strict=True)
-        if isinstance(place, Place) and place.ride and seen.pose and time_s is not None
+        Meeting(sighting, sighting.pose, time_s, place, place.ride, rows[sighting.frame])
+        for sighting, time_s, place in zip(moving, times, places, strict=True)
+        if isinstance(place, Place) and place.ride and sighting.pose and time_s is not None
     ]
-    return sorted(meetings, key=lambda one: (one.time_s, one.seen.frame))
+    return sorted(meetings, key=lambda meeting: (meeting.time_s, meeting.sighting.frame))
 
 
 def _discrepancies(
     meetings: Sequence[Meeting],
     equations: System,
     outlier: BoolArray,
-    found: Estimate,
+    fitted: Estimate,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
-    residual = equations.offset + equations.design @ found.values
+    residual = equations.offset + equations.design @ fitted.values
     track = equations.track
     cov = track @ (equations.fading + equations.white) @ np.swapaxes(track, 1, 2)
     offset_m = np.einsum("nij,nj->ni", track, equations.offset)
     residual_m = np.einsum("nij,nj->ni", track, residual)
     return tuple(
         Discrepancy(
-            one.seen.frame,
-            one.seen.target,
-            one.time_s + time_offset_s,
+            meeting.sighting.frame,
+            meeting.sighting.target,
+            meeting.time_s + time_offset_s,
             offset_m[index],
             cov[index],
             residual_m[index],
             bool(outlier[index]),
         )
-        for index, one in enumerate(meetings)
+        for index, meeting in enumerate(meetings)
     )

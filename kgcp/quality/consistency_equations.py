@@ -39,7 +39,7 @@ class Meeting:
         Of the reference pose.
     """
 
-    seen: Sighting
+    sighting: Sighting
     pose: Pose
     time_s: float
     place: Place
@@ -86,25 +86,30 @@ class System:
         sd_time_s: float,
     ) -> Self:
         """Set up the system of meetings, in their order in time."""
-        rows = [one.row for one in meetings]
+        rows = [meeting.row for meeting in meetings]
         attitude = views.enu_from_camera[rows]
-        in_camera = np.array([one.pose.translation_m for one in meetings])
+        in_camera = np.array([meeting.pose.translation_m for meeting in meetings])
         sight = np.einsum("nij,nj->ni", attitude, in_camera)
-        velocity = np.array([one.ride.velocity_m_s for one in meetings])
-        body = np.array([one.ride.frame_from_body for one in meetings])
-        since_middle = np.array([one.seen.rows_since_middle(camera) for one in meetings])[:, None]
+        velocity = np.array([meeting.ride.velocity_m_s for meeting in meetings])
+        body = np.array([meeting.ride.frame_from_body for meeting in meetings])
+        since_middle = np.array(
+            [meeting.sighting.rows_since_middle(camera) for meeting in meetings]
+        )[:, None]
         moved = _camera_velocity(meetings, views.centre_m[rows], velocity)
         centre = views.centre_m[rows] + moved * since_middle * camera.readout_s
-        offset = np.array([one.place.position_m for one in meetings]) - centre - sight
+        offset = np.array([meeting.place.position_m for meeting in meetings]) - centre - sight
         columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
         design = np.concatenate((*columns, attitude @ cross_matrix(in_camera)), axis=2)
-        fading = np.array([_fading_m2(one.place) for one in meetings])
+        fading = np.array([_fading_m2(meeting.place) for meeting in meetings])
         white = _white_m2(meetings, views, poses, sight)
         shift = sd_time_s * velocity
         white = white + shift[:, :, None] * shift[:, None, :]
-        common_m = np.array([one.seen.sd_common_distance_m or 0.0 for one in meetings])
+        common_m = np.array([meeting.sighting.sd_common_distance_m or 0.0 for meeting in meetings])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-        stated = all(one.place.cov_m2 is not None for one in meetings) and views.cov_m2 is not None
+        stated = (
+            all(meeting.place.cov_m2 is not None for meeting in meetings)
+            and views.cov_m2 is not None
+        )
         return cls(
             offset, design, fading, white, unit * common_m[:, None], stated, _track(velocity, body)
         )
@@ -120,10 +125,10 @@ def _white_m2(
     meetings: Sequence[Meeting], views: Views, poses: ReferencePoses, sight: FloatArray
 ) -> FloatArray:
     """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
-    rows = [one.row for one in meetings]
+    rows = [meeting.row for meeting in meetings]
     attitude = views.enu_from_camera[rows]
     total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
-    measured = [one.seen.pose_cov for one in meetings]
+    measured = [meeting.sighting.pose_cov for meeting in meetings]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
     unstated = _UNSTATED_SD_M**2 * np.eye(3)
@@ -141,7 +146,7 @@ def _camera_velocity(
 
     Where there is nothing to interpolate it is taken to follow the vehicle.
     """
-    time_s = np.array([one.time_s for one in meetings])
+    time_s = np.array([meeting.time_s for meeting in meetings])
     velocity = otherwise.copy()
     breaks = np.flatnonzero(np.diff(time_s) > _NEIGHBOUR_S) + 1
     for run in np.split(np.arange(len(time_s)), breaks):
@@ -158,6 +163,6 @@ def _track(velocity: FloatArray, body: FloatArray) -> FloatArray:
         body[:, :, 0],
     )
     east, north = (ahead[:, :2] / np.linalg.norm(ahead[:, :2], axis=1, keepdims=True)).T
-    none, one = np.zeros_like(east), np.ones_like(east)
-    rows = ((east, north, none), (north, -east, none), (none, none, one))
+    none, ones = np.zeros_like(east), np.ones_like(east)
+    rows = ((east, north, none), (north, -east, none), (none, none, ones))
     return np.moveaxis(np.array(rows), 2, 0)

@@ -102,11 +102,11 @@ class DistanceResiduals:
         radius_px : (n,) array, optional
             Radii that gave them; those of the detections if not given.
         """
-        distance = np.array([one.reference_distance_m for one in compared])
+        distance = np.array([pair.reference_distance_m for pair in compared])
         radius = radius_px
         if radius is None:
             radius = np.array(
-                [one.attempt.exposure.radius_px or one.expected_radius_px for one in compared]
+                [pair.attempt.exposure.radius_px or pair.expected_radius_px for pair in compared]
             )
         return cls(
             distance_m=distance,
@@ -115,7 +115,7 @@ class DistanceResiduals:
             errors=_error_model(compared, _UNSTATED_EDGE_PX * distance / radius),
             exposure={
                 quantity.name: np.array(
-                    [getattr(one.attempt.exposure, quantity.name) for one in compared],
+                    [getattr(pair.attempt.exposure, quantity.name) for pair in compared],
                     dtype=np.float64,
                 )
                 for quantity in QUANTITIES
@@ -127,11 +127,11 @@ def in_time(compared: Sequence[Comparison]) -> list[Comparison]:
     """Sort comparisons by time, those without one by their frames' names behind the others."""
     return sorted(
         compared,
-        key=lambda one: (
-            one.attempt.time_s is None,
-            one.attempt.time_s or 0.0,
-            one.attempt.frame,
-            one.attempt.target,
+        key=lambda pair: (
+            pair.attempt.time_s is None,
+            pair.attempt.time_s or 0.0,
+            pair.attempt.frame,
+            pair.attempt.target,
         ),
     )
 
@@ -142,16 +142,18 @@ def varies(values: FloatArray) -> bool:
 
 
 def _error_model(compared: Sequence[Comparison], unstated_m: FloatArray) -> ErrorModel:
-    seen = [one.attempt.sighting for one in compared]
+    sightings = [pair.attempt.sighting for pair in compared]
     measured = np.array(
         [
-            otherwise if one is None or one.sd_distance_m is None else one.sd_distance_m
-            for one, otherwise in zip(seen, unstated_m, strict=True)
+            otherwise
+            if sighting is None or sighting.sd_distance_m is None
+            else sighting.sd_distance_m
+            for sighting, otherwise in zip(sightings, unstated_m, strict=True)
         ]
     )
-    pose = np.array([one.sds.pose_m if one.sds else _UNSTATED_WHITE_M for one in compared])
-    place = np.array([one.sds.place_m if one.sds else _UNSTATED_LASTING_M for one in compared])
-    times = np.array([one.attempt.time_s for one in compared], dtype=np.float64)
+    pose = np.array([pair.sds.pose_m if pair.sds else _UNSTATED_WHITE_M for pair in compared])
+    place = np.array([pair.sds.place_m if pair.sds else _UNSTATED_LASTING_M for pair in compared])
+    times = np.array([pair.attempt.time_s for pair in compared], dtype=np.float64)
     if not np.isfinite(times).all():  # without times it is not known which are neighbours
         times = np.arange(float(len(pose)))
         return ErrorModel(measured**2 + pose**2 + place**2, np.zeros_like(pose), times)

@@ -149,14 +149,14 @@ def fit_slope(
     middle = float(weight @ x / weight.sum())
     design = np.column_stack((np.ones_like(x), x - middle))
     errors = ErrorModel(sd**2, np.zeros_like(x), np.arange(float(len(x))))
-    found = fit(design, y, errors, is_robust=is_robust)
-    kept = ~found.outlier
-    if np.ptp(x[kept]) == 0.0 or not found.sds.all():
+    result = fit(design, y, errors, is_robust=is_robust)
+    kept = ~result.outlier
+    if np.ptp(x[kept]) == 0.0 or not result.sds.all():
         return None
-    share = 1.0 - (found.chi2 / found.freedom) / (found.chi2_of([0]) / (found.freedom + 1))
-    height, value = found.values.tolist()
-    sd_height, sd_value = found.sds.tolist()
-    chance = two_sided(value / sd_value, found.freedom)
+    share = 1.0 - (result.chi2 / result.freedom) / (result.chi2_of([0]) / (result.freedom + 1))
+    height, value = result.values.tolist()
+    sd_height, sd_value = result.sds.tolist()
+    chance = two_sided(value / sd_value, result.freedom)
     return Slope(
         int(kept.sum()), middle, height, value, sd_height, sd_value, chance, max(0.0, share)
     )

@@ -42,23 +42,23 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     suffix = path.suffix.lower()
     stream = io.BytesIO()
     with sheet(7.0, 8.0) as figure:
-        distance, centre, found = figure.subplots(3, 1, sharex=True)
+        distance, centre, detection = figure.subplots(3, 1, sharex=True)
         figure.suptitle(title, fontsize=12)
         _draw_distance(distance, outlooks)
         _draw_centre(centre, outlooks)
-        _draw_found(found, outlooks)
-        found.set_xscale("log")
-        found.set_xlabel("height above the target [m]")
+        _draw_found(detection, outlooks)
+        detection.set_xscale("log")
+        detection.set_xlabel("height above the target [m]")
         heights = [outlook.height_m for outlook in outlooks]
-        found.set_xticks(heights, labels=[f"{height:g}" for height in heights])
-        found.tick_params(axis="x", which="minor", length=0.0, labelbottom=False)
+        detection.set_xticks(heights, labels=[f"{height:g}" for height in heights])
+        detection.tick_params(axis="x", which="minor", length=0.0, labelbottom=False)
         figure.savefig(stream, format=suffix[1:], metadata=_METADATA[suffix])
     write_bytes(path, stream.getvalue())
 
 
 def _draw_distance(axes: Axes, outlooks: Sequence[Outlook]) -> None:
-    seen = [(o.height_m, 1e3 * o.sd_distance_m) for o in outlooks if o.sd_distance_m is not None]
-    axes.plot(*_columns(seen), "o-", color=BLUE, label="one frame")
+    points = [(o.height_m, 1e3 * o.sd_distance_m) for o in outlooks if o.sd_distance_m is not None]
+    axes.plot(*_columns(points), "o-", color=BLUE, label="one frame")
     common = [
         (o.height_m, 1e3 * o.sd_common_distance_m)
         for o in outlooks
@@ -72,18 +72,18 @@ def _draw_distance(axes: Axes, outlooks: Sequence[Outlook]) -> None:
 
 
 def _draw_centre(axes: Axes, outlooks: Sequence[Outlook]) -> None:
-    seen = [(o.height_m, o.sd_centre_px) for o in outlooks if o.sd_centre_px is not None]
-    axes.plot(*_columns(seen), "o-", color=BLUE)
+    points = [(o.height_m, o.sd_centre_px) for o in outlooks if o.sd_centre_px is not None]
+    axes.plot(*_columns(points), "o-", color=BLUE)
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("sd of centre per axis [px]")
 
 
 def _draw_found(axes: Axes, outlooks: Sequence[Outlook]) -> None:
     heights = [o.height_m for o in outlooks]
-    found = [100.0 * o.found for o in outlooks]
+    rates = [100.0 * o.found for o in outlooks]
     below = [100.0 * (o.found - o.found_low) for o in outlooks]
     above = [100.0 * (o.found_high - o.found) for o in outlooks]
-    axes.errorbar(heights, found, yerr=(below, above), fmt="o", color=BLUE, ecolor=GREY, capsize=4)
+    axes.errorbar(heights, rates, yerr=(below, above), fmt="o", color=BLUE, ecolor=GREY, capsize=4)
     axes.set_ylim(0.0, 105.0)
     axes.set_ylabel("found [%]")
 

@@ -58,9 +58,9 @@ def _errors(
         label="± 1 sd",
     )
     axes.plot(moving.centre, moving.mean, color=VERMILION, linewidth=2.0, label="mean, 10 m")
-    known = np.isfinite(sd)
-    if known.any():
-        reported = moving_statistics(distance[known], sd[known], WINDOW_M)
+    is_stated = np.isfinite(sd)
+    if is_stated.any():
+        reported = moving_statistics(distance[is_stated], sd[is_stated], WINDOW_M)
         for sign, label in ((1.0, "reported ± 1 sd"), (-1.0, None)):
             axes.plot(
                 reported.centre, sign * reported.mean, "--", color=GREY, linewidth=1.4, label=label
@@ -126,10 +126,10 @@ def standardised_histogram(numbers: BiasNumbers) -> Picture:
             (raw, BLUE, True, "error / reported sd"),
             (left, VERMILION, False, "without scale and offset"),
         ):
-            known = np.clip(values[np.isfinite(values)], _BINS[0], _BINS[-1])
-            share = np.full(len(known), 1.0 / (len(known) * 0.5))
+            shown = np.clip(values[np.isfinite(values)], _BINS[0], _BINS[-1])
+            share = np.full(len(shown), 1.0 / (len(shown) * 0.5))
             axes.hist(
-                known,
+                shown,
                 bins=_BINS,
                 weights=share,
                 histtype="stepfilled" if filled else "step",
@@ -153,7 +153,7 @@ def _systematic_m(numbers: BiasNumbers) -> FloatArray:
 
 def error_in_time(numbers: BiasNumbers) -> Picture:
     """Draw errors in metres in time, or in the frames' order where not all have a time."""
-    time_s = np.array([one.attempt.time_s for one in numbers.compared], dtype=np.float64)
+    time_s = np.array([pair.attempt.time_s for pair in numbers.compared], dtype=np.float64)
     minutes, label = (time_s - time_s[0]) / 60.0, "time since the first [min]"
     if not np.isfinite(time_s).all():
         minutes, label = np.arange(float(len(time_s))), "frame, in order"
@@ -168,8 +168,8 @@ def error_in_time(numbers: BiasNumbers) -> Picture:
 
 def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
     """Draw errors in percent where in the image they were measured."""
-    measured = (one.attempt.sighting for one in numbers.compared)
-    centre_px = np.array([seen.centre_px for seen in measured if seen is not None])
+    measured = (pair.attempt.sighting for pair in numbers.compared)
+    centre_px = np.array([sighting.centre_px for sighting in measured if sighting is not None])
     with sheet(7.0, 0.8 + 5.1 * min(1.4, camera.height / camera.width)) as figure:
         axes = figure.subplots()
         axes.set_aspect("equal")
@@ -183,8 +183,8 @@ def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
 
 def flight_map(numbers: BiasNumbers) -> Picture:
     """Draw where the cameras were, and where the target was, coloured by the error."""
-    places = np.array([one.place_m for one in numbers.compared])
-    cameras = np.array([one.camera_m for one in numbers.compared])
+    places = np.array([pair.place_m for pair in numbers.compared])
+    cameras = np.array([pair.camera_m for pair in numbers.compared])
     with sheet(7.0, 6.0) as figure:
         axes = figure.subplots()
         axes.set_aspect("equal", adjustable="datalim")
@@ -221,16 +221,17 @@ def error_against_exposure(numbers: BiasNumbers) -> Picture:
     left = numbers.residual_percent - numbers.explained_percent
     shift = numbers.data.exposure["edge_shift_px"]
     displaced = [
-        one
-        for one in numbers.influences
-        if numbers.is_displaced and one.quantity.name != "edge_shift_px"
+        influence
+        for influence in numbers.influences
+        if numbers.is_displaced and influence.quantity.name != "edge_shift_px"
     ]
     count = -(-(len(numbers.influences) + len(displaced)) // 2)
     with sheet(7.0, 2.7 * count) as figure:
         panels = iter(figure.subplots(count, 2, squeeze=False).ravel())
         points = []
         # pairs side by side, and δ, which has no partner, behind them
-        for influence in (*displaced, *(one for one in numbers.influences if one not in displaced)):
+        alone = [influence for influence in numbers.influences if influence not in displaced]
+        for influence in (*displaced, *alone):
             axes = next(panels)
             axes.axhline(0.0, color="black", linewidth=0.8)
             points.append(scatter(axes, influence.rows, influence.values, left[influence.rows]))
@@ -239,8 +240,8 @@ def error_against_exposure(numbers: BiasNumbers) -> Picture:
             if influence not in displaced:
                 continue
             axes = next(panels)
-            known = np.isfinite(shift[influence.rows])
-            rows, x = influence.rows[known], influence.values[known]
+            has_shift = np.isfinite(shift[influence.rows])
+            rows, x = influence.rows[has_shift], influence.values[has_shift]
             points.append(scatter(axes, rows, x, shift[rows], None, GREEN))
             _line(axes, influence, influence.edge_shift)
             axes.set_ylabel("δ [px]", fontsize=11)
@@ -278,17 +279,17 @@ def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
     with sheet(7.0, 6.4) as figure:
         upper, lower = figure.subplots(2, 1)
         upper.axhline(0.0, color="black", linewidth=0.8)
-        one, two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
-        both = np.concatenate((one, two))
+        by_one, by_two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
+        both = np.concatenate((by_one, by_two))
         points = [
-            scatter(upper, rows, distance, one, "one edge", VERMILION, "x", both),
-            scatter(upper, rows, distance, two, "both edges", among=both),
+            scatter(upper, rows, distance, by_one, "one edge", VERMILION, "x", both),
+            scatter(upper, rows, distance, by_two, "both edges", among=both),
         ]
         upper.set_xlabel("reference distance [m]")
         upper.set_ylabel("error [%]")
         upper.legend(loc="best", ncols=2)
         shift = numbers.data.exposure["edge_shift_px"][rows]
-        points.append(scatter(lower, rows, shift, one - two, None, GREEN))
+        points.append(scatter(lower, rows, shift, by_one - by_two, None, GREEN))
         lower.set_xlabel("edge shift δ [px]")
         lower.set_ylabel("one edge − both [%]")
         return picture(figure, points)
@@ -303,12 +304,13 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
         axes.axhline(0.0, color="black", linewidth=0.8)
         points: list[Points] = []
         for gain in gains:
-            kept = [one for one in results if one.gain == gain and one.change_percent is not None]
-            lost = [one for one in results if one.gain == gain and one.change_percent is None]
+            of_gain = [result for result in results if result.gain == gain]
+            kept = [result for result in of_gain if result.change_percent is not None]
+            lost = [result for result in of_gain if result.change_percent is None]
             label = f"grey × {gain:g}"
             points.append(_changes(axes, kept, colours[gain], label))
             if lost:
-                x = np.array([one.radius_px for one in lost])
+                x = np.array([result.radius_px for result in lost])
                 axes.plot(x, np.zeros(len(x)), "x", color=colours[gain], label=f"{label}: lost")
         axes.set_xscale("log", base=2)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:.0f}")
@@ -319,10 +321,10 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
 
 
 def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, label: str) -> Points:
-    x = np.array([one.radius_px for one in kept])
-    y = np.array([one.change_percent for one in kept], dtype=np.float64)
-    sd = np.array([one.sd_percent or 0.0 for one in kept])
+    x = np.array([result.radius_px for result in kept])
+    y = np.array([result.change_percent for result in kept], dtype=np.float64)
+    sd = np.array([result.sd_percent or 0.0 for result in kept])
     axes.errorbar(
         x, y, yerr=sd, fmt="o", color=colour, ecolor=colour, elinewidth=1.0, capsize=3, label=label
     )
-    return Points(axes, np.array([one.row for one in kept], dtype=np.intp), x, y)
+    return Points(axes, np.array([result.row for result in kept], dtype=np.intp), x, y)

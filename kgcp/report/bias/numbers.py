@@ -207,7 +207,7 @@ class BiasNumbers:
     @property
     def frames(self) -> list[str]:
         """Names of the measurements' frames."""
-        return [one.attempt.frame for one in self.compared]
+        return [pair.attempt.frame for pair in self.compared]
 
     @property
     def biased(self) -> tuple[RangeRow, ...]:
@@ -237,21 +237,21 @@ class BiasNumbers:
 def bias_numbers(study: BiasStudy) -> BiasNumbers:
     """Reduce a study to its numbers; at least one trusted measurement is needed."""
     compared = in_time(study.trusted)
-    measured = [one.attempt.sighting for one in compared if one.attempt.sighting]
-    data = DistanceResiduals.of(compared, np.array([seen.distance_m for seen in measured]))
+    measured = [pair.attempt.sighting for pair in compared if pair.attempt.sighting]
+    data = DistanceResiduals.of(compared, np.array([sighting.distance_m for sighting in measured]))
     percent = 100.0 * data.residual_m / data.distance_m
     regression = regress(data)
     explained = np.zeros_like(percent)
     if regression is not None:
         explained = 100.0 * regression.systematic_m / data.distance_m
-    sd_reference = np.array([one.sds.total_m if one.sds else np.nan for one in compared])
+    sd_reference = np.array([pair.sds.total_m if pair.sds else np.nan for pair in compared])
     sd = np.sqrt(
-        np.array([seen.sd_distance_m for seen in measured], dtype=float) ** 2
-        + np.array([seen.sd_common_distance_m or 0.0 for seen in measured]) ** 2
+        np.array([sighting.sd_distance_m for sighting in measured], dtype=float) ** 2
+        + np.array([sighting.sd_common_distance_m or 0.0 for sighting in measured]) ** 2
         + np.nan_to_num(sd_reference) ** 2
     )
     total, halves, bins = _range_rows(data.distance_m, data.residual_m, sd_reference)
-    detected = [study.trusts(one) for one in study.chances]
+    detected = [study.trusts(pair) for pair in study.chances]
     scaled = (data.residual_m / sd)[np.isfinite(sd)]
     stated = sd_reference[np.isfinite(sd_reference)]
     left_out = Counter(absence.value for absence in study.absences)
@@ -266,14 +266,14 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         total=total,
         halves=halves,
         bins=bins,
-        rates=rates_by_distance([one.reference_distance_m for one in study.chances], detected),
-        radius_rates=rates_by_radius([one.expected_radius_px for one in study.chances], detected),
+        rates=rates_by_distance([pair.reference_distance_m for pair in study.chances], detected),
+        radius_rates=rates_by_radius([pair.expected_radius_px for pair in study.chances], detected),
         regression=regression,
         edges=_edges(study, compared),
         influences=_influences(data, percent - explained),
         standardised=Spread.of(scaled) if scaled.size else None,
         sd_reference_m=float(np.median(stated)) if stated.size else None,
-        astray=tuple(one.attempt.frame for one in study.measured if not study.trusts(one)),
+        astray=tuple(pair.attempt.frame for pair in study.measured if not study.trusts(pair)),
         detected=sum(detected),
         chances=len(detected),
         left_out=tuple(left_out.most_common()),
@@ -359,7 +359,7 @@ def _rates(
 
 
 def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | None:
-    pairs = [edge_distances(one, study.method) for one in compared]
+    pairs = [edge_distances(pair, study.method) for pair in compared]
     rows = np.flatnonzero([pair is not None for pair in pairs])
     if not rows.size:
         return None

@@ -78,17 +78,17 @@ def _range(row: RangeRow) -> Json:
     }
 
 
-def _regression(found: Regression | None) -> Json | None:
-    if found is None:
+def _regression(regression: Regression | None) -> Json | None:
+    if regression is None:
         return None
     return {
-        "count": found.count,
-        "outliers": int(found.outlier.sum()),
-        "scatter": found.scatter,
-        "correlation_s": found.correlation_s,
-        "exposure_share": found.exposure_share,
-        "exposure_probability": found.exposure_probability,
-        "tangled": list(found.tangled),
+        "count": regression.count,
+        "outliers": int(regression.outlier.sum()),
+        "scatter": regression.scatter,
+        "correlation_s": regression.correlation_s,
+        "exposure_share": regression.exposure_share,
+        "exposure_probability": regression.exposure_probability,
+        "tangled": list(regression.tangled),
         "terms": {
             term.name: {
                 "value": term.value,
@@ -97,7 +97,7 @@ def _regression(found: Regression | None) -> Json | None:
                 "significant": term.is_significant,
                 "text": meaning_of(term),
             }
-            for term in found.terms
+            for term in regression.terms
         },
     }
 

@@ -131,8 +131,8 @@ def _bias(numbers: BiasNumbers, limits: Limits) -> Finding:
     if numbers.total.percent.count == 1:
         return Finding(Grade.LOOK, "One frame says nothing about bias.", "error")
     if not numbers.biased:
-        known = numbers.total.sd_reference_percent is not None
-        beyond = "noise and the reference's own errors" if known else "noise"
+        is_stated = numbers.total.sd_reference_percent is not None
+        beyond = "noise and the reference's own errors" if is_stated else "noise"
         text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
         return Finding(Grade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
@@ -147,28 +147,30 @@ def _mean(row: RangeRow) -> str:
 
 
 def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
-    found = numbers.regression
-    if found is None:
+    regression = numbers.regression
+    if regression is None:
         text = "Scale and offset cannot be told apart: too few frames, or distances too alike."
         yield Finding(Grade.LOOK, text, "causes")
         return
-    basic = [term for term in found.terms if term.name in {"scale", "offset_m"}]
+    basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
     if not any(term.is_significant for term in basic):
         values = " and ".join(f"{label_of(term.name)} {value_of(term)}" for term in basic)
         yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
     large = {"scale": 0.01 * limits.scale_percent, "offset_m": limits.offset_m}
-    for term in found.terms:
+    for term in regression.terms:
         if term.name in large and term.is_significant:
             material = abs(term.value) >= large[term.name]
             yield Finding(Grade.LOOK if material else Grade.GOOD, meaning_of(term), "causes")
         elif term.name == "edge_curvature_px2":
             yield Finding(Grade.LOOK, meaning_of(term), "causes")
-    material = found.is_exposure_significant and found.exposure_share >= limits.exposure_share
-    yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(found), "exposure")
+    material = (
+        regression.is_exposure_significant and regression.exposure_share >= limits.exposure_share
+    )
+    yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(regression), "exposure")
 
 
 def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Finding]:
-    changes = [one.change_percent for one in reexposed if one.change_percent is not None]
+    changes = [again.change_percent for again in reexposed if again.change_percent is not None]
     if not changes:
         return
     rms = math.hypot(*changes) / math.sqrt(len(changes))
@@ -183,10 +185,10 @@ def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Find
 
 def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
     """Say whether the reported standard deviations are true; of what scale and offset leave."""
-    found = numbers.regression
-    if found is None or numbers.standardised is None or numbers.sd_reference_m is None:
+    regression = numbers.regression
+    if regression is None or numbers.standardised is None or numbers.sd_reference_m is None:
         return
-    spread = found.scatter
+    spread = regression.scatter
     if spread > limits.standardised_high:
         yield Finding(
             Grade.LOOK,
@@ -204,8 +206,8 @@ def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
 
 
 def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
-    found = numbers.regression
-    outliers = 0 if found is None else int(found.outlier.sum())
+    regression = numbers.regression
+    outliers = 0 if regression is None else int(regression.outlier.sum())
     astray = len(numbers.astray)
     if not outliers + astray:
         return

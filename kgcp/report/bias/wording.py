@@ -84,12 +84,12 @@ def probability_text(probability: float) -> str:
     return "< 0.0001" if probability < 1e-4 else f"{probability:.2g}"
 
 
-def exposure_sentence(found: Regression) -> str:
+def exposure_sentence(regression: Regression) -> str:
     """Return what exposure has to do with the residuals."""
-    if found.exposure_probability is None:
+    if regression.exposure_probability is None:
         return "No exposure quantity varies enough in this flight to be examined."
-    share = f"{100.0 * found.exposure_share:.0f} % of the variance that scale and offset leave"
-    if not found.is_exposure_significant:
+    share = f"{100.0 * regression.exposure_share:.0f} % of the variance that scale and offset leave"
+    if not regression.is_exposure_significant:
         return f"No exposure term is significant; together they explain {share}."
-    clear = [_LABELS[term.name] for term in found.exposure_terms if term.is_significant]
+    clear = [_LABELS[term.name] for term in regression.exposure_terms if term.is_significant]
     return f"The error follows the exposure ({', '.join(clear)}), which explains {share}."
