@@ -9,7 +9,8 @@ import pytest
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.closed_form.circles import concentric_clusters, near_circular, paper_outlines
-from kgcp.measurement.closed_form.contours import eight_bit, find_contours
+from kgcp.measurement.closed_form.contours import find_contours
+from kgcp.measurement.search.pyramid import eight_bit
 from kgcp.settings import DetectSettings
 
 SETTINGS = DetectSettings()

@@ -95,7 +95,7 @@ def test_edges_are_those_of_the_plain_version(seed: int) -> None:
     track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, centres, radii, edges, inlying)
     tracked = 0
     for i in range(40):
-        plain = track_plainly(grey, *centres[i], radii[i])
+        plain = track_plainly(grey, float(centres[i, 0]), float(centres[i, 1]), float(radii[i]))
         if plain is None:
             assert not inlying[i].any()
             continue
