@@ -67,7 +67,12 @@ def command(
             settings.method,
         )
         report = write_report(
-            *(study, the_flight, settings, place.out, reexpose), place.frames_of(the_flight)
+            study,
+            the_flight,
+            settings,
+            place.out,
+            reexpose,
+            stored_frames=place.frames_of(the_flight),
         )
     if as_json:
         import json

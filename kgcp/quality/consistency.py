@@ -15,7 +15,7 @@ from kgcp.georef.exterior_orientation import Views
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Place, Whereabouts
 from kgcp.quality.consistency_equations import Meeting, System
-from kgcp.quality.corrections import LIMITS, Estimate, estimate
+from kgcp.quality.corrections import UNKNOWN_LIMITS, Estimate, estimate
 from kgcp.quality.robust_gls import ErrorModel, find_outliers, weighted_products
 from kgcp.settings import VehicleSettings
 
@@ -110,7 +110,7 @@ def study_consistency(
         -equations.design,
         equations.offset,
         equations.fading + equations.white,
-        limits=LIMITS,
+        limits=UNKNOWN_LIMITS,
         least_scale=1.0,
     )
     if np.count_nonzero(~outlier) < MIN_POINTS:

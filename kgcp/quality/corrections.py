@@ -47,7 +47,7 @@ UNKNOWNS = (
 )
 """In the order in which they are believed: of those that look alike the last is given up."""
 
-LIMITS: FloatArray = np.array([unknown.limit for unknown in UNKNOWNS])
+UNKNOWN_LIMITS: FloatArray = np.array([unknown.limit for unknown in UNKNOWNS])
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ def estimate(products: FloatArray, count: int, *, has_sds: bool) -> Estimate:
         alone; with them they only enlarge it.
     """
     normal, observed, common = products[:-2, :-2], products[:-2, -2], products[:-2, -1]
-    visible = np.flatnonzero(np.diag(normal) * LIMITS**2 > 1.0).tolist()
+    visible = np.flatnonzero(np.diag(normal) * UNKNOWN_LIMITS**2 > 1.0).tolist()
     active, tangles = separable(normal, visible, [_MAX_INFLATION] * len(UNKNOWNS))
     inverse = np.linalg.inv(normal[np.ix_(active, active)])
     values = np.zeros(len(UNKNOWNS))
