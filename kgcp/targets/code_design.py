@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -13,14 +14,19 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.settings import require_range
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.validation import check_targets, same_shape
+from kgcp.targets.validation import check_targets, rotations_coincide, same_shape
 
 LEAST_DISTANCE = 2.0
 """Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
 DOTS = (3, 6)  # fewer say too little; of more, too many overlap however they are laid
-_GRID_DEG = 5.0
+_GRID_DEG, _STARTS = 5.0, 6
+# Where so many codes do not fit by a search on that grid, they may on a coarser one: codes are told
+# apart by a dot that is off by more than a dot's width, which is two steps of a grid just coarser
+# than half of it. On the fine grid the search leaves gaps between codes that no other fits into.
+# 50 codes of four dots are found so, from five of 48 starts; the fine grid ends at 43.
+_COARSE_GRIDS_DEG, _COARSE_STARTS = (6.0, 8.0, 9.0, 10.0, 12.0, 15.0, 18.0, 20.0, 24.0), 40
+_STRIDE = 8  # from start to start, down the list of the best codes
 _ROOM = 1.5  # from dot to dot, of a dot's width: ink must be seen between them
-_STARTS, _STRIDE = 6, 8  # searches begin at so many of the best codes, so far down the list
 _MOST = 10_000  # candidates: those that are farthest from themselves
 _BETTER = 1e-4  # of a dot
 
@@ -90,7 +96,7 @@ def _confusable(ring: Ring, other: str, apart: float) -> SettingError:
     return SettingError(
         "code_deg",
         f"the code of {ring.name!r} is only {apart:.1f} dots away from {other}",
-        f"give one that is at least {LEAST_DISTANCE:g} dots away, or let --new propose one",
+        f"give one that is at least {LEAST_DISTANCE:g} dots away, or have one proposed",
     )
 
 
@@ -99,10 +105,9 @@ def propose_codes(
 ) -> tuple[tuple[float, ...], ...]:
     """Return codes whose least distance, to themselves, each other and known ones, is large.
 
-    All codes on a grid of five degrees with ink between the dots are candidates. From the best
-    ones, the candidate that is farthest from all chosen is added; then each is exchanged for a
-    better one as long as there is one. The result is the best of several such searches; it need
-    not be the best of all.
+    All codes on a grid with ink between the dots are candidates. From the best ones, the candidate
+    that is farthest from all chosen is added; then each is exchanged for a better one as long as
+    there is one. The result is the best of several such searches; it need not be the best of all.
 
     Parameters
     ----------
@@ -119,33 +124,57 @@ def propose_codes(
         If there are not so many codes that cannot be confused.
     """
     require_range("dots", dots, *DOTS)
-    width_deg = 2.0 * ring.dot_half_angle_deg
-    candidates = _candidates(dots, width_deg)
-    if len(candidates) == 0:
+    if not len(_candidates(dots, 2.0 * ring.dot_half_angle_deg, _GRID_DEG)):
         raise SettingError(
             "dots", f"{dots} of this size do not fit on the code circle", "ask for fewer"
         )
-    own = 2.0 * (dots - _turned_overlap(candidates, width_deg))
-    for other in known:
-        own = np.minimum(own, _apart(candidates, np.array(other.code_deg), width_deg))
-    best = np.argsort(-own, kind="stable")[:_MOST]
-    candidates, field = candidates[best], _Candidates(candidates[best], own[best], width_deg, {})
-    starts = range(0, min(len(candidates), _STARTS * _STRIDE), _STRIDE)
-    found = [_search(field, start, count) for start in starts]
-    chosen, least = max(found, key=lambda result: result[1])
-    if len(set(chosen)) < count or least < LEAST_DISTANCE:
+    codes, least = _farthest_codes(ring, count, dots, known, _GRID_DEG, _STARTS)
+    coarse = next((step for step in _COARSE_GRIDS_DEG if step > ring.dot_half_angle_deg), None)
+    if least < LEAST_DISTANCE and coarse is not None:
+        codes, least = max(
+            (codes, least),
+            _farthest_codes(ring, count, dots, known, coarse, _COARSE_STARTS),
+            key=itemgetter(1),
+        )
+    if least < LEAST_DISTANCE:
         raise SettingError(
             "new",
             f"the best {count} codes of {dots} dots are only {least:.1f} dots apart",
-            "ask for fewer codes or more --dots",
+            "ask for fewer codes or for more dots",
         )
-    return tuple(tuple(map(float, candidates[index])) for index in sorted(chosen))
+    return codes
 
 
-def _candidates(dots: int, width_deg: float) -> FloatArray:
-    """Return the codes (m, dots) on the grid, once per rotation, the first dot at 0 [deg]."""
-    steps = round(360.0 / _GRID_DEG)
-    least = math.ceil(_ROOM * width_deg / _GRID_DEG)
+def _farthest_codes(
+    ring: Ring, count: int, dots: int, known: Sequence[Ring], grid_deg: float, starts: int
+) -> tuple[tuple[tuple[float, ...], ...], float]:
+    """Return codes of one grid that are far apart, and their least distance; 0 if there are none.
+
+    Codes that `check_targets` would take for one another count as no distance apart: all their
+    dots may be off by half a dot, which adds up to more than `LEAST_DISTANCE`.
+    """
+    width_deg = 2.0 * ring.dot_half_angle_deg
+    candidates = _candidates(dots, width_deg, grid_deg)
+    own = 2.0 * (dots - _turned_overlap(candidates, width_deg))
+    for other in known:
+        code = np.array(other.code_deg)
+        half_deg = min(ring.dot_half_angle_deg, other.dot_half_angle_deg)
+        own = np.minimum(own, _apart(candidates, code, width_deg))
+        own[rotations_coincide(candidates, code, half_deg)] = 0.0
+    best = np.argsort(-own, kind="stable")[:_MOST]
+    field = _Candidates(candidates[best], own[best], width_deg, grid_deg, {})
+    first = range(0, min(len(best), starts * _STRIDE), _STRIDE)
+    results = [_search(field, start, count) for start in first]
+    chosen, least = max(results, key=itemgetter(1), default=([], 0.0))
+    if len(set(chosen)) < count:
+        return (), 0.0
+    return tuple(tuple(map(float, field.codes[index])) for index in sorted(chosen)), least
+
+
+def _candidates(dots: int, width_deg: float, grid_deg: float) -> FloatArray:
+    """Return the codes (m, dots) on a grid, once per rotation, the first dot at 0 [deg]."""
+    steps = round(360.0 / grid_deg)
+    least = math.ceil(_ROOM * width_deg / grid_deg)
     free = steps - dots * least  # to be shared out among the gaps
     if free < 0:
         return np.empty((0, dots))
@@ -155,7 +184,7 @@ def _candidates(dots: int, width_deg: float) -> FloatArray:
     turned = np.stack([_as_number(np.roll(gaps, turn, axis=1)) for turn in range(dots)])
     gaps = gaps[turned[0] == turned.min(axis=0)]
     starts = np.cumsum(gaps, axis=1)[:, :-1]
-    codes: FloatArray = _GRID_DEG * np.hstack((np.zeros((len(gaps), 1)), starts))
+    codes: FloatArray = grid_deg * np.hstack((np.zeros((len(gaps), 1)), starts))
     return codes
 
 
@@ -212,8 +241,8 @@ class _Candidates:
         [deg]
     own : (m,) array
         Distances to themselves, turned, and to known codes.
-    width_deg : float
-        Of a dot.
+    width_deg, grid_deg : float
+        Of a dot, and from one place of a dot to the next.
     rows : dict
         Index of a candidate → distances (m,) of all to it.
     """
@@ -221,6 +250,7 @@ class _Candidates:
     codes: FloatArray
     own: FloatArray
     width_deg: float
+    grid_deg: float
     rows: dict[int, FloatArray]
 
     def apart(self, index: int) -> FloatArray:
@@ -230,16 +260,18 @@ class _Candidates:
         the other's dots.
         """
         if index not in self.rows:
-            grid_deg = _GRID_DEG * np.arange(round(360.0 / _GRID_DEG))
-            turned = grid_deg[:, None] + grid_deg
+            places_deg = self.grid_deg * np.arange(round(360.0 / self.grid_deg))
+            turned = places_deg[:, None] + places_deg
             overlap = np.zeros(len(self.codes))
             for other in (self.codes[index], -self.codes[index]):
                 covered = sum(_share(turned - dot, self.width_deg) for dot in other)
                 table = np.asarray(covered, dtype=np.float32)
-                steps = np.rint(self.codes / _GRID_DEG).astype(int)
+                steps = np.rint(self.codes / self.grid_deg).astype(int)
                 by_turn = sum(table[column] for column in steps.T)
                 overlap = np.maximum(overlap, np.max(by_turn, axis=1))
-            self.rows[index] = 2.0 * (self.codes.shape[1] - overlap)
+            distances = 2.0 * (self.codes.shape[1] - overlap)
+            same = rotations_coincide(self.codes, self.codes[index], 0.5 * self.width_deg)
+            self.rows[index] = np.where(same, 0.0, distances)
         return self.rows[index]
 
     def farthest(self, others: Sequence[int]) -> tuple[int, float]:

@@ -70,7 +70,7 @@ def lay_out(artwork: Artwork, name: str, paper: Paper, *, is_tiled: bool) -> tup
         if need_mm[0] <= size_mm[0] and need_mm[1] <= size_mm[1]:
             return (_one_sheet(artwork, size_mm),)
     if not is_tiled:
-        remedy = "give --tiled, a larger --sheet or --sheet fit"
+        remedy = "allow several sheets, or take a larger one or 'fit'"
         raise _too_large(name, need_mm, f"{paper} is smaller", remedy)
     plans = [_grid(artwork.box, size_mm) for size_mm in (paper.size_mm, paper.size_mm[::-1])]
     size_mm, rows, columns = min(plans, key=lambda plan: plan[1] * plan[2])

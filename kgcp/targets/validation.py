@@ -8,6 +8,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from kgcp.errors import SettingError
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.targets.layout import Ring, Target
 
 _SAME_SHAPE = 0.1  # relative; ellipses of small targets do not show finer differences
@@ -45,14 +46,28 @@ def same_shape(first: Ring, second: Ring) -> bool:
 
 def codes_coincide(first: Ring, second: Ring) -> bool:
     """Whether some rotation lays every dot of one code at least half onto a dot of the other."""
-    if len(first.code_deg) != len(second.code_deg):
-        return False
-    tolerance_deg = min(first.dot_half_angle_deg, second.dot_half_angle_deg)
-    here, count = np.asarray(first.code_deg), len(first.code_deg)
-    there = np.asarray(second.code_deg)[np.add.outer(np.arange(count), np.arange(count)) % count]
-    offsets = there - here
-    offsets = np.mod(offsets - offsets[:, :1] + 180.0, 360.0) - 180.0  # about the first dot's
-    return bool(np.ptp(offsets, axis=1).min() <= 2.0 * tolerance_deg)
+    half_deg = min(first.dot_half_angle_deg, second.dot_half_angle_deg)
+    codes, other = np.array([first.code_deg]), np.array(second.code_deg)
+    return bool(rotations_coincide(codes, other, half_deg)[0])
+
+
+def rotations_coincide(codes: FloatArray, other: FloatArray, half_deg: float) -> BoolArray:
+    """Tell which codes coincide with another one, as `codes_coincide`.
+
+    Parameters
+    ----------
+    codes, other : (m, n) and (k,) array
+        Directions of the dots, ascending [deg].
+    half_deg : float
+        Half the angle that a dot takes on the code circle.
+    """
+    count = codes.shape[1]
+    if len(other) != count:
+        return np.zeros(len(codes), dtype=np.bool_)
+    turned = other[np.add.outer(np.arange(count), np.arange(count)) % count]
+    offsets = turned - codes[:, None, :]
+    offsets = np.mod(offsets - offsets[..., :1] + 180.0, 360.0) - 180.0  # about the first dot's
+    return np.asarray(np.ptp(offsets, axis=2).min(axis=1) <= 2.0 * half_deg)
 
 
 def _proportions(ring: Ring) -> tuple[float, ...]:

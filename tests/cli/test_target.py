@@ -121,7 +121,7 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
         (["FLIGHT", "--target", "C"], "'C' is not in flight.toml; give one of A, B b"),
         (["FLIGHT", "--plate", "0.16"], "give at least 0.1875 m"),
         (["FLIGHT", "--holes", "5"], "plate: is required by --round"),
-        (["FLIGHT", "--sheet", "A4", "--plate", "0.25"], "A4 is smaller; give --tiled"),
+        (["FLIGHT", "--sheet", "A4", "--plate", "0.25"], "A4 is smaller; allow several sheets"),
         (["FLIGHT", "--tiled"], "'fit' is one sheet"),
         (["FLIGHT", "--format", "png", "--dpi", "2400", "--plate", "0.5"], "million pixels"),
         (["FLIGHT", "--target", "A", "--new", "1"], "target: cannot be combined with --new"),

@@ -18,6 +18,7 @@ from kgcp.targets.code_design import (
     propose_codes,
 )
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.validation import rotations_coincide
 
 
 def ring(*code_deg: float, name: str = "T") -> Ring:
@@ -74,7 +75,7 @@ def test_what_looks_the_same_when_turned_is_near_itself() -> None:
 def test_proposed_codes_are_the_farthest_of_all() -> None:
     """With three dots there are few enough to try all pairs."""
     width_deg = 2.0 * ring(0).dot_half_angle_deg
-    candidates = code_design._candidates(3, width_deg)
+    candidates = code_design._candidates(3, width_deg, 5.0)
     everything = [ring(*code, name=str(i)) for i, code in enumerate(candidates)]
     own = np.array([dots_apart_turned(one) for one in everything])
     proposed = named(propose_codes(ring(0), 1, 3))
@@ -134,3 +135,26 @@ def test_codes_that_are_proposed_pass() -> None:
 def test_too_many_codes_are_refused() -> None:
     with pytest.raises(SettingError, match=r"only \d\.\d dots apart"):
         propose_codes(ring(0), 40, 3)
+
+
+@pytest.mark.parametrize(("count", "dots"), [(10, 4), (12, 4), (18, 4), (20, 5)])
+def test_many_proposed_codes_pass_too(count: int, dots: int) -> None:
+    """Codes that differ by two dots may coincide if all their dots are off by half a dot."""
+    proposed = named(propose_codes(ring(0), count, dots))
+    check_new_codes([Target(one) for one in proposed], [])
+
+
+def test_fifty_codes_of_four_dots_fit_on_a_coarse_grid() -> None:
+    codes, least = code_design._farthest_codes(ring(0), 50, 4, [], 12.0, 40)
+    assert least >= LEAST_DISTANCE
+    check_new_codes([Target(one) for one in named(codes)], [])
+
+
+@given(st.integers(2, 6), st.floats(0.0, 360.0), st.floats(0.0, 11.5), st.integers(0, 10**6))
+def test_codes_coincide_where_all_dots_are_off_by_less_than_half_a_dot(
+    dots: int, turn_deg: float, off_deg: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    code = np.array(random_code(dots, rng))
+    moved = np.sort(np.mod(code + rng.choice([-off_deg, off_deg], dots) + turn_deg, 360.0))
+    assert rotations_coincide(code[None], moved, ring(0).dot_half_angle_deg)[0]

@@ -116,7 +116,7 @@ def test_a_ruler_is_as_long_as_it_says() -> None:
 
 def test_impossible_sheets_say_what_helps() -> None:
     artwork = draw_target(LARGE, None)
-    with pytest.raises(SettingError, match=r"1145 × \d+ mm, A4 is smaller; give --tiled"):
+    with pytest.raises(SettingError, match=r"1145 × \d+ mm, A4 is smaller; allow several sheets"):
         lay_out(artwork, "A", Paper.A4, is_tiled=False)
     with pytest.raises(SettingError, match="'fit' is one sheet"):
         lay_out(artwork, "A", Paper.FIT, is_tiled=True)
