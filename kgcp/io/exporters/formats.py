@@ -15,8 +15,6 @@ class Format:
     ----------
     files : tuple of str
         What it writes, below the results' folder; in brackets: only where there is something.
-    description : str
-        One line.
     """
 
     files: tuple[str, ...]

@@ -81,9 +81,9 @@ def _gcps(points: MapPoints, camera_ids: Mapping[str, int]) -> list[dict[str, ob
             "id": point_id,
             "geolocation": {
                 "crs": {"definition": definition},
-                "coordinates": _ordered(points, group[0].position_map.tolist()),
-                "sigmas": _ordered(
-                    points, (deviations(known_cov(group[0], _FOLDER)) / units).tolist()
+                "coordinates": points.own_axes(group[0].position_map.tolist()),
+                "sigmas": points.own_axes(
+                    (deviations(known_cov(group[0], _FOLDER)) / units).tolist()
                 ),
             },
             "marks": [_mark(point, camera_ids[point.frame]) for point in group],
@@ -99,11 +99,6 @@ def _mark(point: Kgcp, camera_id: int) -> dict[str, object]:
         "position_px": (point.centre_px + CORNER_PX).tolist(),
         "accuracy": largest_sd(known_centre_cov(point, _FOLDER)),
     }
-
-
-def _ordered(points: MapPoints, values: list[float]) -> list[float]:
-    x, y, z = values
-    return [y, x, z] if points.is_north_first else [x, y, z]
 
 
 def _definition(points: MapPoints) -> str:

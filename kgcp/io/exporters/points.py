@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 from pyproj import CRS
@@ -17,6 +18,8 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.gcp import Kgcp
+
+Cell = TypeVar("Cell", str, float)
 
 METRE_DECIMALS = 7  # points that differ never look the same
 DEGREE_DECIMALS = 12
@@ -76,7 +79,7 @@ class MapPoints:
         x, y, z = position_map
         return f"{x:.{decimals}f}", f"{y:.{decimals}f}", f"{z * height_factor:.{METRE_DECIMALS}f}"
 
-    def own_axes(self, xyz: Sequence[str]) -> tuple[str, str, str]:
+    def own_axes(self, xyz: Sequence[Cell]) -> tuple[Cell, Cell, Cell]:
         """Bring x, y, z into the order of the CRS's own definition."""
         x, y, z = xyz
         return (y, x, z) if self.is_north_first else (x, y, z)
@@ -194,13 +197,7 @@ def image_names(
 
 
 def known_cov(point: Kgcp, where: str) -> FloatArray:
-    """Return a point's covariance (3, 3) in map axes [m²].
-
-    Raises
-    ------
-    KgcpError
-        If it has none.
-    """
+    """Return a point's covariance (3, 3) in map axes [m²]; `KgcpError` if it has none."""
     if point.cov_m2 is None:
         raise KgcpError(
             f"{where}: point {point.id} has no standard deviations, which the format needs; give"
@@ -211,13 +208,7 @@ def known_cov(point: Kgcp, where: str) -> FloatArray:
 
 
 def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
-    """Return the covariance (2, 2) of an image point [px²].
-
-    Raises
-    ------
-    KgcpError
-        If it has none.
-    """
+    """Return the covariance (2, 2) of an image point [px²]; `KgcpError` if it has none."""
     if point.centre_cov_px2 is None:
         raise KgcpError(
             f"{where}: the image point of {point.id} has no standard deviations, which the format"

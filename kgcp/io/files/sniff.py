@@ -30,8 +30,6 @@ class ForeignFile:
 
     Attributes
     ----------
-    path : Path
-        Where it lies.
     toml_key : str
         Where flight.toml names it, for messages.
     """

@@ -52,8 +52,6 @@ class Reference:
     ----------
     file : Path
         It is not looked for until a command needs it.
-    notation : PoseNotation
-        How the file is to be understood.
     """
 
     file: Path
@@ -66,14 +64,10 @@ class Flight:
 
     Attributes
     ----------
-    folder : Path
-        Where flight.toml lies.
     name : str
         Of the flight; the folder's where flight.toml gives none.
     crs : str or None
         Coordinate reference system of vehicle, reference and static targets, for pyproj.
-    frames_folder : Path
-        Where the images lie.
     times_file : Path or None
         Frame times; None: EXIF gives them.
     times_format : str or None
@@ -85,8 +79,6 @@ class Flight:
         horizontal axis, in frames without reference attitude [deg]; None: not known.
     targets : tuple of Target
         In the order of the file.
-    toml_text : str
-        flight.toml as it was read.
     """
 
     folder: Path

@@ -38,10 +38,6 @@ class TomlTable:
     ----------
     where : str
         The file and the table, for messages: `flight.toml: [camera]`.
-    values : mapping
-        What tomllib read.
-    known : sequence of str
-        The keys that may stand in it.
 
     Raises
     ------

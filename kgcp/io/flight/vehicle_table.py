@@ -27,8 +27,6 @@ class Vehicle:
     ----------
     trajectory_file : Path
         It is not looked for until a command needs it.
-    notation : TrajectoryNotation
-        How the file is to be understood.
     """
 
     settings: VehicleSettings

@@ -29,12 +29,6 @@ class Exif:
     ----------
     time_s : float or None
         Unix seconds (UTC) of DateTimeOriginal: when the camera says it took the frame.
-    exposure_time_s : float or None
-        Exposure time [s].
-    iso : float or None
-        Sensitivity.
-    f_number : float or None
-        Focal length over aperture.
     """
 
     time_s: float | None = None

@@ -6,9 +6,10 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -54,23 +55,39 @@ def list_frames(folder: Path) -> list[str]:
     """
     if not is_folder(folder):
         raise KgcpError(f"{folder}: is not a folder; correct [frames] folder in flight.toml")
-    frames = []
+    names = []
     for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        frames += [
-            (Path(parent) / name).relative_to(folder).as_posix()
-            for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in FRAME_SUFFIXES
-        ]
-    if not frames:
-        raise KgcpError(
-            f"{folder}: holds no images; put the frames there or correct [frames] folder"
-            " in flight.toml"
-        )
+        names += [(Path(parent) / name).relative_to(folder).as_posix() for name in files]
+    frames = frames_among(names, str(folder))
     for name in frames:
         if _UNDECODED.search(name):
             raise KgcpError(f"{folder}: the name {name!r} is not UTF-8; rename the file")
-    return sorted(frames)
+    return frames
+
+
+def frames_among(names: Sequence[str], folder: str) -> list[str]:
+    """Return the images among the files of a folder, by their paths below it, sorted.
+
+    Raises
+    ------
+    KgcpError
+        If there are none; it says what the folder holds instead.
+    """
+    shown = [name for name in names if not any(part[0] == "." for part in name.split("/"))]
+    frames = [name for name in shown if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
+    if frames:
+        return sorted(frames)
+    other = Counter(PurePosixPath(name).suffix.lower() for name in shown).most_common(1)
+    if other and other[0][0]:
+        suffix, count = other[0]
+        raise KgcpError(
+            f"{folder}: holds no images that kgcp reads, but {count} {suffix} files; convert them"
+            " to JPEG, PNG or TIFF, or correct [frames] folder in flight.toml"
+        )
+    raise KgcpError(
+        f"{folder}: holds no images; put the frames there or correct [frames] folder in flight.toml"
+    )
 
 
 def _refuse_folder(error: OSError) -> None:
@@ -84,8 +101,6 @@ def read_grey(path: Path, camera: Camera) -> GreyArray:
     ----------
     path : Path
         An image of 8 or 16 bits, grey or colour (of which the luma is taken).
-    camera : Camera
-        Says what size the frame must have.
 
     Returns
     -------

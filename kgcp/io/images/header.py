@@ -1,4 +1,10 @@
-"""What the header of an image says, before anything of it is decoded or even read."""
+"""What the header of an image says, before anything of it is decoded or even read.
+
+Pillow tells sizes, but not those of TIFFs: it refuses pixels that frames may have (16-bit RGB), and
+reads every tag on opening. So the directory of a TIFF is walked here, by TIFF 6.0, section 2, and
+by BigTIFF, which counts with 8 bytes where TIFF has 2 or 4. The same walk finds the orientation,
+and files whose tags claim more bytes than there are.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +23,7 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 _WIDTH, _HEIGHT, _ORIENTATION, _EXIF = 256, 257, 274, 34665
 _UPRIGHT = 1
 _SHORT = 3
-_MOST_TAGS = 0xFFFF  # more, libtiff does not read either
+_MOST_TAGS = 0xFFFF  # libtiff reads no more either
 _BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # of types; others: 1
 _INTEGERS = {1: "B", _SHORT: "H", 4: "I", 16: "Q"}  # BYTE, SHORT, LONG, LONG8
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from kgcp.errors import KgcpError
-from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
+from kgcp.io.images.frames import frames_among, list_frames
 
 if TYPE_CHECKING:
     from pyarrow.fs import FileInfo, FileSystem
@@ -206,18 +206,7 @@ def frames_below(folder: Path | StoredFolder) -> list[str]:
     """
     if isinstance(folder, Path):
         return list_frames(folder)
-    names = [
-        name
-        for name, _ in folder.files(is_deep=True)
-        if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES
-        and not any(part.startswith(".") for part in name.split("/"))
-    ]
-    if not names:
-        raise KgcpError(
-            f"{folder}: holds no images; put the frames there or correct [frames] folder"
-            " in flight.toml"
-        )
-    return sorted(names)
+    return frames_among([name for name, _ in folder.files(is_deep=True)], str(folder))
 
 
 def stamps_of(

@@ -35,14 +35,10 @@ def write_table(
 
     Parameters
     ----------
-    path : Path
-        Target file; its folder is made if need be.
     columns : sequence of Column
         The declared columns; a row that lacks one or has others is a programming error.
     rows : iterable of mapping
         Column name to value; None is null. Only a part of them is in memory at a time.
-    metadata : mapping of str
-        Goes into the Parquet schema's key-value metadata.
 
     Raises
     ------

@@ -47,11 +47,6 @@ def versions() -> dict[str, str]:
 def write_run_record(path: Path, record: Mapping[str, object]) -> None:
     """Write a run's record, with versions, the machine and the peak of memory, as JSON.
 
-    Parameters
-    ----------
-    record : mapping
-        What the run has to say: settings, counts, times.
-
     Raises
     ------
     KgcpError

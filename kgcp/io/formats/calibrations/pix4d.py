@@ -9,7 +9,7 @@ size it states; the other .cam, of Inpho, has another model and is refused.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from functools import partial
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile
@@ -20,6 +20,7 @@ _LAST_OF_HEAD = re.compile(r"camera model\b")
 _CAM_HEAD = re.compile(r"^[^\S\n]*Pix4D camera calibration file\s+(\S+)", re.MULTILINE)
 _SENSOR = re.compile(r"sensor width of\s+([\d.eE+-]+)\s*x\s*([\d.eE+-]+)\s*mm")
 _BLOCK_LINES = 10
+_COUNTS = (3, 3, 3, 3, 2)  # of numbers in the lines after an image's name
 
 # fx fy cx cy k1 k2 k3 p1 p2
 _Parameters = tuple[float, ...]
@@ -54,30 +55,24 @@ def _image_entries(file: ForeignFile) -> tuple[Entry, ...]:
         raise file.error(
             "is not made of blocks of ten lines per image", "export it from Pix4D again"
         )
-    found: dict[tuple[tuple[int, int], _Parameters], str] = {}
+    names: dict[tuple[tuple[int, int], _Parameters], str] = {}
     for start in range(0, len(rows), _BLOCK_LINES):
-        name, size, parameters = _image_block(file, rows[start : start + _BLOCK_LINES])
-        found.setdefault((size, parameters), name)
+        line, first = rows[start]
+        name, *size = first.rsplit(maxsplit=2)
+        width, height = file.numbers(" ".join(size), 2, f"line {line}")
+        # camera matrix (3 lines), radial, tangential; position and rotation follow
+        (fx, skew, cx), (_, fy, cy), _, radial, tangential = (
+            file.numbers(row, count, f"line {line}")
+            for count, (line, row) in zip(_COUNTS, rows[start + 1 : start + 6], strict=True)
+        )
+        if skew:
+            raise unsupported(file, f"a skew of {skew:g}", f"line {rows[start + 1][0]}")
+        parameters = (fx, fy, cx, cy, *radial, *tangential)
+        names.setdefault(((int(width), int(height)), parameters), name)
     return tuple(
-        Entry(name, size, _converter(*parameters)) for (size, parameters), name in found.items()
+        Entry(name, size, partial(_camera, parameters))
+        for (size, parameters), name in names.items()
     )
-
-
-def _image_block(
-    file: ForeignFile, rows: Sequence[tuple[int, str]]
-) -> tuple[str, tuple[int, int], _Parameters]:
-    """Return name, size [px], and fx fy cx cy k1 k2 k3 p1 p2 of one image."""
-    line, head = rows[0]
-    name, *size = head.rsplit(maxsplit=2)
-    width, height = file.numbers(" ".join(size), 2, f"line {line}")
-    counts = (3, 3, 3, 3, 2)
-    (fx, skew, cx), (_, fy, cy), _, radial, tangential = (
-        file.numbers(row, count, f"line {number}")
-        for count, (number, row) in zip(counts, rows[1:6], strict=True)
-    )
-    if skew:
-        raise unsupported(file, f"a skew of {skew:g}", f"line {rows[1][0]}")
-    return name, (int(width), int(height)), (fx, fy, cx, cy, *radial, *tangential)
 
 
 def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
@@ -102,18 +97,14 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
                 f" {width} x {height} px",
                 "correct width and height in [camera]",
             )
-        lengths = (number("F"), number("F"), number("Px"), number("Py"))
-        terms = (number("K1"), number("K2"), number("K3"), number("T1"), number("T2"))
-        return _converter(*(per_mm * length for length in lengths), *terms)(width, height)
+        lengths = [per_mm * number(key) for key in ("F", "F", "Px", "Py")]
+        terms = [number(key) for key in ("K1", "K2", "K3", "T1", "T2")]
+        return _camera((*lengths, *terms), width, height)
 
     return Entry(name, None, convert)
 
 
-def _converter(*parameters: float) -> Callable[[int, int], Camera]:
+def _camera(parameters: _Parameters, width: int, height: int) -> Camera:
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
-
-    def convert(width: int, height: int) -> Camera:
-        x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
-        return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
-
-    return convert
+    x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
+    return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)

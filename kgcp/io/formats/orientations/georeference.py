@@ -35,16 +35,8 @@ def on_the_map(
 
     Parameters
     ----------
-    file : ForeignFile
-        For messages.
-    source : SourcePoses
-        As they stand in the file.
     frames : tuple of str
         Their names in the flight.
-    notation : PoseNotation
-        What flight.toml says about the file.
-    crs : str or None
-        The flight's.
 
     Raises
     ------

@@ -17,10 +17,6 @@ def frames_of(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) ->
 
     Parameters
     ----------
-    file : ForeignFile
-        For messages.
-    names : sequence of str
-        Of images.
     frames : sequence of str
         Of the flight, relative to the frames folder; each may stand there repeatedly.
 

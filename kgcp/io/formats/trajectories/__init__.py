@@ -41,8 +41,6 @@ def read_trajectory(
     ----------
     flight_crs : str
         CRS of the flight, for pyproj: that of the result.
-    notation : TrajectoryNotation
-        What flight.toml says about the file.
 
     Raises
     ------

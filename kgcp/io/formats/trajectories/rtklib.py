@@ -1,4 +1,8 @@
-"""Trajectories of RTKLIB: `.pos`."""
+"""Trajectories of RTKLIB: `.pos`.
+
+By RTKLIB's manual, appendix B: heights are above the ellipsoid or a geoid, as the header says;
+covariances stand as signed square roots, `sdne` for the one of north and east.
+"""
 
 from __future__ import annotations
 

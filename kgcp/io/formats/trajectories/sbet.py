@@ -1,4 +1,10 @@
-"""Applanix's smoothed best estimate of trajectory (SBET), and its accuracies (smrmsg)."""
+"""Applanix's smoothed best estimate of trajectory (SBET), and its accuracies (smrmsg).
+
+By POSPac MMS's export formats: both are records of little-endian doubles without any header, so
+that a file says neither its day nor its time system. Angles of SBET are radians. The heading is
+that of the platform in the wander frame, unless the export has corrected it: programs differ, hence
+[vehicle] wander. Standard deviations of smrmsg are metres (north before east) and arc minutes.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +24,7 @@ from kgcp.io.formats.trajectories.times import times_from_week
 _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, heading, wander, …
 _ACCURACY = 10  # time, sd of north, east, down, of 3 velocities, of roll, pitch, heading
 _DOUBLE = 8
+_ARC_MINUTES_PER_DEGREE = 60.0
 _MOST_BYTES = (1 << 30) - 1  # ten hours at 200 Hz
 _MAX_WANDER_RAD = 1e-6
 _TINY = 1e-12  # zeros, and what other bytes are as doubles
@@ -125,4 +132,4 @@ def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, Float
             f"{path}: holds standard deviations that are negative or not finite; export it again"
         )
     at_epochs = np.column_stack([np.interp(wanted, own, column) for column in deviations.T])
-    return at_epochs[:, :3], at_epochs[:, 3:] / 60.0
+    return at_epochs[:, :3], at_epochs[:, 3:] / _ARC_MINUTES_PER_DEGREE

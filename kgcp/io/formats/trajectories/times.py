@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import date, datetime
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -58,14 +58,10 @@ def times_from_week(path: Path, seconds: FloatArray, notation: TrajectoryNotatio
     if clock_s is None:
         raise KgcpError(
             f"{path}: its first epoch, second {seconds[0]:g} of the week, is on a"
-            f" {weekday(float(seconds[0]))}, but {_named(day)}; correct [vehicle] date in"
+            f" {weekday(float(seconds[0]))}, but {day} is a {day:%A}; correct [vehicle] date in"
             " flight.toml"
         )
     return unix_from_clock(clock_s, system)
-
-
-def _named(day: date) -> str:
-    return f"{day} is a {weekday(86400.0 * ((day.weekday() + 1) % 7))}"
 
 
 def _numbers(path: Path, lines: Sequence[int], texts: Sequence[str]) -> FloatArray:
