@@ -1,0 +1,99 @@
+"""The masks' loops over pixels against plain versions, one pixel at a time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from kgcp.measurement.adjustment.masks import _fill_ellipse, _mark_foreign, _mark_other, _plateaus
+
+PIXELS = 4000
+BLACK, WHITE, RADIUS_M, SD_M, SLACK_M = 0.1, 0.8, 0.45, 0.02, 0.004
+
+
+@pytest.mark.parametrize("white", [0.8, 1.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(seed: int, white: float) -> None:
+    rng = np.random.default_rng(seed)
+    points_m = rng.uniform(-0.65, 0.65, (2, PIXELS))
+    rho_m, smooth = np.hypot(*points_m), rng.uniform(0.0, 1.0, PIXELS)
+    spread = np.array([1.0, 0.2, 0.5])
+    foreign = np.empty(PIXELS, dtype=bool)
+    count = _mark_foreign(
+        smooth, points_m, rho_m, spread, BLACK, white, RADIUS_M, SD_M, SLACK_M, foreign
+    )
+    expected = np.zeros(PIXELS, dtype=bool)
+    for i in range(PIXELS):
+        beyond_m = rho_m[i] - RADIUS_M
+        if beyond_m > 2.6 * SD_M:
+            expected[i] = abs(smooth[i] - min(white, 1.0)) > 0.15 * (white - BLACK)
+        elif beyond_m > SLACK_M:
+            direction = points_m[:, i] / rho_m[i]
+            covariance = np.array([[spread[0], spread[1]], [spread[1], spread[2]]])
+            sd_m = SD_M * math.sqrt(direction @ covariance @ direction)
+            sigmas = (beyond_m - SLACK_M) / sd_m
+            darkest = BLACK + (white - BLACK) * (norm.cdf(sigmas) - 0.15)
+            expected[i] = sigmas > 0.85 and smooth[i] < min(darkest, 1.0)
+    np.testing.assert_array_equal(foreign, expected)
+    assert count == expected.sum()
+    assert 100 < count < PIXELS - 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    smooth, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
+    share, off_edge_m = rng.integers(0, 2, PIXELS) * 1.0, rng.uniform(0.0, 0.1, PIXELS)
+    contrast = WHITE - BLACK
+    hidden = np.zeros(PIXELS, dtype=bool)
+    counts = _mark_other(
+        smooth, share, off_edge_m, rho_m, BLACK, contrast, RADIUS_M, SLACK_M, SD_M, hidden
+    )
+    expected, tested = np.zeros(PIXELS, dtype=bool), 0
+    for i in range(PIXELS):
+        off_m, beyond_m = off_edge_m[i] - SLACK_M, rho_m[i] - RADIUS_M - SLACK_M
+        off_level = abs(smooth[i] - (BLACK + contrast * share[i])) / contrast
+        limits = [math.inf]
+        if off_m > 2.6 * SD_M and beyond_m < 0.0:
+            limits.append(0.25)
+        if off_m > 1.2 * SD_M and beyond_m < 1.9 * SD_M:
+            limits.append(0.5)
+        expected[i] = off_level > min(limits)
+        tested += len(limits) > 1
+    np.testing.assert_array_equal(hidden, expected)
+    assert counts == (expected.sum(), tested)
+    assert 100 < counts[0] < tested - 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_levels_are_medians_of_the_third_that_is_clearest_of_edges(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    levels, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
+    share, off_edge_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.1, PIXELS)
+    expected = []
+    for is_kind in (share < 0.5, share >= 0.5):
+        chosen = is_kind & (rho_m < RADIUS_M)
+        clearest = np.argsort(off_edge_m[chosen])[int(0.7 * chosen.sum()) :]
+        expected.append(float(np.median(levels[chosen][clearest])))
+    assert _plateaus(levels, rho_m, share, off_edge_m, RADIUS_M) == pytest.approx(tuple(expected))
+
+
+def test_without_ink_its_level_is_unknown() -> None:
+    one = np.ones(10)
+    black, white = _plateaus(0.7 * one, 0.1 * one, one, one, RADIUS_M)
+    assert math.isnan(black)
+    assert white == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("blur", [(1.0, 1.0, 0.0), (2.3, 0.8, 0.5), (0.7, 3.1, -1.2)])
+def test_the_reach_of_a_blur_is_its_ellipse(blur: tuple[float, float, float]) -> None:
+    xx, yy, xy = blur
+    kernel = np.empty((9, 9), dtype=np.uint8)
+    _fill_ellipse(xx, yy, xy, 2.0, kernel)
+    inverse = np.linalg.inv([[xx, xy], [xy, yy]])
+    for row, column in np.ndindex(9, 9):
+        offset = np.array([column - 4, row - 4])
+        assert kernel[row, column] == (offset @ inverse @ offset <= 4.0 + 1e-9)
