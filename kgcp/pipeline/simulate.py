@@ -7,6 +7,7 @@ import io
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +25,7 @@ from kgcp.io.flight.target_table import target_lines
 from kgcp.pipeline.execution.resilient_map import ordered_map
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import VehicleSettings
+from kgcp.simulation.effects import Effects
 from kgcp.simulation.flight import (
     CRS,
     TARGET_PLATE,
@@ -34,6 +36,7 @@ from kgcp.simulation.flight import (
     render_frame,
 )
 from kgcp.simulation.ground import Ground
+from kgcp.simulation.presets import SimulationSettings, preset
 
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -77,6 +80,8 @@ def _camera_lines(camera: Camera) -> Iterator[str]:
         if value := getattr(camera, key):
             yield f"{key} = {value!r}"
     yield f"response = {json.dumps(camera.response.value)}"
+    if camera.readout_s:
+        yield f"readout_s = {camera.readout_s!r}"
 
 
 def _vehicle_lines(vehicle: VehicleSettings) -> Iterator[str]:
@@ -95,7 +100,7 @@ def readme(plan: FlightPlan) -> str:
     survey = "" if settings.sd_position_m[0] else " --no-survey-errors"
     command = (
         f"kgcp simulate OUT --preset {settings.name} --frames {settings.frames}"
-        f" --seed {plan.seed}{survey}"
+        f" --seed {plan.seed}{survey}{_effect_options(settings)}"
     )
     return f"""# A simulated flight: {settings.name}
 
@@ -122,8 +127,25 @@ target's centre; `x`, `y` its projection [px]; `r00` … `r22` rotation target �
 `cx`, `cy`, `cz` the centre in the camera frame [m]; `gain` exposure, 1 where white of radiance 1
 fills the well; `psf` σ of the point spread [px]; `radius_px` fx · outer radius / distance [px];
 `X`, `Y`, `Z` the centre in the flight's CRS [m]; `streak_x`, `streak_y` motion during the exposure
-[px]; `black`, `white` levels of ink and plate, 0…1.
+[px]; `black`, `white` levels of ink and plate, 0…1, where they are clean and fully lit. With a
+rolling shutter, poses and places are those of the moment at which the row of the target's centre
+is exposed; so are the reference poses.
 """
+
+
+def _effect_options(settings: SimulationSettings) -> str:
+    """Return the options by which a flight's effects differ from those of its preset."""
+    wanted, usual = asdict(Effects.of(settings)), asdict(Effects.of(preset(settings.name)))
+    words = []
+    for name, value in wanted.items():
+        if value == usual[name]:
+            continue
+        if isinstance(value, bool):
+            words.append(f" --{name}" if value else f" --no-{name}")
+        elif value is not None:
+            numbers = value if isinstance(value, tuple) else (value,)
+            words.append(f" --{name} " + " ".join(f"{number:g}" for number in numbers))
+    return "".join(words)
 
 
 @single_threaded()

@@ -129,7 +129,7 @@ class _View:
 
     def seen(self, white: FloatArray, optics: Optics) -> FloatArray:
         """Return the share of white (height, width) that reaches the pixels."""
-        return optics.spread(white, self._oversampling)
+        return optics.spread(white, self._oversampling, self.window.row)
 
     def irradiance(self, share: FloatArray) -> FloatArray:
         """Return the light of a share of white."""
@@ -147,7 +147,7 @@ class _View:
         inside = ((rows >= 0) & (rows < shot.camera.height))[:, None] & (
             (columns >= 0) & (columns < shot.camera.width)
         )
-        return (shot.optics.spread(plate, self._oversampling) > _OPAQUE) & inside
+        return (self.seen(plate, shot.optics) > _OPAQUE) & inside
 
     @property
     def _oversampling(self) -> int:
@@ -231,8 +231,9 @@ def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[Fl
     if shot.has_unknown_streak:
         changes += [(0.0, _STEP_PX, 0.0), (0.0, 0.0, _STEP_PX)]
     for psf, x, y in changes:
-        after = Optics(psf_px + psf, (streak_x + x, streak_y + y))
-        before = Optics(psf_px - psf, (streak_x - x, streak_y - y))
+        optics = shot.optics
+        after = replace(optics, psf_px=psf_px + psf, streak_px=(streak_x + x, streak_y + y))
+        before = replace(optics, psf_px=psf_px - psf, streak_px=(streak_x - x, streak_y - y))
         yield view.seen(white, after) - view.seen(white, before)
     if shot.camera.response is Response.UNKNOWN:
         slope = shot.sensor.tone.slope(shot.gain * view.irradiance(share))

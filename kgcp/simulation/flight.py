@@ -17,6 +17,7 @@ from kgcp.settings import VehicleSettings
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.instruments import adjust_reference, record_trajectory
+from kgcp.simulation.light_field import LightField
 from kgcp.simulation.path import (
     BODY_FROM_PLATE,
     FRAME_INTERVAL_S,
@@ -28,6 +29,7 @@ from kgcp.simulation.path import (
 )
 from kgcp.simulation.plate import Plate
 from kgcp.simulation.presets import SimulationSettings
+from kgcp.simulation.rolling_shutter import RowMotion
 from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
 from kgcp.simulation.shapes import regular_polygon
 from kgcp.targets.layout import Ring, Target
@@ -62,9 +64,9 @@ class FramePlan:
     ----------
     index : int
     time_s : float
-        Mid-exposure, Unix UTC, without error [s].
+        Mid-exposure of the row of the target's centre, Unix UTC, without error [s].
     camera : CameraState
-        Exterior orientation without error.
+        Exterior orientation at that time, without error.
     target : Pose
         Target → camera; also where the target is not `present`.
     target_enu_m : (3,) array
@@ -100,7 +102,7 @@ class FlightPlan:
     target_map : (n, 3) array
         Target centres in the flight's CRS.
     recorded_times_s : (n,) array
-        The frames' times with their error [s].
+        The frames' times with their error: mid-exposure of the middle row [s].
     vehicle : VehicleSettings
         As the surveyor knows it; the true lever arm differs by its error.
     trajectory : Trajectory
@@ -143,7 +145,8 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
         seed,
         frames,
         map_frame.map_from_enu(np.array([frame.target_enu_m for frame in frames])),
-        START_S + elapsed_s + settings.sd_time_s * rng.standard_normal(settings.frames),
+        np.array([_middle_row_time_s(settings, frame) for frame in frames])
+        + settings.sd_time_s * rng.standard_normal(settings.frames),
         VehicleSettings(
             lever_arm_m=LEVER_ARM_M,
             sd_lever_arm_m=(settings.sd_lever_arm_m,) * 3,
@@ -155,7 +158,7 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
 
 
 def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
-    """Render one frame (height, width) of grey values (uint8).
+    """Render one frame (height, width) of grey values, or (height, width, 3) of a phone (uint8).
 
     Parameters
     ----------
@@ -166,13 +169,33 @@ def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
     """
     settings, frame = plan.settings, plan.frames[index]
     rng = _stream(plan.seed, "pixels", index)
+    field = _light_field(plan, frame)
     scene = Scene(
         frame.camera.ground,
-        PlatePose(TARGET_PLATE, frame.target),
-        tuple(PlatePose(DECOY_PLATE, pose) for pose in frame.decoys),
+        PlatePose(TARGET_PLATE, frame.target, field),
+        tuple(PlatePose(DECOY_PLATE, pose, field) for pose in frame.decoys),
     )
     irradiance = render_irradiance(settings.camera, ground, scene, frame.optics, rng)
+    if settings.phone is not None:
+        return settings.phone.photograph(settings.sensor, irradiance, frame.gain, rng)
     return settings.sensor.expose(irradiance, frame.gain, rng)
+
+
+def _light_field(plan: FlightPlan, frame: FramePlan) -> LightField | None:
+    """Return the light on the plates of a frame, each in its own axes.
+
+    It is drawn anew for every frame, dirt included, so that a flight averages over many plates.
+    """
+    settings = plan.settings
+    if settings.shadow is None and settings.dirt is None and settings.glare is None:
+        return None
+    return LightField.drawn(
+        settings.shadow,
+        settings.dirt,
+        settings.glare,
+        frame.gain,
+        _stream(plan.seed, "light", frame.index),
+    )
 
 
 def grow_ground(seed: int) -> Ground:
@@ -218,6 +241,7 @@ def _plan_frames(
             enu_from_body[index] @ BODY_FROM_PLATE,
             target_enu_m[index],
             _stream(seed, "frame", index),
+            _stream(seed, "motion", index),
             present=not absent[index],
             decoy=bool(decoy[index]),
         )
@@ -232,6 +256,7 @@ def _plan_frame(
     enu_from_plate: FloatArray,
     target_enu_m: FloatArray,
     rng: np.random.Generator,
+    motion_rng: np.random.Generator,
     *,
     present: bool,
     decoy: bool,
@@ -259,9 +284,34 @@ def _plan_frame(
         Optics(
             float(rng.uniform(*settings.psf_px)),
             (length * math.cos(direction) + 0.0, length * math.sin(direction) + 0.0),  # no -0
+            settings.lens,
+            _row_motion(settings, pose, motion_rng),
         ),
         float(np.exp(rng.uniform(*np.log(settings.gain)))),
     )
+
+
+def _row_motion(
+    settings: SimulationSettings, target: Pose, rng: np.random.Generator
+) -> RowMotion | None:
+    if not settings.camera.readout_s:
+        return None
+    return settings.motion.drawn(settings.camera, _pose_row(settings, target), rng)
+
+
+def _pose_row(settings: SimulationSettings, target: Pose) -> float:
+    """Return the row of the target's centre, to whose moment a frame's poses belong.
+
+    If the centre is outside the frame, it is the first or last row.
+    """
+    _, row = settings.camera.project(target.translation_m[None])[0]
+    return float(np.clip(row, 0.0, settings.camera.height - 1.0))
+
+
+def _middle_row_time_s(settings: SimulationSettings, frame: FramePlan) -> float:
+    """Return the time of a frame: mid-exposure of its middle row [s]."""
+    rows = _pose_row(settings, frame.target) / (settings.camera.height - 1.0) - 0.5
+    return frame.time_s - rows * settings.camera.readout_s
 
 
 def _lay_decoy(

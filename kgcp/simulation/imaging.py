@@ -2,7 +2,8 @@
 
 The image model, in this order, with electrons as the unit in which physics is done:
 
-1. irradiance of a pixel = scene radiance ∗ Gaussian(σ) ∗ box along the streak ∗ pixel square;
+1. irradiance of a pixel = scene radiance ∗ Gaussian(σ), or a lens's aberrations, ∗ box along the
+   streak ∗ pixel square, at the moment of the pixel's row;
 2. electrons = full well × gain × irradiance (irradiance 1: a perfectly white plate);
 3. noise: Gaussian with variance = electrons (the limit of Poisson's) + read noise²;
 4. clipped to 0 … full well and divided by it; tone curve, 0…1 → 0…1;
@@ -21,6 +22,8 @@ from scipy.ndimage import convolve, gaussian_filter
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.settings import require_range
+from kgcp.simulation.point_spread import Aberration, ComplexArray
+from kgcp.simulation.rolling_shutter import RowMotion
 
 _WHITE_LEVEL = 255.0
 _FILM_CONTRAST = 0.7
@@ -73,23 +76,33 @@ class Optics:
     Attributes
     ----------
     psf_px : float
-        σ of the Gaussian point spread [px].
+        σ of the Gaussian point spread; with an aberration, the root of the product of the
+        largest and the smallest [px].
     streak_px : tuple of float
         Motion of the image during the exposure, x and y [px]; symmetric about mid-exposure.
+    aberration : Aberration or None
+        None: the point spread is a round Gaussian.
+    motion : RowMotion or None
+        Motion of the image from row to row; None: all rows are exposed at once.
     """
 
     psf_px: float
     streak_px: tuple[float, float] = (0.0, 0.0)
+    aberration: Aberration | None = None
+    motion: RowMotion | None = None
 
     @property
     def reach_px(self) -> int:
-        """How far light is spread, at most [px]."""
-        return math.ceil(5.0 * self.psf_px + 0.5 * math.hypot(*self.streak_px)) + 1
+        """How far light is spread or moved, at most [px]."""
+        lens = self.aberration
+        spread = 5.0 * self.psf_px if lens is None else lens.reach_px(self.psf_px)
+        moved = 0.0 if self.motion is None else self.motion.reach_px
+        return math.ceil(spread + moved + 0.5 * math.hypot(*self.streak_px)) + 1
 
-    def spread(self, scene: FloatArray, oversampling: int) -> FloatArray:
+    def spread(self, scene: FloatArray, oversampling: int, first_row: int = 0) -> FloatArray:
         """Blur a scene given on sub-pixels and integrate it over pixels.
 
-        The transfer functions of Gaussian and streak are applied exactly, in the frequency
+        The transfer functions of point spread and streak are applied exactly, in the frequency
         domain; the scene goes on beyond its border as at the border.
 
         Parameters
@@ -98,6 +111,8 @@ class Optics:
             Radiance averaged over each sub-pixel.
         oversampling : int
             Sub-pixels per pixel and axis.
+        first_row : int
+            Row of the frame in which the scene begins, for a rolling shutter.
 
         Returns
         -------
@@ -114,18 +129,27 @@ class Optics:
         ]
         spectrum = scipy.fft.rfft2(np.pad(scene, padding, mode="edge"))
         spectrum *= self._transfer(padded_shape, oversampling)
-        blurred = scipy.fft.irfft2(spectrum, s=padded_shape, overwrite_x=True)
         height, width = scene.shape
+        if self.motion is not None:
+            rows = first_row + np.arange(height // oversampling, dtype=np.float64)
+            return self.motion.integrate(
+                spectrum, padded_shape, margin, oversampling, rows, width // oversampling
+            )
+        blurred = scipy.fft.irfft2(spectrum, s=padded_shape, overwrite_x=True)
         blurred = blurred[margin : margin + height, margin : margin + width]
         blocks = blurred.reshape(height // oversampling, oversampling, -1, oversampling)
         irradiance: FloatArray = blocks.mean(axis=(1, 3))
         return irradiance
 
-    def _transfer(self, shape: list[int], oversampling: int) -> FloatArray:
+    def _transfer(self, shape: list[int], oversampling: int) -> FloatArray | ComplexArray:
         fy = scipy.fft.fftfreq(shape[0])[:, None] * oversampling  # cycles per pixel
         fx = scipy.fft.rfftfreq(shape[1])[None, :] * oversampling
-        fall = -2.0 * (math.pi * self.psf_px) ** 2
-        transfer: FloatArray = np.exp(fall * fy * fy) * np.exp(fall * fx * fx)
+        transfer: FloatArray | ComplexArray
+        if self.aberration is None:
+            fall = -2.0 * (math.pi * self.psf_px) ** 2
+            transfer = np.exp(fall * fy * fy) * np.exp(fall * fx * fx)
+        else:
+            transfer = self.aberration.transfer(self.psf_px, fx, fy)
         if any(self.streak_px):
             transfer *= np.sinc(self.streak_px[0] * fx + self.streak_px[1] * fy)
         return transfer
@@ -162,7 +186,7 @@ class Sensor:
 
     def expected(self, irradiance: FloatArray, gain: float) -> FloatArray:
         """Return grey values 0…255 of an exposure without noise, not rounded."""
-        return self._developed(np.minimum(gain * irradiance, 1.0))
+        return self.develop(np.minimum(gain * irradiance, 1.0))
 
     def variance(self, irradiance: FloatArray, gain: float) -> FloatArray:
         """Return the noise variance of the grey values, to first order.
@@ -179,12 +203,17 @@ class Sensor:
 
     def expose(self, irradiance: FloatArray, gain: float, rng: np.random.Generator) -> GreyArray:
         """Return a frame of grey values (uint8) with noise."""
-        exposure = gain * np.maximum(irradiance, 0.0)
-        deviation = np.sqrt(self.full_well_e * exposure + self.read_noise_e**2) / self.full_well_e
-        exposure += deviation * rng.standard_normal(exposure.shape)
-        return np.rint(self._developed(np.clip(exposure, 0.0, 1.0))).astype(np.uint8)
+        exposure = self.collect(gain * np.maximum(irradiance, 0.0), rng)
+        return np.rint(self.develop(exposure)).astype(np.uint8)
 
-    def _developed(self, exposure: FloatArray) -> FloatArray:
+    def collect(self, exposure: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Return what the pixels read of an exposure ≥ 0: with noise, clipped to 0…1."""
+        deviation = np.sqrt(self.full_well_e * exposure + self.read_noise_e**2) / self.full_well_e
+        noisy = exposure + deviation * rng.standard_normal(exposure.shape)
+        return np.clip(noisy, 0.0, 1.0, out=noisy)
+
+    def develop(self, exposure: FloatArray) -> FloatArray:
+        """Return the grey values 0…255, not rounded, of an exposure 0…1."""
         grey = self.tone.apply(exposure)
         if self.sharpening > 0.0:
             grey = grey + self.sharpening * (grey - gaussian_filter(grey, self.sharpening_px))

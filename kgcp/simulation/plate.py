@@ -11,6 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.light_field import LightField
 from kgcp.simulation.patch import Patch, Window, outline_box
 from kgcp.simulation.shapes import ConvexPolygon, Disc, Shape
 from kgcp.targets.layout import Ring, Target
@@ -117,7 +118,12 @@ def plate_window(camera: Camera, plate: Plate, pose: Pose, optics: Optics) -> Wi
 
 
 def image_plate(
-    camera: Camera, plate: Plate, pose: Pose, optics: Optics, window: Window | None = None
+    camera: Camera,
+    plate: Plate,
+    pose: Pose,
+    optics: Optics,
+    window: Window | None = None,
+    field: LightField | None = None,
 ) -> PlateImage:
     """Ray-cast a plate through the full distorted camera.
 
@@ -130,6 +136,8 @@ def image_plate(
     optics : Optics
     window : Window, optional
         Where to look; default: everything that the plate sends light to.
+    field : LightField, optional
+        Default: the same light everywhere.
     """
     if window is None:
         window = plate_window(camera, plate, pose, optics)
@@ -141,8 +149,12 @@ def image_plate(
     light = plate.white * opacity
     for shape, radiance in plate.print_layers():
         patch.paint(light, shape, radiance)
+    if field is not None:
+        light = field.shine_on(patch, light, opacity)
     return PlateImage(
-        window, optics.spread(opacity, oversampling), optics.spread(light, oversampling)
+        window,
+        optics.spread(opacity, oversampling, window.row),
+        optics.spread(light, oversampling, window.row),
     )
 
 

@@ -8,6 +8,10 @@ from kgcp.errors import SettingError
 from kgcp.geometry.camera import Camera, Response
 from kgcp.settings import require_range
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from kgcp.simulation.light_field import Dirt, Glare, Shadow
+from kgcp.simulation.phone import Phone
+from kgcp.simulation.point_spread import Aberration
+from kgcp.simulation.rolling_shutter import ImageMotion
 
 _CAMERA = Camera(
     width=1600,
@@ -23,6 +27,7 @@ _CAMERA = Camera(
     response=Response.LINEAR,
 )
 _SENSOR = Sensor()
+_MOTION = ImageMotion()
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,16 @@ class SimulationSettings:
         σ of the point spread, uniform [px].
     streak_px : tuple of float
         Length of the motion streak, uniform, in any direction [px].
+    shadow : Shadow or None
+    dirt : Dirt or None
+    glare : Glare or None
+        Light on the plates that is not the same everywhere; None: none of the kind.
+    lens : Aberration or None
+        None: the point spread is a round Gaussian.
+    phone : Phone or None
+        None: grey values are what the `sensor` makes of the light.
+    motion : ImageMotion
+        While rows are read: without effect if the camera's `readout_s` is 0.
     absent_share, decoy_share : float
         Share of frames without the target, and with a plate of another code where there is room.
     jpeg_quality : int or None
@@ -68,6 +83,12 @@ class SimulationSettings:
     gain: tuple[float, float] = (0.7, 1.0)
     psf_px: tuple[float, float] = (0.55, 0.75)
     streak_px: tuple[float, float] = (0.0, 0.0)
+    shadow: Shadow | None = None
+    dirt: Dirt | None = None
+    glare: Glare | None = None
+    lens: Aberration | None = None
+    phone: Phone | None = None
+    motion: ImageMotion = _MOTION
     absent_share: float = 0.1
     decoy_share: float = 0.2
     jpeg_quality: int | None = None
@@ -110,6 +131,17 @@ class SimulationSettings:
 
 _UNKNOWN_RESPONSE = replace(_CAMERA, response=Response.UNKNOWN)
 
+# An ordinary camera in real light: the presets below differ from it by one effect each.
+_ORDINARY = SimulationSettings(
+    name="ordinary",
+    camera=_UNKNOWN_RESPONSE,
+    sensor=Sensor(tone=ToneCurve.SRGB),
+    distance_m=(9.0, 80.0),  # R from 115 down to 13 px
+    gain=(0.6, 1.05),
+    psf_px=(0.55, 0.95),
+    jpeg_quality=93,
+)
+
 _PRESETS = (
     SimulationSettings(name="clean", distance_m=(8.0, 129.0)),  # R from 130 down to 8 px
     SimulationSettings(name="exposure_sweep", gain=(0.35, 2.5)),
@@ -144,6 +176,31 @@ _PRESETS = (
         absent_share=0.125,
         gain=(0.6, 1.05),
         jpeg_quality=94,
+    ),
+    replace(_ORDINARY, name="shadow", shadow=Shadow()),
+    replace(_ORDINARY, name="dirty", dirt=Dirt()),
+    replace(_ORDINARY, name="glare", glare=Glare()),
+    replace(_ORDINARY, name="lens", lens=Aberration(astigmatism=1.6, coma=0.2)),
+    replace(
+        _ORDINARY,
+        name="phone",
+        sensor=Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2),
+        phone=Phone(),
+    ),
+    replace(
+        _ORDINARY,
+        name="rolling",
+        camera=replace(_UNKNOWN_RESPONSE, readout_s=0.03),
+        motion=ImageMotion((160.0, 200.0), sd_px_s=0.0),  # 0.004 and 0.005 px per row
+    ),
+    replace(
+        _ORDINARY,
+        name="mixed",
+        sensor=Sensor(tone=ToneCurve.SRGB, sharpening=0.3, sharpening_px=1.0),
+        shadow=Shadow(light_left=0.7, stripes=1),
+        dirt=Dirt(sd=0.02, stains=3),
+        lens=Aberration(astigmatism=1.2, coma=0.1),
+        phone=Phone(noise_reduction=1.0, local_tone=0.1),
     ),
 )
 

@@ -12,6 +12,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
+from kgcp.simulation.light_field import LightField
 from kgcp.simulation.patch import Patch, Window, outline_box
 from kgcp.simulation.plate import Plate, image_plate, plate_window
 from kgcp.simulation.shapes import Annulus, ConvexPolygon, Disc, Shape, polygon, rectangle
@@ -27,10 +28,11 @@ _SHADOW_SHIFT_M = (0.9, -0.7)
 
 @dataclass(frozen=True, slots=True)
 class PlatePose:
-    """A plate in front of the camera; `pose` is plate → camera."""
+    """A plate in front of the camera; `pose` is plate → camera, `field` the light on it."""
 
     plate: Plate
     pose: Pose
+    field: LightField | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,8 @@ def render_irradiance(
         if window.meets(camera):
             if window.exceeds(camera):
                 window = window.near(camera, optics.reach_px)
-            image_plate(camera, seen.plate, seen.pose, optics, window).paste(irradiance)
+            image = image_plate(camera, seen.plate, seen.pose, optics, window, seen.field)
+            image.paste(irradiance)
     return irradiance
 
 

@@ -1,12 +1,18 @@
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from kgcp.cli import main
 from kgcp.cli.simulate import PRESET_NAMES
-from kgcp.simulation.presets import PRESETS
+from kgcp.geometry.camera import Response
+from kgcp.io.flight.flight import read_flight
+from kgcp.simulation.effects import Effects, with_effects
+from kgcp.simulation.presets import PRESETS, preset
 
 
 def test_every_preset_can_be_chosen() -> None:
@@ -46,3 +52,54 @@ def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["simulate", str(tmp_path), "--frames", "1", "--jobs", "1"])
     assert result.exit_code == 1
     assert "holds something already" in result.stderr
+
+
+EFFECTS: dict[str, Any] = {
+    "shadow": 0.6,
+    "stripes": 2,
+    "dirt": 0.03,
+    "stains": 4,
+    "glare": 0.3,
+    "astigmatism": 1.4,
+    "coma": 0.1,
+    "phone": True,
+    "rolling": 0.02,
+    "motion": (30.0, -40.0),
+}
+
+
+@pytest.mark.parametrize("name", PRESET_NAMES)
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_every_effect_can_be_added_to_every_preset(name: str, effect: str) -> None:
+    before = Effects.of(preset(name))
+    if effect == "coma":
+        before = replace(before, astigmatism=1.0)
+    wanted = replace(before, **{effect: EFFECTS[effect]})
+    assert Effects.of(with_effects(preset(name), wanted)) == wanted
+    assert with_effects(preset(name), Effects.of(preset(name))) == preset(name)
+
+
+def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> None:
+    out = tmp_path / "flight"
+    options = [
+        *("--shadow", "0.6", "--stripes", "2", "--dirt", "0.03", "--stains", "4"),
+        *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1", "--phone"),
+        *("--rolling", "0.02", "--motion", "30", "-40"),
+    ]
+    arguments = ["simulate", str(out), "--frames", "1", "--jobs", "1", *options]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    command = f"kgcp simulate OUT --preset clean --frames 1 --seed 1 {' '.join(options)}\n"
+    assert command in (out / "README.md").read_text(encoding="utf-8")
+    camera = read_flight(out).camera
+    assert camera.readout_s == 0.02
+    assert camera.response is Response.UNKNOWN
+    with Image.open(out / "frames" / "frame_0000.jpg") as frame:
+        assert frame.mode == "RGB"
+
+
+def test_too_much_coma_ends_in_one_line(tmp_path: Path) -> None:
+    out = str(tmp_path / "flight")
+    result = CliRunner().invoke(main, ["simulate", out, "--preset", "lens", "--coma", "0.4"])
+    assert result.exit_code == 1
+    assert "give at most 0.24" in result.stderr

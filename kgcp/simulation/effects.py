@@ -1,0 +1,127 @@
+"""Each effect of real light by one figure: how much of it a simulated flight has.
+
+A flight without the effect has the neutral figure: a share of 1 of the light is left, the ratio of
+the astigmatism is 1, everything else is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from kgcp.simulation.light_field import Dirt, Glare, Shadow
+from kgcp.simulation.point_spread import Aberration
+from kgcp.simulation.presets import SimulationSettings, preset
+from kgcp.simulation.rolling_shutter import ImageMotion
+
+_LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
+
+
+@dataclass(frozen=True, slots=True)
+class Effects:
+    """How much of each effect there is.
+
+    Attributes
+    ----------
+    shadow : float
+        Share of the light that is left behind a shadow edge; 1: there is no edge.
+    stripes : int
+        Number of stripe-shaped shadows.
+    dirt : float
+        Relative standard deviation of the reflectance.
+    stains : int
+        Number of stains.
+    glare : float
+        Peak of highlights, as a share of full scale; it varies between a third of this and this.
+    astigmatism : float
+        Ratio of the largest σ of the point spread to the smallest.
+    coma : float
+        Third central moment of the point spread along its tail, over psf³.
+    phone : bool
+        Whether frames are processed as a phone does it.
+    rolling : float
+        Time from the first row to the last [s].
+    motion : tuple of float or None
+        Motion of the image during that time [px/s]; None: random, anew in each frame.
+    """
+
+    shadow: float = 1.0
+    stripes: int = 0
+    dirt: float = 0.0
+    stains: int = 0
+    glare: float = 0.0
+    astigmatism: float = 1.0
+    coma: float = 0.0
+    phone: bool = False
+    rolling: float = 0.0
+    motion: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, settings: SimulationSettings) -> Effects:
+        """Return the figures of a flight's settings."""
+        shadow = settings.shadow or Shadow(edges=0)
+        dirt = settings.dirt or Dirt(sd=0.0, stains=0)
+        lens = settings.lens or Aberration()
+        return cls(
+            shadow=shadow.light_left if shadow.edges else 1.0,
+            stripes=shadow.stripes,
+            dirt=dirt.sd,
+            stains=dirt.stains,
+            glare=settings.glare.peak[1] if settings.glare else 0.0,
+            astigmatism=lens.astigmatism,
+            coma=lens.coma,
+            phone=settings.phone is not None,
+            rolling=settings.camera.readout_s,
+            motion=None if settings.motion.sd_px_s else settings.motion.mean_px_s,
+        )
+
+
+def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSettings:
+    """Return a flight's settings with other figures of some effects.
+
+    Everything else about an effect stays as it is in the settings or, where they do not have the
+    effect, as it is by default.
+    """
+    had = Effects.of(settings)
+    if (wanted.shadow, wanted.stripes) != (had.shadow, had.stripes):
+        settings = replace(settings, shadow=_shadow(settings.shadow, wanted))
+    if (wanted.dirt, wanted.stains) != (had.dirt, had.stains):
+        dirt = replace(settings.dirt or Dirt(), sd=wanted.dirt, stains=wanted.stains)
+        settings = replace(settings, dirt=dirt)
+    if wanted.glare != had.glare:
+        peak = (_LEAST_PEAK * wanted.glare, wanted.glare)
+        settings = replace(settings, glare=replace(settings.glare or Glare(), peak=peak))
+    if (wanted.astigmatism, wanted.coma) != (had.astigmatism, had.coma):
+        lens = settings.lens or Aberration()
+        lens = replace(lens, astigmatism=wanted.astigmatism, coma=wanted.coma)
+        settings = replace(settings, lens=lens)
+    if wanted.phone != had.phone:
+        settings = _as_of_a_phone(settings) if wanted.phone else replace(settings, phone=None)
+    if wanted.rolling != had.rolling:
+        camera = replace(settings.camera, readout_s=wanted.rolling)
+        settings = replace(settings, camera=camera)
+    if wanted.motion != had.motion:
+        motion = ImageMotion() if wanted.motion is None else ImageMotion(wanted.motion, 0.0)
+        settings = replace(settings, motion=motion)
+    return settings
+
+
+def _shadow(shadow: Shadow | None, wanted: Effects) -> Shadow:
+    """Return a shadow with an edge unless all light is left, and with stripes.
+
+    The light that is left behind stripes alone is that of the settings, or of `Shadow`.
+    """
+    shadow = replace(shadow or Shadow(), stripes=wanted.stripes)
+    if wanted.shadow == 1.0:
+        return replace(shadow, edges=0)
+    return replace(shadow, edges=max(shadow.edges, 1), light_left=wanted.shadow)
+
+
+def _as_of_a_phone(settings: SimulationSettings) -> SimulationSettings:
+    phone = preset("phone")
+    return replace(
+        settings,
+        phone=phone.phone,
+        sensor=phone.sensor,
+        camera=replace(settings.camera, response=phone.camera.response),
+        jpeg_quality=phone.jpeg_quality,
+    )

@@ -1,0 +1,119 @@
+"""Point spreads of real lenses: astigmatic and comatic, with their centroid where they belong.
+
+Coma is Seidel's: rays through the ring of relative radius ρ of the aperture meet the image on a
+circle of radius A ρ², 2 A ρ² away from the chief ray. Uniform light in the aperture puts the
+centroid at A, variances A²/2 along and A²/6 across the tail, and third central moments A³/4 along
+and A³/12 mixed. The spread is moved by −A, so that its centroid is the pixel that a calibration
+means, and the Gaussian that comes on top is made narrower by the coma's variances: second moments
+do not depend on the coma.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import j0
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.settings import require_range
+
+ComplexArray = npt.NDArray[np.complex128]
+
+_NEGLIGIBLE = 1e-9  # of the transfer
+_MOST_COMA = 0.5  # of psf³, with equal axes: a fifth of the variance is left to the Gaussian
+_EXTRA_NODES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Aberration:
+    """How a lens's point spread departs from a round Gaussian. Angles from +x towards +y [deg].
+
+    Attributes
+    ----------
+    astigmatism : float
+        Ratio of the largest σ to the smallest; their product is psf².
+    astigmatism_deg : float
+        Direction of the largest σ.
+    coma : float
+        Third central moment along the tail, over psf³.
+    coma_deg : float
+        Where the tail points.
+    """
+
+    astigmatism: float = 1.0
+    astigmatism_deg: float = 35.0
+    coma: float = 0.0
+    coma_deg: float = 110.0
+
+    def __post_init__(self) -> None:
+        require_range("astigmatism", self.astigmatism, 1.0, 5.0)
+        require_range("coma", self.coma, 0.0, _MOST_COMA)
+        most = _MOST_COMA / self.astigmatism**1.5
+        if self.coma > most:
+            raise SettingError(
+                "coma",
+                f"{self.coma:g} is too much with an astigmatism of {self.astigmatism:g}",
+                f"give at most {math.floor(100.0 * most) / 100.0:g}, or less astigmatism",
+            )
+
+    def reach_px(self, psf_px: float) -> float:
+        """Return how far light is spread, at most [px]."""
+        return 5.0 * psf_px * math.sqrt(self.astigmatism) + 2.0 * self._circle_px(psf_px)
+
+    def covariance_px2(self, psf_px: float) -> FloatArray:
+        """Return the second central moments (2, 2) of the whole spread [px²]."""
+        along = psf_px**2 * self.astigmatism
+        return _oriented(self.astigmatism_deg, along, psf_px**2 / self.astigmatism)
+
+    def transfer(self, psf_px: float, fx: FloatArray, fy: FloatArray) -> FloatArray | ComplexArray:
+        """Return the transfer function at frequencies that broadcast [cycles/px].
+
+        It is complex if there is coma.
+        """
+        circle_px = self._circle_px(psf_px)
+        variances = circle_px**2 / 2.0, circle_px**2 / 6.0
+        (xx, xy), (_, yy) = self.covariance_px2(psf_px) - _oriented(self.coma_deg, *variances)
+        form = xx * fx * fx + 2.0 * xy * fx * fy + yy * fy * fy
+        gaussian: FloatArray = np.exp(-2.0 * math.pi**2 * form)
+        if circle_px == 0.0:
+            return gaussian
+        matters = np.nonzero(gaussian > _NEGLIGIBLE)
+        fx, fy = (np.broadcast_to(f, gaussian.shape)[matters] for f in (fx, fy))
+        transfer: ComplexArray = np.zeros(gaussian.shape, dtype=np.complex128)
+        transfer[matters] = gaussian[matters] * _coma_transfer(circle_px, self.coma_deg, fx, fy)
+        return transfer
+
+    def _circle_px(self, psf_px: float) -> float:
+        """Return A, the radius of the circle that the rim of the aperture makes [px]."""
+        return psf_px * math.cbrt(4.0 * self.coma)
+
+
+def _oriented(direction_deg: float, along: float, across: float) -> FloatArray:
+    """Return the covariance (2, 2) with variances along and across a direction."""
+    angle = math.radians(direction_deg)
+    axis = np.array([math.cos(angle), math.sin(angle)])
+    covariance: FloatArray = across * np.eye(2) + (along - across) * np.outer(axis, axis)
+    return covariance
+
+
+def _coma_transfer(
+    circle_px: float, direction_deg: float, fx: FloatArray, fy: FloatArray
+) -> ComplexArray:
+    """Return the transfer (n,) of coma about its centroid.
+
+    The mean over the circle of u = ρ², which is uniform in 0…1, is a Bessel function; that over
+    u is taken by Gauss-Legendre quadrature, which resolves all turns of the phase.
+    """
+    angle = math.radians(direction_deg)
+    phase = 2.0 * math.pi * circle_px * (math.cos(angle) * fx + math.sin(angle) * fy)
+    turn = 2.0 * math.pi * circle_px * np.hypot(fx, fy)
+    count = math.ceil(float(np.max(2.0 * np.abs(phase) + turn)) / 2.0) + _EXTRA_NODES
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    mean: ComplexArray = np.zeros(phase.shape, dtype=np.complex128)
+    for node, weight in zip(0.5 + 0.5 * nodes, 0.5 * weights, strict=True):
+        mean += weight * j0(node * turn) * np.exp(1j * (1.0 - 2.0 * node) * phase)
+    return mean
