@@ -21,13 +21,13 @@ from kgcp.measurement.search.templates import ANGLES, CIRCLE, SAMPLED_RADII
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
 
-# Tuning of the candidates; its benchmark is `benchmarks.search.hard_frames` (the sets in brackets
-# tell most), and for what is let through without need `benchmarks.search.false_alarms`.
-_MIN_CONTRAST = 0.02  # of the grey values' range (`haze`)
-_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots (`blur`)
+# Tuning of the candidates. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
+# (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
+_MIN_CONTRAST = 0.02  # of the grey values' range
+_MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
 _UNEVEN = 0.5  # spread of ink, disc and plate, of the contrast
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
-_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective (`oblique`)
+_CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _SEED_REACH = 2.0  # around expected places, of their radii
 _SMALLEST_WINDOW_PX = 12
 _DIGITS = 6  # of proportions that are the same

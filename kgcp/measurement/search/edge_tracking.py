@@ -21,18 +21,19 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 
 # Tuning of the tracking. Lengths are in units of the seed's radius, which is right to a fifth.
-# The benchmark of all is `benchmarks.search.hard_frames`; sets that tell more are in brackets.
+# The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants of the search", has
+# what it finds with other values.
 RAYS = 40  # a ring of 6 px radius has about as many pixels along its edge
 _RADII = np.arange(0.5, 1.71, 0.04)  # of samples: seeds are good to a fifth, tilts go to 45°
 _STEP = 2  # samples either side that a slope is taken over: as wide as the blur of small rings
 _EVERY = 2  # ray is looked at first: most seeds are no ring's, and half of the rays tells that
 # Of the weighting of residuals, pass by pass: wide at first, so that a seed that is off by a
-# quarter of its radius still finds the curve (`oblique`); then as narrow as edges scatter.
+# quarter of its radius still finds the curve; then as narrow as edges scatter.
 _WIDTHS_AT_FIRST = np.array((0.25, 0.12, 0.07))
 _WIDTHS = np.array((0.07, 0.05))
 _REACH = 0.17  # of an edge from the first curve; the rises into dots are farther in
 _INLIER = 0.07  # distance from the curve of what counts as its edge, twice that at first
-_MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6  # shares: 40 % may be hidden (`hidden`, `cut`)
+_MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6  # shares: up to 40 % may be hidden
 _FINEST_RADIUS_PX = 12.0  # of rings in the image that they are tracked in, or twice that
 _RIDGE = 1e-3  # keeps the curve through few edges near the mean circle
 

@@ -20,8 +20,8 @@ from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
 
 # Tuning: two seeds, or outlines, are the same ring if their centres are nearer than this, of the
-# radius, and the logarithms of their radii. Looser limits lose replicas inside rings, closer ones
-# only cost time (`benchmarks.search.hard_frames --only cut`, `benchmarks.speed.relative_costs`).
+# radius, and the logarithms of their radii. Narrower limits leave more of them to track, and cost
+# time (`benchmarks.speed.relative_costs`); wider ones take a replica for the ring around it.
 _NEAR_SEEDS, _ALIKE_SEEDS = 0.3, 0.25
 _NEAR_OUTLINES, _ALIKE_OUTLINES = 0.25, 0.15
 _SMALLEST_RATIO = 0.93  # of the radii that a level is searched for to the one of its peaks

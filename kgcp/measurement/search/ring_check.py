@@ -20,18 +20,18 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.measurement.search.pyramid import Pyramid
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX
 
-# Tuning of the check; its benchmark is `benchmarks.search.hard_frames`, the sets that tell most in
-# brackets. Radii are in units of the outer one.
+# Tuning of the check. The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants
+# of the search", has what it finds with other values. Radii are in units of the outer one.
 _RATIOS = np.array((0.76, 1.15, 1.34, 0.33))  # of circles that are sampled
 _RING, _NEAR, _FAR, _CORE = range(4)  # the core's circle is outside of a replica
 _ROUGH = np.array((0.85, 1.1))  # radii that are tried, of the one that the filter answers to most
 _FINE = np.array((0.9, 1.0, 1.1))  # and of each of those
 _FEW, _MANY, _ALL = 8, 16, 24  # directions that are sampled first, then, and at last
-_ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half (`hidden`)
-_MIN_CONTRAST = 5  # grey values (`haze`, `shadow`)
+_ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
+_MIN_CONTRAST = 5  # grey values: less is noise
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
 _LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
-_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast (`shadow`)
+_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
 # Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
 # value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
 # a third may be dark, hidden or beyond the plate, and only bright ranks tell.

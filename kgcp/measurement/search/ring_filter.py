@@ -6,9 +6,9 @@ score is
 
     core − disc + surround − disc
 
-which is positive where a disc is darker than both its core and its surround, 0 on edges and planes,
-and negative on dots. docs/method.md, "Ring filter", has its answer by radius. Larger rings are
-found in reduced images.
+which is large where a disc is darker than both its core and its surround, and 0 on planes and in
+the middle of edges. docs/method.md, "Ring filter", has its answer by radius. Larger rings are found
+in reduced images.
 
 Speed decides the form: the filters go through an image row by row, in strips. Every loop is over
 one row of small integers, of which the processor takes some tens at once, and all that is kept
@@ -23,8 +23,9 @@ import numpy.typing as npt
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 
-# Tuning of the filter; its benchmarks are `benchmarks.search.hard_frames`, for what is found, and
-# `benchmarks.speed.relative_costs`, for what more peaks cost the stages that follow.
+# Tuning of the filter. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
+# (values in docs/method.md, "Constants of the search"), and `benchmarks.speed.relative_costs`, for
+# what more peaks cost the stages that follow.
 PEAK_RADIUS_PX = 2.8
 """Radius that a peak stands for; the check tries rings from 0.76 to 1.21 of it."""
 _UNIT = 225.0 / 4.0  # of scores, per grey value: 3 · 3 · 5 · 5 pixels, and 16 bits hold the quarter

@@ -29,15 +29,15 @@ from kgcp.measurement.search.templates import (
 )
 from kgcp.targets.layout import Ring
 
-# Tuning of the comparison, held by `benchmarks.search.hard_frames` (targets of the sets) and
-# `benchmarks.search.false_alarms` (photographs without any).
+# Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
+# (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
 CODE_LIKE = 0.7
 """Score above which a ring with dots is a code, if another one."""
 _CLEAR_SCORE = 0.9  # of a whole ring, of which nothing is hidden then
-# A dot too many or too few is a misfit of 1 (set `decoys`); faint dots are lost in noise (`blur`).
+# A dot too many or too few is a misfit of 1. Noise may look like a dot if dots are faint.
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
-# Rings of which something hides a part (sets `hidden` and `cut`; decoys for the last three).
+# Rings of which something hides a part.
 _TYPICAL = 0.65  # quantile of steps of light that is not hidden, however much else is
 _MIN_STEP = 0.35  # of the typical one
 _SHORTEST = 13  # samples; a dot that is too large takes less

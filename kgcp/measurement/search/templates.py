@@ -11,8 +11,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.search.correlation import Bank, SingleArray, bank_of
 from kgcp.targets.layout import Ring
 
-# Tuning of the templates. All of it is held by `benchmarks.search.hard_frames`: the set `blur` asks
-# for the most blurred looks, `burnt` for the clipped ones, `small` and `oblique` for the shifts.
+# Tuning of the templates. The benchmark is `benchmarks.search.hard_frames`; docs/method.md,
+# "Constants of the search", has what it finds with fewer looks and shifts.
 # Looks: blur (σ of the edges, of the outer radius), and where the brightest grey value lies between
 # black and white.
 LOOKS = (

@@ -46,7 +46,8 @@ def test_foreign_is_what_is_neither_plate_nor_the_edge_of_the_ring(seed: int, wh
 def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> None:
     rng = np.random.default_rng(seed)
     smooth, rho_m = rng.uniform(0.0, 1.0, PIXELS), rng.uniform(0.0, 0.6, PIXELS)
-    share, off_edge_m = rng.integers(0, 2, PIXELS) * 1.0, rng.uniform(0.0, 0.1, PIXELS)
+    share = rng.integers(0, 2, PIXELS).astype(np.float64)
+    off_edge_m = rng.uniform(0.0, 0.1, PIXELS)
     contrast = WHITE - BLACK
     hidden = np.zeros(PIXELS, dtype=bool)
     counts = _mark_other(

@@ -131,7 +131,7 @@ def by_parabola(disc: Disc, x: FloatArray, y: FloatArray) -> FloatArray:
     blur = z[:, None] - 2.0 * half[:, None] * place
     curving = (slant * blur + outward_t * place) ** 2 - slant**2 - outward_t**2 / 12.0
     bent = (curving * np.exp(-0.5 * blur**2) / np.sqrt(2.0 * np.pi)) @ weights / 2.0
-    return mean_of_normal(z, half) - bent / (2.0 * radius * sd)
+    return np.asarray(mean_of_normal(z, half) - bent / (2.0 * radius * sd))
 
 
 BLURS = st.tuples(st.floats(0.4, 1.5), st.floats(0.4, 1.5), st.floats(-0.6, 0.6))
