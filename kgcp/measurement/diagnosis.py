@@ -33,7 +33,6 @@ def explain(grey: GreyArray, ring: Ring, candidate: Considered, min_radius_px: f
 
     Parameters
     ----------
-    grey : (height, width) array
     ring : Ring
         What it was compared with.
     candidate : Considered

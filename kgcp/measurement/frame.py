@@ -49,7 +49,7 @@ class Examination:
 
 @dataclass(frozen=True, slots=True)
 class _Trial:
-    """What became of one target, before the others are known."""
+    """The plates measured for one target, before they are compared with those of the others."""
 
     target: Target
     plates: tuple[Observation, ...]
@@ -73,7 +73,7 @@ def examine(
     targets: tuple[Target, ...],
     settings: DetectSettings,
     prior: NormalPrior | None = None,
-    known: Sequence[Observation] = (),
+    measured: Sequence[Observation] = (),
 ) -> Examination:
     """Look for every target in a frame and measure what is found.
 
@@ -81,16 +81,12 @@ def examine(
     ----------
     grey : (height, width) array
         Raw frame, uint8 or uint16, of the camera's size.
-    camera : Camera
-        Interior orientation.
     targets : tuple of Target
         All that may be seen.
-    settings : DetectSettings
-        Of the search.
     prior : NormalPrior, optional
         Of the normal of the plate on the vehicle: of all targets without a position of their own.
-    known : sequence of Observation
-        Other targets that are in this frame.
+    measured : sequence of Observation
+        Targets of this frame that are already measured.
     """
     search = paper_outlines if settings.method is Method.PAPER else find_rings
     rings = (ring for target in targets for ring in target.rings)
@@ -105,7 +101,7 @@ def examine(
     considered: list[Considered] = []
     for trial in trials:
         others = (other for other in trials if other is not trial)
-        rivals = [*known, *(plate for other in others for plate in other.plates)]
+        rivals = [*measured, *(plate for other in others for plate in other.plates)]
         own = _undisputed(trial.plates, rivals)
         free = [
             candidate

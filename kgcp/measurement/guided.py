@@ -25,17 +25,17 @@ from kgcp.targets.layout import Target
 # simulated flights, with what the second look adds to them.
 _SIGMAS = 4.0  # of the expectation, in place and radius
 _SMALLEST_PX = 3.0  # radius of a ring that is looked for
-_FARTHEST = 8.0  # radii that a target may be off: more is hardly known
+_FARTHEST = 8.0  # radii that a target may be off: beyond, the expectation is of little use
 _LARGEST_RATIO = 2.0  # of the radius to the expected one
 _SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are tracked from
 _LOWER_SCORE = 0.06
 _WORTH_A_TRY = 0.5  # score of the whole ring
-_TRIES = 4  # per ring: the best ones
+_TRIES = 4  # per ring, the best candidates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expectation:
-    """Where a target must be in a frame, and how large.
+    """Where a target must be in a frame, and how large, with deviations.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Expectation:
     sd_log_radius : float
         Standard deviation of its logarithm.
     source : str
-        What it was made of, in a word.
+        What it was made from, as one word.
     """
 
     centre_px: FloatArray
@@ -58,7 +58,7 @@ class Expectation:
     source: str
 
     def __str__(self) -> str:
-        """Tell it in the detail of a row."""
+        """Text for the detail of a row."""
         x, y = self.centre_px
         return (
             f"expected by {self.source} at ({x:.0f}, {y:.0f}) ± {self.sd_px:.1f} px, radius"
@@ -67,7 +67,7 @@ class Expectation:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it says enough to look there, and only there."""
+        """Whether it is certain enough to look there alone."""
         return (
             _SIGMAS * self.sd_px <= _FARTHEST * self.radius_px
             and _SIGMAS * self.sd_log_radius <= math.log(_LARGEST_RATIO)
@@ -107,7 +107,6 @@ def look_again(
 
     Parameters
     ----------
-    grey : (height, width) array
     rivals : sequence of Observation
         Other targets in this frame.
 

@@ -104,7 +104,6 @@ def correlate(patch: FloatArray, bank: Bank, visible: BoolArray | None = None) -
     ----------
     patch : (rows + shifts − 1, angles) array
         Grey values. Shift s compares the template with the rows from s on.
-    bank : Bank
     visible : (angles,) array of bool, optional
         Which angles of the patch are compared; by default all.
 

@@ -1,4 +1,4 @@
-"""How likely a ring that is no target would be taken for one by chance."""
+"""The chance that a ring with random light on it is taken for a target's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ def code_chance(score: float, ring: Ring, blur_rad: float) -> float:
     ----------
     score : float
         Normalised cross-correlation of the code, best over headings and degrees of blur.
-    ring : Ring
     blur_rad : float
         σ of the edges as an angle along the code circle [rad].
     """
@@ -55,16 +54,14 @@ def _power(ring: Ring) -> FloatArray:
 
 
 def check_chance(observation: Observation, target: Target, ring: Ring, false_alarm: float) -> None:
-    """Refuse a code that a frame may show by chance; without a known blur nothing is refused.
+    """Refuse a code that a frame may show by chance; without a blur estimate nothing is refused.
 
     Parameters
     ----------
-    observation : Observation
-    target : Target
     ring : Ring
         The ring of the target whose code was found.
     false_alarm : float
-        Chance per frame that is put up with.
+        Chance per frame that is accepted.
 
     Raises
     ------

@@ -65,7 +65,6 @@ def check_peaks(pyramid: Pyramid, peaks: FloatArray, ends: IndexArray) -> FloatA
 
     Parameters
     ----------
-    pyramid : Pyramid
     peaks, ends
         As `find_peaks` returns them, of the pyramid's last levels.
 
