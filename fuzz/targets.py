@@ -34,7 +34,8 @@ from kgcp.io.formats.orientations.records import PoseNotation
 from kgcp.io.formats.trajectories import FORMATS as TRAJECTORY_FORMATS
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
-from kgcp.io.images.frames import read_exif, read_grey
+from kgcp.io.images.exif import read_exif
+from kgcp.io.images.frames import read_grey
 from kgcp.pipeline.execution.journal import from_text
 
 CRS = "EPSG:25832"

@@ -18,12 +18,11 @@ from benchmarks.accuracy.bands import RADIUS_BANDS_PX, join_truth, read_truth
 from benchmarks.accuracy.timing import time_measurement, timing_line
 from kgcp.errors import Rejection
 from kgcp.io.flight.flight import Flight, read_flight
-from kgcp.io.images.exif import Exif
 from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.io.tables.columns import Row
-from kgcp.io.tables.detections import FrameResult, detection_rows
+from kgcp.io.tables.detections import detection_rows
 from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Miss
+from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
 from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
 from kgcp.report.bias.reexposure import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
@@ -53,7 +52,7 @@ def _rows_of_frame(task: tuple[Flight, DetectSettings, str, float]) -> list[Row]
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in flight.targets
         )
-    return detection_rows(FrameResult(frame, None, Exif(), outcomes))
+    return detection_rows(FrameResult(frame, None, ExposureSettings(), outcomes))
 
 
 def changes(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:

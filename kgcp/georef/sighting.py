@@ -76,3 +76,40 @@ class Sighting:
     def rows_since_middle(self, camera: Camera) -> float:
         """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""
         return float(self.centre_px[1]) / (camera.height - 1) - 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What may move the edges: the columns of these names in the detections; None is null."""
+
+    radius_px: float | None
+    blur_px: float | None
+    edge_shift_px: float | None
+    black: float | None
+    white: float | None
+    saturated: float | None
+    exposure_time_s: float | None
+    iso: float | None
+    f_number: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One target looked for in one readable frame.
+
+    Attributes
+    ----------
+    frame, target : str
+        As in the detections.
+    time_s : float or None
+        Mid-exposure, Unix UTC [s].
+    sighting : Sighting or None
+        None where the target was not measured.
+    exposure : Exposure
+    """
+
+    frame: str
+    target: str
+    time_s: float | None
+    sighting: Sighting | None
+    exposure: Exposure

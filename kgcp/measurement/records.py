@@ -208,6 +208,52 @@ class Miss:
 Outcome = Observation | Miss
 
 
+@dataclass(frozen=True, slots=True)
+class ExposureSettings:
+    """How the camera exposed a frame; None where it does not say.
+
+    Attributes
+    ----------
+    exposure_time_s : float or None
+        Exposure time [s].
+    iso : float or None
+        Sensitivity.
+    f_number : float or None
+        Focal length over aperture.
+    """
+
+    exposure_time_s: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """All that was learned from one frame.
+
+    Attributes
+    ----------
+    frame : str
+        Path relative to the frames folder.
+    time_s : float or None
+        Mid-exposure, Unix UTC [s].
+    exposure : ExposureSettings
+    outcomes : tuple of Outcome
+        At least one per target, in the targets' order.
+    camera_time_s : float or None
+        When the camera itself says it took the frame, Unix UTC [s].
+    dropped : tuple of Considered
+        Rings that were compared with a target's and dropped, if they are to be shown.
+    """
+
+    frame: str
+    time_s: float | None
+    exposure: ExposureSettings
+    outcomes: tuple[Outcome, ...]
+    camera_time_s: float | None = None
+    dropped: tuple[Considered, ...] = ()
+
+
 def is_unreadable(outcome: Outcome) -> bool:
     """Tell whether an outcome is that of a frame without an image."""
     return isinstance(outcome, Miss) and outcome.reason.status is Status.UNREADABLE

@@ -17,9 +17,8 @@ from typing import Protocol, TypeVar
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.images.remote import stamps_of
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import is_unreadable
+from kgcp.measurement.records import FrameResult, is_unreadable
 from kgcp.pipeline.execution.executor import Crew
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import Loss

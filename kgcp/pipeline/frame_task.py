@@ -11,14 +11,21 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.geometry.conic import Ellipse
-from kgcp.io.images.exif import Exif
-from kgcp.io.images.frames import read_exif, read_grey
+from kgcp.io.images.exif import Exif, read_exif
+from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Expectation, look_again
 from kgcp.measurement.normal_prior import NormalPrior
-from kgcp.measurement.records import Considered, Miss, Observation, Outcome, is_unreadable
+from kgcp.measurement.records import (
+    Considered,
+    ExposureSettings,
+    FrameResult,
+    Miss,
+    Observation,
+    Outcome,
+    is_unreadable,
+)
 from kgcp.measurement.search.template_match import CODE_LIKE
 from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.pipeline.execution.threads import single_threaded
@@ -106,8 +113,8 @@ def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
     reference = task.camera.time_reference
     if time_s is not None and reference is not TimeReference.MIDDLE:
         is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
-        time_s = _mid_exposure_s(time_s, exif, reference, place) if is_readable else None
-    return FrameResult(note.frame, time_s, exif, outcomes, dropped)
+        time_s = _mid_exposure_s(time_s, exif.exposure, reference, place) if is_readable else None
+    return FrameResult(note.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped)
 
 
 @single_threaded()
@@ -148,7 +155,8 @@ def lost_frame(task: FrameTask, note: FrameNote, reason: Reason) -> FrameResult:
     """Return the result of a frame that cannot be examined without the end of the process."""
     outcomes = tuple(Miss(target.name, reason) for target in task.targets)
     is_known = task.camera.time_reference is TimeReference.MIDDLE
-    return FrameResult(note.frame, note.time_s if is_known else None, Exif(), outcomes)
+    time_s = note.time_s if is_known else None
+    return FrameResult(note.frame, time_s, ExposureSettings(), outcomes)
 
 
 def kept_frame(look: SecondLook, reason: Reason) -> FrameResult:
@@ -198,15 +206,18 @@ def _best_dropped(considered: Sequence[Considered]) -> tuple[Considered, ...]:
 
 
 def _mid_exposure_s(
-    time_s: float, exif: Exif, reference: TimeReference, place: Path | StoredFolder
+    time_s: float,
+    exposure: ExposureSettings,
+    reference: TimeReference,
+    place: Path | StoredFolder,
 ) -> float:
-    if exif.exposure_time_s is None:
+    if exposure.exposure_time_s is None:
         raise KgcpError(
             f"{place}: has no exposure time in EXIF, which [camera] time_reference ="
             f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
             " of mid-exposure and delete time_reference"
         )
-    return time_s + reference.to_middle_s(exif.exposure_time_s)
+    return time_s + reference.to_middle_s(exposure.exposure_time_s)
 
 
 def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:

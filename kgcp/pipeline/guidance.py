@@ -12,9 +12,8 @@ from kgcp.errors import KgcpError
 from kgcp.georef.prediction import Track, expect, reference_states, state_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Miss, Observation, is_unreadable
+from kgcp.measurement.records import FrameResult, Miss, Observation, is_unreadable
 from kgcp.targets.layout import Target
 
 

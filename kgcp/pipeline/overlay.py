@@ -13,10 +13,9 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.adjustment.residual_image import contours_px, residuals_of
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Considered, Miss, Observation, Outcome
+from kgcp.measurement.records import Considered, FrameResult, Miss, Observation, Outcome
 from kgcp.pipeline.detection_run import Looks
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import FrameTask

@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from kgcp.errors import Reason, Status
-from kgcp.io.tables.detections import FrameResult
-from kgcp.measurement.records import Miss
+from kgcp.measurement.records import FrameResult, Miss
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +103,8 @@ class Tally:
         self._without_time += result.time_s is None
         if result.frame in self._times:
             self._timed += 1
-        elif result.exif.time_s is not None:
-            self._from_exif[result.exif.time_s.is_integer()] += 1
+        elif result.camera_time_s is not None:
+            self._from_exif[result.camera_time_s.is_integer()] += 1
         for outcome in result.outcomes:
             if isinstance(outcome, Miss):
                 self._reasons[outcome.reason] += 1

@@ -14,7 +14,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import Views, visible_pixels
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import Absence, Place, Whereabouts
 from kgcp.settings import Method
 from kgcp.targets.layout import Target
@@ -59,42 +59,6 @@ class ReferenceSds:
         if place.common_m is not None:
             common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
         return cls(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))
-
-
-@dataclass(frozen=True, slots=True)
-class Exposure:
-    """What may move the edges: the columns of these names in the detections; None is null."""
-
-    radius_px: float | None
-    blur_px: float | None
-    edge_shift_px: float | None
-    black: float | None
-    white: float | None
-    saturated: float | None
-    exposure_time_s: float | None
-    iso: float | None
-    f_number: float | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Attempt:
-    """One target looked for in one readable frame.
-
-    Attributes
-    ----------
-    frame, target : str
-        As in the detections.
-    time_s : float or None
-        Mid-exposure, Unix UTC [s].
-    sighting : Sighting or None
-        None where the target was not measured.
-    """
-
-    frame: str
-    target: str
-    time_s: float | None
-    sighting: Sighting | None
-    exposure: Exposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)

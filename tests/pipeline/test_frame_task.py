@@ -12,9 +12,8 @@ import pytest
 from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Miss, Observation
+from kgcp.measurement.records import FrameResult, Miss, Observation
 from kgcp.pipeline.frame_task import (
     FrameNote,
     FrameTask,

@@ -19,8 +19,9 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.io.flight.flight import read_flight
-from kgcp.io.tables.detections import DETECTION_COLUMNS, FrameResult
+from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
+from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.detect import detect_flight
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import (

@@ -19,10 +19,8 @@ from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.io.images.exif import Exif
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Considered, Miss
+from kgcp.measurement.records import Considered, ExposureSettings, FrameResult, Miss
 from kgcp.pipeline.detection_run import Looks
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import FrameTask
@@ -193,7 +191,7 @@ def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
         for outline in (Ellipse(20.0, 30.0, 6.0, 5.0, 0.1), Ellipse(80.0, 60.0, 9.0, 8.0, 0.1))
     )
     task = FrameTask(flight / "frames", CAMERA, None, (), DetectSettings())
-    result = FrameResult(EMPTY, None, Exif(), (miss,), dropped)
+    result = FrameResult(EMPTY, None, ExposureSettings(), (miss,), None, dropped)
     first, second = sketch_frame(task, result)
     assert (first.card.status, first.card.reason) == ("rejected", "cut")
     assert (second.card.status, second.card.reason) == ("candidate", "code_mismatch")
@@ -210,7 +208,7 @@ class _OneLost:
     def through(self, _: object) -> Iterator[tuple[int, FrameResult, Loss]]:
         outline = Ellipse(20.0, 30.0, 6.0, 5.0, 0.1)
         miss = Miss("A", Reason.CUT, "ring at (20, 30)", 0.9, 1, outline)
-        yield 0, FrameResult("a.png", None, Exif(), (miss,)), Loss.DIED
+        yield 0, FrameResult("a.png", None, ExposureSettings(), (miss,)), Loss.DIED
 
 
 def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:

@@ -93,9 +93,9 @@ def test_exif_tells_exposure_and_time(flight: tuple[FlightPlan, Path]) -> None:
     plan, out = flight
     for frame in plan.frames:
         exif = read_exif(out / f"frames/frame_{frame.index:04d}.png")
-        assert exif.exposure_time_s == pytest.approx(frame.gain / 1250.0, rel=1e-3)
-        assert exif.iso == 100.0
-        assert exif.f_number == pytest.approx(5.6)
+        assert exif.exposure.exposure_time_s == pytest.approx(frame.gain / 1250.0, rel=1e-3)
+        assert exif.exposure.iso == 100.0
+        assert exif.exposure.f_number == pytest.approx(5.6)
         assert exif.time_s == pytest.approx(plan.recorded_times_s[frame.index], abs=2e-6)
 
 
@@ -123,7 +123,7 @@ def test_jpeg_frames_are_close_to_what_was_rendered(tmp_path: Path) -> None:
     grey = read_grey(tmp_path / "flight/frames/frame_0000.jpg", SMALL.camera)
     rendered = render_frame(plan, grow_ground(3), 0)
     assert np.std(grey.astype(float) - rendered) < 2.0
-    assert read_exif(tmp_path / "flight/frames/frame_0000.jpg").iso == 100.0
+    assert read_exif(tmp_path / "flight/frames/frame_0000.jpg").exposure.iso == 100.0
 
 
 def test_a_folder_with_content_is_left_alone(tmp_path: Path) -> None:

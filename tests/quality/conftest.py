@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.georef.target_positions import Whereabouts
-from kgcp.quality.bias_study import Attempt, BiasStudy, Exposure, study_bias
+from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.settings import Method
 from kgcp.simulation.flight import CRS, TARGET_PLATE, FramePlan, frame_name, plan_flight
 from kgcp.simulation.presets import preset

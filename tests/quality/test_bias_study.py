@@ -9,10 +9,10 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.georef.target_positions import Absence, Whereabouts
 from kgcp.georef.trajectory import Trajectory
-from kgcp.quality.bias_study import Attempt, Exposure, edge_distances, study_bias
+from kgcp.quality.bias_study import edge_distances, study_bias
 from kgcp.settings import Method, VehicleSettings
 from kgcp.targets.layout import Ring, Target
 

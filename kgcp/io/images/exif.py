@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -17,6 +17,7 @@ from kgcp.errors import SettingError
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.files.time_text import parse_time
 from kgcp.io.images.header import FORMATS, is_greedy
+from kgcp.measurement.records import ExposureSettings
 
 _EXIF_MARK = b"Exif\0\0"
 
@@ -29,12 +30,11 @@ class Exif:
     ----------
     time_s : float or None
         Unix seconds (UTC) of DateTimeOriginal: when the camera says it took the frame.
+    exposure : ExposureSettings
     """
 
     time_s: float | None = None
-    exposure_time_s: float | None = None
-    iso: float | None = None
-    f_number: float | None = None
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
 
 
 def read_exif(path: Path) -> Exif:
@@ -55,12 +55,12 @@ def read_exif(path: Path) -> Exif:
             tags = _exif_tags(path)
     except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
         return Exif()
-    return Exif(
-        time_s=_time_s(tags),
+    exposure = ExposureSettings(
         exposure_time_s=_positive(tags.get(Base.ExposureTime)),
         iso=_positive(tags.get(Base.ISOSpeedRatings)),
         f_number=_positive(tags.get(Base.FNumber)),
     )
+    return Exif(_time_s(tags), exposure)
 
 
 def _exif_tags(path: Path) -> Mapping[int, Any]:

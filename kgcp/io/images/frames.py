@@ -18,10 +18,10 @@ from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import is_file, is_folder
-from kgcp.io.images.exif import Exif, read_exif
+from kgcp.io.images.exif import read_exif
 from kgcp.io.images.header import image_size, is_cut_png, upright
 
-__all__ = ["Exif", "list_frames", "read_exif", "read_grey"]
+__all__ = ["list_frames", "read_exif", "read_grey"]
 
 FRAME_SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}

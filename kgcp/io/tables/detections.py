@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import KgcpError, Status
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.files.safe_read import is_file
-from kgcp.io.images.frames import Exif
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -38,46 +37,20 @@ from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.records import (
     Alternative,
     CommonUncertainty,
-    Considered,
+    FrameResult,
     Miss,
     Observation,
     Outcome,
     Uncertainty,
 )
-from kgcp.quality.bias_study import Attempt, Exposure
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Target
 
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
 _Part = TypeVar("_Part")
-_Record = tuple["FrameResult", Outcome]
+_Record = tuple[FrameResult, Outcome]
 _Get = Callable[[_Record], object]
-
-
-@dataclass(frozen=True, slots=True)
-class FrameResult:
-    """All that was learned from one frame.
-
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    time_s : float or None
-        Mid-exposure, Unix UTC [s].
-    exif : Exif
-        Exposure quantities.
-    outcomes : tuple of Outcome
-        At least one per target, in the targets' order.
-    dropped : tuple of Considered
-        Rings that were compared with a target's and dropped, if they are to be shown.
-    """
-
-    frame: str
-    time_s: float | None
-    exif: Exif
-    outcomes: tuple[Outcome, ...]
-    dropped: tuple[Considered, ...] = ()
 
 
 def _frame(get: Callable[[FrameResult], object]) -> _Get:
@@ -173,9 +146,9 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("black", NUMBER, _measured(lambda seen: seen.appearance.black)),
     Column("white", NUMBER, _measured(lambda seen: seen.appearance.white)),
     Column("saturated", NUMBER, _measured(lambda seen: seen.appearance.saturated)),
-    Column("exposure_time_s", NUMBER, _frame(lambda result: result.exif.exposure_time_s)),
-    Column("iso", NUMBER, _frame(lambda result: result.exif.iso)),
-    Column("f_number", NUMBER, _frame(lambda result: result.exif.f_number)),
+    Column("exposure_time_s", NUMBER, _frame(lambda result: result.exposure.exposure_time_s)),
+    Column("iso", NUMBER, _frame(lambda result: result.exposure.iso)),
+    Column("f_number", NUMBER, _frame(lambda result: result.exposure.f_number)),
 )
 
 

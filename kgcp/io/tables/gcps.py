@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import fields
 
 from kgcp.georef.gcp import Kgcp
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Exposure, Sighting
 from kgcp.io.tables.columns import (
     NUMBER,
     NUMBERS,
@@ -19,7 +19,7 @@ from kgcp.io.tables.columns import (
     sd_cell,
     time_cell,
 )
-from kgcp.quality.bias_study import Comparison, EdgeDistances, Exposure, edge_distances
+from kgcp.quality.bias_study import Comparison, EdgeDistances, edge_distances
 from kgcp.settings import Method
 
 KGCP_COLUMNS: tuple[Column[Kgcp], ...] = (

@@ -29,13 +29,13 @@ from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.io.files.atomic import whole_file
 from kgcp.io.files.safe_read import is_file
-from kgcp.io.images.exif import Exif
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
     CommonUncertainty,
     Considered,
+    ExposureSettings,
+    FrameResult,
     Miss,
     Observation,
     Uncertainty,
@@ -44,7 +44,7 @@ from kgcp.measurement.records import (
 _RECORDS: dict[str, type] = {
     each.__name__: each
     for each in (
-        *(FrameResult, Exif, Observation, Miss, Considered, Pose, Ellipse),
+        *(FrameResult, ExposureSettings, Observation, Miss, Considered, Pose, Ellipse),
         *(Appearance, Uncertainty, CommonUncertainty, Alternative),
     )
 }

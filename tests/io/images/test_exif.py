@@ -35,9 +35,9 @@ def tagged(path: Path, tags: Mapping[int, object]) -> Path:
 def test_exposure_and_time_are_read(tmp_path: Path, suffix: str) -> None:
     exif = read_exif(tagged(tmp_path / f"frame{suffix}", WHOLE))
     assert exif.time_s == pytest.approx(ON_2026_05_04_AT_9_30 + 5.05, abs=1e-6)
-    assert exif.exposure_time_s == pytest.approx(0.0008)
-    assert exif.iso == 200.0
-    assert exif.f_number == pytest.approx(2.8)
+    assert exif.exposure.exposure_time_s == pytest.approx(0.0008)
+    assert exif.exposure.iso == 200.0
+    assert exif.exposure.f_number == pytest.approx(2.8)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_local_time_of_an_unknown_zone_is_no_time(tmp_path: Path, offset: str | 
         tagged(tmp_path / "frame.jpg", tags if offset is None else {**tags, OFFSET: offset})
     )
     assert exif.time_s is None
-    assert exif.iso == 200.0
+    assert exif.exposure.iso == 200.0
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_frames_of_large_cameras_are_not_taken_for_bombs(tmp_path: Path) -> None
     data[16:24] = (30_000).to_bytes(4, "big") * 2  # IHDR: 900 megapixels
     data[29:33] = __import__("zlib").crc32(data[12:29]).to_bytes(4, "big")
     path.write_bytes(data)
-    assert read_exif(path).iso == 200.0
+    assert read_exif(path).exposure.iso == 200.0
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)

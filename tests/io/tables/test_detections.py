@@ -12,18 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import Reason
 from kgcp.geometry.pose import Pose
-from kgcp.io.images.exif import Exif
-from kgcp.io.tables.detections import (
-    DETECTION_COLUMNS,
-    FrameResult,
-    detection_rows,
-    read_detections,
-)
+from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows, read_detections
 from kgcp.io.tables.parquet import write_table
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
     CommonUncertainty,
+    ExposureSettings,
+    FrameResult,
     Miss,
     Observation,
     Uncertainty,
@@ -56,7 +52,7 @@ EXPOSURE = {"exposure_time_s", "iso", "f_number"}
 FRAME = FrameResult(
     "east/0007.jpg",
     1_781_597_700.25,
-    Exif(exposure_time_s=0.0008, iso=200.0, f_number=5.6),
+    ExposureSettings(exposure_time_s=0.0008, iso=200.0, f_number=5.6),
     (BARE, Miss("C", Reason.CUT, "half of it", 0.7, 3), FULL, Miss("A", Reason.NO_CANDIDATE)),
 )
 
@@ -114,7 +110,7 @@ def test_a_miss_has_its_reason_and_no_measurement() -> None:
 
 @pytest.mark.parametrize("reason", Reason)
 def test_every_reason_makes_a_row(reason: Reason) -> None:
-    (row,) = detection_rows(FrameResult("a.png", None, Exif(), (Miss("A", reason),)))
+    (row,) = detection_rows(FrameResult("a.png", None, ExposureSettings(), (Miss("A", reason),)))
     assert (row["status"], row["reason"]) == (reason.status.value, reason.value)
     assert row["time"] is None
     assert row["status"] != "measured"

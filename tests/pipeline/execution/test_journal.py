@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.io.images.exif import Exif
-from kgcp.io.tables.detections import FrameResult
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
     CommonUncertainty,
     Considered,
+    ExposureSettings,
+    FrameResult,
     Miss,
     Observation,
     Uncertainty,
@@ -30,7 +30,7 @@ from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, to_
 
 NO_RESULTS = (
     *("", "\0", "[]", "{}", "[" * 100_000),
-    *('{"record":"Path"}', '{"record":[]}', '{"record":"Exif","x":1}'),
+    *('{"record":"Path"}', '{"record":[]}', '{"record":"ExposureSettings","x":1}'),
     *('{"record":"Miss","reason":"no such"}', '{"array":[[1],[1,2]]}'),
 )
 
@@ -74,8 +74,9 @@ results = st.builds(
     FrameResult,
     st.text(),
     maybe,
-    st.builds(Exif, maybe, maybe, maybe, maybe),
+    st.builds(ExposureSettings, maybe, maybe, maybe),
     st.lists(observations | misses, min_size=1, max_size=3).map(tuple),
+    maybe,
     st.lists(candidates, max_size=2).map(tuple),
 )
 
@@ -94,7 +95,7 @@ def bits(value: object) -> object:
 
 
 def result(frame: str) -> FrameResult:
-    return FrameResult(frame, 0.1, Exif(), (Miss("A", Reason.CUT, "ü\n"),))
+    return FrameResult(frame, 0.1, ExposureSettings(), (Miss("A", Reason.CUT, "ü\n"),))
 
 
 def open_journal(folder: Path, *, is_new: bool = False, camera: str = "b") -> Journal:

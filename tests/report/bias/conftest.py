@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.pose import Pose
-from kgcp.georef.sighting import Sighting
-from kgcp.quality.bias_study import Attempt, BiasStudy, Comparison, Exposure, ReferenceSds
+from kgcp.georef.sighting import Attempt, Exposure, Sighting
+from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.settings import Method
 
 Compare = Callable[..., Comparison]

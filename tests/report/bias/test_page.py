@@ -16,11 +16,11 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from kgcp.geometry.pose import Pose
-from kgcp.georef.sighting import Sighting
+from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.gcps import BIAS_COLUMNS
 from kgcp.pipeline.bias_report import FIGURE_FILES, write_report
-from kgcp.quality.bias_study import Attempt, BiasStudy, Comparison, Exposure, ReferenceSds
+from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.settings import DetectSettings
 
 Compare = Callable[..., Comparison]
