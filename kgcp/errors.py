@@ -22,7 +22,24 @@ def one_line(text: str) -> str:
 
 
 class KgcpError(Exception):
-    """Something the user can put right. The text is one line: what, where, what to do."""
+    """Something the user can put right. The text is one line: what, where, what to do.
+
+    Parameters
+    ----------
+    text : str
+        In words of the library.
+    option : str, optional
+        Name of the command line's option, without its dashes and perhaps with a value, by which
+        its user does what the text ends with; see `on_command_line`.
+    """
+
+    def __init__(self, text: object = "", *, option: str | None = None) -> None:
+        super().__init__(text)
+        self.option = option
+
+    def on_command_line(self) -> str:
+        """Return the text for a user who has options instead of arguments."""
+        return str(self) if self.option is None else f"{self} (--{self.option})"
 
     def __str__(self) -> str:
         return one_line(super().__str__())
@@ -169,7 +186,7 @@ class Reason(StrEnum):
     TIMED_OUT = (
         "timed_out",
         Status.UNREADABLE,
-        "the frame took longer than `--frame-timeout`, also alone",
+        "the frame took longer than it may, also alone",
     )
 
 

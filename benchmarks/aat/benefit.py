@@ -21,8 +21,9 @@ from benchmarks.aat.figure import draw_benefit
 from benchmarks.aat.gcps import kgcps_of
 from benchmarks.aat.settings import BlockSettings, Way
 from benchmarks.aat.table import Trial, Trials, rows_of, table_lines
+from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import usable_cores
 
 # Deviations of f, cx, cy [px], k1, k2; None: nothing is known but the form of the distortion.
 CALIBRATIONS: dict[str, FloatArray | None] = {

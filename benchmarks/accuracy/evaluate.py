@@ -17,7 +17,7 @@ import pandas as pd
 from benchmarks.accuracy.bands import join_truth, read_truth, summarise, table_lines
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import read_detections
-from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings, Method
 
@@ -26,8 +26,9 @@ def detect(flight_folder: Path, settings: DetectSettings, jobs: int) -> pd.DataF
     """Run the detector over a flight, in a folder that is thrown away, and return its table."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        detect_flight(read_flight(flight_folder), settings, out, jobs=jobs)
-        return read_detections(out / "detections.parquet")
+        flight = read_flight(flight_folder)
+        summary = detect_flight(flight, settings, out=out, options=RunOptions(jobs=jobs))
+        return read_detections(summary.table)
 
 
 @click.command()

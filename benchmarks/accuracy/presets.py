@@ -21,9 +21,10 @@ from benchmarks.accuracy.bands import BOUND_COLUMNS, join_truth, read_truth, sum
 from benchmarks.accuracy.bound import frame_bound
 from benchmarks.accuracy.evaluate import detect
 from benchmarks.accuracy.timing import time_measurement, timing_line
+from benchmarks.pool import ordered_map
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.images.frames import list_frames
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings, Method

@@ -16,6 +16,7 @@ import pandas as pd
 
 from benchmarks.accuracy.bands import RADIUS_BANDS_PX, join_truth, read_truth
 from benchmarks.accuracy.timing import time_measurement, timing_line
+from benchmarks.pool import ordered_map
 from kgcp.errors import Rejection
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.frames import list_frames, read_grey
@@ -23,7 +24,7 @@ from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import detection_rows
 from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.report.bias.reexposure import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
 

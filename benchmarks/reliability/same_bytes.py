@@ -34,11 +34,10 @@ from pathlib import Path
 square = numpy.ones((600, 600))
 square @ square  # the library has its threads before kgcp is there
 from kgcp.io.flight.flight import read_flight
-from kgcp.settings import DetectSettings
-from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.detect import RunOptions, detect_flight
 if __name__ == "__main__":
     flight, out, jobs = sys.argv[1:]
-    detect_flight(read_flight(Path(flight)), DetectSettings(), Path(out), jobs=int(jobs))
+    detect_flight(read_flight(Path(flight)), out=Path(out), options=RunOptions(jobs=int(jobs)))
 """
 _COMPILE_FIRST = """\
 import sys

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -83,7 +84,8 @@ class Life:
         options = ["--out", str(out), "--jobs", str(jobs), "--log-json"]
         command = [sys.executable, "-m", "kgcp", "detect", str(flight), *options]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        self.done = self.total = 0
+        self.done = self.total = 0  # of all stages so far
+        self._totals: dict[str, int] = {}
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -99,15 +101,16 @@ class Life:
             self.lines.append(line)
             if line.startswith('{"event": "progress"'):
                 event = json.loads(line)
-                self.done, self.total = event["done"], event["total"]
+                self._totals[event["stage"]] = event["total"]
+                self.total = sum(self._totals.values())
+                self.done = self.total - event["total"] + event["done"]
 
     def workers(self) -> list[int]:
-        """Find the processes that work for it."""
-        pid = self.process.pid
-        try:
-            children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
-        except OSError:
-            return []
+        """Find the processes that work for it: every thread counts its own children."""
+        children: list[str] = []
+        for path in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
+            with suppress(OSError):  # the thread has just ended
+                children += path.read_text(encoding="ascii").split()
         return [int(child) for child in children if is_worker(int(child))]
 
     def wait_for(self, done: float, seconds: float) -> None:

@@ -18,6 +18,7 @@ import click
 import cv2
 import numpy as np
 
+from benchmarks.pool import ordered_map
 from benchmarks.search.plates import TARGETS
 from benchmarks.search.scene import stream
 from benchmarks.search.verdict import wilson
@@ -27,7 +28,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import list_frames
 from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import Miss
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets

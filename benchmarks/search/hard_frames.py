@@ -16,6 +16,7 @@ from pathlib import Path
 import click
 import cv2
 
+from benchmarks.pool import ordered_map
 from benchmarks.search.plates import TARGETS
 from benchmarks.search.scene import render, stream
 from benchmarks.search.sets import SETS, SETS_BY_NAME, FrameSet
@@ -24,7 +25,7 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import Miss, Outcome
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.settings import DetectSettings
 from kgcp.simulation.scene import PlatePose
 

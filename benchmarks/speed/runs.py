@@ -17,7 +17,7 @@ import cv2
 from benchmarks.speed.costs import Costs, FrameCost, cost_and_memory, cv2_alone
 from benchmarks.speed.sources import Source, flight_over
 from kgcp.io.flight.flight import Flight
-from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.settings import DetectSettings
 
 _JOBS_FRAMES = 120
@@ -38,9 +38,9 @@ class _Clock:
     def note(self, text: str) -> None:
         """Hear of nothing that matters here."""
 
-    def progress(self, done: int, total: int, found: int) -> None:
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
         """Note when a frame was done."""
-        del done, total, found
+        del stage, done, total, found
         self.times_s.append(time.perf_counter())
 
     @property
@@ -66,7 +66,7 @@ def _rate(flight: Flight, out: Path, jobs: int) -> float:
     clock = _Clock()
     out.mkdir()
     settings = replace(DetectSettings(), is_guided=False)
-    detect_flight(flight, settings, out, jobs=jobs, watcher=clock)
+    detect_flight(flight, settings, out=out, options=RunOptions(jobs=jobs), listener=clock)
     return clock.frames_per_s
 
 

@@ -73,7 +73,7 @@ class Program(click.Group):
             with _one_line_warnings():
                 return super().invoke(ctx)
         except KgcpError as error:
-            click.echo(f"kgcp: error: {error}", err=True)
+            click.echo(f"kgcp: error: {error.on_command_line()}", err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
             click.echo("kgcp: interrupted; files written so far are complete", err=True)

@@ -142,7 +142,7 @@ def command(
     if all_candidates and overlay is None:
         raise click.UsageError("--all-candidates needs a contact sheet: give --overlay DIR, too")
     from kgcp.io.flight.flight import read_flight
-    from kgcp.pipeline.detect import detect_flight
+    from kgcp.pipeline.detect import RunOptions, detect_flight
     from kgcp.pipeline.workspace import workplace
 
     settings = DetectSettings(
@@ -156,20 +156,20 @@ def command(
         the_flight = read_flight(place.flight)
         start = time.perf_counter()
         with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
-            summary = detect_flight(
-                *(the_flight, settings, place.out),
+            options = RunOptions(
                 jobs=jobs,
-                watcher=log,
-                overlay=overlay,
-                all_candidates=all_candidates,
-                is_restart=is_restart,
                 frame_timeout_s=frame_timeout,
+                is_restart=is_restart,
                 is_profiled=is_profiled,
                 scheduler=scheduler,
+                overlay=overlay,
+                all_candidates=all_candidates,
                 stored_frames=place.frames_of(the_flight),
             )
+            summary = detect_flight(
+                the_flight, settings, out=place.out, options=options, listener=log
+            )
     seconds = time.perf_counter() - start
-    table = place.named(place.out / "detections.parquet")
-    report(summary, table, overlay, seconds, log, as_json=as_json)
+    report(summary, place.named(summary.table), overlay, seconds, log, as_json=as_json)
     if is_profiled:
         report_stages(summary)

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from threading import Timer
 from types import FrameType
@@ -38,13 +37,13 @@ class Log:
     ----------
     bar : tqdm
         Disabled where it is not wanted.
-    is_quiet, as_json : bool
     """
 
     def __init__(self, bar: tqdm[NoReturn], *, is_quiet: bool, as_json: bool) -> None:
         self._bar = bar
         self.is_quiet, self.is_json = is_quiet, as_json
         self._due_s = 0.0
+        self._stage = ""
         self.done = self.total = 0
 
     def note(self, text: str) -> None:
@@ -55,15 +54,20 @@ class Log:
             self._bar.clear()
             click.echo(f"kgcp: {text}", err=True)
 
-    def progress(self, done: int, total: int, found: int) -> None:
-        """Move the bar."""
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
+        """Move the bar, or begin it anew for another stage."""
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.reset(total)
+            self._bar.set_description(stage, refresh=False)
+            self._bar.initial = done  # what is kept from before is not counted as speed
+            self._bar.n = done
         self.done, self.total = done, total
-        self._bar.total = total
         self._bar.set_postfix(found=found, refresh=False)
         self._bar.update(done - self._bar.n)
         if self.is_json and (time.monotonic() >= self._due_s or done == total):
             self._due_s = time.monotonic() + _JSON_PROGRESS_S
-            self.event("progress", done=done, total=total, found=found)
+            self.event("progress", stage=stage, done=done, total=total, found=found)
 
     def explain_wait(self) -> None:
         """Explain the wait if no frame is finished yet."""
@@ -76,10 +80,13 @@ class Log:
         """Report how far the run got and how to resume it."""
         self._bar.close()
         if self.is_json:
-            self.event("stopped", done=self.done, total=self.total)
+            self.event("stopped", stage=self._stage, done=self.done, total=self.total)
         else:
-            text = f"stopped; {self.done} of {self.total} frames processed, results kept"
-            click.echo(f"kgcp: {text}: repeat the command to resume", err=True)
+            where = f"{self._stage}: " if self._stage else ""
+            text = f"{where}{self.done} of {counted(self.total, 'frame')} processed"
+            click.echo(
+                f"kgcp: stopped; {text}; results kept: repeat the command to resume", err=True
+            )
 
     def event(self, event: str, **values: object) -> None:
         """Print a line of JSON."""
@@ -131,7 +138,7 @@ def report(
 ) -> None:
     """Print the counts of the run; with `as_json` also to stdout."""
     frames_per_s = (summary.frames - summary.kept) / seconds
-    numbers = {**asdict(summary), "seconds": seconds, "frames_per_s": frames_per_s}
+    numbers = {**summary.numbers(), "seconds": seconds, "frames_per_s": frames_per_s}
     files = {"table": table}
     if overlay is not None:
         files["overlay"] = str(overlay / "index.html")
@@ -151,41 +158,40 @@ def report_stages(summary: SurveySummary) -> None:
             click.echo(f"{seconds:10.3f} s  {stage}", err=True)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, in the plural where it must be."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float) -> None:
     counts = ", ".join(
         f"{count} {status.replace('_', ' ')}" for status, count in summary.status.items()
     )
-    click.echo(
-        f"{summary.frames} frames in {seconds:.1f} s ({frames_per_s:.1f}/s): {counts}", err=True
-    )
-    for reason, count in summary.reasons.items():
-        click.echo(f"  {count:6d} {reason}", err=True)
+    speed = f" ({frames_per_s:.1f}/s)" if frames_per_s else ""  # all were kept from before
+    lines = [f"{counted(summary.frames, 'frame')} in {seconds:.1f} s{speed}: {counts}"]
+    lines += [f"  {count:6d} {reason}" for reason, count in summary.reasons.items()]
     if summary.guided:
-        click.echo(f"{summary.guided} of them measured in the second pass", err=True)
+        lines.append(f"{summary.guided} of them measured in the second pass")
     if summary.guide_problem is not None:
-        click.echo(f"second pass without reference poses: {summary.guide_problem}", err=True)
+        lines.append(f"second pass without reference poses: {summary.guide_problem}")
     if summary.not_drawn:
-        click.echo(
-            f"rings not drawn because their frames are missing: {summary.not_drawn}", err=True
-        )
+        lines.append(f"rings not drawn because their frames are missing: {summary.not_drawn}")
     if summary.frames_without_time:
-        click.echo(
+        lines.append(
             f"frames without a time: {summary.frames_without_time}; to turn them into KGCPs, name a"
-            " times file in flight.toml ([frames] times)",
-            err=True,
+            " times file in flight.toml ([frames] times)"
         )
     if summary.exif_times_in_whole_seconds:
-        click.echo(
+        lines.append(
             f"frames with EXIF times in whole seconds only: {summary.exif_times_in_whole_seconds};"
             " a vehicle moves metres in a second: to turn them into KGCPs, name a times file in"
-            " flight.toml ([frames] times)",
-            err=True,
+            " flight.toml ([frames] times)"
         )
     if summary.frames_without_attitude:
-        click.echo(
+        lines.append(
             f"frames without a camera attitude: {summary.frames_without_attitude}; a level plate"
-            " cannot tell their two poses apart: give [camera] plumb_sd_deg",
-            err=True,
+            " cannot tell their two poses apart: give [camera] plumb_sd_deg"
         )
     if summary.times_without_frame:
-        click.echo(f"times without a frame of that name: {summary.times_without_frame}", err=True)
+        lines.append(f"times without a frame of that name: {summary.times_without_frame}")
+    click.echo("\n".join(lines), err=True)

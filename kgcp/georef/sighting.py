@@ -105,7 +105,6 @@ class Attempt:
         Mid-exposure, Unix UTC [s].
     sighting : Sighting or None
         None where the target was not measured.
-    exposure : Exposure
     """
 
     frame: str

@@ -145,7 +145,6 @@ class Observation:
         Projected circle centre in the raw image [px].
     heading_deg : float
         In-image direction of the target's +x axis, clockwise from image x [deg].
-    appearance : Appearance
     alternative : Alternative or None
         None where the two poses coincide.
     uncertainty : Uncertainty or None
@@ -237,7 +236,6 @@ class FrameResult:
         Path relative to the frames folder.
     time_s : float or None
         Mid-exposure, Unix UTC [s].
-    exposure : ExposureSettings
     outcomes : tuple of Outcome
         At least one per target, in the targets' order.
     camera_time_s : float or None

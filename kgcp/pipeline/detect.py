@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp import __version__
 from kgcp.errors import KgcpError
-from kgcp.io.files.lock import locked
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import read_times
@@ -19,20 +17,56 @@ from kgcp.io.tables.columns import SCHEMA_VERSION, Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import versions, write_run_record
+from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Expectation
 from kgcp.measurement.normal_prior import NormalPrior, normal_priors
 from kgcp.pipeline.detection_run import Looks, Watcher
 from kgcp.pipeline.execution.executor import Crew, hired
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_task import FrameNote, FrameTask
+from kgcp.pipeline.frame_task import FrameNote, FrameTask, examine_frame
 from kgcp.pipeline.guidance import expectations, with_expectations
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import Stopwatch, SurveySummary, Tally
+from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings
 
-FRAME_TIMEOUT_S = 300.0  # hundreds of times what a large frame takes
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """How a flight is worked on. The table does not depend on any of it.
+
+    Attributes
+    ----------
+    jobs : int or None
+        Worker processes; 0 works in this one, without a limit of time; None: as many as there are
+        cores, or as the scheduler has threads.
+    frame_timeout_s : float
+        Time for one look at one frame [s].
+    is_restart : bool
+        Whether to begin anew, whatever an interrupted run has left.
+    is_profiled : bool
+        Whether to measure what the workers spend their time on, at the price of some.
+    scheduler : str or None
+        Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
+        frames where they are seen here.
+    overlay : Path or None
+        Folder of a contact sheet of all rings, to be made after the table.
+    all_candidates : bool
+        Whether the contact sheet also shows rings that were compared with a target's and dropped.
+    stored_frames : StoredFolder or None
+        Where the frames are, if not in the flight's folder.
+    """
+
+    jobs: int | None = None
+    frame_timeout_s: float = 300.0  # hundreds of times what a large frame takes
+    is_restart: bool = False
+    is_profiled: bool = False
+    scheduler: str | None = None
+    overlay: Path | None = None
+    all_candidates: bool = False
+    stored_frames: StoredFolder | None = None
 
 
 class Nobody:
@@ -41,25 +75,23 @@ class Nobody:
     def note(self, text: str) -> None:
         """Do nothing."""
 
-    def progress(self, done: int, total: int, found: int) -> None:
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
         """Do nothing."""
+
+
+_DEFAULT_SETTINGS = DetectSettings()
+_DEFAULT_OPTIONS = RunOptions()
+_STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
 
 
 @single_threaded()
 def detect_flight(
     flight: Flight,
-    settings: DetectSettings,
-    out: Path,
+    settings: DetectSettings = _DEFAULT_SETTINGS,
     *,
-    jobs: int | None,
-    watcher: Watcher | None = None,
-    overlay: Path | None = None,
-    all_candidates: bool = False,
-    is_restart: bool = False,
-    frame_timeout_s: float = FRAME_TIMEOUT_S,
-    is_profiled: bool = False,
-    scheduler: str | None = None,
-    stored_frames: StoredFolder | None = None,
+    out: Path | None = None,
+    options: RunOptions = _DEFAULT_OPTIONS,
+    listener: Watcher | None = None,
 ) -> SurveySummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
@@ -68,30 +100,15 @@ def detect_flight(
 
     Parameters
     ----------
-    flight : Flight
-    settings : DetectSettings
-    out : Path
-        Folder of the results.
-    jobs : int or None
-        Worker processes; 0 works in this one, without a limit of time; None: as many as there are
-        cores, or as the scheduler has threads. The table does not depend on it.
-    watcher : Watcher, optional
+    out : Path, optional
+        Folder of the results; by default `kgcp` in the flight's folder.
+    listener : Watcher, optional
         Who is told how the work goes.
-    overlay : Path, optional
-        Folder of a contact sheet of all rings, to be made after the table.
-    all_candidates : bool
-        Whether the contact sheet also shows rings that were compared with a target's and dropped.
-    is_restart : bool
-        Whether to begin anew, whatever an interrupted run has left.
-    frame_timeout_s : float
-        Time for one look at one frame [s].
-    is_profiled : bool
-        Whether to measure what the workers spend their time on, at the price of some.
-    scheduler : str, optional
-        Of a Dask cluster that does the work: its address, or `local:N`. Its workers must see the
-        frames where they are seen here.
-    stored_frames : StoredFolder, optional
-        Where the frames are, if not in the flight's folder.
+
+    Returns
+    -------
+    SurveySummary
+        Counts; its `table` is the file of the detections, for `read_detections`.
 
     Raises
     ------
@@ -100,65 +117,67 @@ def detect_flight(
         be written or is another process's, the scheduler is of no use, or the frames vanish.
     """
     stopwatch = Stopwatch()
-    if scheduler is not None:
+    out = results_folder(flight.folder) if out is None else out
+    if options.scheduler is not None:
         # as the folder is called in whatever folder another process works
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
+    frames_folder = options.stored_frames or flight.frames_folder
     with stopwatch.stage("preparation"):
-        frames = frames_below(stored_frames or flight.frames_folder)
+        frames = frames_below(frames_folder)
         times = {}
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
         data = FlightData(flight, frames)
         notes = _take_notes(flight, data, frames, times)
-        sheet = None if overlay is None else _sheet(flight, overlay)
+        sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     task = FrameTask(
-        stored_frames or flight.frames_folder,
+        frames_folder,
         flight.camera,
         flight.calibration_covariance,
         flight.targets,
         settings,
-        keeps_dropped=overlay is not None and all_candidates,
+        keeps_dropped=options.overlay is not None and options.all_candidates,
     )
-    with (
-        locked(out / ".detections.lock"),
-        Journal(out / ".detections.journal", _making(task), is_new=is_restart) as journal,
-        hired(
-            *(jobs, frame_timeout_s, scheduler, task.frames_folder), is_profiled=is_profiled
-        ) as crew,
-    ):
-        looks = Looks(task, notes, journal, crew, watcher or Nobody())
-        with stopwatch.stage("first look"):
-            looks.look()
-        expected: Mapping[int, Mapping[str, Expectation]] = {}
-        guide_problem = None
-        if settings.is_guided:
-            with stopwatch.stage("second look"):
-                expected, guide_problem = expectations(flight, data, looks.sightings)
-                looks.look_again(expected)
-        tally = Tally(times)
-        if sheet is not None:
-            sheet.clear()
-        with stopwatch.stage("table"):
-            write_table(
-                out / "detections.parquet",
-                DETECTION_COLUMNS,
-                _rows(looks, expected, tally),
-                _provenance(flight, settings),
-            )
-        not_drawn = 0
-        if sheet is not None:
-            with stopwatch.stage("overlay"):
-                not_drawn = draw_overlay(sheet, flight.name, looks, task, expected)
+    table = out / DETECTIONS
+    tally = Tally(times)
+    not_drawn = 0
+    making = _making(task)
+    with Journal(out / ".detections.journal", making, is_new=options.is_restart) as journal:
+        with hired(
+            options.jobs,
+            options.frame_timeout_s,
+            options.scheduler,
+            frames_folder,
+            _STAGE_CALLERS if options.is_profiled else (),
+        ) as crew:
+            looks = Looks(task, notes, journal, crew, listener or Nobody())
+            with stopwatch.stage("first look"):
+                looks.look()
+            expected: Mapping[int, Mapping[str, Expectation]] = {}
+            guide_problem = None
+            if settings.is_guided:
+                with stopwatch.stage("second look"):
+                    expected, guide_problem = expectations(flight, data, looks.sightings)
+                    looks.look_again(expected)
+            if sheet is not None:
+                sheet.clear()
+            with stopwatch.stage("table"):
+                rows = _rows(looks, expected, tally)
+                write_table(table, DETECTION_COLUMNS, rows, _provenance(flight, settings))
+            if sheet is not None:
+                with stopwatch.stage("overlay"):
+                    not_drawn = draw_overlay(sheet, flight.name, looks, task, expected)
         is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
         summary = tally.summary(
+            table=table,
             kept=looks.kept,
             frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
             not_drawn=not_drawn,
             guide_problem=guide_problem,
             stages_s=_stages_s(stopwatch, journal, crew),
         )
-        record = {**asdict(summary), "jobs": crew.jobs, "settings": asdict(settings)}
-        write_run_record(out / "run.json", record)
+        record = {**summary.numbers(), "jobs": crew.jobs, "settings": asdict(settings)}
+        write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
 
@@ -167,13 +186,14 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
     if folder.resolve().is_relative_to(flight.frames_folder.resolve()):
         raise KgcpError(
             f"{folder}: is among the frames, where pictures would be taken for frames;"
-            " choose another --overlay"
+            " choose another folder of pictures",
+            option="overlay",
         )
     return ContactSheet(folder)
 
 
 def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, float]:
-    workers = (crew.stages_s or Counter()).most_common()
+    workers = crew.stages_s.most_common()
     return {
         **stopwatch.stages_s,
         "journal, within these": journal.seconds,

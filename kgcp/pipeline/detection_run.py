@@ -44,8 +44,8 @@ class Watcher(Protocol):
     def note(self, text: str) -> None:
         """Hear of something that the user should know, in one line."""
 
-    def progress(self, done: int, total: int, found: int) -> None:
-        """Hear how many looks are done, of how many, and how many frames show a target."""
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
+        """Hear how many frames of a stage are done, of how many, and how many show a target."""
 
 
 class Looks:
@@ -53,12 +53,8 @@ class Looks:
 
     Parameters
     ----------
-    task : FrameTask
-    notes : sequence of FrameNote
     journal : Journal
         Where results are kept, and may be.
-    crew : Crew
-    watcher : Watcher
 
     Attributes
     ----------
@@ -81,21 +77,24 @@ class Looks:
         self._rows = {note.frame: row for row, note in enumerate(notes)}
         stamps = stamps_of(task.frames_folder, [note.frame for note in notes])
         self._keys = [_key(note, stamp) for note, stamp in zip(notes, stamps, strict=True)]
-        self._done, self._total = 0, len(notes)
+        self._stage, self._done, self._total = "", 0, 0
         self.sightings = Sightings(task.targets, [note.frame for note in notes])
-        self.kept = sum(key in journal for key in self._keys)
+        self.kept = 0
 
     def look(self) -> None:
         """Look at all frames that the journal has not."""
-        self._tell_what_is_kept()
         todo = []
         for row, key in enumerate(self._keys):
-            if key in self._journal:
-                self.sightings.add(row, self._journal.read(key))
+            kept = self._journal.get(key)
+            if kept is None:
+                todo.append(row)
             else:
-                todo.append(self._notes[row])
-        self._advance(self.kept)
-        with closing(self._crew.map(partial(examine_frame, self._task), todo)) as results:
+                self.sightings.add(row, kept)
+        self.kept = len(self._keys) - len(todo)
+        self._tell_what_is_kept(todo)
+        self._begin("first look", self.kept, len(self._keys))
+        notes = (self._notes[row] for row in todo)
+        with closing(self._crew.map(partial(examine_frame, self._task), notes)) as results:
             for note, result in results:
                 row = self._rows[note.frame]
                 if isinstance(result, Loss):
@@ -113,23 +112,26 @@ class Looks:
         expected : mapping of mappings
             By row and target.
         """
-        visible = {
-            row: {name: one for name, one in here.items() if one.is_visible(self._task.camera)}
-            for row, here in expected.items()
-            if self.sightings.is_readable[row]
-        }
+        visible: dict[int, dict[str, Expectation]] = {}
+        for row, by_target in expected.items():
+            if self.sightings.is_readable[row]:
+                camera = self._task.camera
+                named = {name: one for name, one in by_target.items() if one.is_visible(camera)}
+                if named:
+                    visible[row] = named
         keys = {
-            row: f"again-{fingerprint(self._keys[row], here)}"
-            for row, here in visible.items()
-            if here
+            row: f"again-{fingerprint(self._keys[row], named)}" for row, named in visible.items()
         }
-        todo = [row for row, key in keys.items() if key not in self._journal]
+        todo = []
+        for row, key in keys.items():
+            kept = self._journal.get(key)
+            if kept is None:
+                todo.append(row)
+            else:
+                self._keys[row] = key
+                self.sightings.add(row, kept)
+        self._begin("second look", len(keys) - len(todo), len(keys))
         looks = (self._second_look(row, visible[row]) for row in todo)
-        self._total += len(keys)
-        for row in keys.keys() - set(todo):
-            self._keys[row] = keys[row]
-            self.sightings.add(row, self._journal.read(keys[row]))
-        self._advance(len(keys) - len(todo))
         with closing(self._crew.map(partial(examine_frame_again, self._task), looks)) as results:
             for look, result in results:
                 row = self._rows[look.note.frame]
@@ -148,10 +150,10 @@ class Looks:
         self, function: Callable[[FrameResult], _Result]
     ) -> Iterator[tuple[int, FrameResult, _Result | Loss]]:
         """Yield what workers make of the last result of every frame, with its row, as it comes."""
-        self._total += len(self._keys)
+        self._begin("overlay", 0, len(self._keys))
         with closing(self._crew.map(function, self.results())) as made:
             for result, one in made:
-                self._advance(1)
+                self._advance()
                 yield self._rows[result.frame], result, one
 
     def _second_look(self, row: int, expected: Mapping[str, Expectation]) -> SecondLook:
@@ -160,34 +162,39 @@ class Looks:
     def _keep(self, row: int, result: FrameResult) -> None:
         self._journal.add(self._keys[row], result)
         self.sightings.add(row, result)
-        self._advance(1)
+        self._advance()
 
-    def _advance(self, looks: int) -> None:
-        self._done += looks
-        self._watcher.progress(self._done, self._total, self.sightings.found)
+    def _begin(self, stage: str, done: int, total: int) -> None:
+        self._stage, self._done, self._total = stage, done, total
+        if total:
+            self._watcher.progress(stage, done, total, self.sightings.found)
+
+    def _advance(self) -> None:
+        self._done += 1
+        self._watcher.progress(self._stage, self._done, self._total, self.sightings.found)
 
     def _require_frame(self, result: FrameResult) -> None:
         """Stop where frames cannot be read because they are gone, with the disk they were on."""
         path = self._task.frames_folder / result.frame
-        if not isinstance(path, Path):  # of a store, whoever cannot read has told why
+        if not isinstance(path, Path):  # a store says itself why it cannot be read
             return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
             raise KgcpError(
                 f"{path}: has vanished; when the frames are there again, the same command goes on"
             )
 
-    def _tell_what_is_kept(self) -> None:
+    def _tell_what_is_kept(self, todo: Sequence[int]) -> None:
         if self._journal.changes:
             changes = ", ".join(self._journal.changes)
             self._watcher.note(
                 f"starting anew, not with the interrupted run's results: {changes} changed since"
             )
-        seen = {_name_of(key) for key in self._journal}
-        changed = sum(key not in self._journal and _name_of(key) in seen for key in self._keys)
+        kept = {_name_of(key) for key in self._journal}
+        changed = sum(_name_of(self._keys[row]) in kept for row in todo)
         if self.kept or changed:
             self._watcher.note(
-                f"going on with an interrupted run: {self.kept} of {len(self._keys)} frames are"
-                f" done, {changed} have changed since (--restart ignores it)"
+                f"going on with an interrupted run: results of {self.kept} of"
+                f" {len(self._keys)} frames are kept, {changed} have changed since"
             )
 
 

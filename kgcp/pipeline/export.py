@@ -28,10 +28,8 @@ class Delivery:
     ----------
     crs : str
         Of all coordinates.
-    kgcps : tuple of Kgcp
     skipped : tuple of Skip
         Sightings that made no point, or one that was not wanted.
-    priors : tuple of CameraPrior
     carrier : Carrier or None
         The vehicle.
     consistency : Consistency or None

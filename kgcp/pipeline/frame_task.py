@@ -78,7 +78,6 @@ class SecondLook:
 
     Attributes
     ----------
-    note : FrameNote
     first : FrameResult
         Of the first look.
     expected : mapping of str to Expectation

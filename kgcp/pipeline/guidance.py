@@ -20,14 +20,8 @@ from kgcp.targets.layout import Target
 class Sightings:
     """What all frames must know of each other for a second look: few numbers of every frame.
 
-    Parameters
-    ----------
-    targets : sequence of Target
-    frames : sequence of str
-
     Attributes
     ----------
-    frames : sequence of str
     time_s : (n,) array
         Mid-exposures [s]; NaN: not known.
     states : mapping of str to (n, 3) array

@@ -6,7 +6,8 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from kgcp.errors import Reason, Status
 from kgcp.measurement.records import FrameResult, Miss
@@ -18,6 +19,8 @@ class SurveySummary:
 
     Attributes
     ----------
+    table : Path
+        The detections, that were written.
     frames : int
         Frames examined.
     status : dict of int
@@ -45,6 +48,7 @@ class SurveySummary:
         Time that each stage of the work took [s].
     """
 
+    table: Path
     frames: int
     status: Mapping[str, int]
     reasons: Mapping[str, int]
@@ -57,6 +61,10 @@ class SurveySummary:
     not_drawn: int
     guide_problem: str | None
     stages_s: Mapping[str, float]
+
+    def numbers(self) -> dict[str, object]:
+        """Return all but the table, by name, for JSON."""
+        return {name: value for name, value in asdict(self).items() if name != "table"}
 
 
 class Stopwatch:
@@ -116,6 +124,7 @@ class Tally:
     def summary(
         self,
         *,
+        table: Path,
         kept: int,
         frames_without_attitude: int,
         not_drawn: int,
@@ -124,6 +133,7 @@ class Tally:
     ) -> SurveySummary:
         """Return the counts, with what else there is to say."""
         return SurveySummary(
+            table=table,
             frames=self._frames,
             status={kind.value: self._status[kind] for kind in Status},
             reasons={reason.value: count for reason, count in self._reasons.most_common()},

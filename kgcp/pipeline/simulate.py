@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -22,7 +24,8 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.target_table import target_lines
-from kgcp.pipeline.execution.resilient_map import ordered_map
+from kgcp.pipeline.execution.executor import hired
+from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import VehicleSettings
 from kgcp.simulation.effects import Effects
@@ -156,7 +159,6 @@ def write_simulated_flight(
 
     Parameters
     ----------
-    plan : FlightPlan
     out : Path
         The folder to be; it must not exist, or be empty.
     jobs : int
@@ -176,8 +178,16 @@ def write_simulated_flight(
     try:
         shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
         (partial / "frames").mkdir(parents=True)
-        for _ in _write_frames(plan, partial / "frames", jobs):
-            on_frame()
+        write_frame = functools.partial(_write_frame, plan, partial / "frames")
+        with hired(0 if jobs == 1 else jobs, math.inf, None, partial) as crew:
+            for index, result in crew.map(write_frame, range(len(plan.frames))):
+                if isinstance(result, Loss):
+                    raise KgcpError(
+                        f"{out}: the process that rendered frame {index} has ended twice; free"
+                        " memory, or use fewer processes",
+                        option="jobs",
+                    )
+                on_frame()
         write_texts(plan, partial)
         if out.exists():
             out.rmdir()
@@ -216,31 +226,15 @@ def _exif(plan: FlightPlan, index: int) -> bytes:
     return exif.tobytes()
 
 
-def _write_frames(plan: FlightPlan, folder: Path, jobs: int) -> Iterator[None]:
-    """Render and write every frame, yielding after each."""
-    return ordered_map(
-        _write_frame_in_worker,
-        range(len(plan.frames)),
-        jobs=jobs,
-        start=_start_worker,
-        start_arguments=(plan, folder),
-    )
-
-
-_worker: tuple[FlightPlan, Path, Ground] | None = None  # once per process: the ground is large
-
-
-def _start_worker(plan: FlightPlan, folder: Path) -> None:
-    global _worker  # noqa: PLW0603 - the only state a pool's initializer can leave behind
-    _worker = plan, folder, grow_ground(plan.seed)
-
-
-def _write_frame_in_worker(index: int) -> None:
-    if _worker is None:
-        raise RuntimeError("worker used before it was started")
-    plan, folder, ground = _worker
-    encoded = encode_frame(plan, index, render_frame(plan, ground, index))
+def _write_frame(plan: FlightPlan, folder: Path, index: int) -> None:
+    encoded = encode_frame(plan, index, render_frame(plan, _ground(plan.seed), index))
     (folder / frame_name(plan.settings, index)).write_bytes(encoded)
+
+
+@functools.lru_cache(maxsize=1)
+def _ground(seed: int) -> Ground:
+    """Return the ground of a flight, which is large: once per process."""
+    return grow_ground(seed)
 
 
 def write_texts(plan: FlightPlan, folder: Path) -> None:

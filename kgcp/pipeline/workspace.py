@@ -36,13 +36,17 @@ def results_folder(flight: Path) -> Path:
     """
     folder = flight / NAME
     if folder.is_symlink():
-        raise KgcpError(f"{folder}: is a link; delete it, or name where it leads with --out")
+        raise KgcpError(
+            f"{folder}: is a link; delete it, or name where it leads as the results folder",
+            option="out",
+        )
     for parent, folders, _ in os.walk(folder):
         for name in folders:
             path = Path(parent) / name
             if path.is_symlink():
                 raise KgcpError(
-                    f"{path}: is a link to a folder; delete it, or choose another --out"
+                    f"{path}: is a link to a folder; delete it, or choose another results folder",
+                    option="out",
                 )
     return folder
 
@@ -89,7 +93,6 @@ def workplace(
 
     Parameters
     ----------
-    flight : Path or StoredFolder
     out : Path, StoredFolder or None
         None: the folder `kgcp` in the flight's.
     needs : sequence of str
@@ -119,7 +122,7 @@ def workplace(
         try:
             yield place
         except KgcpError as error:
-            raise KgcpError(place.named(error)) from error
+            raise KgcpError(place.named(error), option=error.option) from error
         if stored_out is not None:
             _deliver(place.out, stored_out, fetched)
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
-from kgcp.cli.detect_log import log_to_stderr
+from kgcp.cli.detect_log import log_to_stderr, report
+from kgcp.pipeline.run_summary import Tally
 
 
 def test_a_wait_is_explained_until_a_frame_is_done(capsys: pytest.CaptureFixture[str]) -> None:
     with log_to_stderr(is_quiet=False, as_json=False) as log:
         log.explain_wait()
         assert "compiles" in capsys.readouterr().err
-        log.progress(1, 2, 0)
+        log.progress("first look", 1, 2, 0)
         capsys.readouterr()
         log.explain_wait()
         assert "compiles" not in capsys.readouterr().err
@@ -21,3 +25,41 @@ def test_quiet_runs_explain_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with log_to_stderr(is_quiet=True, as_json=False) as log:
         log.explain_wait()
     assert not capsys.readouterr().err
+
+
+def test_a_stopped_run_tells_how_far_it_came(capsys: pytest.CaptureFixture[str]) -> None:
+    with log_to_stderr(is_quiet=False, as_json=False) as log:
+        for total, text in ((1, "0 of 1 frame processed"), (12, "0 of 12 frames processed")):
+            log.progress("second look", 0, total, 0)
+            capsys.readouterr()
+            log.stop()
+            said = f"kgcp: stopped; second look: {text}; results kept: repeat the command to resume"
+            assert said in capsys.readouterr().err
+
+
+def test_the_bar_begins_anew_with_every_stage() -> None:
+    with log_to_stderr(is_quiet=True, as_json=False) as log:
+        for stage, done, total in (
+            ("first look", 0, 9),
+            ("first look", 9, 9),
+            ("second look", 1, 2),
+        ):
+            log.progress(stage, done, total, 0)
+            assert (log.done, log.total) == (done, total)
+
+
+@pytest.mark.parametrize(("kept", "speed"), [(0, " (0.5/s)"), (1, "")])
+def test_a_speed_is_told_of_frames_that_were_worked_on(
+    kept: int, speed: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    summary = Tally({}).summary(
+        table=tmp_path,
+        kept=kept,
+        frames_without_attitude=0,
+        not_drawn=0,
+        guide_problem=None,
+        stages_s={},
+    )
+    with log_to_stderr(is_quiet=False, as_json=False) as log:
+        report(replace(summary, frames=1), "table", None, 2.0, log, as_json=False)
+    assert f"1 frame in 2.0 s{speed}: 0 measured" in capsys.readouterr().err

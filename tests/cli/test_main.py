@@ -40,6 +40,12 @@ def test_a_known_error_is_one_line_and_exit_1() -> None:
     )
 
 
+def test_an_error_names_the_option_that_helps() -> None:
+    error = KgcpError("out: is full; choose another results folder", option="out")
+    assert str(error).endswith("choose another results folder")
+    assert run_raising(error)[2].endswith("; choose another results folder (--out)\n")
+
+
 def test_a_known_warning_is_one_line_and_the_work_goes_on() -> None:
     class OneCommand(Program):
         def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:  # noqa: ARG002 - click's signature

@@ -97,7 +97,7 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     assert 1 <= done < FRAMES
     result = run(flight, tmp_path)
     assert result.exit_code == 0
-    assert f"kgcp: going on with an interrupted run: {done} of {FRAMES} frames are" in result.stderr
+    assert f"results of {done} of {FRAMES} frames are kept, 0 have" in result.stderr
     assert f"{FRAMES} frames in" in result.stderr
 
 

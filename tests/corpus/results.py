@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,6 +31,7 @@ _DRAW = ("target", "--format", "svg", "--format", "pdf", "--format", "dxf")
 _REMEASURE = ("bias-report", "--reexpose", "9")
 _TABLE = "kgcp/detections.parquet"
 _JOURNAL = "kgcp/.detections.journal"
+_DEEP = b"made-by " + b"[" * 100_000 + b"\n"
 _SCRIPT = "<script>alert(1)<"
 _FRAME = f"{_SCRIPT}img src=x onerror=alert(2)>.png"
 
@@ -141,15 +143,13 @@ CASES = (
         _link("kgcp/.detections.parquet.part", "../../elsewhere/precious.txt"),
     ),
     Case("a record that is a link", _link("kgcp/run.json", "../../elsewhere/precious.txt")),
-    Case("a lock that is a link", _link("kgcp/.detections.lock", "../../elsewhere/lock"), "; "),
     Case("a journal that is a link", _link(_JOURNAL, "../../elsewhere"), "is a link"),
     # what an interrupted run seems to have left
-    Case("a journal of noise", _bytes(f"{_JOURNAL}/journal.json", b"\xff\0{[")),
-    Case("a journal that is a pickle", _bytes(f"{_JOURNAL}/journal.json", pickle.dumps(_Trap()))),
-    Case("a journal in depth", _bytes(f"{_JOURNAL}/journal.json", b"[" * 100_000)),
-    Case("a journal that is a pipe", _fifo(f"{_JOURNAL}/journal.json")),
-    Case("a part that is a pipe", _fifo(f"{_JOURNAL}/part-0000001.txt")),
-    Case("a gigabyte of journal", _huge(f"{_JOURNAL}/part-0000001.txt"), is_huge=True),
+    Case("a journal of noise", _bytes(_JOURNAL, b"\xff\0{[")),
+    Case("a journal that is a pickle", _bytes(_JOURNAL, pickle.dumps(_Trap()))),
+    Case("a journal in depth", _bytes(_JOURNAL, b"%08x " % zlib.crc32(_DEEP) + _DEEP)),
+    Case("a journal that is a pipe", _fifo(_JOURNAL), "is not a file"),
+    Case("a gigabyte of journal", _huge(_JOURNAL), is_huge=True),
     # the table that others made
     Case(
         "no table", lambda flight: (flight / _TABLE).unlink(), "run 'kgcp detect'", command=_EXPORT

@@ -18,7 +18,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
-from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.run_summary import SurveySummary
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings
@@ -55,7 +55,7 @@ def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> S
         text = text.replace(old, new)
     (folder / "flight.toml").write_text(text, encoding="utf-8")
     try:
-        return detect_flight(read_flight(folder), DetectSettings(), out, jobs=jobs)
+        return detect_flight(read_flight(folder), out=out, options=RunOptions(jobs=jobs))
     finally:
         (folder / "flight.toml").write_text(original, encoding="utf-8")
 
@@ -135,8 +135,8 @@ def test_a_second_look_finds_what_the_reference_promises(tiny: Path, tmp_path: P
         (is_guided, jobs): detect_flight(
             flight,
             DetectSettings(is_guided=is_guided),
-            tmp_path / f"{is_guided}{jobs}",
-            jobs=jobs,
+            out=tmp_path / f"{is_guided}{jobs}",
+            options=RunOptions(jobs=jobs),
         )
         for is_guided, jobs in ((False, 0), (True, 0), (True, 2))
     }
@@ -170,11 +170,8 @@ def test_dropped_rings_are_further_cards_of_the_sheet(tiny: Path, tmp_path: Path
         sheet = tmp_path / f"sheet{len(pages)}"
         detect_flight(
             read_flight(tiny),
-            DetectSettings(),
-            tmp_path / f"out{len(pages)}",
-            jobs=jobs,
-            overlay=sheet,
-            all_candidates=all_candidates,
+            out=tmp_path / f"out{len(pages)}",
+            options=RunOptions(jobs=jobs, overlay=sheet, all_candidates=all_candidates),
         )
         pages.append((sheet / "index.html").read_text(encoding="utf-8"))
     outcomes, serial, parallel = pages

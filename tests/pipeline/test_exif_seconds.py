@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from kgcp.io.flight.flight import read_flight
-from kgcp.pipeline.detect import detect_flight
-from kgcp.settings import DetectSettings
+from kgcp.pipeline.detect import RunOptions, detect_flight
 
 EXIF_IFD, DATE_TIME, OFFSET, SUBSEC = 0x8769, 0x9003, 0x9011, 0x9291
 FLIGHT = """\
@@ -58,6 +57,6 @@ def test_only_times_that_are_used_count(
         frame(tmp_path, name, subsec)
     if times:
         (tmp_path / "frames.csv").write_text(f"frame,time\n{times}")
-    summary = detect_flight(read_flight(tmp_path), DetectSettings(), tmp_path / "out", jobs=0)
+    summary = detect_flight(read_flight(tmp_path), options=RunOptions(jobs=0))
     assert summary.exif_times_in_whole_seconds == count
     assert summary.frames_without_time == 0

@@ -11,8 +11,7 @@ from click.testing import CliRunner
 
 from kgcp.cli import main
 from kgcp.io.flight.flight import read_flight
-from kgcp.pipeline.detect import detect_flight
-from kgcp.settings import DetectSettings
+from kgcp.pipeline.detect import RunOptions, detect_flight
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_flight"
 Corrections = dict[str, dict[str, float | bool | None]]
@@ -77,7 +76,7 @@ INJECTIONS = (
 def test_what_is_wrong_in_flight_toml_is_named_with_its_amount(tmp_path: Path) -> None:
     flight = tmp_path / "flight"
     shutil.copytree(SAMPLE, flight, ignore=shutil.ignore_patterns("kgcp"))
-    detect_flight(read_flight(flight), DetectSettings(), flight / "kgcp", jobs=0)
+    detect_flight(read_flight(flight), options=RunOptions(jobs=0))
     before, no_advice = corrections(flight, "[vehicle]\n", "[vehicle]\n")
     assert no_advice == []
     for one in INJECTIONS:

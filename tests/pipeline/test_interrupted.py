@@ -22,7 +22,7 @@ from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.records import FrameResult
-from kgcp.pipeline.detect import detect_flight
+from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import (
     FrameNote,
@@ -63,14 +63,17 @@ class Stop:
     def __init__(self, after: int = 1000) -> None:
         self.after = after
         self.notes: list[str] = []
-        self.done = self.total = self.found = 0
+        self.done = self.found = 0  # of all stages together
+        self.totals: dict[str, int] = {}
 
     def note(self, text: str) -> None:
         self.notes.append(text)
 
-    def progress(self, done: int, total: int, found: int) -> None:
-        self.done, self.total, self.found = done, total, found
-        if done >= self.after:
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
+        self.totals[stage] = total
+        self.done = sum(self.totals.values()) - total + done
+        self.found = found
+        if self.done >= self.after:
             raise KeyboardInterrupt
 
 
@@ -125,10 +128,10 @@ def detect(
     min_radius_px: float = 6.0,
 ) -> SurveySummary:
     return detect_flight(
-        *(read_flight(folder), DetectSettings(min_radius_px=min_radius_px), folder / "kgcp"),
-        jobs=0,
-        watcher=watcher,
-        is_restart=is_restart,
+        read_flight(folder),
+        DetectSettings(min_radius_px=min_radius_px),
+        options=RunOptions(jobs=0, is_restart=is_restart),
+        listener=watcher,
     )
 
 
@@ -156,11 +159,11 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
     flight: Path, undisturbed: bytes, looks: Counter[str]
 ) -> None:
     after, total = 1, FRAMES
-    while after <= total:
+    while after <= total:  # which the second look increases
         watcher = Stop(after)
         with pytest.raises(KeyboardInterrupt):
             detect(flight, watcher)
-        after, total = after + 1, watcher.total
+        after, total = after + 1, sum(watcher.totals.values())
         assert files(flight) == [".detections.journal"]
     watcher = Stop()
     summary = detect(flight, watcher)
@@ -173,12 +176,13 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
     assert files(flight) == ["detections.parquet", "run.json"]
     assert summary.kept == FRAMES
     rows = read_table(flight / "kgcp" / "detections.parquet", DETECTION_COLUMNS)
-    assert watcher.done == watcher.total
+    assert watcher.totals == {"first look": FRAMES, "second look": len(EMPTY)}
+    assert watcher.done == FRAMES + len(EMPTY)
     assert watcher.found == (rows["status"] == "measured").sum() > FRAMES // 2
     (note,) = watcher.notes
     assert note == (
-        f"going on with an interrupted run: {FRAMES} of {FRAMES} frames are done,"
-        " 0 have changed since (--restart ignores it)"
+        f"going on with an interrupted run: results of {FRAMES} of {FRAMES} frames are kept,"
+        " 0 have changed since"
     )
 
 
@@ -214,12 +218,12 @@ def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
             with pytest.raises(KeyboardInterrupt):
                 detect(flight, watcher)
             assert watcher.notes[0].startswith(
-                f"going on with an interrupted run: 5 of {FRAMES} frames are done, 3 have changed"
+                "going on with an interrupted run: results of 5 of 9 frames are kept, 3 have"
             )
         else:
             detect(flight, watcher)
             assert watcher.notes[0].startswith(
-                f"going on with an interrupted run: 7 of {FRAMES} frames are done, 1 have changed"
+                "going on with an interrupted run: results of 7 of 9 frames are kept, 1 have"
             )
     twice = {"f_1.png", "f_2.png", "f_7.png"}
     first = {frame: times for frame, times in looks.items() if "again" not in frame}
@@ -273,8 +277,8 @@ def test_frames_that_vanish_stop_the_run_and_are_no_rows(
     frames, elsewhere = flight / "frames", flight / "elsewhere"
 
     class Unmount(Stop):
-        def progress(self, done: int, total: int, found: int) -> None:
-            super().progress(done, total, found)
+        def progress(self, stage: str, done: int, total: int, found: int) -> None:
+            super().progress(stage, done, total, found)
             if done == 4:
                 frames.rename(elsewhere)
 
@@ -288,9 +292,9 @@ def test_frames_that_vanish_stop_the_run_and_are_no_rows(
 
 def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
     class Second(Stop):
-        def progress(self, done: int, total: int, found: int) -> None:
-            super().progress(done, total, found)
-            with pytest.raises(KgcpError, match=rf"writing here \(process {os.getpid()}\)"):
+        def progress(self, stage: str, done: int, total: int, found: int) -> None:
+            super().progress(stage, done, total, found)
+            with pytest.raises(KgcpError, match="another kgcp is writing here; wait"):
                 detect(flight)
 
     detect(flight, Second())
@@ -309,7 +313,7 @@ def test_a_frame_that_kills_its_worker_costs_no_other(
     with monkeypatch.context() as patch:
         patch.setattr("kgcp.pipeline.detection_run.examine_frame", examine_or_die)
         settings = DetectSettings(is_guided=False)  # a second look would start more processes
-        detect_flight(read_flight(flight), settings, flight / "kgcp", jobs=1)
+        detect_flight(read_flight(flight), settings, options=RunOptions(jobs=1))
     table_path = flight / "kgcp" / "detections.parquet"
     rows = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
     assert rows.index[rows["status"] == "unreadable"].to_list() == ["f_8.png"]
@@ -326,7 +330,7 @@ def test_who_is_lost_is_tried_again_by_the_next_run(
     flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def lossy(
-        function: Callable[[Any], FrameResult], items: Iterable[Any], **_: object
+        function: Callable[[Any], FrameResult], items: Iterable[Any], *_: object
     ) -> Generator[tuple[Any, FrameResult | Loss]]:
         for item in items:
             is_deadly = isinstance(item, FrameNote) and item.frame == "f_2.png"

@@ -52,7 +52,9 @@ def write_bytes(path: Path, content: bytes) -> None:
         with whole_file(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
-        raise KgcpError(f"{path}: cannot be written ({error}); choose another folder") from error
+        raise KgcpError(
+            f"{path}: cannot be written ({error}); choose another results folder", option="out"
+        ) from error
 
 
 def write_all(contents: Mapping[Path, bytes]) -> None:

@@ -58,7 +58,9 @@ def write_table(
                 group = chain((row,), islice(remaining, _ROWS_PER_GROUP - 1))
                 writer.write_table(_table(schema, group))
     except OSError as error:
-        raise KgcpError(f"{path}: cannot be written ({error}); choose another folder") from error
+        raise KgcpError(
+            f"{path}: cannot be written ({error}); choose another results folder", option="out"
+        ) from error
 
 
 def _table(schema: pa.Schema, rows: Iterable[Row]) -> pa.Table:

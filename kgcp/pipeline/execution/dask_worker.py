@@ -1,18 +1,15 @@
 """In a Dask worker: calls are made in processes beside it, and not in its threads.
 
-Every thread keeps one process and gives its frames to that. What ends a process or hangs there ends
-nothing of Dask's, the limit of time is the kernel's as at home, and threads do not meet inside a
-decoder whose complaints are the whole process's.
+Every thread keeps one process and gives its frames to that. What ends a process or hangs there
+ends nothing of Dask's, and threads do not meet inside a decoder whose complaints are the whole
+process's.
 """
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import threading
-import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,11 +17,9 @@ from typing import Any
 
 from kgcp.errors import KgcpError
 from kgcp.io.tables.provenance import versions
-from kgcp.pipeline.execution.local_processes import LocalPool
-from kgcp.pipeline.execution.resilient_map import Overdue
+from kgcp.pipeline.execution.local_processes import WorkerProcess
 
-_pools: dict[int, tuple[str, LocalPool]] = {}  # by thread: a run, and one process for it
-_pools_lock = threading.Lock()
+_processes: dict[int, tuple[str, WorkerProcess]] = {}  # by thread: a run, and one process for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +44,7 @@ class Terms:
     folders: tuple[Path, ...]
 
 
-def nothing() -> None:
+def nothing(_: object) -> None:
     """Do nothing: to be called shows that the way there and back is open."""
 
 
@@ -58,10 +53,10 @@ def on_worker(terms: Terms, function: Callable[..., Any], *args: Any) -> Any:  #
 
     Raises
     ------
-    BrokenExecutor
-        If the process ends; `Overdue` if the limit of time ended it.
+    Lost
+        If the process ends, or the call takes too long.
     KgcpError
-        If the worker is not as the terms want it.
+        If the worker is not as the terms want it, or cannot start a process.
     Exception
         As the function does.
     """
@@ -71,16 +66,7 @@ def on_worker(terms: Terms, function: Callable[..., Any], *args: Any) -> Any:  #
             raise KgcpError(
                 f"{folder}: is not seen by the worker {_here()}; mount it there under the same name"
             )
-    began_s = math.inf
-    try:
-        pool = _pool(terms)
-        began_s = time.monotonic()
-        return pool.submit(function, *args).result()
-    except BrokenExecutor as error:
-        _drop(threading.get_ident())
-        if time.monotonic() - began_s >= terms.limit_s:
-            raise Overdue(f"after {terms.limit_s} s") from error
-        raise
+    return _process(terms).call(function, *args)
 
 
 def _require_same_versions(terms: Terms) -> None:
@@ -105,31 +91,22 @@ def _here() -> str:
     return str(get_worker().address)
 
 
-def _pool(terms: Terms) -> LocalPool:
+def _process(terms: Terms) -> WorkerProcess:
     thread = threading.get_ident()
-    with _pools_lock:
-        run, pool = _pools.get(thread, (None, None))
-    if pool is None or run != terms.run:
-        _drop(thread)  # of a run that had no time to say that it ends
+    run, process = _processes.get(thread, (None, None))
+    if process is None or run != terms.run:
+        if process is not None:
+            process.end()  # of a run that had no time to say that it ends
         # Dask's workers may have no children, lest these outlive them. Ours end with their parent.
         multiprocessing.current_process().daemon = False
-        pool = LocalPool(1, terms.limit_s)
-        with _pools_lock:
-            _pools[thread] = (terms.run, pool)
-        pool.submit(nothing).result()  # its start is not counted as work
-    return pool
-
-
-def _drop(thread: int) -> None:
-    with _pools_lock:
-        _, pool = _pools.pop(thread, (None, None))
-    if pool is not None:
-        pool.shutdown(cancel_futures=True)
+        process = WorkerProcess(terms.limit_s)
+        _processes[thread] = terms.run, process
+    return process
 
 
 def release(run: str) -> None:
     """End all processes of a run."""
-    with _pools_lock:
-        threads = [thread for thread, (owner, _) in _pools.items() if owner == run]
-    for thread in threads:
-        _drop(thread)
+    for thread, (owner, process) in tuple(_processes.items()):
+        if owner == run:
+            del _processes[thread]
+            process.end()

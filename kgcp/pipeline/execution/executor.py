@@ -1,8 +1,7 @@
-"""Who looks at the frames: this process, others of this machine, or those of a cluster."""
+"""Who works on the frames: this process, others of this machine, or those of a cluster."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor
@@ -24,51 +23,38 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class Crew:
-    """Who does the work.
+    """Workers, the same for all that a run does.
 
     Attributes
     ----------
     jobs : int
-        Worker processes; 0 works in this one.
-    limit_s : float
-        Time for one look at one frame [s]; no limit in this process.
-    stages_s : Counter of float, or None
-        Takes the time of all workers by stage [s]; None: it is not measured.
-    elsewhere : callable or None
-        Makes an executor of other machines' workers, which raises `Overdue`; None: they are
-        processes of this one.
+        How many there are; 0: this process.
+    callers : tuple of callable
+        Whose callees are the stages to be timed; empty: nothing is timed.
+    stages_s : Counter of float
+        Takes the time of all workers by stage [s].
     """
 
     jobs: int
-    limit_s: float
-    stages_s: Counter[str] | None = None
-    elsewhere: Callable[[], Executor] | None = None
+    executor: Executor
+    callers: tuple[Callable[..., object], ...]
+    stages_s: Counter[str]
 
     def map(
         self, function: Callable[[_Item], _Result], items: Iterable[_Item]
     ) -> Generator[tuple[_Item, _Result | Loss]]:
         """Yield items and results as they come."""
-        if self.stages_s is None:
-            yield from self._map(function, items)
+        if not self.callers:
+            yield from careful_map(function, items, self.executor, self.jobs)
             return
-        with closing(self._map(partial(profiled, function), items)) as results:
+        timed = partial(profiled, self.callers, function)
+        with closing(careful_map(timed, items, self.executor, self.jobs)) as results:
             for item, result in results:
                 if isinstance(result, Loss):
                     yield item, result
                 else:
                     self.stages_s.update(result.stages_s)
                     yield item, result.result
-
-    def _map(
-        self, function: Callable[[_Item], _Result], items: Iterable[_Item]
-    ) -> Generator[tuple[_Item, _Result | Loss]]:
-        limit_s = self.limit_s if self.elsewhere is None else math.inf  # it is told who was late
-        return careful_map(function, items, start=self._start, jobs=self.jobs, limit_s=limit_s)
-
-    def _start(self, jobs: int) -> Executor:
-        if self.elsewhere is not None:
-            return self.elsewhere()
-        return Inline() if self.jobs == 0 else LocalPool(jobs, self.limit_s)
 
 
 @contextmanager
@@ -77,31 +63,33 @@ def hired(
     limit_s: float,
     scheduler: str | None,
     frames: Path | StoredFolder,
-    *,
-    is_profiled: bool,
+    callers: tuple[Callable[..., object], ...] = (),
 ) -> Iterator[Crew]:
     """Have a crew until the block ends.
 
     Parameters
     ----------
     jobs : int or None
-        None: the usable cores, or all threads that the scheduler has.
+        0: this process; None: the usable cores, or all threads that the scheduler has.
     limit_s : float
+        Time for one look at one frame [s]; no limit in this process.
     scheduler : str or None
         As `kgcp.pipeline.execution.dask_client.connected` takes it; None: this machine works alone.
     frames : Path or StoredFolder
         Where they are; other machines must see a folder under the same, absolute, name.
-    is_profiled : bool
+    callers : tuple of callable
+        To time what they call; see `profiled`.
 
     Raises
     ------
     KgcpError
         If the scheduler is of no use.
     """
-    stages_s: Counter[str] | None = Counter() if is_profiled else None
     if scheduler is None:
-        yield Crew(usable_cores() if jobs is None else jobs, limit_s, stages_s)
+        jobs = usable_cores() if jobs is None else jobs
+        with LocalPool(jobs, limit_s) if jobs else Inline() as executor:
+            yield Crew(jobs, executor, callers, Counter())
         return
     folders = (frames,) if isinstance(frames, Path) else ()
     with connected(scheduler, limit_s, folders) as cluster:
-        yield Crew(jobs or cluster.jobs, limit_s, stages_s, cluster.executor)
+        yield Crew(jobs or cluster.jobs, cluster, callers, Counter())

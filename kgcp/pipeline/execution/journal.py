@@ -1,23 +1,31 @@
 """What a run has done so far, kept beside its output until the output is there.
 
-A journal is a folder of part files, each complete or absent, and `journal.json`, which says by what
-its results were made. A line of a part is a checksum, a key, and the result of one frame. The key
-says all that the result depends on: a result is found again if, and only if, all of it is the same.
+A journal is a file of lines: a checksum, a key, and the result of one frame. The key says all that
+the result depends on: a result is found again if, and only if, all of it is the same. The first
+line says by what all results were made. A line is appended when its result is there, so that
+whatever ends the run leaves at most one broken line, which counts as not done.
+
 Records are written as text without the loss of a bit. Not by pickling: a journal lies in a folder
-that may come from anybody, and a pickle may run code.
+that may come from anybody, and a pickle may run code. Nor as a database: SQLite is no shorter once
+it must not trust the file (schemas with triggers, trees without end, rollback journals that name
+files to delete), and knows no checksums.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
-import shutil
+import os
+import stat
 import time
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,8 +35,6 @@ import numpy as np
 from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.io.files.atomic import whole_file
-from kgcp.io.files.safe_read import is_file
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
@@ -50,14 +56,10 @@ _RECORDS: dict[str, type] = {
 }
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
 
-_HEADER = "journal.json"
-_SHORTEST_S = 1.0  # between two parts
-_PAUSES = 100  # times as long as the last part took to write, at least: 1 % of the time
-_LARGEST_PART = 1000  # results, all of which are in memory until it is written
-_CHECKSUM = 8  # hexadecimal digits
-_OFFSET_BITS = 40
-_DIGITS = 7  # of the parts' numbers
-_LONGEST_LINE = 1 << 26  # bytes: what is longer is no result
+_MADE_BY = "made-by"  # the key of the first line
+_SHORTEST_S = 1.0  # between two waits for the disk: what a power failure may cost
+_PAUSES = 100  # times as long as the last wait took, at least: 1 % of the time
+_LONGEST_LINE = 1 << 26  # bytes: what is longer is not a result
 
 
 def to_text(value: object) -> str:
@@ -115,14 +117,14 @@ def _record(cells: dict[str, Any]) -> object:
 
 
 class Journal:
-    """Results of frames by their keys, on disk.
+    """Results of frames by their keys, on disk; only one process at a time has it.
 
     Used in a `with` block, at the end of which, however that is left, all results are kept.
 
     Parameters
     ----------
-    folder : Path
-        Made if need be. What was made otherwise is deleted.
+    path : Path
+        The file; it and its folder are made if need be. What was made otherwise is deleted.
     making : mapping of str
         By what results are made: name, in words, to value.
     is_new : bool
@@ -131,39 +133,34 @@ class Journal:
     Attributes
     ----------
     changes : tuple of str
-        Names of what is not as it was in the journal that was found, which was deleted for it.
+        Inputs that have changed since the journal was written, which was emptied therefore.
     seconds : float
         Spent here, for the run's record.
 
     Raises
     ------
     KgcpError
-        Here and by all methods, if the folder cannot be read or written.
+        Here and by all methods, if another process has the journal, or it cannot be read or
+        written.
     """
 
-    def __init__(self, folder: Path, making: Mapping[str, str], *, is_new: bool) -> None:
-        self._folder = folder
-        self._places: dict[str, int] = {}  # by key: part and offset in one number, to be small
-        self._parts = 0
-        self._waiting: dict[str, bytes] = {}
-        self._read_last: tuple[int, bytes] = (0, b"")  # the part's number, and all of it
+    def __init__(self, path: Path, making: Mapping[str, str], *, is_new: bool) -> None:
+        self._path = path
         self._due_s = time.monotonic() + _SHORTEST_S
         self.seconds = 0.0
-        try:
-            if folder.is_symlink():
-                raise OSError(errno.EMLINK, "is a link; delete it")
-            found = None if is_new else _read_header(folder)
-            self.changes = tuple(
-                name for name, value in making.items() if found and found.get(name) != value
-            )
-            if found is None or self.changes:
-                shutil.rmtree(folder, ignore_errors=True)
-                folder.mkdir(parents=True)
-                with whole_file(folder / _HEADER) as temporary:
-                    temporary.write_text(json.dumps(dict(making), indent=1), encoding="utf-8")
-            self._find_results()
-        except OSError as error:
-            raise self._unusable(error) from error
+        self.changes: tuple[str, ...] = ()
+        self._writer = _locked(path)
+        with self._access():
+            self._reader = path.open("rb")
+            self._offsets = self._find_lines()
+            made_by = self._made_by()
+            if is_new or made_by != making:
+                if made_by and not is_new:
+                    self.changes = tuple(key for key in making if made_by.get(key) != making[key])
+                self._writer.truncate(0)
+                self._reader.seek(0, os.SEEK_END)  # it forgets what was there
+                self._offsets.clear()
+                self._append(_MADE_BY, json.dumps(dict(making)))
 
     def __enter__(self) -> Self:
         return self
@@ -179,100 +176,123 @@ class Journal:
         except KgcpError:
             if kind is None or not issubclass(kind, KgcpError):  # of which this is the echo
                 raise
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._places or key in self._waiting
+        finally:
+            self._reader.close()
+            self._writer.close()
 
     def __iter__(self) -> Iterator[str]:
-        yield from self._places
-        yield from self._waiting
+        """Yield the keys of all results."""
+        return (key for key in self._offsets if key != _MADE_BY)
+
+    def get(self, key: str) -> FrameResult | None:
+        """Return the result of a key; None if there is none that can be read."""
+        if key not in self._offsets:
+            return None
+        with self._access(), suppress(ValueError, IndexError):
+            return from_text(self._body(key))
+        return None
+
+    def read(self, key: str) -> FrameResult:
+        """Return the result of a key that was there."""
+        result = self.get(key)
+        if result is None:
+            raise KgcpError(f"{self._path}: is damaged; begin anew", option="restart")
+        return result
 
     def add(self, key: str, result: FrameResult) -> None:
-        """Keep a result, on disk within a second or so."""
-        began_s = time.monotonic()
-        body = f"{key} {to_text(result)}\n".encode()
-        self._waiting[key] = f"{zlib.crc32(body):0{_CHECKSUM}x} ".encode() + body
-        self.seconds += time.monotonic() - began_s
-        if len(self._waiting) >= _LARGEST_PART or time.monotonic() >= self._due_s:
+        """Keep a result: at once for other processes, and on the disk within a second or so."""
+        with self._access():
+            self._append(key, to_text(result))
+        if time.monotonic() >= self._due_s:
             self.flush()
 
     def flush(self) -> None:
-        """Put on disk what is not there yet."""
-        if not self._waiting:
-            return
+        """Wait until the disk has all results."""
         began_s = time.monotonic()
-        number = self._parts + 1
-        try:
-            with whole_file(self._part(number)) as temporary:
-                temporary.write_bytes(b"".join(self._waiting.values()))
-        except OSError as error:
-            raise self._unusable(error) from error
-        offset = 0
-        for key, line in self._waiting.items():
-            self._places[key] = number << _OFFSET_BITS | offset
-            offset += len(line)
-        self._parts = number
-        self._waiting.clear()
-        took_s = time.monotonic() - began_s
-        self.seconds += took_s
-        self._due_s = time.monotonic() + max(_SHORTEST_S, _PAUSES * took_s)
-
-    def read(self, key: str) -> FrameResult:
-        """Return the result of a key that is in the journal."""
-        if key in self._waiting:
-            self.flush()
-        began_s = time.monotonic()
-        number, offset = divmod(self._places[key], 1 << _OFFSET_BITS)
-        path = self._part(number)
-        try:
-            if number != self._read_last[0]:  # results are read in nearly the order of the parts
-                self._read_last = number, path.read_bytes()
-            part = self._read_last[1]
-            result = from_text(part[offset : part.index(b"\n", offset)].split(b" ", 2)[2])
-        except OSError as error:
-            raise self._unusable(error) from error
-        except (ValueError, IndexError) as error:
-            raise KgcpError(f"{path}: is damaged ({error}); run again with --restart") from error
-        self.seconds += time.monotonic() - began_s
-        return result
+        with self._access():
+            os.fsync(self._writer.fileno())
+        ended_s = time.monotonic()
+        self._due_s = ended_s + max(_SHORTEST_S, _PAUSES * (ended_s - began_s))
 
     def remove(self) -> None:
         """Delete it: the output is there."""
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._places.clear()
-        self._waiting.clear()
-        self._read_last = (0, b"")
+        with self._access():
+            self._path.unlink()  # before the lock on it goes
 
-    def _find_results(self) -> None:
-        """Index the whole lines of all parts; what else is there counts as not done."""
-        for path in filter(is_file, sorted(self._folder.glob(f"part-{'[0-9]' * _DIGITS}.txt"))):
-            number = int(path.stem.partition("-")[2])
-            self._parts = max(self._parts, number)
-            offset = 0
-            with path.open("rb") as stream:
-                while line := stream.readline(_LONGEST_LINE):
-                    body = line[_CHECKSUM + 1 :]
-                    if line[:_CHECKSUM] == f"{zlib.crc32(body):0{_CHECKSUM}x}".encode():
-                        key = body.partition(b" ")[0].decode(errors="replace")
-                        self._places[key] = number << _OFFSET_BITS | offset
-                    offset += len(line)
+    def _append(self, key: str, text: str) -> None:
+        body = f"{key} {text}\n".encode()
+        line = b"%08x %b" % (zlib.crc32(body), body)
+        self._offsets[key] = self._writer.seek(0, os.SEEK_END)
+        if self._writer.write(line) != len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def _part(self, number: int) -> Path:
-        return self._folder / f"part-{number:0{_DIGITS}d}.txt"
+    def _body(self, key: str) -> bytes:
+        self._reader.seek(self._offsets[key])
+        return self._reader.readline(_LONGEST_LINE).split(b" ", 2)[2]
 
-    def _unusable(self, error: OSError) -> KgcpError:
-        return KgcpError(
-            f"{self._folder}: {error.strerror}; when that is put right, the same command goes on"
-            " from what is kept there"
-        )
+    def _find_lines(self) -> dict[str, int]:
+        """Index the whole lines; what else is there counts as not done."""
+        offsets: dict[str, int] = {}
+        offset = 0
+        while line := self._reader.readline(_LONGEST_LINE):
+            checksum, _, body = line.partition(b" ")
+            if checksum == b"%08x" % zlib.crc32(body):
+                offsets[body.partition(b" ")[0].decode(errors="replace")] = offset
+            elif not line.endswith(b"\n"):  # a next line would be part of it
+                self._writer.truncate(offset)
+                break
+            offset += len(line)
+        return offsets
+
+    def _made_by(self) -> Mapping[str, str]:
+        made_by = None
+        with suppress(LookupError, ValueError, RecursionError):
+            made_by = json.loads(self._body(_MADE_BY))
+        return made_by if isinstance(made_by, dict) else {}
+
+    @contextmanager
+    def _access(self) -> Iterator[None]:
+        """Count the time of the block, and make lines of its errors."""
+        began_s = time.monotonic()
+        try:
+            yield
+        except OSError as error:
+            raise KgcpError(
+                f"{self._path}: {error.strerror}; when that is put right, the same command goes on"
+                " from what is kept there"
+            ) from error
+        finally:
+            self.seconds += time.monotonic() - began_s
 
 
-def _read_header(folder: Path) -> Mapping[str, str] | None:
-    """Return by what the results in a journal were made; None if there is none."""
-    if not is_file(folder / _HEADER):
-        return None
+def _locked(path: Path) -> FileIO:
+    """Open a file for writing, made if need be, that no other process has.
+
+    The lock is the kernel's: it ends with the process that holds it, however that ends.
+    """
     try:
-        header = json.loads((folder / _HEADER).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError, RecursionError):
-        return None
-    return header if isinstance(header, dict) else None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():
+            raise OSError(errno.ELOOP, "is a link; delete it")
+        while True:
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            with ExitStack() as stack:
+                file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
+                if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    raise OSError(errno.EINVAL, "is not a file; delete it")
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Whoever had it may have deleted it between the two steps of opening and locking.
+                if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    stack.pop_all()
+                    return file
+    except BlockingIOError as error:
+        raise KgcpError(
+            f"{path.parent}: another kgcp is writing here; wait for its end, or choose another"
+            " results folder",
+            option="out",
+        ) from error
+    except OSError as error:
+        raise KgcpError(
+            f"{path}: cannot be written ({error.strerror}); choose another results folder",
+            option="out",
+        ) from error

@@ -1,75 +1,192 @@
-"""Processes of this machine, which neither outlive their parent nor work too long on one item."""
+"""Processes of this machine that make calls: killed when late, and gone when their parent is.
+
+Every process has a pipe of its own. With a queue that processes share, one that is killed while it
+holds the queue's lock stops all others: that ruled out `ProcessPoolExecutor`, which ends all work
+then, and `pebble.ProcessPool`, which waits for ever (seen after six kills in the midst of results).
+"""
 
 from __future__ import annotations
 
 import multiprocessing
-import multiprocessing.connection
 import os
+import pickle
 import signal
 import threading
+import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from kgcp.errors import KgcpError
+from kgcp.pipeline.execution.resilient_map import Loss, Lost
 from kgcp.pipeline.execution.signals import stops_held
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
+_SPAWN = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
+_STARTS = 3  # of a process, before it counts as impossible
+_LONGEST_WAIT_S = 1e6  # that the kernel can be asked for
 
-class LocalPool(ProcessPoolExecutor):
-    """Processes of this machine, none of which outlives this one or works too long on one item.
 
-    They hold one end of a pipe and end when the other one closes, however that happens.
+class WorkerProcess:
+    """A process that makes one call at a time; started when first needed, and again after a loss.
+
+    Parameters
+    ----------
+    limit_s : float
+        Time for one call [s], after which the process is killed: also inside a decoder.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = min(limit_s, _LONGEST_WAIT_S)
+        self._lock = threading.Lock()  # of starting and killing, which two threads may do
+        self._is_over = False
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._connection: Connection[Any, Any] | None = None
+        self._function: Callable[..., Any] | None = None  # what the process has been sent
+
+    def call(self, function: Callable[..., Any], /, *args: Any) -> Any:  # noqa: ANN401 - those of any function
+        """Return the result of a call.
+
+        Raises
+        ------
+        Lost
+            If the process ends, or the call takes too long.
+        KgcpError
+            If processes cannot be started.
+        Exception
+            As the function does.
+        """
+        connection = self._connection or self._start()
+        if function is not self._function:
+            self._answer(connection, None, function)  # may import much: not counted as work
+            self._function = function
+        return self._answer(connection, self._limit_s, args)
+
+    def end(self) -> None:
+        """Kill the process, and start none any more; a call under way is lost."""
+        self._is_over = True
+        self._kill()
+
+    def _answer(self, connection: Connection[Any, Any], limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
+        try:
+            connection.send((limit_s is None, sent))
+            if connection.poll(limit_s):
+                result, error = connection.recv()
+            else:
+                result, error = None, Lost(Loss.LATE)
+        except (EOFError, OSError):
+            result, error = None, Lost(Loss.DIED)
+        if isinstance(error, Lost):
+            self._kill()
+        if error is not None:
+            raise error
+        return result
+
+    def _start(self) -> Connection[Any, Any]:
+        for _ in range(_STARTS):
+            own, other = _SPAWN.Pipe()
+            try:
+                with self._lock:
+                    if self._is_over:
+                        raise Lost(Loss.DIED)
+                    use_one_thread_each()
+                    self._process = _SPAWN.Process(target=_serve, args=(other,), daemon=True)
+                    self._process.start()
+                other.close()
+                own.recv()  # it is there: its start is not counted as work
+            except (EOFError, OSError):
+                self._kill()
+            else:
+                self._connection = own
+                return own
+        raise KgcpError(
+            "processes end as soon as they are started; free memory, or work in this one",
+            option="jobs 0",
+        )
+
+    def _kill(self) -> None:
+        with self._lock:
+            process, self._process = self._process, None
+            self._connection = self._function = None
+            if process is not None and process.pid is not None:
+                process.kill()
+                process.join()
+
+
+def _serve(connection: Connection[Any, Any]) -> None:
+    """Make calls until the parent closes the pipe, or ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    connection.send(None)
+    function: Any = None  # of the calls, until another one comes
+    while True:
+        try:
+            data = connection.recv_bytes()
+        except EOFError:
+            return
+        result, error = None, None
+        try:
+            is_function, sent = pickle.loads(data)  # noqa: S301 - the parent's own
+            if is_function:
+                function = sent
+            else:
+                result = function(*sent)
+        except Exception as raised:
+            error = _portable(raised)
+        connection.send((result, error))
+
+
+def _end_with_parent() -> None:
+    """End in the midst of work as soon as the parent is gone, however it went."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def _portable(error: Exception) -> Exception:
+    """Return what arrives in another process, with a note of where it was raised."""
+    error.add_note(traceback.format_exc())
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
+    except Exception:  # whatever the constructor of an exception demands
+        return RuntimeError("".join(traceback.format_exception(error)))
+    return error
+
+
+class LocalPool(ThreadPoolExecutor):
+    """Threads, each of which lets a process of its own make its calls.
 
     Parameters
     ----------
     jobs : int
         Processes.
     limit_s : float
-        Time for one call [s], after which the kernel ends its process: also inside a decoder.
+        Time for one call [s].
     """
 
     def __init__(self, jobs: int, limit_s: float) -> None:
-        use_one_thread_each()
-        context = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
-        self._limit_s = limit_s
-        self._held, self._leash = context.Pipe(duplex=False)
-        super().__init__(jobs, context, initializer=_begin, initargs=(self._held,))
+        super().__init__(jobs)
+        self._workers = [WorkerProcess(limit_s) for _ in range(jobs)]
+        self._idle = list(self._workers)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
-        """Let a process make a call within the limit of time."""
+        """Let a process make a call, within the limit of time."""
+        with stops_held():  # threads and processes inherit that Ctrl-C is none of their business
+            return super().submit(self._call, fn, *args, **kwargs)
+
+    def _call(self, function: Callable[..., Any], /, *args: Any) -> Any:  # noqa: ANN401 - those of any function
+        worker = self._idle.pop()  # the one that was busy last; there are as many as threads
+        try:
+            return worker.call(function, *args)
+        finally:
+            self._idle.append(worker)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: FBT001, FBT002 - the base class's signature
+        """End the processes, also in the midst of their work."""
         with stops_held():
-            return super().submit(_within, self._limit_s, fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002 - the base class's signature
-        """End the processes; with `cancel_futures` in the midst of their work."""
-        with stops_held():
-            if cancel_futures:
-                self._leash.close()
-            super().shutdown(wait, cancel_futures=cancel_futures)
-            self._leash.close()
-            self._held.close()
-
-
-def _begin(leash: multiprocessing.connection.Connection) -> None:
-    """Set up a worker: it ends by its parent's will, by its parent's end, and by its alarm."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    threading.Thread(target=_end_with, args=(leash,), daemon=True).start()
-
-
-def _end_with(leash: multiprocessing.connection.Connection) -> None:
-    leash.poll(None)  # nothing is ever sent: until the other end is closed
-    os._exit(1)
-
-
-def _within(
-    limit_s: float,
-    function: Callable[..., Any],
-    *args: Any,  # noqa: ANN401 - those of any function
-    **kwargs: Any,  # noqa: ANN401
-) -> Any:  # noqa: ANN401
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
-        return function(*args, **kwargs)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+            super().shutdown(wait=False, cancel_futures=cancel_futures)
+            for worker in self._workers:
+                worker.end()
+            super().shutdown(wait=wait)

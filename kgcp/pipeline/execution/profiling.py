@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cProfile
+import inspect
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,8 +15,6 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _PACKAGE = PurePath(__file__).parents[2]
-# What these functions call are the stages; they themselves only string them together.
-_CONDUCTORS = (_PACKAGE / "pipeline" / "frame_task.py", _PACKAGE / "measurement" / "frame.py")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,35 +25,32 @@ class Profiled(Generic[_Result]):
     stages_s: Mapping[str, float]
 
 
-def profiled(function: Callable[[_Item], _Result], item: _Item) -> Profiled[_Result]:
+def profiled(
+    callers: tuple[Callable[..., object], ...], function: Callable[[_Item], _Result], item: _Item
+) -> Profiled[_Result]:
     """Call a function and measure its stages, at the price of some time.
+
+    Parameters
+    ----------
+    callers : tuple of callable
+        Functions that only string stages together, as do all others of their modules: what these
+        modules call elsewhere in the package are the stages.
 
     Raises
     ------
     Exception
         As the function does.
     """
+    files = {inspect.getfile(inspect.unwrap(caller)) for caller in callers}
     profiler = cProfile.Profile()
     result = profiler.runcall(function, item)
     stages_s: dict[str, float] = defaultdict(float)
     for entry in profiler.getstats():
-        if isinstance(entry.code, CodeType) and _path(entry.code) in _CONDUCTORS:
+        if isinstance(entry.code, CodeType) and entry.code.co_filename in files:
             for call in entry.calls or ():
-                stage = _stage(call.code)
-                if stage is not None:
-                    stages_s[stage] += call.totaltime
+                if isinstance(call.code, CodeType) and call.code.co_filename not in files:
+                    path = PurePath(call.code.co_filename)
+                    if path.is_relative_to(_PACKAGE):
+                        module = path.relative_to(_PACKAGE).with_suffix("").parts
+                        stages_s[".".join((*module, call.code.co_name))] += call.totaltime
     return Profiled(result, dict(stages_s))
-
-
-def _stage(code: CodeType | str) -> str | None:
-    """Name a function of the package that is no conductor: module and function."""
-    if not isinstance(code, CodeType):
-        return None
-    path = _path(code)
-    if path in _CONDUCTORS or not path.is_relative_to(_PACKAGE):
-        return None
-    return ".".join((*path.relative_to(_PACKAGE).with_suffix("").parts, code.co_name))
-
-
-def _path(code: CodeType) -> PurePath:
-    return PurePath(code.co_filename)

@@ -18,7 +18,9 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
 
 def test_a_rename_that_fails_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.txt" / "occupied").mkdir(parents=True)
-    with pytest.raises(KgcpError, match=r"a\.txt: cannot be written .*; choose another folder"):
+    with pytest.raises(
+        KgcpError, match=r"a\.txt: cannot be written .*; choose another results folder"
+    ):
         write_bytes(tmp_path / "a.txt", b"content")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 

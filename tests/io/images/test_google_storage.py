@@ -21,8 +21,7 @@ from pyarrow.fs import FileSelector, FileSystem
 from benchmarks.reliability.torture import make_flight
 from kgcp.cli import main
 from kgcp.io.flight.flight import read_flight
-from kgcp.pipeline.detect import detect_flight
-from kgcp.settings import DetectSettings
+from kgcp.pipeline.detect import RunOptions, detect_flight
 
 FRAMES = 4
 
@@ -66,7 +65,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def expected(flight: Path) -> bytes:
     out = flight.parent / "here"
-    detect_flight(read_flight(flight), DetectSettings(), out, jobs=0)
+    detect_flight(read_flight(flight), out=out, options=RunOptions(jobs=0))
     return (out / "detections.parquet").read_bytes()
 
 

@@ -22,9 +22,8 @@ from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.images.remote import StoredFolder, at_hand, frames_below, parsed_url, stamps_of
-from kgcp.pipeline.detect import Nobody, detect_flight
+from kgcp.pipeline.detect import Nobody, RunOptions, detect_flight
 from kgcp.pipeline.workspace import workplace
-from kgcp.settings import DetectSettings
 
 FRAMES = 6
 KEYS = {
@@ -62,7 +61,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def expected(flight: Path) -> bytes:
     out = flight.parent / "here"
-    detect_flight(read_flight(flight), DetectSettings(), out, jobs=0)
+    detect_flight(read_flight(flight), out=out, options=RunOptions(jobs=0))
     return (out / "detections.parquet").read_bytes()
 
 
@@ -124,7 +123,7 @@ def test_points_are_made_of_stored_detections(
 
 
 class Stop(Nobody):
-    def progress(self, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
         if done == FRAMES // 2:
             raise KeyboardInterrupt
 
@@ -134,10 +133,9 @@ def test_what_an_interrupted_run_has_done_is_kept_on_this_machine(
     bucket: FileSystem, endpoint: str, query: str, flight: Path, expected: bytes
 ) -> None:
     out = parsed_url(f"s3://flights/results/7{query}")
+    options = RunOptions(jobs=0)
     with pytest.raises(KeyboardInterrupt), workplace(flight, out) as place:
-        detect_flight(
-            *(read_flight(place.flight), DetectSettings(), place.out), jobs=0, watcher=Stop()
-        )
+        detect_flight(read_flight(place.flight), out=place.out, options=options, listener=Stop())
     assert not [name for name in names_in(endpoint) if "parquet" in name]
     done = detect(str(flight), "--out", f"s3://flights/results/7{query}", "--jobs", "0", "--json")
     assert json.loads(done.stdout)["kept"] == FRAMES // 2

@@ -97,7 +97,9 @@ def test_rows_that_fail_half_way_leave_the_old_table(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_is_a_known_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(KgcpError, match=r"cannot be written .* choose another folder") as caught:
+    with pytest.raises(
+        KgcpError, match=r"cannot be written .* choose another results folder"
+    ) as caught:
         write_table(tmp_path / "file" / "t.parquet", COLUMNS, ROWS, {})
     one_line(caught.value)
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import signal
 import sys
 from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,11 +25,10 @@ from benchmarks.reliability.torture import make_flight
 from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
-from kgcp.pipeline.detect import Nobody, detect_flight
+from kgcp.pipeline.detect import Nobody, RunOptions, detect_flight
 from kgcp.pipeline.execution.dask_client import connected
-from kgcp.pipeline.execution.dask_worker import _pools
-from kgcp.pipeline.execution.resilient_map import Loss, careful_map
-from kgcp.settings import DetectSettings
+from kgcp.pipeline.execution.dask_worker import _processes
+from kgcp.pipeline.execution.resilient_map import Loss, Lost, careful_map
 
 FRAMES = 8
 ANY_PORT = "127.0.0.1:0"
@@ -59,13 +57,12 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def expected(flight: Path) -> bytes:
     """The table of a run in this process."""
-    return detect(flight, "here", jobs=0)
+    return detect(flight, "here", RunOptions(jobs=0))
 
 
-def detect(flight: Path, out: str, **options: object) -> bytes:
+def detect(flight: Path, out: str, options: RunOptions, listener: Nobody | None = None) -> bytes:
     folder = flight.parent / out
-    arguments = {"jobs": None, **options}
-    detect_flight(read_flight(flight), DetectSettings(), folder, **arguments)  # type: ignore[arg-type] # of many types
+    detect_flight(read_flight(flight), out=folder, options=options, listener=listener)
     return (folder / "detections.parquet").read_bytes()
 
 
@@ -76,7 +73,7 @@ class Killer(Nobody):
         self.cluster, self.done = cluster, done
         self.killed: int | None = None
 
-    def progress(self, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
         if self.killed is None and done >= self.done:
             self.killed = self.cluster.workers[0].pid
             os.kill(self.killed, signal.SIGKILL)
@@ -95,11 +92,10 @@ def test_what_kills_its_process_or_hangs_costs_no_worker_and_no_other() -> None:
     items = ["1 + 1", deadly, "2 + 2", slow, "3 + 3", "4 + 4"]
     with connected("local:2", 0.5, ()) as workers:
         assert workers.jobs == 2
-        start = lambda _: workers.executor()  # noqa: E731 - short
-        results = dict(careful_map(eval, items, start=start, jobs=2, limit_s=math.inf))
+        results = dict(careful_map(eval, items, workers, 2))
         assert workers.jobs == 2
-        assert _pools
-    assert not _pools, "no process is left of the run"
+        assert _processes
+    assert not _processes, "no process is left of the run"
     assert results == {
         **{item: eval(item) for item in items if item[0].isdigit()},  # noqa: S307 - these are ours
         deadly: Loss.DIED,
@@ -111,7 +107,8 @@ def test_a_cluster_that_loses_a_worker_gives_the_bytes_of_this_process(
     flight: Path, expected: bytes, cluster: LocalCluster
 ) -> None:
     killer = Killer(cluster, 3)
-    assert detect(flight, "dask", scheduler=cluster.scheduler_address, watcher=killer) == expected
+    options = RunOptions(scheduler=cluster.scheduler_address)
+    assert detect(flight, "dask", options, killer) == expected
     assert killer.killed is not None
     assert (flight.parent / "dask" / "run.json").exists()
 
@@ -121,7 +118,7 @@ def test_what_dask_gives_up_is_tried_again_or_a_line() -> None:
         for error, kind in (
             (
                 KilledWorker("key", cast("WorkerState", SimpleNamespace(address="tcp://one")), 3),
-                BrokenExecutor,
+                Lost,
             ),
             (ModuleNotFoundError("kgcp"), KgcpError),
             (LookupError("of the call itself"), LookupError),
@@ -160,7 +157,7 @@ def test_a_scheduler_that_is_of_no_use_is_a_line(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("kgcp.pipeline.execution.dask_client._WORKERS_S", 0.4)
     monkeypatch.setattr("kgcp.pipeline.execution.dask_client._WATCH_S", 0.2)
     for scheduler, problem in (
-        ("local:0", "is no address; give one like"),
+        ("local:0", "is not an address; give one like"),
         ("tcp://127.0.0.1:9", "cannot be reached"),
         ("carrier://pigeon:1", "cannot be reached"),
     ):

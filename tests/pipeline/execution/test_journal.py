@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -103,6 +106,17 @@ def open_journal(folder: Path, *, is_new: bool = False, camera: str = "b") -> Jo
     return Journal(folder / "journal", making, is_new=is_new)
 
 
+def fill(folder: Path, count: int) -> None:
+    with open_journal(folder) as journal:
+        for number in range(count):
+            journal.add(f"key-{number}", result(str(number)))
+
+
+def keys(folder: Path) -> list[str]:
+    with open_journal(folder) as journal:
+        return sorted(journal)
+
+
 @settings(max_examples=40, deadline=None)
 @given(results)
 def test_a_result_comes_back_to_the_last_bit(one: FrameResult) -> None:
@@ -132,22 +146,22 @@ def test_results_are_found_by_those_who_come_later(tmp_path: Path) -> None:
         with open_journal(tmp_path) as journal:
             assert len(list(journal)) == start
             for number in range(start, start + 100):
-                journal.add(f"key-{number}", result(str(number)))
-            assert journal.read(f"key-{start}").frame == str(start)
-            assert journal.read(f"key-{start + 99}").frame == str(start + 99)
-    journal = open_journal(tmp_path)
-    assert [journal.read(key).frame for key in journal] == [str(number) for number in range(300)]
-    assert "key-300" not in journal
-    journal.remove()
+                journal.add(f"key-{number:03d}", result(str(number)))
+            assert journal.read(f"key-{start:03d}").frame == str(start)
+            assert journal.read(f"key-{start + 99:03d}").frame == str(start + 99)
+    with open_journal(tmp_path) as journal:
+        frames = [journal.read(key).frame for key in sorted(journal)]
+        assert frames == [str(number) for number in range(300)]
+        assert journal.get("key-300") is None
+        journal.remove()
     assert not list(tmp_path.iterdir())
 
 
 def test_only_what_was_made_alike_is_kept(tmp_path: Path) -> None:
-    with open_journal(tmp_path) as journal:
-        journal.add("key", result("a"))
+    fill(tmp_path, 1)
     with open_journal(tmp_path, camera="c") as journal:
         assert journal.changes == ("the camera",)
-        assert "key" not in journal
+        assert journal.get("key-0") is None
         journal.add("key", result("b"))
     with open_journal(tmp_path, camera="c") as journal:
         assert journal.changes == ()
@@ -157,60 +171,123 @@ def test_only_what_was_made_alike_is_kept(tmp_path: Path) -> None:
         assert not list(journal)
 
 
+def run(program: str, folder: Path) -> subprocess.Popen[str]:
+    """Start a program that finds a journal open, in another process."""
+    lines = (
+        "import os, sys",
+        "from pathlib import Path",
+        "from kgcp.errors import Reason",
+        "from kgcp.measurement.records import ExposureSettings, FrameResult, Miss",
+        "from kgcp.pipeline.execution.journal import Journal",
+        "making = {'the settings': 'a', 'the camera': 'b'}",
+        "journal = Journal(Path(sys.argv[1]), making, is_new=False)",
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", "\n".join((*lines, program)), str(folder / "journal")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_one_process_at_a_time_has_it(tmp_path: Path) -> None:
+    with run("print('open', flush=True); sys.stdin.read()", tmp_path) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "open\n"
+        with pytest.raises(KgcpError, match=r"another kgcp is writing here; wait") as caught:
+            open_journal(tmp_path)
+        assert caught.value.on_command_line().endswith("choose another results folder (--out)")
+        other.kill()
+    assert keys(tmp_path) == [], "its lock ended with the process"
+
+
+def test_results_outlive_a_kill(tmp_path: Path) -> None:
+    program = (
+        "for number in range(5000):\n"
+        "    outcomes = (Miss('A', Reason.CUT, 'x' * 500),)\n"
+        "    result = FrameResult(str(number), 0.1, ExposureSettings(), outcomes)\n"
+        "    journal.add(f'key-{number}', result)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    with run(program, tmp_path) as other:
+        other.wait()
+    assert len(keys(tmp_path)) == 5000
+
+
 @pytest.mark.parametrize(
-    "damage", [lambda line: line[:-20], lambda line: line.replace(b"cut", b"cat"), lambda _: b"\0"]
+    "damage",
+    [
+        lambda line: line[:-20] + b"\n",
+        lambda line: line.replace(b"cut", b"cat"),
+        lambda line: line.replace(b"0.1", b"0.2"),
+        lambda _: b"\0\n",
+        lambda line: (body := line[9:].replace(b"cut", b"cat")) and b"%08x " % crc32(body) + body,
+    ],
 )
 def test_damaged_lines_count_as_not_done(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    fill(tmp_path, 3)
+    lines = (tmp_path / "journal").read_bytes().splitlines(keepends=True)
+    lines[2] = damage(lines[2])
+    (tmp_path / "journal").write_bytes(b"".join(lines))
     with open_journal(tmp_path) as journal:
-        for number in range(3):
-            journal.add(f"key-{number}", result(str(number)))
-    (part,) = (tmp_path / "journal").glob("part-*")
-    lines = part.read_bytes().splitlines(keepends=True)
-    part.write_bytes(b"".join((lines[0], damage(lines[1]), b"\n", lines[2])))
-    journal = open_journal(tmp_path)
-    assert list(journal) == ["key-0", "key-2"]
-    assert journal.read("key-2").frame == "2"
+        assert journal.get("key-1") is None
+        assert journal.read("key-2").frame == "2"
+    (tmp_path / "journal").write_bytes(b"".join(lines[1:]))
+    assert keys(tmp_path) == [], "nothing says what made it"
 
 
-def test_a_full_disk_is_a_line_and_the_journal_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    journal = open_journal(tmp_path)
-    journal.add("key-0", result("0"))
-    journal.flush()
-    journal.add("key-1", result("1"))
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(KgcpError, match=r"journal: No space left on device; when that is put"):
-            journal.flush()
-    assert list(open_journal(tmp_path)) == ["key-0"]
-    assert not list((tmp_path / "journal").glob(".*"))
-    journal.flush()
-    assert list(open_journal(tmp_path)) == ["key-0", "key-1"]
+def test_a_line_that_was_cut_spoils_no_other(tmp_path: Path) -> None:
+    fill(tmp_path, 2)
+    data = (tmp_path / "journal").read_bytes()
+    (tmp_path / "journal").write_bytes(data[:-20])
+    with open_journal(tmp_path) as journal:
+        assert list(journal) == ["key-0"]
+        journal.add("key-2", result("2"))
+    assert keys(tmp_path) == ["key-0", "key-2"]
 
 
-def test_a_vanished_folder_is_a_line_and_is_not_made_again(tmp_path: Path) -> None:
-    journal = open_journal(tmp_path)
-    journal.add("key", result("a"))
-    (tmp_path / "journal").rename(tmp_path / "elsewhere")
-    with pytest.raises(KgcpError, match=r"journal: No such file or directory; when that"):
-        journal.flush()
-    assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]
-    (tmp_path / "elsewhere").rename(tmp_path / "journal")
-    journal.flush()
-    assert list(open_journal(tmp_path)) == ["key"]
+@pytest.mark.parametrize("key", ["made-by", "never"])
+def test_a_result_that_cannot_be_read_again_is_an_error(key: str, tmp_path: Path) -> None:
+    text = r"journal: is damaged; begin anew"
+    with open_journal(tmp_path) as journal, pytest.raises(KgcpError, match=text) as caught:
+        journal.read(key)
+    assert caught.value.on_command_line().endswith(" (--restart)")
 
 
-def test_a_link_is_no_journal(tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "journal").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(KgcpError, match=r"is a link; delete it"):
+def test_a_full_disk_is_a_line_and_the_journal_stays(tmp_path: Path) -> None:
+    program = (
+        "import resource, signal\n"
+        "from kgcp.errors import KgcpError\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (700, 700))\n"
+        "try:\n"
+        "    with journal:\n"
+        "        for number in range(9):\n"
+        "            miss = Miss('A', Reason.CUT, 'x' * 50)\n"
+        "            result = FrameResult(str(number), 0.1, ExposureSettings(), (miss,))\n"
+        "            journal.add(f'key-{number}', result)\n"
+        "except KgcpError as error:\n"
+        "    print(error)\n"
+    )
+    with run(program, tmp_path) as other:
+        told, _ = other.communicate()
+    assert "journal: No space left on device; when that is put right" in told
+    assert keys(tmp_path) == ["key-0"]
+
+
+def test_what_is_in_the_way_is_a_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(KgcpError, match=r"cannot be written .*; choose another results folder"):
+        open_journal(tmp_path / "file")
+    (tmp_path / "precious").write_bytes(b"mine")
+    (tmp_path / "journal").symlink_to(tmp_path / "precious")
+    with pytest.raises(KgcpError, match=r"journal: cannot be written \(is a link; delete it\)"):
         open_journal(tmp_path)
-    assert not list((tmp_path / "elsewhere").iterdir())
+    assert (tmp_path / "precious").read_bytes() == b"mine"
+    (tmp_path / "journal").unlink()
+    os.mkfifo(tmp_path / "journal")
+    with pytest.raises(KgcpError, match=r"journal: cannot be written \(is not a file; delete it\)"):
+        open_journal(tmp_path)
 
 
 def test_writing_takes_little_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

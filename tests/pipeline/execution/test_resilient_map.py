@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, SettingError
 from kgcp.pipeline.execution.local_processes import LocalPool
-from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map
+from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map, usable_cores
 
 DEADLY, UNLUCKY, SLOW = 3, 5, 7
 LIMIT_S = 1.5
@@ -46,26 +46,25 @@ def fail(item: int) -> int:
     raise LookupError(str(item))
 
 
-def pool(jobs: int) -> Executor:
-    return LocalPool(jobs, LIMIT_S)
+def fail_oddly(_: int) -> int:
+    raise SettingError("fx", "is 0", "give more")  # which pickle cannot make again
 
 
-def long_pool(jobs: int) -> Executor:
-    return LocalPool(jobs, 300.0)
+def pid_and(*values: object) -> tuple[int, tuple[object, ...]]:
+    return os.getpid(), values
 
 
-def broken_pool(jobs: int) -> Executor:
-    """A pool whose processes do not live to see their first item."""
-    executor = LocalPool(jobs, LIMIT_S)
-    executor._initializer = os._exit
-    executor._initargs = (1,)
-    return executor
+def end_process(_: object) -> None:
+    os._exit(1)
+
+
+def pool(jobs: int, limit_s: float = LIMIT_S) -> Executor:
+    return LocalPool(jobs, limit_s) if jobs else Inline()
 
 
 def test_what_kills_its_process_is_lost_and_nothing_else(tmp_path: Path) -> None:
-    results = dict(
-        careful_map(*(partial(work, tmp_path), range(9)), start=pool, jobs=2, limit_s=LIMIT_S)
-    )
+    with pool(2) as executor:
+        results = dict(careful_map(partial(work, tmp_path), range(9), executor, 2))
     lost = {DEADLY: Loss.DIED, SLOW: Loss.LATE}
     assert results == {item: lost.get(item, item * item) for item in range(9)}
     assert (tmp_path / "died").exists(), "died once, and was tried again"
@@ -81,17 +80,34 @@ def test_few_items_are_taken_before_their_time() -> None:
 
     for jobs, ahead in ((0, 1), (2, 5)):
         taken = 0
-        start = pool if jobs else lambda _: Inline()
-        mapped = careful_map(abs, numbers(), start=start, jobs=jobs, limit_s=LIMIT_S)
-        with closing(mapped) as results:
+        with (
+            pool(jobs) as executor,
+            closing(careful_map(abs, numbers(), executor, jobs)) as results,
+        ):
             for done, _ in enumerate(islice(results, 30), start=1):
                 assert taken <= done + ahead
 
 
 def test_what_an_item_raises_arrives() -> None:
-    for jobs, start in ((0, lambda _: Inline()), (1, pool)):
-        with pytest.raises(LookupError, match="4"):
-            list(careful_map(fail, (4,), start=start, jobs=jobs, limit_s=LIMIT_S))
+    for jobs in (0, 1):
+        with pool(jobs) as executor, pytest.raises(LookupError, match="4"):
+            list(careful_map(fail, (4,), executor, jobs))
+    with (
+        pool(1) as executor,
+        pytest.raises(RuntimeError, match="SettingError: fx: is 0; give more"),
+    ):
+        list(careful_map(fail_oddly, (4,), executor, 1))
+
+
+def test_one_pool_serves_several_maps(tmp_path: Path) -> None:
+    with pool(1) as executor:
+        (first,) = careful_map(partial(pid_and, tmp_path), (1,), executor, 1)
+        (second,) = careful_map(pid_and, (2,), executor, 1)
+        with pytest.raises(LookupError):
+            list(careful_map(fail, (4,), executor, 1))
+        (third,) = careful_map(pid_and, (2,), executor, 1)
+    assert first[1] == (second[1][0], (tmp_path, 1))  # type: ignore[index] # nothing was lost
+    assert second == third
 
 
 @pytest.mark.usefixtures("sigint_raises")
@@ -102,15 +118,17 @@ def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
         signal.raise_signal(signal.SIGINT)
         steps.append(f"{item} ended")
 
-    inline = careful_map(stop, (1, 2), start=lambda _: Inline(), jobs=0, limit_s=LIMIT_S)
     with pytest.raises(KeyboardInterrupt):
-        list(inline)
+        list(careful_map(stop, (1, 2), Inline(), 0))
     assert steps == ["1 ended"]
 
 
-def test_processes_that_cannot_start_are_a_line() -> None:
-    with pytest.raises(KgcpError, match="end as soon as they are started; free memory"):
-        list(careful_map(abs, (1, 2), start=broken_pool, jobs=1, limit_s=LIMIT_S))
+def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kgcp.pipeline.execution.local_processes._serve", end_process)
+    text = "end as soon as they are started; free memory"
+    with pool(1) as executor, pytest.raises(KgcpError, match=text) as caught:
+        list(careful_map(abs, (1, 2), executor, 1))
+    assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
 def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
@@ -122,12 +140,8 @@ def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
             time.sleep(0.05)
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        list(
-            careful_map(
-                *(partial(wait_forever, tmp_path), stop()), start=long_pool, jobs=1, limit_s=300.0
-            )
-        )
+    with pytest.raises(KeyboardInterrupt), pool(1, 300.0) as executor:
+        list(careful_map(partial(wait_forever, tmp_path), stop(), executor, 1))
     assert time.monotonic() - start_s < 60.0
     wait_until_gone(workers_in(tmp_path))
 
@@ -155,11 +169,12 @@ def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
     program = (
         "from functools import partial; from pathlib import Path; import sys\n"
         "sys.path.insert(0, sys.argv[2])\n"
-        "from test_resilient_map import long_pool, wait_forever\n"
+        "from test_resilient_map import pool, wait_forever\n"
         "from kgcp.pipeline.execution.resilient_map import careful_map\n"
         "if __name__ == '__main__':\n"
         "    work = partial(wait_forever, Path(sys.argv[1]))\n"
-        "    list(careful_map(work, (1, 2), start=long_pool, jobs=2, limit_s=300.0))\n"
+        "    with pool(2, 300.0) as executor:\n"
+        "        list(careful_map(work, (1, 2), executor, 2))\n"
     )
     script, marks = tmp_path / "parent.py", tmp_path / "marks"
     marks.mkdir()
@@ -171,3 +186,7 @@ def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
             time.sleep(0.05)
         parent.kill()
     wait_until_gone(workers_in(marks))
+
+
+def test_there_is_a_core_to_use() -> None:
+    assert 1 <= usable_cores() <= (os.cpu_count() or 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from kgcp.pipeline.execution.resilient_map import ordered_map, usable_cores
+from benchmarks.pool import ordered_map
 
 ITEMS = tuple(range(11))
 
@@ -65,7 +65,3 @@ def test_one_item_needs_no_pool(tmp_path: Path) -> None:
     one = ordered_map(shifted, (4,), jobs=3, start=begin, start_arguments=(1, tmp_path))
     assert list(one) == [17]
     assert [path.name for path in tmp_path.iterdir()] == [str(os.getpid())]
-
-
-def test_there_is_a_core_to_use() -> None:
-    assert 1 <= usable_cores() <= (os.cpu_count() or 1)
