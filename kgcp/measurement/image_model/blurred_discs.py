@@ -1,7 +1,7 @@
 """The inner loop of the measurement, compiled: what blurred discs add to the pixels in reach.
 
 A pixel sees the share of a disc that its blur covers: the integral of an anisotropic Gaussian, and
-of a motion, over the disc. There is no closed form. Along one direction the integral is closed, and
+of a motion, over the disc. It has no closed form. Along one direction the integral is closed, and
 two rules take care of the other one (docs/method.md, "Blurred discs", derives both):
 
 - discs that are large against the blur: their edge is a parabola there, and the mean over it is a

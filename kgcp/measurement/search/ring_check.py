@@ -1,8 +1,8 @@
 """Grey values on circles around places that may be a ring's: how dark it is, and how even.
 
-The ring filter answers to much that is no ring. Here few samples per place decide, dark ones on the
-ring and bright ones around it, in more and more directions; most places are dropped after eight. At
-last the samples on ring, core and surround, 24 each, must be of one grey value each. Order
+The ring filter also answers to much else. Here few samples per place decide, dark ones on the ring
+and bright ones around it, in more and more directions; most places are dropped after eight. At last
+the samples on ring, core and surround, 24 each, must be of one grey value each. Order
 statistics measure that, not means: dots brighten and something in the way may hide a part of any
 circle, which moves the mean and the largest values, but not those of lower rank. docs/method.md,
 "Ring check", has the ranks.

@@ -230,7 +230,7 @@ def test_derivatives_are_those_of_the_level(rule: Quadrature, streak: tuple[floa
     if any(streak):
         numeric |= {BY_STREAK_X: slope(streak_x=step), BY_STREAK_Y: slope(streak_y=step)}
     for row, expected in numeric.items():
-        if rule is Quadrature.EDGE:  # what blur askew to the radius adds has no derivatives
+        if rule is Quadrature.EDGE:  # what oblique blur adds has no derivatives
             off = np.linalg.norm(seen[row] - expected)
             assert off < 0.2 * np.linalg.norm(expected), row
         else:
@@ -264,7 +264,7 @@ def test_derivatives_of_an_edge_under_an_even_blur_are_those_of_the_level() -> N
         (24.0, (0.9, 0.9, 0.0, 0.2, 0.1)),
     ],
 )
-def test_an_edge_bends_under_a_blur_askew_as_chords_say(
+def test_an_edge_bends_under_oblique_blur_as_chords_say(
     radius: float, blur: tuple[float, float, float, float, float]
 ) -> None:
     """Blur or motion across the radius that goes with such along it."""

@@ -89,7 +89,7 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
         levels.append(white_level(pose.matrix, RAYS, other.vector, pairs).value)
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order; and all
-    # leave out derivatives of what blur askew to the radius adds
+    # leave out derivatives of what oblique blur adds
     tolerance = 0.06 if index in {3, 4, 5} else 0.03
     assert np.abs(numeric - share.jacobian[index]).max() < tolerance * np.abs(numeric).max()
 

@@ -41,7 +41,7 @@ class PlainCheck:
         return int(np.sum((ring < self.dark) & is_bright))
 
     def clearness(self, radius: float, clear: float) -> float:
-        """Contrast, less half of the ring's spread; 0 if it is no ring."""
+        """Contrast, less half of the ring's spread; 0 if it is not a ring."""
         ring, core, near, far = (
             self.samples(ratio * radius, 24) for ratio in (RING, CORE, NEAR, FAR)
         )

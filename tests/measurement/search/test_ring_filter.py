@@ -71,7 +71,7 @@ def test_peaks_are_those_of_the_definition(shape: tuple[int, int], seed: int) ->
 
 
 def test_the_answer_to_a_ring_by_its_radius_is_that_of_the_documentation() -> None:
-    """Of its contrast; sampled 20 times per pixel, blurred by 0.6 px."""
+    """As a share of its contrast; sampled 20 times per pixel, blurred by 0.6 px."""
     size, fine = 31, 20
     y, x = (np.mgrid[: size * fine, : size * fine] + 0.5) / fine - 0.5 * size
     for radius, answer in ((2.0, -0.12), (2.5, 0.09), (2.8, 0.22), (3.5, 0.37), (4.2, 0.31)):
