@@ -30,7 +30,7 @@ from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings, Method
 from kgcp.simulation.crlb import Bound
 from kgcp.simulation.flight import FlightPlan, FramePlan, frame_name, plan_flight
-from kgcp.simulation.presets import SimulationSettings, preset
+from kgcp.simulation.presets import PRESETS, SimulationSettings, preset
 
 PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far")
 _FRAMES = 36
@@ -90,7 +90,7 @@ def _folder_or_temporary(keep: Path | None) -> Iterator[Path]:
 
 
 @click.command()
-@click.option("--preset", "names", multiple=True, type=click.Choice(PRESET_NAMES))
+@click.option("--preset", "names", multiple=True, type=click.Choice(tuple(PRESETS)))
 @click.option("--frames", type=click.IntRange(2), default=None, help="Per preset.")
 @click.option("--quick", is_flag=True, help=f"{_QUICK_FRAMES} frames per preset.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)

@@ -21,7 +21,7 @@ from kgcp.settings import require_range
 from kgcp.simulation.patch import Patch
 
 _REACH_M = 0.9  # of the plate's corners from its centre
-_EDGE_REACH_M = 0.35  # a shadow edge passes the plate's centre within this: it crosses the ring
+_EDGE_REACH_M = 0.45  # shadow edges pass the centre within this: they meet the ring
 _STRIPE_REACH_M = 0.4
 _HIGHLIGHT_REACH_M = 0.45
 _FAR_M = 100.0  # width of a shade that has one edge only
@@ -149,9 +149,13 @@ class Shade:
 
     def _risen(self, distance_m: FloatArray) -> FloatArray:
         """Return the share of a uniform disc that is above a straight horizon."""
-        height = np.clip(distance_m * (2.0 / self.penumbra_m), -1.0, 1.0)
-        share: FloatArray = height * np.sqrt(1.0 - height * height) + np.arcsin(height)
-        return 0.5 + share / math.pi
+        height = distance_m * (2.0 / self.penumbra_m)
+        share = (height > 0.0).astype(np.float64)
+        soft = np.nonzero(np.abs(height) < 1.0)
+        height = height[soft]
+        segment = height * np.sqrt(1.0 - height * height) + np.arcsin(height)
+        share[soft] = 0.5 + segment / math.pi
+        return share
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,9 +23,9 @@ from kgcp.settings import require_range
 
 ComplexArray = npt.NDArray[np.complex128]
 
-_NEGLIGIBLE = 1e-9  # of the transfer
+_NEGLIGIBLE = 1e-7  # of the transfer
 _MOST_COMA = 0.5  # of psf³, with equal axes: a fifth of the variance is left to the Gaussian
-_EXTRA_NODES = 6
+_EXTRA_NODES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def _coma_transfer(
     angle = math.radians(direction_deg)
     phase = 2.0 * math.pi * circle_px * (math.cos(angle) * fx + math.sin(angle) * fy)
     turn = 2.0 * math.pi * circle_px * np.hypot(fx, fy)
-    count = math.ceil(float(np.max(2.0 * np.abs(phase) + turn)) / 2.0) + _EXTRA_NODES
+    count = math.ceil(float(np.max(2.0 * np.abs(phase) + turn)) / 3.0) + _EXTRA_NODES
     nodes, weights = np.polynomial.legendre.leggauss(count)
     mean: ComplexArray = np.zeros(phase.shape, dtype=np.complex128)
     for node, weight in zip(0.5 + 0.5 * nodes, 0.5 * weights, strict=True):

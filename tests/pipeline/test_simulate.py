@@ -14,6 +14,7 @@ from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.pipeline.simulate import write_simulated_flight
+from kgcp.simulation.effects import Effects, with_effects
 from kgcp.simulation.flight import (
     CRS,
     TARGET_PLATE,
@@ -116,6 +117,15 @@ def test_any_number_of_processes_writes_the_same_bytes(
 ) -> None:
     write(SMALL, tmp_path / "again", jobs=2)
     assert contents(tmp_path / "again") == contents(flight[1])
+
+
+def test_real_light_is_the_same_in_any_number_of_processes(tmp_path: Path) -> None:
+    effects = Effects(0.5, 1, 0.05, 3, 0.4, 1.3, 0.1, phone=True, rolling=0.02)
+    settings = with_effects(replace(SMALL, frames=3), effects)
+    for jobs in (1, 2):
+        write(settings, tmp_path / f"jobs_{jobs}", jobs)
+    assert contents(tmp_path / "jobs_1") == contents(tmp_path / "jobs_2")
+    assert read_flight(tmp_path / "jobs_1").camera.readout_s == 0.02
 
 
 def test_jpeg_frames_are_close_to_what_was_rendered(tmp_path: Path) -> None:
