@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from kgcp.simulation.light_field import Dirt, Glare, Shadow
+from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.presets import SimulationSettings, preset
 from kgcp.simulation.rolling_shutter import ImageMotion

@@ -8,7 +8,7 @@ from kgcp.errors import SettingError
 from kgcp.geometry.camera import Camera, Response
 from kgcp.settings import require_range
 from kgcp.simulation.imaging import Sensor, ToneCurve
-from kgcp.simulation.light_field import Dirt, Glare, Shadow
+from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.phone import Phone
 from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.rolling_shutter import ImageMotion

@@ -16,16 +16,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import (
-    Cloud,
-    Dirt,
-    Glare,
-    Highlight,
-    LightField,
-    Shade,
-    Shadow,
-    Stain,
-)
+from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade, Stain
+from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.patch import Patch, Window
 from kgcp.simulation.plate import image_plate
 from kgcp.simulation.shapes import ConvexPolygon, rectangle
