@@ -18,9 +18,9 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.gcp import Kgcp, build_kgcps
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import Whereabouts
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.measurement.systematic_errors import common_uncertainty, pose_by_calibration
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.ground import Ground
@@ -166,18 +166,18 @@ def distance_by_calibration(camera: Camera, pose: Pose) -> FloatArray:
     return np.array([by[name] for name in FREE_PARAMETERS])
 
 
-def _measure(block: Block, ground: Ground, target: Target, index: int) -> Observation | None:
+def _measure(block: Block, ground: Ground, target: Target, index: int) -> Measurement | None:
     """Return the target as kgcp measures it, its image point in the whole frame."""
     grey, first_px = render_window(block, ground, index)
     believed = window_of(block.believed, first_px)
     outcome = measure_frame(grey, believed, (target,), DetectSettings())[0]
-    if not isinstance(outcome, Observation):
+    if not isinstance(outcome, Measurement):
         return None
     common = common_uncertainty(believed, None, target.ring, outcome.pose)
     return replace(outcome, centre_px=outcome.centre_px + first_px, common=common)
 
 
-def _sighting(block: Block, index: int, seen: Observation) -> Sighting:
+def _sighting(block: Block, index: int, seen: Measurement) -> Sighting:
     uncertainty, common = seen.uncertainty, seen.common
     return Sighting(
         frame=f"{index:04d}",

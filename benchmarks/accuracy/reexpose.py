@@ -22,9 +22,9 @@ from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.frames import list_frames, read_grey
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import detection_rows
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
 from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.measure import measure_frame
 from kgcp.report.bias.reexposure import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
 
@@ -48,7 +48,7 @@ def _rows_of_frame(task: tuple[Flight, DetectSettings, str, float]) -> list[Row]
     flight, settings, frame, gain = task
     grey = reexposed(read_grey(flight.frames_folder / frame, flight.camera), gain)
     try:
-        outcomes = measure_frame(grey, flight.camera, flight.targets, settings)
+        outcomes = tuple(measure_frame(grey, flight.camera, flight.targets, settings))
     except Rejection as rejection:
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in flight.targets

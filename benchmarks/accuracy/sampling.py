@@ -24,10 +24,10 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.io.flight.flight import read_flight
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.image_model.plate import circles_of
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
@@ -52,7 +52,7 @@ def sampled_error(camera: Camera, target: Target, row: pd.Series, samples: int) 
         noisy = np.rint(plate + rng.normal(scale=_NOISE, size=plate.shape)).astype(np.uint8)
         grey[y0 : y0 + height, x0 : x0 + width] = noisy
         (seen,) = measure_frame(grey, camera, (target,), DetectSettings())
-        if isinstance(seen, Observation):
+        if isinstance(seen, Measurement):
             errors.append(100.0 * (seen.pose.distance_m / pose.distance_m - 1.0))
     return float(np.mean(errors)) if errors else float("nan")
 

@@ -12,8 +12,8 @@ from kgcp.errors import Rejection
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import InitialPose, Observation
+from kgcp.measurement.records import InitialPose, Measurement
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings, Method
 
 
@@ -29,7 +29,7 @@ def time_measurement(flight: Flight, frames: Sequence[str]) -> list[float]:
     for frame in frames:
         grey = read_grey(flight.frames_folder / frame, flight.camera)
         for start in measure_frame(grey, flight.camera, flight.targets, search):
-            if not isinstance(start, Observation):
+            if not isinstance(start, Measurement):
                 continue
             near = start.appearance
             start_pose = InitialPose(

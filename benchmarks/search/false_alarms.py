@@ -26,9 +26,9 @@ from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import list_frames
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import Miss
 from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets

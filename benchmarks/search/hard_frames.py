@@ -23,9 +23,9 @@ from benchmarks.search.sets import SETS, SETS_BY_NAME, FrameSet
 from benchmarks.search.verdict import HEADER, Verdict, describe, failure_lines, judge, table_line
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.records import Miss, Outcome
 from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.scene import PlatePose
 
@@ -36,7 +36,7 @@ def measured(grey: GreyArray, frame_set: FrameSet, seed: int, index: int) -> tup
     """Search a frame for all targets, of which most are absent."""
     camera = frame_set.shot(seed, index).camera
     try:
-        return measure_frame(grey, camera, TARGETS, DetectSettings())
+        return tuple(measure_frame(grey, camera, TARGETS, DetectSettings()))
     except Rejection as rejection:
         return tuple(Miss(t.name, rejection.reason, rejection.detail) for t in TARGETS)
 

@@ -13,7 +13,7 @@ from benchmarks.search.scene import Shot, radius_px, tilt_deg
 from benchmarks.search.sets import FrameSet
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import image_heading_deg
-from kgcp.measurement.records import Miss, Observation, Outcome
+from kgcp.measurement.records import Measurement, Miss, Outcome
 from kgcp.simulation.scene import PlatePose
 
 _Z95 = 1.959964
@@ -61,7 +61,7 @@ def judge(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> Verdict:
     measured less well; `wrong`, a measurement that is of no plate of that name: farther from
     all of them than three pixels and half their radius, or a second one of the same plate.
     """
-    left = [outcome for outcome in outcomes if isinstance(outcome, Observation)]
+    left = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     notes = _Notes()
     for seen in shot.wanted:
         observation = _nearest(shot.camera, seen, left)
@@ -92,12 +92,12 @@ def describe(shot: Shot, seen: PlatePose) -> str:
     )
 
 
-def _distance_px(camera: Camera, seen: PlatePose, observation: Observation) -> float:
+def _distance_px(camera: Camera, seen: PlatePose, observation: Measurement) -> float:
     centre = camera.project(seen.pose.translation_m)
     return float(np.linalg.norm(observation.centre_px - centre))
 
 
-def _nearest(camera: Camera, seen: PlatePose, left: list[Observation]) -> Observation | None:
+def _nearest(camera: Camera, seen: PlatePose, left: list[Measurement]) -> Measurement | None:
     reach = max(_NEAREST_PX, 0.5 * radius_px(camera, seen))
     near = [
         (_distance_px(camera, seen, observation), i)
@@ -116,7 +116,7 @@ def _miss_of(seen: PlatePose, outcomes: Sequence[Outcome], words: str) -> tuple[
     return "another_instance", f"{words}: only another one was measured"
 
 
-def _problems(camera: Camera, seen: PlatePose, observation: Observation) -> Iterator[str]:
+def _problems(camera: Camera, seen: PlatePose, observation: Measurement) -> Iterator[str]:
     off_px, limit_px = _distance_px(camera, seen, observation), _MAX_CENTRE_PX
     if observation.uncertainty is not None:
         worst = float(np.linalg.eigvalsh(observation.uncertainty.centre_cov_px2)[-1])
@@ -131,7 +131,7 @@ def _problems(camera: Camera, seen: PlatePose, observation: Observation) -> Iter
         yield f"heading off by {(turn + 180.0) % 360.0 - 180.0:+.0f}°"
 
 
-def _wrong(shot: Shot, observation: Observation) -> tuple[str, str]:
+def _wrong(shot: Shot, observation: Measurement) -> tuple[str, str]:
     x, y = observation.centre_px
     text = (
         f"{observation.target} by ring {observation.ring} at ({x:.1f}, {y:.1f}),"

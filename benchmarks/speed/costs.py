@@ -14,9 +14,9 @@ import cv2
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import read_grey
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.measurement.search.candidates import find_rings
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
@@ -111,7 +111,7 @@ def cost_of(path: Path, camera: Camera, targets: tuple[Target, ...]) -> FrameCos
     decode_s, grey = _timed(lambda: read_grey(path, camera))
     search_s, _ = _timed(lambda: find_rings(grey, settings))
     measure_s, seen = _timed(lambda: measure_frame(grey, camera, targets, settings))
-    found = sum(isinstance(one, Observation) for one in seen)
+    found = sum(isinstance(one, Measurement) for one in seen)
     return FrameCost(grey.size, decode_s, search_s, measure_s, found)
 
 

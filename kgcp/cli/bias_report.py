@@ -42,37 +42,18 @@ def command(
 
     Example: kgcp bias-report sample_flight
     """
-    from kgcp.io.flight.data import FlightData
     from kgcp.io.flight.flight import read_flight
-    from kgcp.io.tables.detections import read_attempts, read_settings
     from kgcp.pipeline.workspace import DETECTIONS, workplace
-    from kgcp.quality.bias_study import study_bias
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.pipeline.bias_report import write_report
+    from kgcp.pipeline.bias_report import bias_study
 
     with workplace(flight, out, (DETECTIONS,)) as place:
         the_flight = read_flight(place.flight)
-        table = detections or place.out / DETECTIONS
-        attempts = read_attempts(table, the_flight.targets)
-        settings = read_settings(table)
-        data = FlightData(the_flight, [attempt.frame for attempt in attempts])
-        study = study_bias(
-            attempts,
-            data.reference_poses,
-            data.whereabouts,
-            the_flight.camera,
-            the_flight.targets,
-            settings.method,
-        )
-        report = write_report(
-            study,
-            the_flight,
-            settings,
-            place.out,
-            reexpose,
-            stored_frames=place.frames_of(the_flight),
+        bias = bias_study(the_flight, detections or place.out / DETECTIONS)
+        report = bias.write_report(
+            place.out, reexpose=reexpose, stored_frames=place.frames_of(the_flight)
         )
     if as_json:
         import json

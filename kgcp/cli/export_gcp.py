@@ -19,9 +19,8 @@ from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
     from kgcp.georef.target_positions import Carrier
-    from kgcp.io.exporters.points import MapPoints
     from kgcp.io.images.remote import StoredFolder
-    from kgcp.pipeline.export import Delivery
+    from kgcp.pipeline.export import GcpSet
     from kgcp.quality.consistency import Consistency
 
 ALL = "all"
@@ -88,47 +87,36 @@ def command(
     Example: kgcp export-gcp sample_flight --format odm
     """
     from kgcp.georef.selection import Selection
-    from kgcp.io.exporters.points import MapPoints
     from kgcp.io.exporters.write import not_renewed
     from kgcp.io.flight.flight import read_flight
-    from kgcp.io.tables.consistency import write_consistency
-    from kgcp.io.tables.gcps import KGCP_COLUMNS, kgcp_row
-    from kgcp.io.tables.parquet import write_table
-    from kgcp.io.tables.provenance import provenance
-    from kgcp.pipeline.export import prepare
+    from kgcp.pipeline.export import make_gcps, write_gcps
     from kgcp.pipeline.workspace import DETECTIONS, workplace
 
     with workplace(flight, out, (DETECTIONS,)) as place:
         the_flight = read_flight(place.flight)
         source = detections or place.out / DETECTIONS
-        made = prepare(the_flight, source, Selection(**selection), crs)
-        table = place.out / "kgcps.parquet"
-        metadata = {**provenance(the_flight), "crs": made.crs}
-        write_table(table, KGCP_COLUMNS, map(kgcp_row, made.kgcps), metadata)
-        written = [table]
-        if made.consistency is not None:
-            written += write_consistency(place.out, made.consistency, provenance(the_flight))
-        points = MapPoints(made.crs, made.kgcps, the_flight.camera, made.priors)
-        more, left_out = _export(points, formats, place.out)
+        made = make_gcps(the_flight, source, selection=Selection(**selection), crs=crs)
+        written = write_gcps(made, place.out)
+        more, left_out = _export(made, formats, place.out)
         written += more
         older = not_renewed(place.out, written)
     _report(made, written, left_out, older, place.named, as_json=as_json)
 
 
 def _export(
-    points: MapPoints, formats: tuple[str, ...], folder: Path
+    made: GcpSet, formats: tuple[str, ...], folder: Path
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the named formats; with `all`, every format that can hold the points.
 
     Returns the paths, and by format why it was left out.
     """
     from kgcp.errors import KgcpError
-    from kgcp.io.exporters.write import export
+    from kgcp.pipeline.export import export_gcps
 
     written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):
         try:
-            written += export(points, name, folder)
+            written += export_gcps(made, (name,), folder)
         except KgcpError as error:
             if name in formats:
                 raise
@@ -137,7 +125,7 @@ def _export(
 
 
 def _report(
-    made: Delivery,
+    made: GcpSet,
     written: list[Path],
     left_out: dict[str, str],
     older: tuple[str, ...],
@@ -148,12 +136,12 @@ def _report(
     from collections import Counter
 
     reasons = Counter(skip.reason.value for skip in made.skipped)
-    checks = sum(point.is_checkpoint for point in made.kgcps)
+    checks = sum(point.is_checkpoint for point in made.gcps)
     if as_json:
         import json
 
         summary = {
-            "kgcps": len(made.kgcps),
+            "kgcps": len(made.gcps),
             "checkpoints": checks,
             "skipped": dict(reasons),
             "advice": _advice(made.consistency),
@@ -164,11 +152,11 @@ def _report(
         click.echo(json.dumps(summary))
     of_these = f" ({checks} check points)" if checks else ""
     click.echo(
-        f"{len(made.kgcps)} KGCPs{of_these}, {len(made.skipped)} sightings left out", err=True
+        f"{len(made.gcps)} KGCPs{of_these}, {len(made.skipped)} sightings left out", err=True
     )
     for reason, times in reasons.most_common():
         click.echo(f"  {times:6d} {reason}", err=True)
-    _report_deviations(made.carrier)
+    _report_deviations(made.vehicle)
     if made.consistency is not None:
         _report_consistency(made.consistency)
     for path in _named(written):

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
@@ -82,6 +84,83 @@ class Camera:
     response: Response = Response.UNKNOWN
     readout_s: float = 0.0
     time_reference: TimeReference = TimeReference.MIDDLE
+
+    @classmethod
+    def from_opencv(
+        cls,
+        camera_matrix: npt.ArrayLike,
+        distortion: npt.ArrayLike,
+        size: tuple[int, int],
+        *,
+        response: Response = Response.UNKNOWN,
+        readout_s: float = 0.0,
+    ) -> Self:
+        """Return the camera that `cv2.calibrateCamera` found.
+
+        Parameters
+        ----------
+        camera_matrix : (3, 3) array
+            Principal distances and principal point [px]; without skew.
+        distortion : array of 4, 5 or 8 numbers, in any shape
+            k1, k2, p1, p2, k3, k4, k5, k6. The further numbers of OpenCV's models of 12 and 14
+            (thin prism, tilted sensor) must be zero.
+        size : tuple of int
+            Width and height of the frames [px], as OpenCV's `imageSize`.
+        response, readout_s
+            As the fields of these names.
+
+        Raises
+        ------
+        SettingError
+            If this camera model cannot express the matrix or the coefficients.
+        """
+        matrix = np.asarray(camera_matrix, dtype=np.float64)
+        if matrix.shape != (3, 3) or matrix[1:, 0].any() or tuple(matrix[2, 1:]) != (0.0, 1.0):
+            raise SettingError(
+                "camera_matrix",
+                "is not of the form fx 0 cx, 0 fy cy, 0 0 1",
+                "give the matrix that cv2.calibrateCamera returns",
+            )
+        if matrix[0, 1] != 0.0:
+            raise SettingError(
+                "camera_matrix",
+                f"has a skew of {matrix[0, 1]:g}",
+                "calibrate without skew, as cv2.calibrateCamera does",
+            )
+        numbers = np.asarray(distortion, dtype=np.float64).ravel()
+        if len(numbers) not in {4, 5, 8, 12, 14}:
+            raise SettingError(
+                "distortion",
+                f"has {len(numbers)} numbers",
+                "give 4, 5 or 8 coefficients in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6",
+            )
+        if numbers[8:].any():
+            raise SettingError(
+                "distortion",
+                "has terms of a thin prism or a tilted sensor, which have no place in this model",
+                "calibrate with cv2.CALIB_RATIONAL_MODEL or fewer terms",
+            )
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(numbers[:8], (0, max(0, 8 - len(numbers)))).tolist()
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+        width, height = size
+        return cls(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            k1=k1,
+            k2=k2,
+            p1=p1,
+            p2=p2,
+            k3=k3,
+            k4=k4,
+            k5=k5,
+            k6=k6,
+            response=response,
+            readout_s=readout_s,
+        )
 
     def __post_init__(self) -> None:
         for key, size in (("width", self.width), ("height", self.height)):

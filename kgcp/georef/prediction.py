@@ -17,7 +17,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import Views, visible_pixel
 from kgcp.georef.target_positions import Place, Whereabouts
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.targets.layout import Target
 
 _MIN_FOUND = 4  # frames that a reference must have proved itself on
@@ -49,7 +49,7 @@ class Track:
         return np.asarray(np.isfinite(self.state[:, 0]))
 
 
-def state_of(observation: Observation) -> FloatArray:
+def state_of(observation: Measurement) -> FloatArray:
     """Return centre [px] and logarithm of the radius [px] of an observation (3,)."""
     return np.append(observation.centre_px, np.log(observation.appearance.radius_px))
 

@@ -16,7 +16,7 @@ from kgcp.measurement.closed_form.chain import measure_ring
 from kgcp.measurement.closed_form.circles import paper_outlines
 from kgcp.measurement.diagnosis import explain
 from kgcp.measurement.normal_prior import NormalPrior
-from kgcp.measurement.records import Considered, Miss, Observation, Outcome
+from kgcp.measurement.records import Considered, Measurement, Miss, Outcome
 from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
 from kgcp.measurement.search.code_signal import CodeMatch, fixed_lag_score, points_of_code
 from kgcp.measurement.search.false_alarm import check_chance
@@ -52,19 +52,8 @@ class _Trial:
     """The plates measured for one target, before they are compared with those of the others."""
 
     target: Target
-    plates: tuple[Observation, ...]
+    plates: tuple[Measurement, ...]
     considered: tuple[Considered, ...]
-
-
-def measure_frame(
-    grey: GreyArray,
-    camera: Camera,
-    targets: tuple[Target, ...],
-    settings: DetectSettings,
-    prior: NormalPrior | None = None,
-) -> tuple[Outcome, ...]:
-    """Return the outcomes of `examine`."""
-    return examine(grey, camera, targets, settings, prior).outcomes
 
 
 def examine(
@@ -73,7 +62,7 @@ def examine(
     targets: tuple[Target, ...],
     settings: DetectSettings,
     prior: NormalPrior | None = None,
-    measured: Sequence[Observation] = (),
+    measured: Sequence[Measurement] = (),
 ) -> Examination:
     """Look for every target in a frame and measure what is found.
 
@@ -85,7 +74,7 @@ def examine(
         All that may be seen.
     prior : NormalPrior, optional
         Of the normal of the plate on the vehicle: of all targets without a position of their own.
-    measured : sequence of Observation
+    measured : sequence of Measurement
         Targets of this frame that are already measured.
     """
     search = paper_outlines if settings.method is Method.PAPER else find_rings
@@ -114,8 +103,8 @@ def examine(
 
 
 def _undisputed(
-    plates: tuple[Observation, ...], rivals: list[Observation]
-) -> tuple[Observation, ...]:
+    plates: tuple[Measurement, ...], rivals: list[Measurement]
+) -> tuple[Measurement, ...]:
     """Leave out plates that look more like another target's; number the others by score."""
     kept = [
         plate
@@ -126,7 +115,7 @@ def _undisputed(
     return tuple(replace(plate, instance=i) for i, plate in enumerate(kept))
 
 
-def _share_a_plate(first: Observation, second: Observation) -> bool:
+def _share_a_plate(first: Measurement, second: Measurement) -> bool:
     radius_px = max(first.appearance.radius_px, second.appearance.radius_px)
     return bool(np.linalg.norm(first.centre_px - second.centre_px) < radius_px)
 
@@ -140,7 +129,7 @@ def _try_target(
     prior: NormalPrior | None,
 ) -> _Trial:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
-    plates: list[Observation] = []
+    plates: list[Measurement] = []
     considered: list[Considered] = []
     for ring in target.rings:
         free = (
@@ -180,7 +169,7 @@ def measure_match(
     match: CodeMatch,
     settings: DetectSettings,
     prior: NormalPrior | None,
-) -> Observation:
+) -> Measurement:
     """Measure a matched ring by the method of the settings, and make sure that it is the target.
 
     Raises

@@ -14,7 +14,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.frame import measure_match
 from kgcp.measurement.normal_prior import NormalPrior
-from kgcp.measurement.records import Considered, Observation
+from kgcp.measurement.records import Considered, Measurement
 from kgcp.measurement.search.candidates import find_rings_at
 from kgcp.measurement.search.code_signal import CodeMatch
 from kgcp.measurement.search.template_match import judge, polar_patch
@@ -82,7 +82,7 @@ class Expectation:
             and self.radius_px >= _SMALLEST_PX
         )
 
-    def check(self, observation: Observation) -> None:
+    def check(self, observation: Measurement) -> None:
         """Raise `Rejection` (`POOR_FIT`) unless an observation agrees, in place and in radius."""
         off_px = float(np.linalg.norm(observation.centre_px - self.centre_px))
         ratio = observation.appearance.radius_px / self.radius_px
@@ -97,8 +97,8 @@ def look_again(
     expectation: Expectation,
     settings: DetectSettings,
     prior: NormalPrior | None,
-    rivals: Sequence[Observation],
-) -> tuple[Observation | None, tuple[Considered, ...]]:
+    rivals: Sequence[Measurement],
+) -> tuple[Measurement | None, tuple[Considered, ...]]:
     """Look for one target where it must be, however faint its ring is.
 
     Rings are tracked from all possible places and radii, without the ring filter and the ring
@@ -107,12 +107,12 @@ def look_again(
 
     Parameters
     ----------
-    rivals : sequence of Observation
+    rivals : sequence of Measurement
         Other targets in this frame.
 
     Returns
     -------
-    observation : Observation or None
+    observation : Measurement or None
         The first that passes, the main ring's candidates tried before the replicas'.
     considered : tuple of Considered
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,7 +129,7 @@ class InitialPose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class Measurement:
     """One measured target.
 
     Attributes
@@ -168,6 +169,16 @@ class Observation:
     common: CommonUncertainty | None = None
     is_guided: bool = False
 
+    @property
+    def distance_m(self) -> float:
+        """Camera centre to target centre [m]."""
+        return self.pose.distance_m
+
+    @property
+    def sd_distance_m(self) -> float:
+        """Standard deviation of the distance [m]; NaN where the method estimates none."""
+        return math.nan if self.uncertainty is None else self.uncertainty.sd_distance_m
+
     def covers(self, outline: Ellipse) -> bool:
         """Tell whether a ring lies on this plate."""
         offset = np.linalg.norm(outline.centre - self.centre_px)
@@ -204,7 +215,7 @@ class Miss:
     outline: Ellipse | None = None
 
 
-Outcome = Observation | Miss
+Outcome = Measurement | Miss
 
 
 @dataclass(frozen=True, slots=True)

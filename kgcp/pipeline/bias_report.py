@@ -1,4 +1,4 @@
-"""The report's files."""
+"""The bias study of a flight, and the files of its report."""
 
 from __future__ import annotations
 
@@ -8,22 +8,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from kgcp.errors import KgcpError, Rejection
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
+from kgcp.io.tables.detections import read_attempts, read_settings
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import provenance
 from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import stops_held
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.quality.bias_study import BiasStudy
+from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -44,6 +48,8 @@ from kgcp.report.ring_picture import RingView, draw_closeup
 from kgcp.report.style import Picture
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
+
+REEXPOSED_FRAMES = 12
 
 FIGURE_FILES = {
     "error": "bias_error.png",
@@ -69,6 +75,90 @@ class Report:
     def summary(self) -> Json:
         """Return all numbers for machines, and the paths of the files."""
         return {**self.numbers, "files": [str(path) for path in self.files]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightBias:
+    """Measured distances of a flight against its reference poses.
+
+    Attributes
+    ----------
+    flight : Flight
+    settings : DetectSettings
+        That the distances were measured with.
+    study : BiasStudy
+        Every comparison.
+    """
+
+    flight: Flight
+    settings: DetectSettings
+    study: BiasStudy
+
+    def summary(self) -> Json:
+        """Return the numbers of `bias_summary.json`, without re-exposed frames."""
+        numbers = bias_numbers(self.study)
+        return summary_of(numbers, assess(numbers, []), [])
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the comparisons as a table with the columns of `bias.parquet`."""
+        names = [column.name for column in BIAS_COLUMNS]
+        rows = [bias_row(pair, self.study.method) for pair in self.study.measured]
+        return pd.DataFrame(rows, columns=names)
+
+    def write_report(
+        self,
+        folder: Path | str | None = None,
+        *,
+        reexpose: int = REEXPOSED_FRAMES,
+        stored_frames: StoredFolder | None = None,
+    ) -> Report:
+        """Write bias.parquet, bias_summary.json, the figures and bias_report.html.
+
+        Parameters
+        ----------
+        folder : Path, optional
+            By default the flight's results folder.
+        reexpose : int
+            How many frames to measure again, with darker and brighter grey values.
+        stored_frames : StoredFolder, optional
+            Where the frames are, if not in the flight's folder.
+
+        Raises
+        ------
+        KgcpError
+            If no measurement can be compared, or a file cannot be written.
+        """
+        folder = results_folder(self.flight.folder) if folder is None else Path(folder)
+        return write_report(self.study, self.flight, self.settings, folder, reexpose, stored_frames)
+
+
+@single_threaded()
+def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBias:
+    """Compare the distances of a flight's detections with its reference poses.
+
+    Parameters
+    ----------
+    detections : Path, optional
+        What `detect_flight` wrote; by default in the flight's results folder.
+
+    Raises
+    ------
+    KgcpError
+        If flight.toml names no reference poses, or a file is missing or unreadable.
+    """
+    table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
+    attempts = read_attempts(table, flight.targets)
+    settings = read_settings(table)
+    data = FlightData(flight, [attempt.frame for attempt in attempts])
+    study = study_bias(
+        attempts,
+        data.reference_poses,
+        data.whereabouts,
+        flight.camera,
+        flight.targets,
+        settings.method,
+    )
+    return FlightBias(flight, settings, study)
 
 
 @single_threaded()

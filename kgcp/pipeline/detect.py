@@ -89,7 +89,7 @@ def detect_flight(
     flight: Flight,
     settings: DetectSettings = _DEFAULT_SETTINGS,
     *,
-    out: Path | None = None,
+    out: Path | str | None = None,
     options: RunOptions = _DEFAULT_OPTIONS,
     listener: Watcher | None = None,
 ) -> SurveySummary:
@@ -117,7 +117,7 @@ def detect_flight(
         be written or is another process's, the scheduler is of no use, or the frames vanish.
     """
     stopwatch = Stopwatch()
-    out = results_folder(flight.folder) if out is None else out
+    out = results_folder(flight.folder) if out is None else Path(out)
     if options.scheduler is not None:
         # as the folder is called in whatever folder another process works
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())

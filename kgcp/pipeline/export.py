@@ -1,11 +1,13 @@
-"""From a flight and its detections to what `kgcp export-gcp` hands over."""
+"""Ground control points: from a flight and its detections to points, and from these to files."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
@@ -13,60 +15,97 @@ from kgcp.georef.gcp import Kgcp, Skip, build_kgcps, on_map
 from kgcp.georef.local_frame import MapChange
 from kgcp.georef.selection import Selection, select
 from kgcp.georef.target_positions import Carrier
+from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
+from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.write import export
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.tables.consistency import write_consistency
 from kgcp.io.tables.detections import read_attempts
+from kgcp.io.tables.gcps import KGCP_COLUMNS, kgcp_row
+from kgcp.io.tables.parquet import write_table
+from kgcp.io.tables.provenance import provenance
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.consistency import Consistency, study_consistency
+
+_DEFAULT_SELECTION = Selection()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Delivery:
-    """Everything that is handed over, on one map.
+class GcpSet:
+    """All points of an export, on one map.
 
     Attributes
     ----------
+    flight : Flight
+        Whose points they are.
     crs : str
         Of all coordinates.
+    gcps : tuple of Kgcp
     skipped : tuple of Skip
-        Sightings that made no point, or one that was not wanted.
-    carrier : Carrier or None
-        The vehicle.
+        Sightings that made no point, or a point that was not selected.
+    camera_priors : tuple of CameraPrior
+        Position and attitude of the camera, from plate and vehicle.
+    vehicle : Carrier or None
+        None if no target is carried by a vehicle.
     consistency : Consistency or None
-        None where there are no reference poses, or too few frames to compare.
+        None if there are no reference poses, or too few frames to compare.
     """
 
+    flight: Flight
     crs: str
-    kgcps: tuple[Kgcp, ...]
+    gcps: tuple[Kgcp, ...]
     skipped: tuple[Skip, ...]
-    priors: tuple[CameraPrior, ...]
-    carrier: Carrier | None
+    camera_priors: tuple[CameraPrior, ...]
+    vehicle: Carrier | None
     consistency: Consistency | None
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the points as a table with the columns of `kgcps.parquet`."""
+        names = [column.name for column in KGCP_COLUMNS]
+        return pd.DataFrame([kgcp_row(point) for point in self.gcps], columns=names)
 
 
 @single_threaded()
-def prepare(flight: Flight, detections: Path, wanted: Selection, crs: str | None) -> Delivery:
-    """Place, select and bring onto the map `crs` (None: the flight's) what was measured.
+def make_gcps(
+    flight: Flight,
+    detections: Path | str | None = None,
+    *,
+    selection: Selection = _DEFAULT_SELECTION,
+    crs: str | None = None,
+) -> GcpSet:
+    """Make ground control points of a flight's detections and its vehicle's trajectory.
 
-    Reference poses are mostly made after the points: a file that is not there yet is no error.
+    Reference poses are mostly made after the points: a file that does not exist yet is no error.
+
+    Parameters
+    ----------
+    detections : Path, optional
+        What `detect_flight` wrote; by default in the flight's results folder.
+    selection : Selection
+        Which points are wanted.
+    crs : str, optional
+        Of the points, for pyproj; by default the flight's.
 
     Raises
     ------
     KgcpError
-        If nothing was measured, it cannot be placed, a file is unreadable, or a CRS unusable.
+        If nothing was measured or can be placed, a file is unreadable, or a CRS unusable.
     """
-    attempts = read_attempts(detections, flight.targets)
+    table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
+    attempts = read_attempts(table, flight.targets)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     if not sightings:
         raise KgcpError(
-            f"{detections}: no target was measured in any frame;"
+            f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
     data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
     whereabouts = data.whereabouts
     frame = whereabouts.frame
     placed, absent = build_kgcps(sightings, whereabouts, flight.camera)
-    kgcps, unwanted = select(placed, sightings, frame, flight.camera, wanted)
+    kgcps, unwanted = select(placed, sightings, frame, flight.camera, selection)
     consistency = None
     if data.has_reference:
         poses = data.reference_poses
@@ -74,11 +113,57 @@ def prepare(flight: Flight, detections: Path, wanted: Selection, crs: str | None
     if crs is not None and kgcps:
         change = MapChange.to(crs, frame, np.asarray(kgcps[0].position_map))
         kgcps, frame = on_map(kgcps, change), change.target
-    return Delivery(
-        frame.crs,
-        kgcps,
-        (*absent, *unwanted),
-        camera_priors(kgcps, sightings, whereabouts, frame),
-        whereabouts.carrier,
-        consistency,
+    return GcpSet(
+        flight=flight,
+        crs=frame.crs,
+        gcps=kgcps,
+        skipped=(*absent, *unwanted),
+        camera_priors=camera_priors(kgcps, sightings, whereabouts, frame),
+        vehicle=whereabouts.carrier,
+        consistency=consistency,
     )
+
+
+@single_threaded()
+def export_gcps(
+    gcp_set: GcpSet, formats: Sequence[str] = DEFAULT_FORMATS, folder: Path | str | None = None
+) -> list[Path]:
+    """Write the files of some formats, and return their paths.
+
+    Parameters
+    ----------
+    gcp_set : GcpSet
+        By `make_gcps`.
+    formats : sequence of str
+        Names as in `kgcp export-gcp --list-formats`.
+    folder : Path, optional
+        Of the files; by default the flight's results folder.
+
+    Raises
+    ------
+    KgcpError
+        If a format is unknown or cannot hold the points, there are none, or a file cannot be
+        written.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        raise KgcpError(f"format {unknown[0]!r}: is unknown; give one of {', '.join(FORMATS)}")
+    folder = results_folder(gcp_set.flight.folder) if folder is None else Path(folder)
+    points = MapPoints(gcp_set.crs, gcp_set.gcps, gcp_set.flight.camera, gcp_set.camera_priors)
+    return [path for name in dict.fromkeys(formats) for path in export(points, name, folder)]
+
+
+def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
+    """Write `kgcps.parquet` and, with reference poses, the files of the consistency.
+
+    Raises
+    ------
+    KgcpError
+        If a file cannot be written.
+    """
+    about = provenance(gcp_set.flight)
+    table = folder / "kgcps.parquet"
+    write_table(table, KGCP_COLUMNS, map(kgcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
+    if gcp_set.consistency is None:
+        return [table]
+    return [table, *write_consistency(folder, gcp_set.consistency, about)]

@@ -21,8 +21,8 @@ from kgcp.measurement.records import (
     Considered,
     ExposureSettings,
     FrameResult,
+    Measurement,
     Miss,
-    Observation,
     Outcome,
     is_unreadable,
 )
@@ -130,7 +130,7 @@ def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
     found = {
         outcome.target: outcome
         for outcome in look.first.outcomes
-        if isinstance(outcome, Observation) and outcome.instance == 0
+        if isinstance(outcome, Measurement) and outcome.instance == 0
     }
     considered: list[Considered] = []
     for target in task.targets:
@@ -173,7 +173,7 @@ def _merged(
     task: FrameTask,
     look: SecondLook,
     grey: GreyArray,
-    found: Mapping[str, Observation],
+    found: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
     """Put what was found in the place of misses, and explain the others by what is known now."""

@@ -13,7 +13,7 @@ from kgcp.georef.prediction import Track, expect, reference_states, state_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import FrameResult, Miss, Observation, is_unreadable
+from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.targets.layout import Target
 
 
@@ -44,7 +44,7 @@ class Sightings:
         """Take what is needed from the result of a frame."""
         self.time_s[row] = math.nan if result.time_s is None else result.time_s
         self.is_readable[row] = not any(map(is_unreadable, result.outcomes))
-        seen = [one for one in result.outcomes if isinstance(one, Observation)]
+        seen = [one for one in result.outcomes if isinstance(one, Measurement)]
         self.found += bool(seen) - int(self._is_found[row])
         self._is_found[row] = bool(seen)
         for observation in seen:

@@ -15,7 +15,7 @@ from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
 from kgcp.measurement.adjustment.residual_image import contours_px, residuals_of
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import Considered, FrameResult, Miss, Observation, Outcome
+from kgcp.measurement.records import Considered, FrameResult, Measurement, Miss, Outcome
 from kgcp.pipeline.detection_run import Looks
 from kgcp.pipeline.execution.resilient_map import Loss
 from kgcp.pipeline.frame_task import FrameTask
@@ -128,7 +128,7 @@ def _rings(result: FrameResult) -> list[Outcome | Considered]:
 
 
 def _has_place(ring: Outcome | Considered) -> bool:
-    return isinstance(ring, Observation) or ring.outline is not None
+    return isinstance(ring, Measurement) or ring.outline is not None
 
 
 def _lost(result: FrameResult, why: str) -> list[Sketch]:
@@ -141,7 +141,7 @@ def _lost(result: FrameResult, why: str) -> list[Sketch]:
 
 
 def _sketch(task: FrameTask, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
-    if not isinstance(ring, Observation):
+    if not isinstance(ring, Measurement):
         pictures = None if ring.outline is None else draw_ring(grey, _outlined(ring.outline))
         return Sketch(_card(frame, ring), pictures)
     target = next(target for target in task.targets if target.name == ring.target)
@@ -167,7 +167,7 @@ def _card(
     residual_percent: float | None = None,
     note: str = "",
 ) -> Card:
-    if isinstance(ring, Observation):
+    if isinstance(ring, Measurement):
         return _measured_card(frame, ring, residual_percent, note)
     reason = ring.reason.value if ring.reason else ""
     if isinstance(ring, Miss):
@@ -191,7 +191,7 @@ def _card(
 
 
 def _measured_card(
-    frame: str, observation: Observation, residual_percent: float | None, note: str
+    frame: str, observation: Measurement, residual_percent: float | None, note: str
 ) -> Card:
     distance_m, spread = observation.pose.distance_m, observation.uncertainty
     sd = "" if spread is None else f" ± {1e3 * spread.sd_distance_m:.1f} mm"
@@ -210,7 +210,7 @@ def _measured_card(
     )
 
 
-def _values(observation: Observation, residual_percent: float | None) -> list[str]:
+def _values(observation: Measurement, residual_percent: float | None) -> list[str]:
     """Return the values in few words; those that are not known are left out."""
     appearance, spread = observation.appearance, observation.uncertainty
     x, y = observation.centre_px

@@ -20,8 +20,8 @@ from benchmarks.aat.gcps import (
 from benchmarks.aat.settings import BlockSettings, Way, random_stream
 from benchmarks.aat.table import Trial, summarise, table_lines
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.ground import Ground
 
@@ -174,8 +174,8 @@ def test_distances_follow_the_calibration_as_a_new_measurement_does(block: Block
         ]
         for camera in (block.believed, changed)
     )
-    assert isinstance(before, Observation)
-    assert isinstance(after, Observation)
+    assert isinstance(before, Measurement)
+    assert isinstance(after, Measurement)
     predicted_m = distance_by_calibration(block.believed, before.pose) @ steps
     assert predicted_m == pytest.approx(0.05, rel=0.2)  # 3 px of 2900 at 48 m
     moved_m = after.pose.distance_m - before.pose.distance_m

@@ -18,7 +18,7 @@ from benchmarks.search.verdict import judge, wilson
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.records import Appearance, Miss, Observation
+from kgcp.measurement.records import Appearance, Measurement, Miss
 from kgcp.simulation.scene import PlatePose
 from kgcp.targets.validation import codes_coincide, same_shape
 
@@ -99,9 +99,9 @@ def test_frames_are_the_same_each_time_and_differ() -> None:
     assert first.shape != other.shape or np.any(first != other)
 
 
-def observed(shot: Shot, seen: PlatePose, pose: Pose | None = None) -> Observation:
+def observed(shot: Shot, seen: PlatePose, pose: Pose | None = None) -> Measurement:
     pose = pose or seen.pose
-    return Observation(
+    return Measurement(
         *(seen.plate.target.name, seen.plate.target.name, 0, 0.97, pose),
         shot.camera.project(pose.translation_m),
         image_heading_deg(shot.camera, pose),

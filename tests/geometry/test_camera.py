@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 PLAIN = Camera(1600, 1100, 2306.0, 2302.0, 792.6, 543.9)
@@ -42,6 +42,58 @@ def test_projection_is_opencv_s(lens: str) -> None:
     np.testing.assert_allclose(
         camera.project(points), opencv_pixels(camera, points), rtol=0.0, atol=1e-9
     )
+
+
+MATRIX = np.array([[2306.0, 0.0, 792.6], [0.0, 2302.0, 543.9], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_a_camera_of_opencv_s_numbers_projects_as_opencv_does(count: int) -> None:
+    rng = np.random.default_rng(count)
+    distortion = np.zeros(count)
+    distortion[:8] = (0.21, -0.12, 4e-4, -3e-4, 0.02, 0.28, -0.15, 0.03)[:count]
+    points = rng.uniform((-3.0, -2.0, 9.0), (3.0, 2.0, 30.0), (200, 3))
+    for numbers in (distortion, distortion[None], distortion[:, None]):  # as versions return them
+        camera = Camera.from_opencv(MATRIX, numbers, (1600, 1100))
+        expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, numbers)
+        np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0.0, atol=1e-9)
+    assert (camera.width, camera.height) == (1600, 1100)
+
+
+def test_what_opencv_does_not_know_can_be_given_beside_its_numbers() -> None:
+    camera = Camera.from_opencv(
+        MATRIX.tolist(), [0.0] * 5, (1600, 1100), response=Response.LINEAR, readout_s=0.02
+    )
+    assert camera == replace(PLAIN, response=Response.LINEAR, readout_s=0.02)
+
+
+def changed(row: int, column: int, value: float) -> FloatArray:
+    matrix = MATRIX.copy()
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("matrix", "distortion", "words"),
+    [
+        (changed(0, 1, 0.3), [0.0] * 5, "camera_matrix: has a skew of 0.3; calibrate without"),
+        (changed(1, 0, 0.3), [0.0] * 5, "is not of the form fx 0 cx"),
+        (changed(2, 2, 2.0), [0.0] * 5, "is not of the form fx 0 cx"),
+        (changed(0, 0, -1.0), [0.0] * 5, "fx: "),
+        (changed(0, 2, np.nan), [0.0] * 5, "cx: "),
+        (MATRIX[:2], [0.0] * 5, "is not of the form fx 0 cx"),
+        (MATRIX, [0.0] * 6, "distortion: has 6 numbers; give 4, 5 or 8"),
+        (MATRIX, [], "distortion: has 0 numbers"),
+        (MATRIX, [0.0] * 11 + [1e-4], "thin prism or a tilted sensor"),
+        (MATRIX, [0.0] * 12 + [0.1, 0.0], "thin prism or a tilted sensor"),
+        (MATRIX, [0.0, np.inf, 0.0, 0.0], "k2: is not a finite number"),
+    ],
+)
+def test_numbers_that_are_no_camera_of_this_model_are_refused(
+    matrix: FloatArray, distortion: list[float], words: str
+) -> None:
+    with pytest.raises(SettingError, match=words):
+        Camera.from_opencv(matrix, distortion, (1600, 1100))
 
 
 @pytest.mark.parametrize("lens", LENSES)

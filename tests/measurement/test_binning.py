@@ -16,10 +16,10 @@ from kgcp.geometry.pixel_grid import normalised_grid
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import imaging_of
 from kgcp.measurement.adjustment.residual_image import residuals_of
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
@@ -41,10 +41,10 @@ class Shot:
     psf_px: float
     grey: GreyArray
 
-    def measured(self) -> Observation:
+    def measured(self) -> Measurement:
         settings = DetectSettings()
         outcome = measure_frame(self.grey, self.camera, (TARGET_PLATE.target,), settings)[0]
-        assert isinstance(outcome, Observation)
+        assert isinstance(outcome, Measurement)
         return outcome
 
 

@@ -11,8 +11,9 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.frame import examine, measure_frame
-from kgcp.measurement.records import Miss, Observation
+from kgcp.measurement.frame import examine
+from kgcp.measurement.records import Measurement, Miss
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -81,12 +82,12 @@ def test_the_ring_of_a_measured_target_explains_no_other_s_miss(
 ) -> None:
     plates = [(bare, place_plate((140.0, 180.0), 40.0))]
     seen, missed = measure_frame(draw_frame(*plates), camera, (bare, plate_b()), SETTINGS)
-    assert isinstance(seen, Observation)
+    assert isinstance(seen, Measurement)
     assert missed == Miss("B", Reason.NO_CANDIDATE)
     third = Target(Ring("C", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 90.0, 130.0, 220.0)))
     plates.append((third, place_plate((340.0, 180.0), 40.0)))
     seen, missed = measure_frame(draw_frame(*plates), camera, (bare, plate_b()), SETTINGS)
-    assert isinstance(seen, Observation)
+    assert isinstance(seen, Measurement)
     assert isinstance(missed, Miss)
     assert (missed.reason, missed.candidates) == (Reason.OTHER_CODE, 1)
     assert "ring at (340, 180)" in missed.detail
@@ -100,7 +101,7 @@ def test_all_that_was_considered_is_kept(
         (plate_b(), place_plate((340.0, 180.0), 40.0)),
     ]
     examination = examine(draw_frame(*plates), camera, (bare, plate_b()), SETTINGS)
-    assert all(isinstance(outcome, Observation) for outcome in examination.outcomes)
+    assert all(isinstance(outcome, Measurement) for outcome in examination.outcomes)
     dropped = {(one.target, one.reason) for one in examination.considered}
     assert dropped == {
         *(("A", None), ("A", Reason.OTHER_CODE), ("B", None), ("B", Reason.OTHER_CODE)),
@@ -112,7 +113,7 @@ def test_a_code_that_chance_explains_is_refused(
 ) -> None:
     frame = draw_frame((bare, place_plate((240.0, 180.0), 9.0, turn_deg=30.0)))
     (seen,) = measure_frame(frame, camera, (bare,), SETTINGS)
-    assert isinstance(seen, Observation)
+    assert isinstance(seen, Measurement)
     (missed,) = measure_frame(frame, camera, (bare,), DetectSettings(false_alarm=1e-30))
     assert isinstance(missed, Miss)
     assert missed.reason is Reason.CODE_MISMATCH

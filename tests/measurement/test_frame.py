@@ -10,8 +10,8 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Miss, Observation
+from kgcp.measurement.records import Measurement, Miss
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Ring, Target
 
@@ -26,9 +26,9 @@ def other_plate(target: Target) -> Target:
     return Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, OTHER_CODE), target.replicas)
 
 
-def measured(frame: GreyArray, camera: Camera, target: Target) -> list[Observation]:
+def measured(frame: GreyArray, camera: Camera, target: Target) -> list[Measurement]:
     outcomes = measure_frame(frame, camera, (target,), SETTINGS)
-    return [outcome for outcome in outcomes if isinstance(outcome, Observation)]
+    return [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_each_target_has_its_own_outcome_in_order(
     other = other_plate(target)
     frame = draw_frame((target, place_plate((150.0, 150.0), 50.0)))
     found, missed = measure_frame(frame, camera, (target, other), SETTINGS)
-    assert isinstance(found, Observation)
+    assert isinstance(found, Measurement)
     assert isinstance(missed, Miss)
     assert missed == Miss("B", Reason.NO_CANDIDATE), "the only ring is that of A"
 

@@ -11,9 +11,9 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.frame import measure_frame
 from kgcp.measurement.guided import Expectation, look_again
-from kgcp.measurement.records import Miss, Observation
+from kgcp.measurement.records import Measurement, Miss
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -31,7 +31,7 @@ def expected_at(
 
 def look(
     grey: GreyArray, camera: Camera, target: Target, expectation: Expectation
-) -> Observation | None:
+) -> Measurement | None:
     return look_again(grey, camera, target, expectation, SETTINGS, None, ())[0]
 
 
@@ -135,7 +135,7 @@ def test_another_target_s_plate_is_not_looked_at(
 ) -> None:
     grey = draw_frame((target, place_plate((200.0, 150.0), 12.0)))
     (rival,) = measure_frame(grey, camera, (target,), SETTINGS)
-    assert isinstance(rival, Observation)
+    assert isinstance(rival, Measurement)
     wanted = expected_at(200.0, 150.0, 12.0)
     assert look_again(grey, camera, target, wanted, SETTINGS, None, (rival,)) == (None, ())
 

@@ -14,9 +14,9 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.frame import examine
 from kgcp.measurement.normal_prior import NormalPrior, normal_priors
-from kgcp.measurement.records import Alternative, Observation
+from kgcp.measurement.records import Alternative, Measurement
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
@@ -47,14 +47,14 @@ def photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
 
 def measure(
     grey: GreyArray, prior: NormalPrior | None, target: Target = TARGET_PLATE.target
-) -> Observation:
-    (outcome,) = measure_frame(grey, CAMERA, (target,), DetectSettings(), prior)
-    assert isinstance(outcome, Observation)
+) -> Measurement:
+    (outcome,) = examine(grey, CAMERA, (target,), DetectSettings(), prior).outcomes
+    assert isinstance(outcome, Measurement)
     return outcome
 
 
 @cache
-def frame(number: int) -> tuple[Pose, GreyArray, Observation]:
+def frame(number: int) -> tuple[Pose, GreyArray, Measurement]:
     """The truth, the image and what the image alone says."""
     rng = np.random.default_rng(number)
     pose = far_pose(rng)
@@ -66,12 +66,12 @@ def angle_deg(one: Pose, other: Pose) -> float:
     return math.degrees(math.acos(min(1.0, float(one.normal @ other.normal))))
 
 
-def other_pose(seen: Observation) -> Alternative:
+def other_pose(seen: Measurement) -> Alternative:
     assert seen.alternative is not None
     return seen.alternative
 
 
-def is_right(seen: Observation, truth: Pose) -> bool:
+def is_right(seen: Measurement, truth: Pose) -> bool:
     return angle_deg(seen.pose, truth) < angle_deg(other_pose(seen).pose, truth)
 
 

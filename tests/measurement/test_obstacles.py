@@ -16,9 +16,10 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.frame import measure_frame, measure_match
-from kgcp.measurement.records import InitialPose, Observation
+from kgcp.measurement.frame import measure_match
+from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.plate import Plate
@@ -189,7 +190,7 @@ def test_a_target_with_a_hidden_quarter_is_found_and_measured(
     plate = with_layers((Disc(on_circle(0.45, angle_deg), quarter_m), radiance))
     grey = photograph(LENS, pose, rng, plate=plate)
     (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
-    assert isinstance(seen, Observation)
+    assert isinstance(seen, Measurement)
     assert seen.uncertainty is not None
     off_m = abs(seen.pose.distance_m - pose.distance_m)
     assert off_m < 5.0 * seen.uncertainty.sd_distance_m

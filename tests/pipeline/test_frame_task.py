@@ -13,7 +13,7 @@ from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.guided import Expectation
-from kgcp.measurement.records import FrameResult, Miss, Observation
+from kgcp.measurement.records import FrameResult, Measurement, Miss
 from kgcp.pipeline.frame_task import (
     FrameNote,
     FrameTask,
@@ -61,7 +61,7 @@ def test_what_is_found_again_explains_no_other_s_miss(folder: Path) -> None:
     first, second = look_twice(folder, {"A": EXPECTED})
     assert all(isinstance(one, Miss) and one.candidates == 2 for one in first.outcomes)
     found, missed = second.outcomes
-    assert isinstance(found, Observation)
+    assert isinstance(found, Measurement)
     assert found.is_guided
     assert found.common is not None
     assert isinstance(missed, Miss)
@@ -87,7 +87,7 @@ def test_where_nothing_is_the_first_reason_stays(folder: Path) -> None:
 
 def test_a_measured_target_is_left_as_it_is(folder: Path) -> None:
     first, second = look_twice(folder, {"B": EXPECTED}, DetectSettings())
-    assert isinstance(first.outcomes[0], Observation)
+    assert isinstance(first.outcomes[0], Measurement)
     assert second.outcomes[0] is first.outcomes[0]
     missed = second.outcomes[1]
     assert isinstance(missed, Miss)

@@ -11,8 +11,8 @@ from kgcp.errors import SettingError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
@@ -44,7 +44,7 @@ def outlooks() -> tuple[Outlook, ...]:
     return look_ahead(CAMERA, calibration, TARGET, (*HEIGHTS_M, 3.0, 1.0, 100.0), CONDITIONS)
 
 
-def measured(height_m: float, rng: np.random.Generator) -> tuple[Observation, Pose]:
+def measured(height_m: float, rng: np.random.Generator) -> tuple[Measurement, Pose]:
     """Photograph the target as the plan supposes it, and measure it."""
     way, turn, motion = rng.uniform(0.0, 2.0 * math.pi, 3)
     tilt = math.radians(TILT_DEG) * np.array([math.cos(way), math.sin(way), 0.0])
@@ -59,7 +59,7 @@ def measured(height_m: float, rng: np.random.Generator) -> tuple[Observation, Po
     spread = Optics(CONDITIONS.psf_px, streak).spread(light, _FINE)
     grey = Sensor().expose(spread, GAIN, rng)
     (outcome,) = measure_frame(grey, CAMERA, (TARGET,), DetectSettings())
-    assert isinstance(outcome, Observation)
+    assert isinstance(outcome, Measurement)
     return outcome, pose
 
 

@@ -96,7 +96,7 @@ class Flight:
     toml_text: str
 
 
-def read_flight(folder: Path) -> Flight:
+def read_flight(folder: Path | str) -> Flight:
     """Read and validate the flight.toml of a flight folder.
 
     Raises
@@ -106,6 +106,7 @@ def read_flight(folder: Path) -> Flight:
         is unknown, missing or of the wrong type, a value impossible, or the frames' folder, the
         times file or the calibration file does not exist.
     """
+    folder = Path(folder)
     table, text = _read_toml(folder / "flight.toml")
     frames_folder, times_file, times_format = _read_frames(table, folder)
     camera = table.table("camera", CAMERA_KEYS)

@@ -38,8 +38,8 @@ from kgcp.measurement.records import (
     Alternative,
     CommonUncertainty,
     FrameResult,
+    Measurement,
     Miss,
-    Observation,
     Outcome,
     Uncertainty,
 )
@@ -58,7 +58,7 @@ def _frame(get: Callable[[FrameResult], object]) -> _Get:
 
 
 def _outcome(
-    of_observation: Callable[[Observation], object], of_miss: Callable[[Miss], object]
+    of_observation: Callable[[Measurement], object], of_miss: Callable[[Miss], object]
 ) -> _Get:
     def get(record: _Record) -> object:
         outcome = record[1]
@@ -67,14 +67,14 @@ def _outcome(
     return get
 
 
-def _measured(get: Callable[[Observation], object]) -> _Get:
+def _measured(get: Callable[[Measurement], object]) -> _Get:
     return _outcome(get, lambda _: None)
 
 
-def _part(part: Callable[[Observation], _Part | None], get: Callable[[_Part], object]) -> _Get:
+def _part(part: Callable[[Measurement], _Part | None], get: Callable[[_Part], object]) -> _Get:
     """Get from a part of an observation; null where the method does not estimate it."""
 
-    def of_observation(observation: Observation) -> object:
+    def of_observation(observation: Measurement) -> object:
         value = part(observation)
         return None if value is None else get(value)
 
@@ -162,11 +162,28 @@ def detection_rows(result: FrameResult) -> list[Row]:
     return [row_of(DETECTION_COLUMNS, (result, outcome)) for outcome in outcomes]
 
 
-def read_detections(path: Path) -> pd.DataFrame:
-    """Read `detections.parquet`; `KgcpError` if `kgcp detect` has not written it."""
+def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFrame:
+    """Read a table of detections, whose columns docs/conventions.md explains.
+
+    Parameters
+    ----------
+    path : Path
+        `detections.parquet`.
+    status : str, optional
+        Only rows with this status, for example "measured"; by default all.
+
+    Raises
+    ------
+    KgcpError
+        If the table is missing, unreadable or damaged, or the status is unknown.
+    """
+    path = Path(path)
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; run 'kgcp detect' on this flight first")
-    return read_table(path, DETECTION_COLUMNS)
+    if status is not None and status not in set(Status):
+        raise KgcpError(f"status {status!r}: is unknown; give one of {', '.join(Status)}")
+    table = read_table(path, DETECTION_COLUMNS)
+    return table if status is None else table[table["status"] == status].reset_index(drop=True)
 
 
 def read_attempts(path: Path, targets: Sequence[Target]) -> list[Attempt]:

@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.measurement.adjustment.solver import Fit
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import plateau_levels
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.targets.layout import Ring
 
 _MAX_OUTLIERS = 0.3
@@ -52,7 +52,7 @@ def check_fit(fit: Fit) -> None:
         )
 
 
-def check_precision(observation: Observation) -> None:
+def check_precision(observation: Measurement) -> None:
     """Refuse a measurement so uncertain that it can hardly be of this target.
 
     Even far, blurred and badly exposed targets are measured to some parts in a thousand; clutter

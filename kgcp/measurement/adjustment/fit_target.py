@@ -31,7 +31,7 @@ from kgcp.measurement.image_model.noise import find_censoring
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
 from kgcp.measurement.normal_prior import NormalPrior
-from kgcp.measurement.records import Alternative, InitialPose, Observation
+from kgcp.measurement.records import Alternative, InitialPose, Measurement
 from kgcp.targets.layout import Target
 
 _MARGIN_PX = 12.0
@@ -47,7 +47,7 @@ def measure_by_model(
     start: InitialPose,
     prior: NormalPrior | None = None,
     visible: BoolArray | None = None,
-) -> Observation:
+) -> Measurement:
     """Measure a target that the search has found.
 
     Parameters
@@ -149,14 +149,14 @@ def _observation(
     start: InitialPose,
     poses: TwoPoses,
     prior: NormalPrior | None,
-) -> Observation:
+) -> Measurement:
     best, other = poses.best, poses.other
     pose = best.parameters.pose
     covariance = pose_covariance(best)
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += _spread_over_both(poses, ambiguity)
-    return Observation(
+    return Measurement(
         target=target.name,
         ring=start.ring,
         instance=0,

@@ -22,7 +22,7 @@ from kgcp.geometry.circle import (
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.closed_form.edges import EdgeFit, fit_edge, patch_around
-from kgcp.measurement.records import Alternative, Appearance, Observation
+from kgcp.measurement.records import Alternative, Appearance, Measurement
 from kgcp.measurement.search.code_signal import (
     CODE_ANGLES_RAD,
     CodeMatch,
@@ -68,7 +68,7 @@ class PosedRing:
     centre_misfit_px: float
 
 
-def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> Observation:
+def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMatch) -> Measurement:
     """Measure one matched ring by the paper's chain; instance 0.
 
     Raises
@@ -84,7 +84,7 @@ def measure_ring(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     turn = nearest.pose.rotation.T @ mirrored.pose.rotation
     alternative = Alternative(mirrored.pose, mirrored.centre_misfit_px - nearest.centre_misfit_px)
     distinct = np.linalg.norm(turn - np.eye(3)) > _SAME_POSE_RAD
-    return Observation(
+    return Measurement(
         target=target.name,
         ring=match.ring.name,
         instance=0,

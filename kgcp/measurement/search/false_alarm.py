@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.measurement.search.code_signal import reference_signals
 from kgcp.targets.layout import Ring, Target
 
@@ -53,7 +53,7 @@ def _power(ring: Ring) -> FloatArray:
     return np.asarray(power / power.sum(axis=1, keepdims=True))
 
 
-def check_chance(observation: Observation, target: Target, ring: Ring, false_alarm: float) -> None:
+def check_chance(observation: Measurement, target: Target, ring: Ring, false_alarm: float) -> None:
     """Refuse a code that a frame may show by chance; without a blur estimate nothing is refused.
 
     Parameters

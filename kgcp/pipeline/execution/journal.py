@@ -42,15 +42,15 @@ from kgcp.measurement.records import (
     Considered,
     ExposureSettings,
     FrameResult,
+    Measurement,
     Miss,
-    Observation,
     Uncertainty,
 )
 
 _RECORDS: dict[str, type] = {
     each.__name__: each
     for each in (
-        *(FrameResult, ExposureSettings, Observation, Miss, Considered, Pose, Ellipse),
+        *(FrameResult, ExposureSettings, Measurement, Miss, Considered, Pose, Ellipse),
         *(Appearance, Uncertainty, CommonUncertainty, Alternative),
     )
 }

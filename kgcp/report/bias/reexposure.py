@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.measurement.guided import Expectation, look_again
-from kgcp.measurement.records import Observation
+from kgcp.measurement.records import Measurement
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
@@ -69,7 +69,7 @@ def measure_again(
     """
     expected = Expectation(centre_px, _SD_PX, radius_px, _SD_LOG_RADIUS, "the unchanged frame")
 
-    def measured(gain: float) -> Observation | None:
+    def measured(gain: float) -> Measurement | None:
         changed = _reexposed_around(grey, gain, centre_px, radius_px)
         return look_again(changed, camera, target, expected, settings, None, ())[0]
 
@@ -80,7 +80,7 @@ def measure_again(
 
 
 def _compare(
-    before: Observation, after: Observation | None, gain: float, radius_px: float, row: int
+    before: Measurement, after: Measurement | None, gain: float, radius_px: float, row: int
 ) -> Reexposed:
     if after is None:
         return Reexposed(row, gain, radius_px, None, None, None)

@@ -30,8 +30,8 @@ from kgcp.io.print.drawing import check_pixels, pdf_of, png_of, svg_of
 from kgcp.io.print.dxf import dxf_of
 from kgcp.io.print.typeface import fit_text, font
 from kgcp.io.print.write import FORMATS, check_stems, file_stem, write_sheets
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import Miss, Observation
+from kgcp.measurement.records import Measurement, Miss
+from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.artwork import Plate, draw_target
 from kgcp.targets.layout import Ring, Target
@@ -245,7 +245,7 @@ def test_what_was_printed_is_found_with_its_code(number: int) -> None:
     pose = Pose((tilt * turn).as_matrix(), distance_m * ray / np.linalg.norm(ray))
     frame = photograph(rasterise(sheet, 127), sheet, pose, number)
     outcomes = measure_frame(frame, CAMERA, TARGETS, DetectSettings())
-    found = [outcome for outcome in outcomes if isinstance(outcome, Observation)]
+    found = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     assert [observation.target for observation in found] == [TARGETS[number].name]
     assert all(isinstance(outcome, Miss) for outcome in outcomes if outcome not in found)
     assert found[0].pose.distance_m == pytest.approx(distance_m, rel=2e-3)

@@ -20,8 +20,8 @@ from kgcp.measurement.records import (
     CommonUncertainty,
     ExposureSettings,
     FrameResult,
+    Measurement,
     Miss,
-    Observation,
     Uncertainty,
 )
 
@@ -29,7 +29,7 @@ POSE = Pose(
     Rotation.from_rotvec(np.radians([8.0, -5.0, 40.0])).as_matrix(), np.array([1.0, -2.0, 14.0])
 )
 COV = np.diag([1e-4, 2e-4, 9e-4, 1e-5, 2e-5, 3e-5])
-FULL = Observation(
+FULL = Measurement(
     target="B",
     ring="B-inner",
     instance=0,

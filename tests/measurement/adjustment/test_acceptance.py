@@ -18,7 +18,7 @@ from kgcp.measurement.adjustment.problem import Imaging
 from kgcp.measurement.adjustment.solver import Fit
 from kgcp.measurement.adjustment.two_poses import fit_both_poses
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.records import Appearance, Observation
+from kgcp.measurement.records import Appearance, Measurement
 from kgcp.targets.layout import Target
 
 PlacePlate = Callable[..., Pose]
@@ -96,10 +96,10 @@ def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlaceP
     pose = place_plate((205.4, 190.7), 20.0)
     along = pose.translation_m / pose.distance_m
 
-    def observed(relative_sd: float) -> Observation:
+    def observed(relative_sd: float) -> Measurement:
         cov = 1e-8 * np.eye(6)
         cov[:3, :3] += (relative_sd * pose.distance_m) ** 2 * np.outer(along, along)
-        return Observation(
+        return Measurement(
             *("A", "A", 0, 0.9, pose, camera.project(pose.translation_m), 0.0),
             Appearance(20.0, 0.1, 0.8, 0.0),
             None,

@@ -15,7 +15,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.records import InitialPose, Observation
+from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 
@@ -68,7 +68,7 @@ def errors_of(photograph: Photograph, start_near: StartNear) -> Callable[..., Er
     return measure
 
 
-def standardised(camera: Camera, seen: Observation, truth: Pose) -> tuple[float, ...]:
+def standardised(camera: Camera, seen: Measurement, truth: Pose) -> tuple[float, ...]:
     assert seen.uncertainty is not None
     off_m = seen.pose.distance_m - truth.distance_m
     off_px = seen.centre_px - camera.project(truth.translation_m)

@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.records import InitialPose, Observation
+from kgcp.measurement.records import InitialPose, Measurement
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 
@@ -29,7 +29,7 @@ def some_pose(rng: np.random.Generator) -> Pose:
     return Pose((turn * heading).as_matrix(), ray * 0.45 * LENS.mean_focal_px / 13.0)
 
 
-def check_distance(seen: Observation, truth: Pose) -> None:
+def check_distance(seen: Measurement, truth: Pose) -> None:
     assert seen.uncertainty is not None
     off_m = abs(seen.pose.distance_m - truth.distance_m)
     assert off_m < 4.0 * seen.uncertainty.sd_distance_m

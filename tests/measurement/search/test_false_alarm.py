@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.records import Appearance, Observation
+from kgcp.measurement.records import Appearance, Measurement
 from kgcp.measurement.search.code_signal import match_code
 from kgcp.measurement.search.false_alarm import RINGS_PER_FRAME, check_chance, code_chance
 from kgcp.simulation.flight import TARGET_PLATE
@@ -21,7 +21,7 @@ from kgcp.targets.layout import Ring
 TARGET = TARGET_PLATE.target
 MAIN, REPLICA = TARGET.rings
 FRAMES = 20_000
-OBSERVATION = Observation(
+OBSERVATION = Measurement(
     *("A", "A", 0, 0.95, Pose(Rotation.identity().as_matrix(), np.array([0.0, 0.0, 90.0]))),
     *(np.array([100.0, 100.0]), 0.0, Appearance(12.0, 0.1, 0.8, 0.0, 0.0, blur_px=0.8)),
     *(None, None),

@@ -25,8 +25,8 @@ from kgcp.measurement.records import (
     Considered,
     ExposureSettings,
     FrameResult,
+    Measurement,
     Miss,
-    Observation,
     Uncertainty,
 )
 from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, to_text
@@ -50,7 +50,7 @@ def arrays(*shape: int) -> st.SearchStrategy[np.ndarray[tuple[int, ...], np.dtyp
 
 poses = st.builds(Pose, arrays(3, 3), arrays(3))
 observations = st.builds(
-    Observation,
+    Measurement,
     target=st.text(),
     ring=st.text(),
     instance=st.integers(0, 9),

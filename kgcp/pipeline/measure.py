@@ -1,0 +1,77 @@
+"""One frame in memory, measured: the way in for programs that have their own images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.measurement.frame import examine
+from kgcp.measurement.records import Outcome
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Target
+from kgcp.targets.validation import check_targets
+
+
+@single_threaded()
+def measure_frame(
+    grey: GreyArray,
+    camera: Camera,
+    targets: Sequence[Target],
+    settings: DetectSettings = DetectSettings(),  # noqa: B008 - frozen
+) -> list[Outcome]:
+    """Find and measure the targets in one frame.
+
+    Parameters
+    ----------
+    grey : (height, width) array of uint8 or uint16
+        The raw frame: not undistorted, not rotated, of the camera's size. Pixel (0, 0) is the
+        centre of the top-left pixel.
+    camera : Camera
+        Its interior orientation.
+    targets : sequence of Target
+        All that may be seen.
+    settings : DetectSettings
+        Of search and measurement.
+
+    Returns
+    -------
+    list of Measurement or Miss
+        In the order of the targets: for each its measured plates, best score first, or one `Miss`
+        with the reason.
+
+    Raises
+    ------
+    KgcpError
+        If the array is not one grey frame of the camera's size, or the targets cannot be told
+        apart.
+    """
+    _check_frame(grey, camera)
+    if not targets:
+        raise KgcpError("targets: is empty; name at least one target to look for")
+    check_targets(tuple(targets))
+    return list(examine(np.ascontiguousarray(grey), camera, tuple(targets), settings).outcomes)
+
+
+def _check_frame(grey: GreyArray, camera: Camera) -> None:
+    if not isinstance(grey, np.ndarray):
+        raise KgcpError(f"the frame is a {type(grey).__name__}; give a numpy array of grey values")
+    if grey.ndim != 2:
+        raise KgcpError(
+            f"the frame has the shape {grey.shape}, not (height, width); convert it to grey values,"
+            " for example by cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)"
+        )
+    if grey.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise KgcpError(
+            f"the frame has the type {grey.dtype}; give the camera's own uint8 or uint16 values"
+        )
+    if grey.shape != (camera.height, camera.width):
+        height, width = grey.shape
+        raise KgcpError(
+            f"the frame is {width} x {height} px, but the camera {camera.width} x {camera.height};"
+            " give the whole raw frame, or the calibration for this size"
+        )
