@@ -73,7 +73,7 @@ LIBRARIES: dict[str, frozenset[str]] = {
     "report": IMAGES | {"jinja2", "matplotlib"},
     "report.bias": IMAGES | {"jinja2", "markupsafe", "matplotlib"},
     "pipeline.execution": frozenset({"cv2", "distributed", "numpy", "scipy", "threadpoolctl"}),
-    "pipeline": IMAGES | {"PIL", "pyarrow"},
+    "pipeline": IMAGES | {"pandas", "PIL", "pyarrow"},
     "cli": frozenset({"click", "tqdm"}),
     "__main__": frozenset(),
 }
