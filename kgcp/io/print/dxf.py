@@ -26,6 +26,8 @@ def dxf_of(artwork: Artwork) -> bytes:
             drawing.layers.add(layer.value, color=_COLOURS.get(layer, 7))
         for shape in artwork.shapes:
             _add(drawing.modelspace(), shape)
+        for name in sorted(drawing.entitydb.dxf_types_in_use()):
+            drawing.classes.add_class(name)  # else ezdxf adds them in the order of a set
         stream = io.StringIO()
         drawing.write(stream)
     finally:

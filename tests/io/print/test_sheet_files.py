@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -323,6 +325,35 @@ def test_the_same_sheets_are_the_same_bytes(tmp_path: Path) -> None:
     assert len(first) == 2 + 2 * len(sheets)
     for one, other in zip(first, again, strict=True):
         assert one.read_bytes() == other.read_bytes(), one.name
+
+
+_DIGESTS = """
+import hashlib
+from pathlib import Path
+from kgcp.io.print.write import FORMATS, write_sheets
+from kgcp.targets.artwork import draw_target
+from kgcp.targets.layout import Ring, Target
+from kgcp.targets.sheets import Paper, lay_out
+target = Target(Ring("T", 0.09, 0.045, 0.0643, 0.0129, (0.0, 47.0, 100.0, 260.0)))
+sheets = lay_out(draw_target(target, None), "T", Paper.A4, is_tiled=False)
+for path in write_sheets(sheets, "T", Path({folder!r}), FORMATS, 50):
+    print(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+"""
+
+
+def test_the_bytes_do_not_depend_on_the_process(tmp_path: Path) -> None:
+    """Sets of strings have another order in each process."""
+    printed = {
+        subprocess.run(
+            [sys.executable, "-c", _DIGESTS.format(folder=str(tmp_path / seed))],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        ).stdout
+        for seed in ("1", "2", "5", "9")
+    }
+    assert len(printed) == 1
 
 
 def test_pictures_of_too_many_pixels_are_refused() -> None:
