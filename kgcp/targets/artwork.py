@@ -29,7 +29,6 @@ class Plate:
     ----------
     width_mm : float
         Of the square, or diameter.
-    is_round : bool
     hole_mm : float or None
         Diameter of four mounting holes; None: no holes.
     """

@@ -20,10 +20,10 @@ LEAST_DISTANCE = 2.0
 """Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
 DOTS = (3, 6)  # fewer say too little; of more, too many overlap however they are laid
 _GRID_DEG, _STARTS = 5.0, 6
-# Where so many codes do not fit by a search on that grid, they may on a coarser one: codes are told
-# apart by a dot that is off by more than a dot's width, which is two steps of a grid just coarser
-# than half of it. On the fine grid the search leaves gaps between codes that no other fits into.
-# 50 codes of four dots are found so, from five of 48 starts; the fine grid ends at 43.
+# Many codes that do not fit on that grid may fit on a coarser one. Codes are told apart by a dot
+# that is off by more than a dot's width: two steps of a grid just coarser than half of it. On the
+# fine grid the search leaves gaps between codes that no other fits into: it places 43 codes of
+# four dots. The coarse one places 50, from a quarter of its starts.
 _COARSE_GRIDS_DEG, _COARSE_STARTS = (6.0, 8.0, 9.0, 10.0, 12.0, 15.0, 18.0, 20.0, 24.0), 40
 _STRIDE = 8  # from start to start, down the list of the best codes
 _ROOM = 1.5  # from dot to dot, of a dot's width: ink must be seen between them
@@ -44,10 +44,10 @@ def dots_apart(first: Ring, second: Ring, *, mirrored: bool = False) -> float:
     mirrored : bool
         Whether the second one is seen from behind.
     """
-    here, there = np.array(first.code_deg), np.array(second.code_deg)
+    code, other = np.array(first.code_deg), np.array(second.code_deg)
     width_deg = 2.0 * max(first.dot_half_angle_deg, second.dot_half_angle_deg)
-    overlap = _overlap(here[None], -there if mirrored else there, width_deg)[0].max()
-    return len(here) + len(there) - 2.0 * float(overlap)
+    overlap = _overlap(code[None], -other if mirrored else other, width_deg)[0].max()
+    return len(code) + len(other) - 2.0 * float(overlap)
 
 
 def dots_apart_turned(ring: Ring) -> float:
@@ -88,8 +88,8 @@ def check_new_codes(new: Sequence[Target], known: Sequence[Target]) -> None:
             continue
         apart = dots_apart(target.ring, other.ring, mirrored=mirrored)
         if apart < LEAST_DISTANCE:
-            seen = f"that of {other.name!r}{', seen from behind' if mirrored else ''}"
-            raise _confusable(target.ring, seen, apart)
+            which = f"that of {other.name!r}{', seen from behind' if mirrored else ''}"
+            raise _confusable(target.ring, which, apart)
 
 
 def _confusable(ring: Ring, other: str, apart: float) -> SettingError:
@@ -121,7 +121,7 @@ def propose_codes(
     Raises
     ------
     SettingError
-        If there are not so many codes that cannot be confused.
+        If so many codes would be confused with each other.
     """
     require_range("dots", dots, *DOTS)
     if not len(_candidates(dots, 2.0 * ring.dot_half_angle_deg, _GRID_DEG)):
@@ -148,7 +148,7 @@ def propose_codes(
 def _farthest_codes(
     ring: Ring, count: int, dots: int, known: Sequence[Ring], grid_deg: float, starts: int
 ) -> tuple[tuple[tuple[float, ...], ...], float]:
-    """Return codes of one grid that are far apart, and their least distance; 0 if there are none.
+    """Return codes of one grid that are far apart, and their least distance; 0 without codes.
 
     Codes that `check_targets` would take for one another count as no distance apart: all their
     dots may be off by half a dot, which adds up to more than `LEAST_DISTANCE`.
@@ -216,8 +216,8 @@ def _turned_overlap(codes: FloatArray, width_deg: float) -> FloatArray:
     first, second = np.nonzero(~np.eye(codes.shape[1], dtype=bool))
     turns = codes[:, second] - codes[:, first]
     overlap = np.zeros(turns.shape)
-    for here, there in itertools.product(range(codes.shape[1]), repeat=2):
-        overlap += _share((codes[:, there] - codes[:, here])[:, None] - turns, width_deg)
+    for i, j in itertools.product(range(codes.shape[1]), repeat=2):
+        overlap += _share((codes[:, j] - codes[:, i])[:, None] - turns, width_deg)
     overlap[np.abs((turns + 180.0) % 360.0 - 180.0) < width_deg] = 0.0
     return np.asarray(overlap.max(axis=1))
 
@@ -274,34 +274,29 @@ class _Candidates:
             self.rows[index] = np.where(same, 0.0, distances)
         return self.rows[index]
 
-    def farthest(self, others: Sequence[int]) -> tuple[int, float]:
-        """Return the candidate that is farthest from others, and its distance."""
-        least = np.minimum.reduce([self.own, *(self.apart(index) for index in others)])
-        least[list(others)] = -1.0
-        best = int(least.argmax())
-        return best, float(least[best])
-
-    def least(self, chosen: Sequence[int]) -> float:
-        """Return the least distance among some candidates."""
-        between = [self.apart(i)[j] for i, j in itertools.combinations(chosen, 2)]
-        return float(min([self.own[list(chosen)].min(), *between]))
-
 
 def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], float]:
     """Choose `count` candidates far apart, and return them with their least distance."""
     chosen = [start]
+    least = np.minimum(field.own, field.apart(start))
     while len(chosen) < count:
-        chosen.append(field.farthest(chosen)[0])
-    improved = True
-    while improved:
-        improved = False
+        chosen.append(int(least.argmax()))
+        least = np.minimum(least, field.apart(chosen[-1]))
+    # Distances of all candidates to the chosen ones, and to one infinitely far away.
+    rows = np.array([*map(field.apart, chosen), np.full(len(least), np.inf)])
+    is_better = True
+    while is_better:
+        is_better = False
+        nearest, second = np.partition(rows, 1, axis=0)[:2]
         for place, held in enumerate(chosen):
-            others = chosen[:place] + chosen[place + 1 :]
-            now = min([field.own[held], *(field.apart(index)[held] for index in others)])
-            best, least = field.farthest(others)
-            if least > now + _BETTER:
-                chosen[place], improved = best, True
-    return chosen, field.least(chosen)
+            without = np.minimum(field.own, np.where(rows[place] == nearest, second, nearest))
+            best = int(without.argmax())
+            if without[best] > without[held] + _BETTER:
+                chosen[place], rows[place], is_better = best, field.apart(best), True
+                nearest, second = np.partition(rows, 1, axis=0)[:2]
+    between = rows[:-1, chosen]
+    np.fill_diagonal(between, np.inf)
+    return chosen, float(min(field.own[chosen].min(), between.min()))
 
 
 def chosen_targets(known: Sequence[Target], names: Sequence[str]) -> tuple[Target, ...]:
@@ -343,10 +338,10 @@ def new_targets(
     Raises
     ------
     SettingError
-        If a code is none, or could be confused, or there is no diameter.
+        If a code is invalid or could be confused, or the diameter is missing.
     """
     ring = _model(known, diameter_m)
-    names = _free_names({one.name for target in known for one in target.rings})
+    names = _free_names({ring.name for target in known for ring in target.rings})
     given = [Target(replace(ring, name=next(names), code_deg=_angles(code))) for code in codes]
     check_new_codes(given, known)
     if not count:
@@ -395,5 +390,5 @@ def _angles(code: str) -> tuple[float, ...]:
     except ValueError:
         angles = (math.nan,)
     if not all(map(math.isfinite, angles)):
-        raise SettingError("code", f"{code!r} is no list of angles", "give them as 0,43,78,180")
+        raise SettingError("code", f"{code!r} is not a list of angles", "give them as 0,43,78,180")
     return angles

@@ -69,14 +69,12 @@ class Text:
 
     Attributes
     ----------
-    words : str
     start_mm : Point
         Left end of the baseline.
     size_mm : float
         Of the type: from line to line, set solid.
     room_mm : float
         How wide it may be.
-    is_bold : bool
     """
 
     words: str
@@ -162,8 +160,6 @@ class Sheet:
     ----------
     label : str
         Of one sheet among several: `r1c2`, row and column; else empty.
-    width_mm, height_mm : float
-    artwork : Artwork
     centre_mm : Point
         Where the artwork's origin is on the sheet.
     window : Box

@@ -47,10 +47,8 @@ def lay_out(artwork: Artwork, name: str, paper: Paper, *, is_tiled: bool) -> tup
 
     Parameters
     ----------
-    artwork : Artwork
     name : str
         Of the target, for messages and the margins of tiles.
-    paper : Paper
     is_tiled : bool
         Whether several sheets may be used; one is, where it suffices.
 

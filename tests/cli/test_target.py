@@ -116,7 +116,7 @@ def test_codes_that_are_their_own_image_are_warned_of(flight: Path) -> None:
     [
         (["--new", "2"], "diameter: is missing"),
         (["--code", "0,90,180,270", "--diameter", "0.2"], "away from itself, turned"),
-        (["--code", "a", "--diameter", "0.2"], "'a' is no list of angles"),
+        (["--code", "a", "--diameter", "0.2"], "'a' is not a list of angles"),
         (["FLIGHT", "--code", "10,53,88.25,190"], "rotations of each other"),
         (["FLIGHT", "--target", "C"], "'C' is not in flight.toml; give one of A, B b"),
         (["FLIGHT", "--plate", "0.16"], "give at least 0.1875 m"),

@@ -147,8 +147,8 @@ def test_new_targets_have_the_proportions_of_the_first() -> None:
 @pytest.mark.parametrize(
     ("codes", "diameter_m", "words"),
     [
-        (["0,x"], 1.0, "'0,x' is no list of angles"),
-        (["0,nan"], 1.0, "no list of angles"),
+        (["0,x"], 1.0, "'0,x' is not a list of angles"),
+        (["0,nan"], 1.0, "not a list of angles"),
         (["0,10"], 1.0, "overlap"),
         (["0,43,78,180"], None, "diameter: is missing"),
     ],
