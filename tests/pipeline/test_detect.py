@@ -198,7 +198,7 @@ def test_without_reference_poses_the_camera_is_plumb_or_unknown(
     assert detect(flight, tmp_path / "a", LEVEL, no_poses).frames_without_attitude == FRAMES
     plumb = ("[camera]\n", "[camera]\nplumb_sd_deg = 20.0\n")
     assert detect(flight, tmp_path / "b", LEVEL, no_poses, plumb).frames_without_attitude == 0
-    with pytest.raises(KgcpError, match=r"plumb_sd_deg: stands without \[vehicle\] level_sd_deg;"):
+    with pytest.raises(KgcpError, match=r"plumb_sd_deg: needs \[vehicle\] level_sd_deg;"):
         detect(flight, tmp_path / "c", plumb)
 
 
