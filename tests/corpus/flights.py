@@ -209,7 +209,7 @@ POSES: Mapping[str, tuple[str | bytes, str]] = {
                         "resources": [
                             {
                                 "format": "application/opf-calibrated-cameras+json",
-                                "uri": "../../../../../../../etc/passwd",
+                                "uri": f"{'../' * 20}etc/passwd",
                             }
                         ]
                     }

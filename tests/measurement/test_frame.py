@@ -10,6 +10,7 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.frame import examine
 from kgcp.measurement.records import Measurement, Miss
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings, Method
@@ -118,7 +119,7 @@ def test_each_target_has_its_own_outcome_in_order(
 ) -> None:
     other = other_plate(target)
     frame = draw_frame((target, place_plate((150.0, 150.0), 50.0)))
-    found, missed = measure_frame(frame, camera, (target, other), SETTINGS)
+    found, missed = examine(frame, camera, (target, other), SETTINGS).outcomes
     assert isinstance(found, Measurement)
     assert isinstance(missed, Miss)
     assert missed == Miss("B", Reason.NO_CANDIDATE), "the only ring is that of A"
