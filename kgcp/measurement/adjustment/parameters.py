@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +12,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.light_field import LightField
 from kgcp.measurement.image_model.photometry import Light, Param
 
 _NO_POSE = (0.0,) * 6
@@ -28,19 +29,22 @@ class Parameters:
     ----------
     matrix : (3, 4) array
         Of the pose: rotation and translation [m], target → camera.
-    vector : (19,) array
+    vector : (23,) array
         All others in the order of `Param`, with zeros for the pose.
+    field : LightField, optional
+        Of light that is not the same everywhere.
     """
 
     matrix: FloatArray
     vector: FloatArray
+    field: LightField | None = None
 
     @staticmethod
     def of(pose: Pose, blur: Blur, light: Light) -> Parameters:
         """Collect the numbers."""
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
         of_blur = (mean, difference, blur.xy, blur.streak_x, blur.streak_y)
-        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values)))
+        return Parameters(pose.matrix, np.array((*_NO_POSE, *of_blur, *light.values, *blur.skew)))
 
     @cached_property
     def pose(self) -> Pose:
@@ -51,25 +55,32 @@ class Parameters:
     def blur(self) -> Blur:
         """The blur."""
         mean, difference, xy, *streak = self.vector[Param.BLUR_MEAN : Param.BLACK].tolist()
-        return Blur(mean + difference, mean - difference, xy, *streak)
+        xxx, xxy, xyy, yyy = self.vector[Param.SKEW_XXX :].tolist()
+        even = Blur(mean + difference, mean - difference, xy, *streak)
+        return replace(even, skew=(xxx, xxy, xyy, yyy))
 
     @cached_property
     def light(self) -> Light:
         """The light."""
-        return Light(*self.vector[Param.BLACK :].tolist())
+        return Light(*self.vector[Param.BLACK : Param.SKEW_XXX].tolist())
+
+    @property
+    def has_skew(self) -> bool:
+        """Whether the point spread is skew."""
+        return bool(self.vector[Param.SKEW_XXX :].any())
 
     def at(self, pose: Pose) -> Parameters:
         """Return the same blur and light at another pose."""
-        return Parameters(pose.matrix, self.vector)
+        return Parameters(pose.matrix, self.vector, self.field)
 
     def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (19,) in the order of `Param`.
+        """Return the parameters after a step (23,) in the order of `Param`.
 
         That of the pose is a translation [m] and a left rotation vector [rad].
         """
         matrix = rotation_about(step[3:6]) @ self.matrix
         matrix[:, 3] = self.matrix[:, 3] + step[:3]
-        return Parameters(matrix, _moved_others(self.vector, step))
+        return Parameters(matrix, _moved_others(self.vector, step), self.field)
 
 
 @compiled

@@ -27,6 +27,8 @@ class Blur:
         Covariance of the Gaussian part, pixel integration included [px²].
     streak_x, streak_y : float
         Motion during exposure [px].
+    skew : (4,) tuple of float
+        Third cumulants xxx, xxy, xyy, yyy [px³].
     """
 
     xx: float
@@ -34,6 +36,7 @@ class Blur:
     xy: float
     streak_x: float = 0.0
     streak_y: float = 0.0
+    skew: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @property
     def has_streak(self) -> bool:
@@ -44,11 +47,14 @@ class Blur:
         """Return a blur that is so many times as wide."""
         square = factor * factor
         streak = (factor * self.streak_x, factor * self.streak_y)
-        return Blur(square * self.xx, square * self.yy, square * self.xy, *streak)
+        cube = square * factor
+        xxx, xxy, xyy, yyy = self.skew
+        skew = (cube * xxx, cube * xxy, cube * xyy, cube * yyy)
+        return Blur(square * self.xx, square * self.yy, square * self.xy, *streak, skew)
 
     @property
     def vector(self) -> FloatArray:
-        """All five, in the order of the attributes."""
+        """All but the skew, in the order of the attributes."""
         return np.array([self.xx, self.yy, self.xy, self.streak_x, self.streak_y])
 
     @property

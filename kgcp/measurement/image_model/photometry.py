@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
@@ -36,9 +36,14 @@ class Param(IntEnum):
     TONE_2 = 16
     TONE_3 = 17
     SHARPENING = 18
+    SKEW_XXX = 19
+    SKEW_XXY = 20
+    SKEW_XYY = 21
+    SKEW_YYY = 22
 
 
-PARAM_COUNT = 19
+PARAM_COUNT = 23
+PLAIN_COUNT = 19  # without the skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +128,12 @@ def srgb_slope(light: FloatArray) -> FloatArray:
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
+_SKEW = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
 _SHARE_STEPS = 400
+GEOMETRY_ROWS = 11  # of pose and blur, without the skew
+# Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
+_CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
+_NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,45 +154,89 @@ class Imager:
     response: Response
     mask: Mask | None
 
-    def levels(self, share: FloatArray, light: Light) -> FloatArray:
-        """Return the modelled grey values (n,) before clipping."""
+    def levels(
+        self, share: FloatArray, light: Light, added: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the modelled grey values (n,) before clipping.
+
+        `added` (2, n) is what ink and plate have more light at every pixel, of their contrast.
+        """
         value = np.empty(len(share))
-        _expose(share, self.offsets, light.values, value)
+        _expose(share, self.offsets, light.values, self._added(added), value)
         value = encoded(value, self.response)
         if self.mask is None:
             return value
-        return value + light.sharpening * self._detail(self.mask, value, light)
+        return value + light.sharpening * self._detail(self.mask, value, light, added)
 
-    def linearised(self, share: WhiteShare, light: Light) -> tuple[FloatArray, FloatArray]:
-        """Return the grey values (n,) and their Jacobian (19, n)."""
+    def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the levels of ink and of plate at all pixels, where the light is uneven."""
+        ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
+        return encoded(ink, self.response), encoded(plate, self.response)
+
+    def _sharpen_levels(
+        self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray
+    ) -> None:
+        """Sharpen the derivatives by what is added to ink and to plate."""
+        ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
+        if self.response is Response.SRGB:
+            ink *= srgb_slope(toned(added[0], light.values))
+            plate *= srgb_slope(toned(1.0 + added[1], light.values))
+        by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
+        by_ink += light.sharpening * mask.detail(by_ink, ink, 0.0)
+        by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate)
+
+    def _added(self, added: FloatArray | None) -> FloatArray:
+        return _NOTHING if added is None else added
+
+    def linearised(
+        self, share: WhiteShare, light: Light, added: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the grey values (n,) and their Jacobian; `added` as in `levels`.
+
+        It has 19 rows, or 23 where the point spread is skew. Where the light is uneven it has 25,
+        the last two by what is added to ink and to plate.
+        """
         value = np.empty(len(share.value))
-        jacobian = np.empty((PARAM_COUNT, len(value)))
+        has_skew = len(share.jacobian) > GEOMETRY_ROWS
+        rows = PARAM_COUNT if has_skew or added is not None else PLAIN_COUNT
+        jacobian = np.empty((rows + (0 if added is None else 2), len(value)))
         has_tone = self.response is Response.UNKNOWN
         _expose_with_slopes(
-            share.value, share.jacobian, self.offsets, light.values, has_tone, value, jacobian
+            *(share.value, share.jacobian, self.offsets, light.values, self._added(added)),
+            *(has_tone, value, jacobian),
         )
         if self.response is Response.SRGB:
             jacobian *= srgb_slope(value)
             value = encoded(value, self.response)
         if self.mask is None:
             return value, jacobian
+        if added is not None:
+            self._sharpen_levels(self.mask, jacobian, light, added)
         self._sharpen(self.mask, jacobian, light)
-        detail = self._detail(self.mask, value, light)
+        detail = self._detail(self.mask, value, light, added)
         jacobian[Param.SHARPENING] = detail
         return value + light.sharpening * detail, jacobian
 
-    def _detail(self, mask: Mask, value: FloatArray, light: Light) -> FloatArray:
+    def _detail(
+        self, mask: Mask, value: FloatArray, light: Light, added: FloatArray | None
+    ) -> FloatArray:
         """Return what the mask adds to the grey values at full strength.
 
         Where no edge is near there is no blur, and over the mask the light's gradient is flat.
         """
-        return mask.detail(value, *plateau_levels(light, self.response))
+        if added is None:
+            return mask.detail(value, *plateau_levels(light, self.response))
+        ink, plate = self.local_levels(light, added)
+        return mask.detail(value, ink, plate)
 
     def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
         """Sharpen the rows of a Jacobian."""
         rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
         if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
             rows += _STREAK_ROWS
+        if len(jacobian) > PLAIN_COUNT and jacobian[Param.SKEW_XXX].any():
+            for row in _SKEW:
+                jacobian[row] += light.sharpening * mask.detail(jacobian[row], 0.0, 0.0)
         others = (1.0, 1.0)
         if self.response is Response.SRGB:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
@@ -195,6 +249,23 @@ def share_at(level: float, light: Light, response: Response) -> float:
     return _share_at(float(decoded(np.array(level), response)), light.values)
 
 
+@inlined
+def _toned(
+    x: float, tone_1: float, tone_2: float, tone_3: float
+) -> tuple[float, float, float, float]:
+    """Return the tone curve at a share x, its slope, arch and lean.
+
+    The derivatives by the three tone parameters are arch, arch · lean and arch · lean² where the
+    curve follows its formula, and nearly so beyond, where it goes on straight.
+    """
+    within = min(max(x, -_CURVED_BELOW), 1.0 + _CURVED_ABOVE)
+    arch, lean = within * (1.0 - within), 2.0 * within - 1.0
+    tone = within + arch * (tone_1 + lean * (tone_2 + lean * tone_3))
+    slope = 1.0 - tone_1 * lean
+    slope += tone_2 * (6.0 * arch - 1.0) + tone_3 * lean * (8.0 * arch - 1.0)
+    return tone + slope * (x - within), slope, arch, lean
+
+
 @compiled
 def _share_at(level: float, light: tuple[float, ...]) -> float:
     """Return where between ink and plate a level is first passed for good, by steps of 1/400."""
@@ -204,8 +275,7 @@ def _share_at(level: float, light: tuple[float, ...]) -> float:
         return 0.0
     for k in range(1, _SHARE_STEPS + 1):
         t = k / _SHARE_STEPS
-        lean = 2.0 * t - 1.0
-        tone = t + t * (1.0 - t) * (tone_1 + lean * (tone_2 + lean * tone_3))
+        tone, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
         there = black + (white - black) * tone
         if there > level:
             return (k - 1 + (level - highest) / (there - highest)) / _SHARE_STEPS
@@ -214,15 +284,39 @@ def _share_at(level: float, light: tuple[float, ...]) -> float:
 
 
 @compiled
+def toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
+    """Return the levels, before a known encoding, of light between that of ink, 0, and plate, 1."""
+    level = np.empty(len(x))
+    for i in range(len(x)):
+        tone, _, _, _ = _toned(x[i], light[4], light[5], light[6])
+        level[i] = light[0] + (light[1] - light[0]) * tone
+    return level
+
+
+@compiled
+def _tone_slopes(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
+    """Return the derivatives of `toned`."""
+    slopes = np.empty(len(x))
+    for i in range(len(x)):
+        _, slope, _, _ = _toned(x[i], light[4], light[5], light[6])
+        slopes[i] = (light[1] - light[0]) * slope
+    return slopes
+
+
+@compiled
 def _expose(
-    share: FloatArray, offsets: FloatArray, light: tuple[float, ...], value: FloatArray
+    share: FloatArray,
+    offsets: FloatArray,
+    light: tuple[float, ...],
+    added: FloatArray,
+    value: FloatArray,
 ) -> None:
     """Fill in black + (white − black) · tone(share), times the gradient of the light."""
     black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
+    each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
-        t = share[i]
-        lean = 2.0 * t - 1.0
-        tone = t + t * (1.0 - t) * (tone_1 + lean * (tone_2 + lean * tone_3))
+        ink, plate = added[0, each * i], 1.0 + added[1, each * i]
+        tone, _, _, _ = _toned(ink + (plate - ink) * share[i], tone_1, tone_2, tone_3)
         lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
         value[i] = (black + (white - black) * tone) * lit
 
@@ -233,30 +327,40 @@ def _expose_with_slopes(
     by_geometry: FloatArray,
     offsets: FloatArray,
     light: tuple[float, ...],
+    added: FloatArray,
     has_tone: bool,  # noqa: FBT001 - compiled functions have no keywords
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Do as `_expose`, with derivatives by geometry (11, n), then in the order of `Param`."""
+    """Do as `_expose`, with derivatives by geometry (11 or 15, n), then in the order of `Param`.
+
+    Where the light is uneven, those by what is added to ink and to plate follow.
+    """
     black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
     contrast, gains = white - black, np.empty(len(share))
+    has_skew = by_geometry.shape[0] > 11
+    each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
-        t = share[i]
-        arch, lean = t * (1.0 - t), 2.0 * t - 1.0
-        tone = t + arch * (tone_1 + lean * (tone_2 + lean * tone_3))
-        slope = 1.0 - tone_1 * lean
-        slope += tone_2 * (6.0 * arch - 1.0) + tone_3 * lean * (8.0 * arch - 1.0)
+        ink, plate = added[0, each * i], 1.0 + added[1, each * i]
+        x = ink + (plate - ink) * share[i]
+        tone, slope, arch, lean = _toned(x, tone_1, tone_2, tone_3)
         lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
         core = black + contrast * tone
         value[i] = core * lit
         gain = contrast * lit
-        gains[i] = gain * slope
+        gains[i] = gain * slope * (plate - ink)
         jacobian[11, i] = lit * (1.0 - tone)
         jacobian[12, i] = lit * tone
         jacobian[13, i], jacobian[14, i] = core * offsets[0, i], core * offsets[1, i]
         bend = gain * arch if has_tone else 0.0
         jacobian[15, i], jacobian[16, i], jacobian[17, i] = bend, bend * lean, bend * lean * lean
         jacobian[18, i] = 0.0
+        if each:
+            jacobian[23, i] = gain * slope * (1.0 - share[i])
+            jacobian[24, i] = gain * slope * share[i]
+    for k in range(19, min(23, len(jacobian))):
+        for i in range(len(share)):
+            jacobian[k, i] = gains[i] * by_geometry[k - 8, i] if has_skew else 0.0
     for k in range(11):
         for i in range(len(share)):
             jacobian[k, i] = gains[i] * by_geometry[k, i]

@@ -44,15 +44,17 @@ class Mask:
     ink: FloatArray
     plate: FloatArray
 
-    def detail(self, values: FloatArray, ink: float, plate: float) -> FloatArray:
+    def detail(
+        self, values: FloatArray, ink: float | FloatArray, plate: float | FloatArray
+    ) -> FloatArray:
         """Return what the mask adds at full strength (n,).
 
         Parameters
         ----------
         values : (n,) array
             Of the modelled pixels.
-        ink, plate : float
-            Values of the others.
+        ink, plate : float or (n,) array
+            Values of the others, about each modelled pixel.
         """
         modelled, between = np.zeros(len(values) + 1), np.zeros(len(self.along_rows) + 1)
         modelled[:-1] = values  # the last one is read for pixels that are not modelled

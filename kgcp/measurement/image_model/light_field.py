@@ -1,0 +1,189 @@
+"""Light that is not the same everywhere: how the levels of ink and plate vary over a window.
+
+The levels have a smooth part, splines on two grids of knots, and may have straight edges of
+shadows. Both add to the levels of ink and of plate, before tone curve and sharpening as those do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+
+SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
+ANGLE, OFFSET, LOG_WIDTH, INK, PLATE = range(5)  # of a shadow's edge
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knots:
+    """Grids of knots over a window.
+
+    Attributes
+    ----------
+    x0, y0 : float
+        The corner of the first cell [px].
+    spacings_px : (g,) tuple of float
+    columns, rows : (g,) tuples of int
+        How many knots each grid has.
+    """
+
+    x0: float
+    y0: float
+    spacings_px: tuple[float, ...]
+    columns: tuple[int, ...]
+    rows: tuple[int, ...]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many knots each grid has in all."""
+        return tuple(c * r for c, r in zip(self.columns, self.rows, strict=True))
+
+    def weights(self, pixels: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Return the knots (n, 9 g) that points (2, n) depend on, and by how much each."""
+        reach = SPAN * SPAN
+        knots = np.empty((pixels.shape[1], reach * len(self.spacings_px)), np.intp)
+        weights = np.empty(knots.shape)
+        first = 0
+        for g, spacing in enumerate(self.spacings_px):
+            part = slice(g * reach, (g + 1) * reach)
+            _weigh(
+                *(pixels, self.x0, self.y0, spacing, self.columns[g], self.rows[g], first),
+                *(knots[:, part], weights[:, part]),
+            )
+            first += self.counts[g]
+        return knots, weights
+
+
+def knots_over(
+    x0: float, y0: float, width: int, height: int, spacings_px: tuple[float, ...]
+) -> Knots:
+    """Lay grids over a window."""
+    return Knots(
+        x0 - 0.5,
+        y0 - 0.5,
+        spacings_px,
+        tuple(int(width // spacing) + SPAN for spacing in spacings_px),
+        tuple(int(height // spacing) + SPAN for spacing in spacings_px),
+    )
+
+
+@compiled
+def _weigh(
+    pixels: FloatArray,
+    x0: float,
+    y0: float,
+    spacing: float,
+    columns: int,
+    rows: int,
+    first: int,
+    knots: IndexArray,
+    weights: FloatArray,
+) -> None:
+    along_x, along_y = np.empty(3), np.empty(3)
+    for i in range(pixels.shape[1]):
+        x, y = (pixels[0, i] - x0) / spacing, (pixels[1, i] - y0) / spacing
+        column = min(max(int(np.floor(x)), 0), columns - 3)
+        row = min(max(int(np.floor(y)), 0), rows - 3)
+        for along, t in ((along_x, x - column), (along_y, y - row)):
+            along[0], along[2] = 0.5 * (1.0 - t) * (1.0 - t), 0.5 * t * t
+            along[1] = 1.0 - along[0] - along[2]
+        for r in range(3):
+            for c in range(3):
+                knots[i, 3 * r + c] = first + (row + r) * columns + column + c
+                weights[i, 3 * r + c] = along_y[r] * along_x[c]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightField:
+    """What the levels of ink and plate have more than on average, over a window.
+
+    Attributes
+    ----------
+    knots : Knots
+    values : (2, k) array
+        Of ink and plate at all knots.
+    precision : (2, k) array
+        Of the values' prior, about 0.
+    edges : (s, 5) array
+        Straight edges of shadows: direction of its normal [rad], offset along that from the
+        centre [px], logarithm of the penumbra's σ [px], and what is added beyond to the levels of
+        ink and plate.
+    centre_px : (2,) array
+    """
+
+    knots: Knots
+    values: FloatArray
+    precision: FloatArray
+    edges: FloatArray
+    centre_px: FloatArray
+
+    @property
+    def penalty(self) -> float:
+        """The priors' part of the negative log-likelihood."""
+        return float(0.5 * np.sum(self.precision * self.values**2)) + edge_penalty(self.edges)
+
+    def added(self, pixels: FloatArray) -> FloatArray:
+        """Return what the levels of ink and plate (2, n) have more at pixels (2, n)."""
+        return added_by_knots(*self.knots.weights(pixels), self.values) + self.of_edges(pixels)
+
+    def of_edges(self, pixels: FloatArray) -> FloatArray:
+        """Return the part of the shadows' edges."""
+        added = np.zeros((2, pixels.shape[1]))
+        for edge in self.edges:
+            added += edge[INK:, None] * ndtr(beyond(edge, pixels - self.centre_px[:, None]))
+        return added
+
+    def edge_rows(self, pixels: FloatArray, by_level: FloatArray) -> FloatArray:
+        """Return the derivatives (5 s, n) by the shadows' edges.
+
+        `by_level` (2, n) are those by the levels of ink and plate.
+        """
+        offsets = pixels - self.centre_px[:, None]
+        rows = np.empty((len(self.edges), 5, pixels.shape[1]))
+        for k, edge in enumerate(self.edges):
+            z = beyond(edge, offsets)
+            density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+            across = -math.sin(edge[ANGLE]) * offsets[0] + math.cos(edge[ANGLE]) * offsets[1]
+            by_z = (edge[INK] * by_level[0] + edge[PLATE] * by_level[1]) * density
+            per_px = math.exp(-edge[LOG_WIDTH])
+            rows[k, ANGLE] = by_z * across * per_px
+            rows[k, OFFSET] = -by_z * per_px
+            rows[k, LOG_WIDTH] = -by_z * z
+            rows[k, INK:] = by_level * ndtr(z)
+        return rows.reshape(-1, pixels.shape[1])
+
+    def moved(self, values: FloatArray, edges: FloatArray) -> LightField:
+        """Return the field after a step."""
+        return replace(self, values=self.values + values, edges=self.edges + edges)
+
+
+def beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
+    """Return how far places (2, n) [px] are beyond a shadow's edge, in penumbra's σ."""
+    along = np.cos(edge[ANGLE]) * offsets[0] + np.sin(edge[ANGLE]) * offsets[1]
+    return np.asarray((along - edge[OFFSET]) / np.exp(edge[LOG_WIDTH]))
+
+
+EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
+EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
+
+
+def edge_penalty(edges: FloatArray) -> float:
+    """Return the priors' part of shadows' edges."""
+    return float(0.5 * np.sum(EDGE_PRECISION * (edges - EDGE_MEAN) ** 2))
+
+
+@compiled
+def added_by_knots(knots: IndexArray, weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Return Σ weights · values, of ink and of plate: (2, n)."""
+    added = np.zeros((2, len(knots)))
+    for i in range(len(knots)):
+        for j in range(knots.shape[1]):
+            k = knots[i, j]
+            added[0, i] += weights[i, j] * values[0, k]
+            added[1, i] += weights[i, j] * values[1, k]
+    return added

@@ -1,0 +1,90 @@
+"""Levels that vary over a window: splines on grids of knots, straight edges of shadows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.image_model.light_field import LightField, knots_over
+
+_SPACING_PX = 8.0
+
+
+def _field(columns: int = 64, rows: int = 48) -> LightField:
+    knots = knots_over(100.0, 200.0, columns, rows, (_SPACING_PX,))
+    count = sum(knots.counts)
+    return LightField(
+        knots,
+        np.zeros((2, count)),
+        np.ones((2, count)),
+        np.empty((0, 5)),
+        np.array([132.0, 224.0]),
+    )
+
+
+def _pixels() -> FloatArray:
+    return np.random.default_rng(1).uniform((100.0, 200.0), (163.0, 247.0), (500, 2)).T
+
+
+def test_weights_add_up_to_one_everywhere() -> None:
+    _, weights = _field().knots.weights(_pixels())
+    assert np.abs(weights.sum(axis=1) - 1.0).max() < 1e-12
+    assert weights.min() >= 0.0
+
+
+def test_weights_are_those_of_quadratic_b_splines() -> None:
+    field, pixels = _field(), _pixels()
+    knots, weights = field.knots.weights(pixels)
+    dense = np.zeros((pixels.shape[1], sum(field.knots.counts)))
+    np.put_along_axis(dense, knots, weights, axis=1)
+    along = [
+        np.stack(
+            [
+                BSpline.basis_element(_SPACING_PX * np.arange(k - 2, k + 2), extrapolate=False)(at)
+                for k in range(count)
+            ]
+        )
+        for at, count in zip(
+            pixels - np.array([[99.5], [199.5]]),
+            (field.knots.columns[0], field.knots.rows[0]),
+            strict=True,
+        )
+    ]
+    columns, rows = (np.nan_to_num(each) for each in along)
+    expected = np.einsum("rn,cn->nrc", rows, columns).reshape(len(dense), -1)
+    assert np.abs(dense - expected).max() < 1e-12
+
+
+def test_derivatives_by_a_shadow_s_edge_are_those_of_differences() -> None:
+    edge, pixels = np.array([[0.4, 3.0, 0.9, -0.05, -0.4]]), _pixels()
+    field = replace(_field(), edges=edge)
+    by_level = np.random.default_rng(2).normal(size=(2, pixels.shape[1]))
+    rows, step = field.edge_rows(pixels, by_level), 1e-6
+    for k in range(5):
+        change = step * np.eye(5)[k]
+        more, less = (replace(field, edges=edge + sign * change) for sign in (1.0, -1.0))
+        slope = (more.of_edges(pixels) - less.of_edges(pixels)) / (2.0 * step)
+        assert np.abs(rows[k] - np.sum(by_level * slope, axis=0)).max() < 1e-7
+
+
+def test_a_slope_of_the_knots_is_a_slope_of_the_field() -> None:
+    field, pixels = _field(), _pixels()
+    columns, rows = field.knots.columns[0], field.knots.rows[0]
+    slope = np.tile(0.01 * _SPACING_PX * np.arange(columns), rows)
+    added = replace(field, values=np.stack((slope, -slope))).added(pixels)
+    along = np.polyfit(pixels[0], added[0], 1)
+    assert along[0] == pytest.approx(0.01, rel=1e-9)
+    assert np.abs(added[0] - np.polyval(along, pixels[0])).max() < 1e-12
+    assert np.abs(added[0] + added[1]).max() < 1e-12
+
+
+def test_a_shadow_is_half_as_deep_at_its_edge_and_whole_beyond() -> None:
+    edge = np.array([[0.0, 5.0, np.log(2.0), -0.03, -0.5]])
+    pixels = np.array([[137.0, 160.0, 110.0], [224.0, 230.0, 215.0]])
+    added = replace(_field(), edges=edge).added(pixels)
+    assert added[1] == pytest.approx([-0.25, -0.5, 0.0], abs=1e-6)
+    assert added[0] == pytest.approx([-0.015, -0.03, 0.0], abs=1e-6)
