@@ -25,7 +25,7 @@ from kgcp.targets.layout import Ring
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
-_UNEVEN = 0.5  # spread of ink, disc and plate, of the contrast
+_UNEVEN = 0.8  # spread of ink, disc and plate, of the contrast: half of it may lie in shade
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _SEED_REACH = 2.0  # around expected places, of their radii

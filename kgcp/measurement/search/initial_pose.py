@@ -27,6 +27,7 @@ from kgcp.measurement.search.code_signal import (
     points_of_code,
 )
 from kgcp.measurement.search.sampling import FAINTEST_SLOPE, sample_ellipses, sample_grey
+from kgcp.measurement.search.template_match import code_in_even_light
 from kgcp.targets.layout import Target
 
 # Tuning of the start. The adjustment corrects all of it; a start that is worse costs rounds, and
@@ -34,6 +35,7 @@ from kgcp.targets.layout import Target
 _REACH_PX, _STEP_PX = 3.0, 0.2  # of the profile across an edge
 _MAX_TURN_DEG = 8.0  # by which a heading of the search may be off
 _AXIS_ERROR_PX = 0.3  # of an outline
+_CLEAR_CODE = 0.85  # score below which uneven light may be what makes the code unlike itself
 
 _OUTLINE_RAD = CODE_ANGLES_RAD[::5]  # of an ellipse enough points give its undistorted image
 _EVERYWHERE = np.ones((1, len(_OUTLINE_RAD)), dtype=bool)
@@ -58,6 +60,12 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     ]
     codes = sample_grey(grey, np.array([points_of_code(camera, pose, ring) for pose in poses]))
     scores, lags_deg = match_code(codes, ring)
+    if scores.max() < _CLEAR_CODE:
+        even = [code_in_even_light(grey, camera, pose, ring) for pose in poses]
+        if all(code is not None for code in even):
+            even_scores, even_lags_deg = match_code(np.array(even), ring)
+            if even_scores.max() > scores.max():
+                scores, lags_deg = even_scores, even_lags_deg
     best = int(scores.argmax())
     turn_deg = (float(lags_deg[best]) + 180.0) % 360.0 - 180.0
     pose = poses[best]

@@ -23,10 +23,13 @@ from kgcp.measurement.search.templates import (
     FREQUENCIES,
     LOOKS,
     SAMPLED_RADII,
+    SHIFTS,
     TEMPLATE_RADII,
     code_rows,
+    edge_rows,
     templates_of,
 )
+from kgcp.measurement.search.uneven_light import evened_patch
 from kgcp.targets.layout import Ring
 
 # Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
@@ -34,6 +37,7 @@ from kgcp.targets.layout import Ring
 CODE_LIKE = 0.7
 """Score above which a ring with dots is a code, if another one."""
 _CLEAR_SCORE = 0.9  # of a whole ring, of which nothing is hidden then
+_WORTH_EVENING = 0.6  # score: rings of something else, most of them, are below
 # A dot too many or too few is a misfit of 1. Noise may look like a dot if dots are faint.
 _MAX_MISFIT, _MISFIT_FAINT, _MISFIT_BY_DOTS = 0.45, 0.2, 0.5
 _DARKEST_BLACK = -0.3  # of the contrast: sharpening makes small rings darker than black
@@ -129,6 +133,23 @@ def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict
     return judge(sample_grey(grey, points), ring)
 
 
+def code_in_even_light(
+    grey: GreyArray, camera: Camera, pose: Pose, ring: Ring
+) -> FloatArray | None:
+    """Return what a pose shows along the code circle (360,), as it would be in even light.
+
+    None where the light is even, or where a part is not a ring.
+    """
+    radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
+    points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
+    even = evened_patch(sample_grey(grey, points), ring, SHIFTS)
+    if even is None:
+        return None
+    row = int(np.abs(SAMPLED_RADII * ring.outer_diameter_m - ring.code_diameter_m).argmin())
+    sampled_deg = np.arange(ANGLES) * (360.0 / ANGLES)
+    return np.asarray(np.interp(np.arange(360.0), sampled_deg, even[row], period=360.0))
+
+
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
     """Sample a frame around an outline, for `judge`: (radii, angles)."""
     return np.asarray(sample_ellipses(grey, (outline,), SAMPLED_RADII, CIRCLE)[0])
@@ -137,13 +158,20 @@ def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
 def judge(patch: FloatArray, ring: Ring) -> Verdict:
     """Compare a polar patch (radii, angles) of the frame with the ring's templates.
 
-    Where a part of the ring is hidden, the rest of it is compared.
+    In uneven light it is compared as it would be in even light; where a part of the ring is
+    hidden, the rest of it is compared.
     """
     templates = templates_of(ring)
     whole = best_placement(correlate(patch, templates))
     verdict = _verdict(patch, ring, whole, None)
     if verdict.is_clear:
         return verdict
+    if verdict.score > _WORTH_EVENING:
+        even = evened_patch(patch, ring, whole.shift)
+        if even is not None:
+            in_even_light = _verdict(even, ring, best_placement(correlate(even, templates)), None)
+            if in_even_light.is_clear:
+                return in_even_light
     visible = visible_angles(patch[whole.shift : whole.shift + len(TEMPLATE_RADII)], ring)
     if visible is None or not may_show_code(patch, visible, ring, whole.shift):
         return verdict
@@ -248,22 +276,10 @@ def visible_angles(patch: FloatArray, ring: Ring) -> BoolArray | None:
     (angles,) array of bool, or None
         None if nothing is hidden, or too much.
     """
-    plate, outside, disc, inside = _edge_rows(ring)
+    plate, outside, disc, inside = edge_rows(ring)
     visible = np.empty(ANGLES, dtype=bool)
     hidden = _mark_visible(patch[plate] - patch[outside], patch[disc] - patch[inside], visible)
     return visible if 0 < hidden <= _MOST_HIDDEN * ANGLES else None
-
-
-@lru_cache(maxsize=64)
-def _edge_rows(ring: Ring) -> tuple[int, ...]:
-    """Return the rows on either side of the outer edge, and of the inner one, bright ones first."""
-    code = ring.code_diameter_m / ring.outer_diameter_m
-    dot = ring.dot_diameter_m / ring.outer_diameter_m
-    outside, inside = 0.5 * (1.0 + code + dot), 0.5 * (ring.inner_ratio + code - dot)
-    return tuple(
-        int(np.abs(TEMPLATE_RADII - ratio).argmin())
-        for ratio in (1.1, outside, 0.85 * ring.inner_ratio, inside)
-    )
 
 
 @compiled

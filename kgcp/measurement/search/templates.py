@@ -73,6 +73,18 @@ def code_rows(ring: Ring) -> tuple[int, int]:
     return int(rows[0]), int(rows[-1])
 
 
+@lru_cache(maxsize=64)
+def edge_rows(ring: Ring) -> tuple[int, ...]:
+    """Return the rows on either side of the outer edge, and of the inner one, bright ones first."""
+    code = ring.code_diameter_m / ring.outer_diameter_m
+    dot = ring.dot_diameter_m / ring.outer_diameter_m
+    outside, inside = 0.5 * (1.0 + code + dot), 0.5 * (ring.inner_ratio + code - dot)
+    return tuple(
+        int(np.abs(TEMPLATE_RADII - ratio).argmin())
+        for ratio in (1.1, outside, 0.85 * ring.inner_ratio, inside)
+    )
+
+
 def _draw(ring: Ring) -> SingleArray:
     """Draw the ring on white, `_PX` pixels to its outer radius."""
     size = round(2.0 * _REACH * _PX) + 1
