@@ -19,6 +19,7 @@ from kgcp.measurement.image_model.window import contour_px, cut_window, semi_maj
 from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.light_field import LightField
 from kgcp.simulation.plate import Plate, image_plate
 from kgcp.targets.layout import Ring, Target
 
@@ -144,7 +145,10 @@ def imaging_of() -> Callable[..., Imaging]:
 
 @pytest.fixture(scope="session")
 def photograph() -> Callable[..., GreyArray]:
-    """Frame of one plate by the simulator; `shade` takes light away, by pixel coordinates."""
+    """Frame of one plate by the simulator; `shade` takes light away, by pixel coordinates.
+
+    `field` is the light on the plate, in its axes.
+    """
 
     def take(
         camera: Camera,
@@ -155,9 +159,11 @@ def photograph() -> Callable[..., GreyArray]:
         sensor: Sensor = Sensor(),  # noqa: B008 - frozen
         gain: float = 0.9,
         shade: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+        field: LightField | None = None,
+        optics: Optics = Optics(0.7),  # noqa: B008 - frozen
     ) -> GreyArray:
         irradiance = np.full((camera.height, camera.width), 0.2)
-        image_plate(camera, plate, pose, Optics(0.7)).paste(irradiance)
+        image_plate(camera, plate, pose, optics, field=field).paste(irradiance)
         if shade is not None:
             y, x = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
             irradiance *= shade(x, y)

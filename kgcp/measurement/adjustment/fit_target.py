@@ -19,12 +19,12 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
+from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.problem import Imaging, apparent_response
 from kgcp.measurement.adjustment.two_poses import (
     TwoPoses,
     advantage,
     choose_by_prior,
-    fit_both_poses,
 )
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.noise import find_censoring
@@ -71,11 +71,13 @@ def measure_by_model(
     """
     pose = _without_edge_shift(start)
     imaging = replace(imaging_of(grey, camera, target, pose), visible=visible)
-    poses = fit_both_poses(imaging, pose, _start_blur(start, imaging.window.binning))
+    poses = fit_in_any_light(imaging, pose, _start_blur(start, imaging.window.binning))
     if prior is not None:
         poses = choose_by_prior(imaging, poses, prior)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
+    if poses.even is not None:
+        check_code(poses.even, target.ring)
     observation = _observation(camera, target, start, poses, prior)
     check_precision(observation)
     return observation

@@ -27,7 +27,7 @@ class Unknowns:
     ----------
     free : (p,) array of int
         Estimated parameters, by `Param`.
-    mean, precision : (19,) array
+    mean, precision : (23,) array
         Independent normal priors on the nuisance parameters; precision 0: none.
     free_precision : (p,) array
         Of the estimated parameters.
@@ -88,7 +88,7 @@ def propose(
     unknowns: Unknowns,
     damping: float,
 ) -> tuple[FloatArray, float]:
-    """Return a step (19,) and the gain that it promises.
+    """Return a step (23,) and the gain that it promises.
 
     Raises
     ------

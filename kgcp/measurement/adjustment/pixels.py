@@ -77,6 +77,7 @@ def choose_sample(
     *,
     most: int | None = None,
     slack_px: float = 0.0,
+    plateau: int = _PLATEAU_PIXELS,
 ) -> Sample:
     """Choose the pixels near edges, and a share of the plateaus; `most` of them, where given.
 
@@ -99,7 +100,7 @@ def choose_sample(
         unused |= hidden_pixels(seen, light, slack_px)
     if imaging.visible is not None:
         unused |= ~imaging.visible[_steps_about(seen.bare.points_m, len(imaging.visible))]
-    index = _useful_pixels(seen, unused)
+    index = _useful_pixels(seen, unused, plateau)
     is_thinned = most is not None and len(index) > most
     if most is not None and is_thinned:
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
@@ -145,7 +146,7 @@ def _steps_about(points_m: FloatArray, count: int) -> IndexArray:
     return np.asarray(np.rint(turns * count).astype(np.intp) % count)
 
 
-def _useful_pixels(seen: SeenPlate, unused: BoolArray) -> IndexArray:
+def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArray:
     """Return the pixels near edges, and those of the plateaus, thinned; of the used ones.
 
     Within circles that are not measured none is used.
@@ -159,6 +160,7 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray) -> IndexArray:
         *(seen.bare.rho_m, seen.bare.off_measured_m, unused),
         *((_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale, tail_m),
         *(_unmeasured_m(seen), limit * imaging.outer_radius_m),
+        plateau,
         index,
     )
     return index[:count]
@@ -181,6 +183,7 @@ def _choose(
     tail_m: float,
     unmeasured_m: float,
     limit_m: float,
+    plateau: int,
     index: IndexArray,
 ) -> int:
     """Fill in all pixels near edges, and a share of those clear of all edges; return how many."""
@@ -188,7 +191,7 @@ def _choose(
     for i in range(len(rho_m)):
         is_flat = off_edge_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
         flat += is_flat and not unused[i]
-    step, number, count = max(1, flat // _PLATEAU_PIXELS), 0, 0
+    step, number, count = max(1, flat // plateau), 0, 0
     for i in range(len(rho_m)):
         if unused[i] or rho_m[i] >= limit_m:
             continue

@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.level_equations import LevelEquations
 from kgcp.measurement.adjustment.normal_equations import (
     Unknowns,
     normal_matrix,
@@ -15,8 +18,10 @@ from kgcp.measurement.adjustment.normal_equations import (
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, choose_sample
 from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.image_model.blurred_plate import white_level, white_share
+from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, white_share
 from kgcp.measurement.image_model.noise import Misfit, Noise, estimate_noise, misfit
+from kgcp.measurement.image_model.photometry import Param
+from kgcp.measurement.image_model.skew import skew_rows
 
 _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
@@ -60,12 +65,15 @@ class Fit:
     sample : Sample
     parameters : Parameters
     prediction : Prediction
-    jacobian : (19, n) array
+    jacobian : (19, n), (23, n) or (25, n) array
+        As of `Imager.linearised`.
     sd : (n,) array
         Noise of every pixel, as level.
     misfit : Misfit
         Without the priors.
     unknowns : Unknowns
+    varied : LevelEquations or None
+        Of levels that vary; None: the light is even.
     """
 
     sample: Sample
@@ -75,6 +83,7 @@ class Fit:
     sd: FloatArray
     misfit: Misfit
     unknowns: Unknowns
+    varied: LevelEquations | None = None
 
     @property
     def scaled_jacobian(self) -> FloatArray:
@@ -84,21 +93,50 @@ class Fit:
     @property
     def total(self) -> float:
         """Negative log-likelihood with the priors."""
-        return self.misfit.total + self.unknowns.penalty(self.parameters)
+        field = self.parameters.field
+        of_field = 0.0 if field is None else field.penalty
+        return self.misfit.total + self.unknowns.penalty(self.parameters) + of_field
 
 
 def predict(sample: Sample, parameters: Parameters) -> Prediction:
     """Model the grey values of a sample."""
     share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
-    levels = sample.imager.levels(share.value, parameters.light)
+    if parameters.has_skew:
+        share = _skewed(share, sample, parameters)
+    levels = sample.imager.levels(share.value, parameters.light, added_levels(sample, parameters))
     return Prediction(share.points_m, share.value, levels)
 
 
 def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
-    """Model the grey values of a sample, and return their Jacobian (19, n) with them."""
+    """Model the grey values of a sample, and return their Jacobian with them.
+
+    It is that of `Imager.linearised`. Derivatives by the point spread's skew are left out where
+    there is none.
+    """
     share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
-    levels, jacobian = sample.imager.linearised(share, parameters.light)
+    if parameters.has_skew:
+        share = _skewed(share, sample, parameters)
+    added = added_levels(sample, parameters)
+    levels, jacobian = sample.imager.linearised(share, parameters.light, added)
     return Prediction(share.points_m, share.value, levels), jacobian
+
+
+def _skewed(share: WhiteShare, sample: Sample, parameters: Parameters) -> WhiteShare:
+    """Add what a skew point spread does to the white share and to its derivatives.
+
+    Those by pose and blur stay as they are: the skew changes them by a few per cent.
+    """
+    rows = skew_rows(parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.pairs)
+    value = share.value + parameters.vector[Param.SKEW_XXX :] @ rows
+    jacobian = np.vstack((share.jacobian, rows)) if len(share.jacobian) else share.jacobian
+    return WhiteShare(share.points_m, value, jacobian)
+
+
+def added_levels(sample: Sample, parameters: Parameters) -> FloatArray | None:
+    """Return what the levels of ink and plate (2, n) have more where the light is uneven."""
+    if parameters.field is None:
+        return None
+    return parameters.field.added(sample.imaging.window.pixels(sample.index))
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:

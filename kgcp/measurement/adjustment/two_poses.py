@@ -41,10 +41,13 @@ class TwoPoses:
     ----------
     best, other : Fit
         The better and the worse one, on the same pixels with the same noise.
+    even : Fit, optional
+        The better one before levels were let vary, which may hide a dot; None if they do not vary.
     """
 
     best: Fit
     other: Fit
+    even: Fit | None = None
 
 
 def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
@@ -53,7 +56,7 @@ def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
     other = _mirrored_fit(rough, _UNLIKELY)
     near, far = (other, rough) if other.total < rough.total else (rough, other)
     best = adjust_with_streak(imaging, _with_sharpening(imaging, near.parameters))
-    other = _fit_at(best, far.parameters.pose)
+    other = fit_at(best, far.parameters.pose)
     if other.total < best.total:
         best = adjust(imaging, other.parameters, best.unknowns)
         other = _mirrored_fit(best)
@@ -119,8 +122,12 @@ def choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> Tw
     """Let the poses change places where the prior outweighs the image; adjust the new best one."""
     if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
         return poses
-    best = adjust(imaging, poses.other.parameters, poses.best.unknowns)
-    turned = TwoPoses(best, _mirrored_fit(best))
+    if poses.best.varied is None:
+        best = adjust(imaging, poses.other.parameters, poses.best.unknowns)
+        turned = TwoPoses(best, _mirrored_fit(best))
+    else:
+        turned = TwoPoses(poses.other, poses.best, poses.even)
+        best = turned.best
     is_better = advantage(turned, pose_covariance(best), prior) >= 0.0
     return turned if is_better else poses
 
@@ -160,7 +167,7 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
     return other
 
 
-def _fit_at(fit: Fit, pose: Pose) -> Fit:
+def fit_at(fit: Fit, pose: Pose) -> Fit:
     """Fit another pose to the pixels of a fit, unless it is hopeless."""
     parameters = fit.parameters.at(pose)
     prediction = predict(fit.sample, parameters)

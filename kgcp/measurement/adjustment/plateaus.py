@@ -1,0 +1,214 @@
+"""How even the light is, from what is flat on the plate: ink and white clear of all edges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.image_model.light_field import INK, PLATE, LightField
+from kgcp.measurement.image_model.photometry import Light
+from kgcp.measurement.image_model.unblurred import BarePlate, look_at_plate
+
+# Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`; lengths in radii, light in
+# contrasts, where nothing else is said.
+_CLEAR_SIGMAS, _CLEAR_PX, _MOST_CLEAR = 2.0, 1.0, 0.1  # of an edge
+_BORDER = 0.18  # of the plate beyond the ring
+_SMOOTHED = 0.16
+_WIDE, _WIDE_SHARE = 3.0, 0.02  # where nothing flat is near, what is farther off counts
+_UNEVEN = 0.12  # smoothed levels vary so much: one pair of them would mislead
+_GLARE, _DARKEST_PLATE, _DARKER_INK = 0.06, 0.35, 0.5
+_GLARE_REACH, _SEEN = 1.5, 1e-3
+_LEAST_CONTRAST = 0.1
+_FEWEST_PIXELS = 12  # on either side of a step
+_MOST_PIXELS = 4000
+_TURNS, _OFFSETS, _REACH = 36, 61, 1.1  # of steps that are tried
+_STEP_GAIN = 0.5  # of the variance, that a step must explain
+_FIRST_WIDTH = 0.06
+_LEAST_BY_INK, _MOST_BY_INK = -0.1, 0.6  # change of ink by that of plate: shade takes, glare adds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plateaus:
+    """Levels of ink and plate all over a window, from where they are seen.
+
+    Attributes
+    ----------
+    levels : (2, n) array
+        Of ink and of plate, at every pixel.
+    typical : tuple of two floats
+        Medians.
+    extremes : tuple of two floats
+        The darkest ink and the brightest plate, smoothed.
+    uneven : float
+        How much they vary, of the contrast.
+    flat : tuple of two (m,) arrays of int
+        Pixels of ink and plate clear of edges.
+    """
+
+    levels: FloatArray
+    typical: tuple[float, float]
+    extremes: tuple[float, float]
+    uneven: float
+    flat: tuple[IndexArray, IndexArray]
+
+    @property
+    def is_uneven(self) -> bool:
+        """Whether the levels vary so much that one pair of them would mislead."""
+        return self.uneven > _UNEVEN
+
+
+def look_at_plateaus(imaging: Imaging, pose: Pose, sd_px: float) -> Plateaus | None:
+    """Smooth ink and plate each over what is seen of them; None if too little is."""
+    window = imaging.window
+    bare = look_at_plate(imaging.circles, imaging.measured_count, pose, window.rays)
+    clear = _clear_of_edges(imaging, bare, sd_px)
+    ink, plate = (np.flatnonzero(kind) for kind in _kinds(imaging, bare, clear))
+    if min(len(ink), len(plate)) < 2 * _FEWEST_PIXELS:
+        return None
+    levels = np.array([_smoothed_over(imaging, flat) for flat in (ink, plate)])
+    black, white = (float(np.median(window.smooth[flat])) for flat in (ink, plate))
+    if white <= black:
+        return None
+    darkest, dark = np.quantile(levels[0, ink], (0.05, 0.95)).tolist()
+    bright, brightest = np.quantile(levels[1, plate], (0.05, 0.95)).tolist()
+    return Plateaus(
+        levels=levels,
+        typical=(black, white),
+        extremes=(darkest, brightest),
+        uneven=max(dark - darkest, brightest - bright) / (white - black),
+        flat=(ink, plate),
+    )
+
+
+def _clear_of_edges(imaging: Imaging, bare: BarePlate, sd_px: float) -> BoolArray:
+    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    clear_px = min(_CLEAR_SIGMAS * sd_px + _CLEAR_PX, _MOST_CLEAR * imaging.outer_radius_px)
+    within = bare.rho_m < (1.0 + _BORDER) * imaging.outer_radius_m
+    if imaging.visible is not None:
+        turns = np.arctan2(bare.points_m[1], bare.points_m[0]) / (2.0 * math.pi)
+        count = len(imaging.visible)
+        within &= imaging.visible[np.rint(turns * count).astype(np.intp) % count]
+    return np.asarray(within & (bare.off_edge_m >= clear_px / px_per_m))
+
+
+def _kinds(imaging: Imaging, bare: BarePlate, clear: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Tell what is ink and what is plate.
+
+    Ink as bright as plate is a dot of another code, and so is dark plate: neither may pass for
+    light. Glare makes ink brighter, but the plate around it, too.
+    """
+    values = imaging.window.smooth
+    is_ink, is_plate = clear & (bare.share < 0.5), clear & (bare.share > 0.5)
+    if is_ink.any() and is_plate.any():
+        ink, plate = (float(np.median(values[kind])) for kind in (is_ink, is_plate))
+        contrast = plate - ink
+        around = _plate_around(imaging, is_plate)
+        limit = np.where(around > plate + _GLARE * contrast, around, plate)
+        is_ink &= values < limit - _DARKER_INK * contrast
+        is_plate &= values > ink + _DARKEST_PLATE * contrast
+    return is_ink, is_plate
+
+
+def _plate_around(imaging: Imaging, is_plate: BoolArray) -> FloatArray:
+    """Return the level of the plate near every pixel; 0 where there is none near."""
+    sigma_px = _GLARE_REACH * _smoothing_px(imaging)
+    weight = is_plate.astype(np.float64)
+    near, total = (
+        _blurred(imaging, values, sigma_px) for values in (weight, weight * imaging.window.smooth)
+    )
+    return np.where(near > _SEEN, total / np.maximum(near, _SEEN), 0.0)
+
+
+def _smoothed_over(imaging: Imaging, flat: IndexArray) -> FloatArray:
+    """Smooth the window over some of its pixels (n,)."""
+    weight = np.zeros(len(imaging.window.smooth))
+    weight[flat] = 1.0
+    light = weight * imaging.window.smooth
+    sigma_px = _smoothing_px(imaging)
+    near, total = (_blurred(imaging, values, sigma_px) for values in (weight, light))
+    wide, broad = (_blurred(imaging, values, _WIDE * sigma_px) for values in (weight, light))
+    return np.asarray((total + _WIDE_SHARE * broad) / (near + _WIDE_SHARE * wide + 1e-9))
+
+
+def _smoothing_px(imaging: Imaging) -> float:
+    return max(2.0, _SMOOTHED * imaging.outer_radius_px)
+
+
+def _blurred(imaging: Imaging, values: FloatArray, sigma_px: float) -> FloatArray:
+    image = values.reshape(imaging.window.height, imaging.window.width)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float64).ravel()
+
+
+def evened_window(imaging: Imaging, plateaus: Plateaus) -> Imaging:
+    """Return the window as it would be in even light, by the levels seen."""
+    window = imaging.window
+    (black, white), (ink, plate) = plateaus.typical, plateaus.levels
+    contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
+    factor = (white - black) / contrast
+    levels = black + (window.levels - ink) * factor
+    smooth = black + (window.smooth - ink) * factor
+    return replace(imaging, window=replace(window, levels=levels, smooth=smooth))
+
+
+def field_of(field: LightField, imaging: Imaging, plateaus: Plateaus, light: Light) -> LightField:
+    """Return a field whose finest knots have the levels seen."""
+    knots, window = field.knots, imaging.window
+    spacing, columns, rows = knots.spacings_px[-1], knots.columns[-1], knots.rows[-1]
+    x = np.clip(spacing * (np.arange(columns) - 0.5) - 0.5, 0, window.width - 1)
+    y = np.clip(spacing * (np.arange(rows) - 0.5) - 0.5, 0, window.height - 1)
+    at = (np.rint(y).astype(int)[:, None] * window.width + np.rint(x).astype(int)).ravel()
+    values = np.zeros_like(field.values)
+    levels = plateaus.levels[:, at] - np.array([[light.black], [light.white]])
+    values[:, -len(at) :] = levels / (light.white - light.black)
+    return replace(field, values=values)
+
+
+def step_across(imaging: Imaging, plateaus: Plateaus) -> FloatArray | None:
+    """Return the straight edge that explains most of how the levels vary; None if that is little.
+
+    As in `LightField.edges` (5,), but with grey values for the levels of ink and plate.
+    """
+    window = imaging.window
+    step = max(1, sum(map(len, plateaus.flat)) // _MOST_PIXELS)
+    chosen = [flat[::step] for flat in plateaus.flat]
+    offsets = [window.pixels(flat) - imaging.centre_px[:, None] for flat in chosen]
+    values = [window.smooth[flat] for flat in chosen]
+    noise = [max(float(np.median(np.abs(np.diff(v)))) ** 2, 1e-8) for v in values]
+    whole = sum(float(np.var(v)) * len(v) / n for v, n in zip(values, noise, strict=True))
+    radius_px = _REACH * imaging.outer_radius_px
+    bins = np.linspace(-radius_px, radius_px, _OFFSETS)
+    best, edge = 0.0, None
+    for angle in math.pi * np.arange(_TURNS) / _TURNS:
+        gain, rises = np.zeros(_OFFSETS - 2), np.empty((2, _OFFSETS - 2))
+        for k in (0, 1):
+            along = math.cos(angle) * offsets[k][0] + math.sin(angle) * offsets[k][1]
+            rises[k], explained = _steps(along, values[k], bins)
+            gain += explained / noise[k]
+        place = int(gain.argmax())
+        if gain[place] > best:
+            best = float(gain[place])
+            width_px = max(1.0, _FIRST_WIDTH * radius_px)
+            edge = np.array((angle, bins[place + 1], math.log(width_px), *rises[:, place]))
+    if edge is None or best < _STEP_GAIN * whole:
+        return None
+    by_ink = edge[INK] / edge[PLATE] if edge[PLATE] else math.inf
+    return edge if _LEAST_BY_INK < by_ink < _MOST_BY_INK else None
+
+
+def _steps(
+    along: FloatArray, values: FloatArray, bins: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the step of the mean at every inner border of bins, and what it explains."""
+    count, total = np.histogram(along, bins)[0], np.histogram(along, bins, weights=values)[0]
+    below, sum_below = np.cumsum(count)[:-1], np.cumsum(total)[:-1]
+    above, sum_above = count.sum() - below, total.sum() - sum_below
+    usable = np.minimum(below, above) >= _FEWEST_PIXELS
+    rise = sum_above / np.maximum(above, 1) - sum_below / np.maximum(below, 1)
+    rise = np.where(usable, rise, 0.0)
+    return rise, np.asarray(rise**2 * below * above / max(count.sum(), 1))

@@ -1,0 +1,318 @@
+"""Levels of ink and plate that vary over the plate, adjusted with pose, blur and light.
+
+They are random effects: values at knots with a prior of zero mean, of which the variance comes from
+the frame itself. docs/method.md, "Light that is not the same everywhere", says why.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.level_equations import (
+    AtKnots,
+    LevelEquations,
+    eliminate_levels,
+    gather,
+)
+from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix, scaled_rows
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import Sample, choose_sample
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.solver import Fit, Prediction, linearise, noise_of, predict
+from kgcp.measurement.image_model.light_field import (
+    EDGE_MEAN,
+    EDGE_PRECISION,
+    SPAN,
+    LightField,
+    knots_over,
+)
+from kgcp.measurement.image_model.noise import Misfit, misfit
+from kgcp.measurement.image_model.photometry import (
+    PARAM_COUNT,
+    Param,
+    encoded,
+    plateau_levels,
+    toned,
+)
+
+# Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`.
+_ROUNDS, _PHASES, _STEPS, _OTHER_STEPS = 2, 3, 5, 6
+_ENOUGH, _NEGLIGIBLE = 0.05, 1e-6  # of log-likelihood
+_LARGE_CHANGE = 0.005  # of the contrast: linearised anew beyond
+_DAMPING, _DAMPED, _MAX_DAMPING = 1e-7, 1e-3, 1e6
+_LIKE_A_TILT = 0.07  # as in `normal_equations`
+_SETTLED_PX = 0.1
+_LEAST_SD, _MOST_SD, _FIRST_SD = 1e-4, 1.0, 0.1  # of the levels' prior, of the contrast
+_FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8  # knots: px, per radius, and radii apart
+_SLACK_PX = 0.4
+_PLATEAU_PIXELS = 1200
+_LEAST_CONTRAST = 0.05
+# Mean square of the residuals' sums over cells, of what independent residuals make it: above, the
+# levels vary. Frames in even light have about 1.
+_ASKS = 2.5
+_ENOUGH_POWER = 0.05  # of the cell that tells most
+
+
+def even_field(imaging: Imaging) -> LightField:
+    """Return a field that adds nothing yet: a fine grid, and a coarse one if that is coarser."""
+    radius, window = imaging.outer_radius_px, imaging.window
+    fine, coarse = max(_FINEST_PX, radius / _FINE), _COARSE * radius
+    spacings_px = (coarse, fine) if coarse > 1.5 * fine else (fine,)
+    knots = knots_over(window.x0, window.y0, window.width, window.height, spacings_px)
+    count = sum(knots.counts)
+    return LightField(
+        knots=knots,
+        values=np.zeros((2, count)),
+        precision=np.full((2, count), _FIRST_SD**-2),
+        edges=np.empty((0, 5)),
+        centre_px=imaging.centre_px,
+    )
+
+
+def excess_of_cells(fit: Fit) -> float:
+    """Return the mean square of sums over cells, of what independent residuals make it."""
+    sample, light = fit.sample, fit.parameters.light
+    field = even_field(sample.imaging)
+    knots, weights = field.knots.weights(sample.imaging.window.pixels(sample.index))
+    finest = AtKnots(knots[:, -SPAN * SPAN :], weights[:, -SPAN * SPAN :])
+    contrast = light.white - light.black
+    by_level = contrast * fit.jacobian[[int(Param.BLACK), int(Param.WHITE)]] / fit.sd
+    count = field.values.shape[1]
+    sums = gather(finest, by_level, fit.misfit.score, count)
+    squares = AtKnots(finest.knots, finest.weights**2)
+    power = gather(squares, by_level**2, fit.misfit.weight, count)
+    telling = power > _ENOUGH_POWER * power.max()
+    return float(np.mean(sums[telling] ** 2 / power[telling]))
+
+
+def asks_for_levels(fit: Fit) -> bool:
+    """Tell whether residuals go together over the cells of the finest grid."""
+    return excess_of_cells(fit) > _ASKS
+
+
+def fit_levels(
+    imaging: Imaging, starts: list[Parameters], other: Pose, unknowns: Unknowns
+) -> tuple[Fit, Fit]:
+    """Adjust with a field from the first start that leads anywhere, and so at another pose.
+
+    Returns
+    -------
+    best, other : Fit
+        The better and the worse one.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`, or as `choose_sample`, if no start leads anywhere.
+    """
+    for start in starts:
+        try:
+            first = _adjust_levels(imaging, start, unknowns)
+            break
+        except Rejection as failure:
+            problem = failure
+    else:
+        raise problem
+    second = _minimise(
+        first.sample,
+        first.parameters.at(other),
+        first.sd,
+        first.unknowns,
+        _equations_of(first).at_knots,
+        steps=_OTHER_STEPS,
+    )
+    return (second, first) if second.total < first.total else (first, second)
+
+
+def _adjust_levels(imaging: Imaging, start: Parameters, unknowns: Unknowns) -> Fit:
+    """Adjust with a field of levels, in rounds: pixels are chosen anew in each."""
+    parameters = start if start.field is not None else replace(start, field=even_field(imaging))
+    for _ in range(_ROUNDS):
+        sample = choose_sample(
+            _evened(imaging, parameters),
+            parameters.pose,
+            parameters.blur,
+            parameters.light,
+            slack_px=_SLACK_PX,
+            plateau=_PLATEAU_PIXELS,
+        )
+        fit = _adjust_on(replace(sample, imaging=imaging), parameters, unknowns)
+        before, parameters = parameters.matrix[:, 3], fit.parameters
+        shift = np.linalg.norm(parameters.matrix[:, 3] - before) / parameters.matrix[2, 3]
+        if shift * imaging.focal_px < _SETTLED_PX:
+            break
+    return fit
+
+
+def _evened(imaging: Imaging, parameters: Parameters) -> Imaging:
+    """Return a window of which the smooth image is as if the light were even."""
+    field, window = parameters.field, imaging.window
+    if field is None:
+        return imaging
+    added = field.added(window.pixels(np.arange(len(window.levels))))
+    light = parameters.light
+    black, white = plateau_levels(light, imaging.response)
+    ink, plate = (
+        encoded(toned(x, light.values), imaging.response) for x in (added[0], 1.0 + added[1])
+    )
+    contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
+    smooth = black + (window.smooth - ink) * (white - black) / contrast
+    return replace(imaging, window=replace(window, smooth=smooth))
+
+
+def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Fit:
+    """Adjust on a sample; noise, and the prior of the levels, come from the phase before."""
+    field = _field_of(parameters)
+    at_knots = AtKnots(*field.knots.weights(sample.imaging.window.pixels(sample.index)))
+    linear = linearise(sample, parameters)
+    for phase in range(_PHASES):
+        sd = noise_of(sample, linear[0]).sd
+        fit = _minimise(sample, parameters, sd, unknowns, at_knots, steps=_STEPS, linear=linear)
+        linear = (fit.prediction, fit.jacobian)
+        parameters = fit.parameters
+        if phase < _PHASES - 1:
+            parameters = replace(parameters, field=_with_variances(fit))
+    return fit
+
+
+def _with_variances(fit: Fit) -> LightField:
+    """Return the field with the prior that its values ask for (MacKay's fixed point).
+
+    The variance of a group is Σ c² / γ, with γ the number of values that the pixels determine;
+    groups are the grids, of ink and of plate.
+    """
+    field, equations = _field_of(fit.parameters), _equations_of(fit)
+    grid = np.repeat(np.arange(len(field.knots.counts)), field.knots.counts)
+    group = np.append(grid, grid + len(field.knots.counts))
+    determined = 1.0 - equations.precision * equations.variances()
+    precision, values = np.empty(len(group)), field.values.ravel()
+    for g in range(group.max() + 1):
+        number = float(np.sum(determined[group[equations.used] == g]))
+        sd = math.sqrt(float(np.sum(values[group == g] ** 2)) / max(number, 0.5))
+        precision[group == g] = min(max(sd, _LEAST_SD), _MOST_SD) ** -2
+    return replace(field, precision=precision.reshape(2, -1))
+
+
+def _minimise(
+    sample: Sample,
+    parameters: Parameters,
+    sd: FloatArray,
+    unknowns: Unknowns,
+    at_knots: AtKnots,
+    *,
+    steps: int,
+    linear: tuple[Prediction, FloatArray] | None = None,
+) -> Fit:
+    """Minimise the negative log-likelihood with all priors, as `solver.minimise` does."""
+    prediction, jacobian = linearise(sample, parameters) if linear is None else linear
+    current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
+    total = _total(current, unknowns, parameters)
+    light = parameters.light
+    contrast = max(light.white - light.black, sample.imaging.window.levels_per_count)
+    relative_sd = float(np.mean(sd)) / contrast
+    damping = _DAMPING
+    equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
+    for _ in range(steps):
+        while True:
+            candidate, promised = _proposed(equations, current, parameters, unknowns, damping)
+            is_far = relative_sd * math.sqrt(2.0 * promised / len(sd)) > _LARGE_CHANGE
+            if is_far:
+                attempt, attempt_jacobian = linearise(sample, candidate)
+            else:
+                attempt, attempt_jacobian = predict(sample, candidate), jacobian
+            trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
+            trial_total = _total(trial, unknowns, candidate)
+            is_better = trial_total <= total + _NEGLIGIBLE
+            if is_better or promised < _ENOUGH or damping > _MAX_DAMPING:
+                break
+            damping = max(10.0 * damping, _DAMPED)
+        if not is_better:
+            break
+        gain, total = total - trial_total, trial_total
+        parameters, prediction, current = candidate, attempt, trial
+        damping = max(0.1 * damping, 1e-9)
+        if is_far:
+            jacobian = attempt_jacobian
+            equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
+        if gain < _ENOUGH:
+            break
+    equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
+    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns, equations)
+
+
+def _total(current: Misfit, unknowns: Unknowns, parameters: Parameters) -> float:
+    return current.total + unknowns.penalty(parameters) + _field_of(parameters).penalty
+
+
+def _field_of(parameters: Parameters) -> LightField:
+    """Return the field, which all parameters of this module have."""
+    return cast("LightField", parameters.field)
+
+
+def _equations_of(fit: Fit) -> LevelEquations:
+    return cast("LevelEquations", fit.varied)
+
+
+def _equations(
+    sample: Sample,
+    parameters: Parameters,
+    jacobian: FloatArray,
+    sd: FloatArray,
+    unknowns: Unknowns,
+    current: Misfit,
+    at_knots: AtKnots,
+) -> LevelEquations:
+    """Return the equations of pose, blur, light and shadows' edges, with the levels eliminated."""
+    field = _field_of(parameters)
+    by_level = jacobian[PARAM_COUNT:] / sd
+    scaled = scaled_rows(jacobian, unknowns.free, sd)
+    precision = unknowns.free_precision
+    if len(field.edges):
+        pixels = sample.imaging.window.pixels(sample.index)
+        scaled = np.vstack((scaled, field.edge_rows(pixels, by_level)))
+        precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
+    normal = normal_matrix(scaled, current, replace(unknowns, free_precision=precision))
+    return eliminate_levels(scaled, normal, at_knots, by_level, current, field.precision)
+
+
+def _proposed(
+    equations: LevelEquations,
+    current: Misfit,
+    parameters: Parameters,
+    unknowns: Unknowns,
+    damping: float,
+) -> tuple[Parameters, float]:
+    """Return the parameters after a step, and the gain that it promises."""
+    field, free = _field_of(parameters), unknowns.free
+    of_levels = equations.gradient_of_levels(current.score, field.values)
+    pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
+    pull_of_edges = (EDGE_PRECISION * (EDGE_MEAN - field.edges)).ravel()
+    gradient = equations.scaled @ current.score + np.append(pull, pull_of_edges)
+    reduced = gradient - equations.projected @ of_levels
+    alone = equations.half_solved(of_levels)
+    damped = _damped(equations.normal, parameters, damping)
+    _, solution, failure = dposv(damped.T, reduced)
+    promised = 0.5 * float(reduced @ solution) + 0.5 * float(alone @ alone)
+    if failure or not math.isfinite(promised):
+        raise Rejection(Reason.POOR_FIT, "singular normal equations")
+    step = np.zeros(PARAM_COUNT)
+    step[free] = solution[: len(free)]
+    values = equations.step_of_levels(of_levels, solution)
+    edges = solution[len(free) :].reshape(-1, 5)
+    return replace(parameters.moved(step), field=field.moved(values, edges)), promised
+
+
+def _damped(normal: FloatArray, parameters: Parameters, damping: float) -> FloatArray:
+    """Add to the diagonal; tilts are held back like the distance, as in `normal_equations`."""
+    stiffness = np.diag(normal).copy()
+    reach_m = _LIKE_A_TILT * float(np.linalg.norm(parameters.matrix[:, 3]))
+    stiffness[3:6] = np.maximum(stiffness[3:6], reach_m * reach_m * stiffness[2])
+    return np.asarray(normal + np.diag(damping * stiffness))

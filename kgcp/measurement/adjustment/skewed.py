@@ -1,0 +1,60 @@
+"""Whether a point spread is skew, from the residuals of a fit that takes it for symmetric."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
+from kgcp.measurement.adjustment.solver import Fit, added_levels
+from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, Param
+from kgcp.measurement.image_model.skew import skew_rows
+
+_SKEW = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
+_SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
+# χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
+# have 13 at most, the 14 of light/lens 35 and more.
+_ASKS = 25.0
+
+
+def asks_for_skew(fit: Fit) -> bool:
+    """Tell whether third moments would take more of the residuals than chance (score test)."""
+    if fit.sample.imaging.window.binning > 1 or fit.unknowns.free[-1] >= _SKEW[0]:
+        return False
+    scaled = np.vstack((fit.scaled_jacobian, _by_skew(fit) / fit.sd))
+    precision = np.append(fit.unknowns.free_precision, np.zeros(len(_SKEW)))
+    normal = normal_matrix(scaled, fit.misfit, replace(fit.unknowns, free_precision=precision))
+    count = len(fit.unknowns.free)
+    score = scaled[count:] @ fit.misfit.score
+    mixed = np.linalg.solve(normal[:count, :count], normal[:count, count:])
+    own = normal[count:, count:] - normal[count:, :count] @ mixed
+    return bool(score @ np.linalg.solve(own, score) > _ASKS)
+
+
+def _by_skew(fit: Fit) -> FloatArray:
+    """Return the derivatives (4, n) of the grey values by the skew; the others are known."""
+    sample, parameters = fit.sample, fit.parameters
+    rows = skew_rows(parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.pairs)
+    by_geometry = np.vstack((np.zeros((GEOMETRY_ROWS, rows.shape[1])), rows))
+    share = WhiteShare(fit.prediction.points_m, fit.prediction.share, by_geometry)
+    added = added_levels(sample, parameters)
+    return sample.imager.linearised(share, parameters.light, added)[1][_SKEW]
+
+
+def with_skew(unknowns: Unknowns) -> Unknowns:
+    """Return the unknowns with the third moments among them."""
+    free = np.append(unknowns.free, _SKEW)
+    precision = unknowns.precision.copy()
+    precision[_SKEW] = _SKEW_SD_PX3**-2
+    return Unknowns(free, unknowns.mean, precision, precision[free])
+
+
+def loss_per_pixel(fit: Fit) -> float:
+    """Return the negative log-likelihood with the priors, noise included, by pixel.
+
+    Fits with spreads of other shapes use other pixels: their sums do not compare.
+    """
+    return (fit.total + float(np.sum(np.log(fit.sd)))) / len(fit.sd)

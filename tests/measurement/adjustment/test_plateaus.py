@@ -1,0 +1,73 @@
+"""What is flat on a plate: even light, a shadow's edge, and dots that are not light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, step_across
+from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.image_model.light_field import ANGLE, OFFSET, PLATE
+from kgcp.targets.layout import Target
+
+CENTRE_PX, LEFT, OFF_PX = (205.4, 190.7), 0.5, 12.0
+WAY = math.radians(25.0)
+
+
+@pytest.fixture(scope="module")
+def look(
+    target: Target,
+    camera: Camera,
+    place_plate: Callable[..., Pose],
+    draw_frame: Callable[..., GreyArray],
+    imaging_of: Callable[..., Imaging],
+) -> Callable[..., tuple[Imaging, Plateaus]]:
+    def at(
+        shown: Target, shade: Callable[[FloatArray], FloatArray] | None = None
+    ) -> tuple[Imaging, Plateaus]:
+        pose = place_plate(CENTRE_PX, 60.0, tilt_deg=10.0)
+        grey = draw_frame((shown, pose))
+        if shade is not None:
+            y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
+            along = (x - CENTRE_PX[0]) * math.cos(WAY) + (y - CENTRE_PX[1]) * math.sin(WAY)
+            grey = np.rint(grey * shade(along)).astype(np.uint8)
+        imaging = imaging_of(grey, camera, target, pose)
+        plateaus = look_at_plateaus(imaging, pose, 0.8)
+        assert plateaus is not None
+        return imaging, plateaus
+
+    return at
+
+
+def test_even_light_is_even(look: Callable[..., tuple[Imaging, Plateaus]], target: Target) -> None:
+    imaging, plateaus = look(target)
+    assert not plateaus.is_uneven
+    assert plateaus.typical == pytest.approx((0.08, 0.75), abs=0.006)
+    assert step_across(imaging, plateaus) is None
+
+
+def test_a_shadow_s_edge_is_found_where_it_lies(
+    look: Callable[..., tuple[Imaging, Plateaus]], target: Target
+) -> None:
+    imaging, plateaus = look(target, lambda along: np.where(along > OFF_PX, LEFT, 1.0))
+    assert plateaus.is_uneven
+    edge = step_across(imaging, plateaus)
+    assert edge is not None
+    assert edge[ANGLE] == pytest.approx(WAY, abs=math.radians(8.0))
+    assert edge[OFFSET] == pytest.approx(OFF_PX, abs=4.0)
+    assert edge[PLATE] == pytest.approx(-0.75 * (1.0 - LEFT), rel=0.1)
+
+
+def test_dots_of_another_code_are_not_light(
+    look: Callable[..., tuple[Imaging, Plateaus]], target: Target
+) -> None:
+    more = replace(target.ring, code_deg=(*target.ring.code_deg, 230.0))
+    _, plateaus = look(Target(more, target.replicas))
+    assert not plateaus.is_uneven

@@ -1,0 +1,164 @@
+"""Shadows, highlights, dirt and skew lenses on rendered plates: errors and their deviations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment import extensions
+from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.frame import measure_frame
+from kgcp.measurement.records import InitialPose, Miss, Observation
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Optics
+from kgcp.simulation.light_field import Cloud, Dirt, Highlight, LightField, Shade
+from kgcp.simulation.plate import Plate
+from kgcp.simulation.point_spread import Aberration
+from kgcp.targets.layout import Target
+
+LENS = Camera(420, 340, 900.0, 901.0, 208.2, 171.7, response=Response.LINEAR)
+RADIUS_PX, FRAMES = 45.0, 4
+Photograph = Callable[..., GreyArray]
+StartNear = Callable[..., InitialPose]
+Lights = Callable[[np.random.Generator], LightField]
+
+
+def some_pose(rng: np.random.Generator) -> Pose:
+    ray = np.append(LENS.undistort(np.array([210.0, 170.0]) + rng.uniform(-20.0, 20.0, 2)), 1.0)
+    tilt = Rotation.from_rotvec(np.radians([*rng.uniform(-20.0, 20.0, 2), 0.0]))
+    turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
+    return Pose((tilt * turn).as_matrix(), ray * 0.45 * LENS.mean_focal_px / RADIUS_PX)
+
+
+def shadow_edge(rng: np.random.Generator) -> LightField:
+    """Half of the light is taken from one side of a line across the ring."""
+    way = rng.uniform(0.0, 2.0 * math.pi)
+    shade = Shade((math.cos(way), math.sin(way)), 50.0 + rng.uniform(-0.3, 0.3), 100.0, 0.06)
+    return LightField(light_left=0.5, shades=(shade,))
+
+
+def highlight(rng: np.random.Generator) -> LightField:
+    way = rng.uniform(0.0, 2.0 * math.pi)
+    return LightField(highlight=Highlight((0.3 * math.cos(way), 0.3 * math.sin(way)), 0.2, 0.3))
+
+
+def dirt(rng: np.random.Generator) -> LightField:
+    return LightField(cloud=Cloud.drawn(Dirt(sd=0.06, correlation_m=0.12), rng))
+
+
+def measured(
+    photograph: Photograph, start_near: StartNear, seed: int, lights: Lights
+) -> tuple[Pose, Observation]:
+    rng = np.random.default_rng(300 + seed)
+    pose = some_pose(rng)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=lights(rng))
+    return pose, measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
+
+
+@pytest.mark.parametrize(
+    ("lights", "percent"), [(shadow_edge, 0.06), (highlight, 0.03), (dirt, 0.03)]
+)
+def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
+    photograph: Photograph, start_near: StartNear, lights: Lights, percent: float
+) -> None:
+    errors, sigmas = [], []
+    for seed in range(FRAMES):
+        pose, seen = measured(photograph, start_near, seed, lights)
+        assert seen.uncertainty is not None
+        off_m = seen.pose.distance_m - pose.distance_m
+        errors.append(100.0 * off_m / pose.distance_m)
+        sigmas.append(off_m / seen.uncertainty.sd_distance_m)
+    assert np.abs(errors).max() < percent
+    assert 0.1 < math.sqrt(np.mean(np.square(sigmas))) < 2.0
+
+
+def test_a_comatic_lens_displaces_the_centre_by_little(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    rng = np.random.default_rng(8)
+    pose = some_pose(rng)
+    optics = Optics(1.0, aberration=Aberration(coma=0.4))
+    grey = photograph(LENS, pose, rng, gain=0.65, optics=optics)
+    seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
+    assert seen.uncertainty is not None
+    off_px = seen.centre_px - LENS.project(pose.translation_m[None])[0]
+    chi2 = off_px @ np.linalg.solve(seen.uncertainty.centre_cov_px2, off_px)
+    assert np.linalg.norm(off_px) < 0.02
+    assert chi2 < 12.0
+
+
+def test_in_even_light_nothing_changes(
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plain model's result is the result, to the last bit."""
+    rng = np.random.default_rng(11)
+    pose = some_pose(rng)
+    grey, start = photograph(LENS, pose, rng), start_near(LENS, pose, rng)
+    seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    for gate in ("asks_for_levels", "asks_for_skew"):
+        monkeypatch.setattr(extensions, gate, lambda _: False)
+    plain = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    assert seen.pose.matrix.tobytes() == plain.pose.matrix.tobytes()
+    assert seen.uncertainty is not None
+    assert plain.uncertainty is not None
+    assert seen.uncertainty.pose_cov.tobytes() == plain.uncertainty.pose_cov.tobytes()
+
+
+def test_uneven_light_is_measured_the_same_every_time(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    first, second = (
+        measured(photograph, start_near, 1, shadow_edge)[1].pose.matrix for _ in range(2)
+    )
+    assert first.tobytes() == second.tobytes()
+
+
+def other_code(code_deg: tuple[float, ...]) -> Plate:
+    target = TARGET_PLATE.target
+    return replace(
+        TARGET_PLATE, target=Target(replace(target.ring, code_deg=code_deg), target.replicas)
+    )
+
+
+@pytest.mark.parametrize("lights", [lambda _: None, shadow_edge, highlight])
+@pytest.mark.parametrize("change", ["more", "fewer", "moved"])
+def test_levels_that_vary_hide_no_other_code(
+    photograph: Photograph, start_near: StartNear, lights: Lights, change: str
+) -> None:
+    code = TARGET_PLATE.target.ring.code_deg
+    gap = max(range(len(code)), key=lambda k: (code[(k + 1) % len(code)] - code[k]) % 360.0)
+    between = code[gap] + 0.5 * ((code[(gap + 1) % len(code)] - code[gap]) % 360.0)
+    shown = {
+        "more": (*code, between % 360.0),
+        "fewer": code[: len(code) // 2],
+        "moved": (*code[:-1], code[-1] + 8.0),
+    }[change]
+    for seed in range(2):
+        rng = np.random.default_rng(500 + seed)
+        pose = some_pose(rng)
+        field = lights(rng)
+        grey = photograph(LENS, pose, rng, plate=other_code(shown), gain=0.65, field=field)
+        with pytest.raises(Rejection) as caught:
+            measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
+        assert caught.value.reason in {Reason.OTHER_CODE, Reason.POOR_FIT}
+        (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
+        assert isinstance(seen, Miss)
+
+
+def test_a_plate_half_in_shade_is_found(photograph: Photograph) -> None:
+    rng = np.random.default_rng(21)
+    pose = some_pose(rng)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=shadow_edge(rng))
+    (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
+    assert isinstance(seen, Observation)
+    assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=1e-3)
