@@ -16,12 +16,13 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.frame import measure_frame
-from kgcp.measurement.records import InitialPose, Miss, Observation
+from kgcp.measurement.frame import examine
+from kgcp.measurement.records import InitialPose, Measurement, Miss
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import Cloud, Dirt, Highlight, LightField, Shade
+from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade
+from kgcp.simulation.light_settings import Dirt
 from kgcp.simulation.plate import Plate
 from kgcp.simulation.point_spread import Aberration
 from kgcp.targets.layout import Target
@@ -58,7 +59,7 @@ def dirt(rng: np.random.Generator) -> LightField:
 
 def measured(
     photograph: Photograph, start_near: StartNear, seed: int, lights: Lights
-) -> tuple[Pose, Observation]:
+) -> tuple[Pose, Measurement]:
     rng = np.random.default_rng(300 + seed)
     pose = some_pose(rng)
     grey = photograph(LENS, pose, rng, gain=0.65, field=lights(rng))
@@ -151,7 +152,7 @@ def test_levels_that_vary_hide_no_other_code(
         with pytest.raises(Rejection) as caught:
             measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
         assert caught.value.reason in {Reason.OTHER_CODE, Reason.POOR_FIT}
-        (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
+        (seen,) = examine(grey, LENS, (TARGET_PLATE.target,), DetectSettings()).outcomes
         assert isinstance(seen, Miss)
 
 
@@ -159,6 +160,6 @@ def test_a_plate_half_in_shade_is_found(photograph: Photograph) -> None:
     rng = np.random.default_rng(21)
     pose = some_pose(rng)
     grey = photograph(LENS, pose, rng, gain=0.65, field=shadow_edge(rng))
-    (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
-    assert isinstance(seen, Observation)
+    (seen,) = examine(grey, LENS, (TARGET_PLATE.target,), DetectSettings()).outcomes
+    assert isinstance(seen, Measurement)
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=1e-3)
