@@ -30,10 +30,10 @@ from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 from kgcp.io.formats.trajectories import FORMATS as TRAJECTORY_FORMATS
 from kgcp.io.formats.trajectories import read_trajectory
-from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.pipeline.execution.journal import from_text
@@ -66,10 +66,10 @@ LATE_MODULES = (
 """What readers import when they are called."""
 
 _CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
-_COURSE = TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0))
+_COURSE = TrajectoryFileOptions(course_sd_deg=(2.0, 2.0, 3.0))
 _DATED = replace(_COURSE, first_day=date(2026, 6, 16), time_system=TimeSystem.GPS)
 _NOTATIONS = (
-    *(TrajectoryNotation(format=kind) for kind in TRAJECTORY_FORMATS.names),
+    *(TrajectoryFileOptions(format=kind) for kind in TRAJECTORY_FORMATS.names),
     *(replace(_DATED, format=kind) for kind in ("csv", "tum")),
     replace(_DATED, format="sbet", course_sd_deg=None, wander=Wander.SUBTRACT),
     replace(_COURSE, format="rtklib"),
@@ -110,8 +110,8 @@ def poses(data: bytes, folder: Path) -> None:
     path = _written_among_parts(folder, data)
     _allow(lambda: read_reference_poses(path, crs=CRS, frames=FRAMES))
     stated = _chosen(data, (None, CRS, "EPSG:4978"))
-    notation = PoseNotation(_chosen(data, tuple(POSE_FORMATS.names)), stated)
-    read_reference_poses(path, notation, crs=CRS, frames=FRAMES)
+    options = OrientationFileOptions(_chosen(data, tuple(POSE_FORMATS.names)), stated)
+    read_reference_poses(path, options, crs=CRS, frames=FRAMES)
 
 
 def calibrations(data: bytes, folder: Path) -> None:

@@ -76,7 +76,7 @@ class DetectSettings:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """The target carrier: how its trajectory leads to the target.
+    """The vehicle: how its trajectory leads to the target.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
 from kgcp.io.tables.columns import Column
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
-from kgcp.io.tables.gcps import BIAS_COLUMNS, KGCP_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from tests.test_layers import LAYERS, MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,7 +49,7 @@ def first_column(text: str) -> list[str]:
     ("heading", "columns"),
     [
         ("detections.parquet", DETECTION_COLUMNS),
-        ("kgcps.parquet", KGCP_COLUMNS),
+        ("kgcps.parquet", GCP_COLUMNS),
         ("consistency.parquet", CONSISTENCY_COLUMNS),
         ("bias.parquet", BIAS_COLUMNS),
     ],

@@ -15,9 +15,9 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.gcp import Kgcp, build_kgcps
+from kgcp.georef.gcp import Gcp, build_gcps
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Whereabouts
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.measurement.records import Measurement
 from kgcp.measurement.systematic_errors import common_uncertainty, pose_by_calibration
 from kgcp.pipeline.measure import measure_frame
@@ -93,8 +93,10 @@ def measure_kgcps(block: Block) -> KgcpSet:
     seen = [_measure(block, ground, target, index) for index in range(len(block.views))]
     found = [(index, one) for index, one in enumerate(seen) if one is not None]
     sightings = [_sighting(block, index, one) for index, one in found]
-    whereabouts = Whereabouts.of(CRS, (target,), block.ride.trajectory, block.ride.settings)
-    points, _ = build_kgcps(sightings, whereabouts, block.believed)
+    target_positions = TargetPositions.of(
+        CRS, (target,), block.ride.trajectory, block.ride.settings
+    )
+    points, _ = build_gcps(sightings, target_positions, block.believed)
     slopes = [distance_by_calibration(block.believed, one.pose) for _, one in found]
     return _assembled(points, np.array(slopes), block.ride.settings.correlation_s)
 
@@ -195,11 +197,11 @@ def _sighting(block: Block, index: int, seen: Measurement) -> Sighting:
     )
 
 
-def _assembled(points: Sequence[Kgcp], slopes: FloatArray, correlation_s: float) -> KgcpSet:
+def _assembled(points: Sequence[Gcp], slopes: FloatArray, correlation_s: float) -> KgcpSet:
     """Bring the points from the map into the block's frame, with their correlations."""
-    frame = map_frame()
-    position = frame.enu_from_map(np.array([point.position_map for point in points]))
-    axes = frame.grid_rotation(position)
+    local_frame = map_frame()
+    position = local_frame.enu_from_map(np.array([point.position_map for point in points]))
+    axes = local_frame.grid_rotation(position)
     times_s = np.array([point.time_s for point in points])
     cov = axes @ np.array([point.cov_m2 for point in points]) @ np.swapaxes(axes, 1, 2)
     common = axes @ np.array([point.common_m for point in points])

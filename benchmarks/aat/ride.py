@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 
 from benchmarks.aat.settings import BlockSettings, axes_of, ground_m, map_frame, on_corridor
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
-from kgcp.simulation.path import BODY_FROM_PLATE, CarrierStates
+from kgcp.simulation.path import BODY_FROM_PLATE, VehicleStates
 
 _START_S = 1_781_597_700.0  # 2026-06-16T08:15:00Z
 _LEAD_S = 5.0  # trajectory before the first and after the last frame
@@ -53,31 +53,31 @@ class Ride:
 
 def drive(settings: BlockSettings, times_s: FloatArray, rng: np.random.Generator) -> Ride:
     """Drive along the corridor; frames are taken at times (n,) since the start [s]."""
-    frame = map_frame()
+    local_frame = map_frame()
     nominal = VehicleSettings(
         lever_arm_m=(-0.8, 0.15, -1.95),
         sd_lever_arm_m=(settings.sd_lever_arm_m,) * 3,
         sd_time_s=settings.sd_time_s,
     )
     states, road_m = _states(settings, times_s)
-    body = frame.level_rotations(states.position_enu_m) @ states.level_from_body
+    body = local_frame.level_rotations(states.position_enu_m) @ states.level_from_body
     lever_m = nominal.lever_arm_m + settings.sd_lever_arm_m * rng.standard_normal(3)
     return Ride(
         target_enu_m=states.position_enu_m + body @ lever_m,
         enu_from_plate=body @ BODY_FROM_PLATE,
         road_m=road_m,
         plate_scale=1.0 + settings.sd_diameter_m / 0.9 * float(rng.standard_normal()),
-        trajectory=_record(settings, frame, nominal.correlation_s, times_s[-1], rng),
+        trajectory=_record(settings, local_frame, nominal.correlation_s, times_s[-1], rng),
         settings=nominal,
         frame_times_s=_START_S + times_s + settings.sd_time_s * float(rng.standard_normal()),
     )
 
 
-def _states(settings: BlockSettings, elapsed_s: FloatArray) -> tuple[CarrierStates, FloatArray]:
+def _states(settings: BlockSettings, elapsed_s: FloatArray) -> tuple[VehicleStates, FloatArray]:
     """Return the true vehicle at times (n,), and the height of the road [m]."""
     along_m = settings.speed_m_s * elapsed_s + 2.0 * np.sin(0.11 * elapsed_s)
     road_m = ground_m(settings, along_m, np.zeros_like(along_m))
-    states = CarrierStates(
+    states = VehicleStates(
         on_corridor(settings, along_m, np.zeros_like(along_m), road_m + _POINT_ABOVE_ROAD_M),
         roll_deg=0.9 * np.sin(0.43 * elapsed_s) + 0.3,
         pitch_deg=0.5 * np.sin(0.61 * elapsed_s),
@@ -88,7 +88,7 @@ def _states(settings: BlockSettings, elapsed_s: FloatArray) -> tuple[CarrierStat
 
 def _record(
     settings: BlockSettings,
-    frame: MapFrame,
+    local_frame: LocalFrame,
     correlation_s: float,
     duration_s: float,
     rng: np.random.Generator,
@@ -104,7 +104,7 @@ def _record(
     errors = np.asarray(lfilter([1.0], [1.0, -kept], steps, axis=0))
     return Trajectory(
         _START_S + elapsed_s,
-        frame.map_from_enu(states.position_enu_m) + errors[:, :3] * sd_m,
+        local_frame.map_from_enu(states.position_enu_m) + errors[:, :3] * sd_m,
         attitude_deg + errors[:, 3:] * sd_deg,
         np.tile(sd_m, (len(elapsed_s), 1)),
         np.tile(sd_deg, (len(elapsed_s), 1)),

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 
 CRS = "EPSG:25832"
 ORIGIN_MAP: FloatArray = np.array([689_412.0, 5_336_208.0, 545.0])
@@ -115,9 +115,9 @@ def random_stream(seed: int, purpose: str, index: int = 0) -> np.random.Generato
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
 
 
-def map_frame() -> MapFrame:
+def map_frame() -> LocalFrame:
     """Return the frame of all blocks."""
-    return MapFrame.at(CRS, ORIGIN_MAP)
+    return LocalFrame.at(CRS, ORIGIN_MAP)
 
 
 def axes_of(horizontal_and_up: tuple[float, float]) -> FloatArray:

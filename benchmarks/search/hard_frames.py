@@ -20,7 +20,14 @@ from benchmarks.pool import ordered_map
 from benchmarks.search.plates import TARGETS
 from benchmarks.search.scene import render, stream
 from benchmarks.search.sets import SETS, SETS_BY_NAME, FrameSet
-from benchmarks.search.verdict import HEADER, Verdict, describe, failure_lines, judge, table_line
+from benchmarks.search.verdict import (
+    HEADER,
+    FrameVerdict,
+    describe,
+    failure_lines,
+    judge_frame,
+    table_line,
+)
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.measurement.records import Miss, Outcome
@@ -47,15 +54,15 @@ def picture(frame_set: FrameSet, seed: int, index: int) -> GreyArray:
     return render(frame_set.shot(seed, index), seed, noise)
 
 
-def verdict_of(task: tuple[str, int, int]) -> Verdict:
+def verdict_of(task: tuple[str, int, int]) -> FrameVerdict:
     """Render, measure and judge one frame: set, seed and index."""
     name, seed, index = task
     frame_set = SETS_BY_NAME[name]
     grey = picture(frame_set, seed, index)
-    return judge(index, frame_set.shot(seed, index), measured(grey, frame_set, seed, index))
+    return judge_frame(index, frame_set.shot(seed, index), measured(grey, frame_set, seed, index))
 
 
-def run_set(frame_set: FrameSet, frames: int, seed: int, jobs: int) -> Iterator[Verdict]:
+def run_set(frame_set: FrameSet, frames: int, seed: int, jobs: int) -> Iterator[FrameVerdict]:
     """Yield the verdicts of a set's frames, in their order."""
     tasks = [(frame_set.name, seed, index) for index in range(frames)]
     yield from ordered_map(
@@ -82,7 +89,7 @@ def show_frame(frame_set: FrameSet, seed: int, index: int, save: Path | None) ->
             print(f"{outcome.target} {outcome.reason.value}: {outcome.detail}")
         else:
             print(f"{outcome.target} measured by ring {outcome.ring} at {outcome.centre_px}")
-    verdict = judge(index, shot, outcomes)
+    verdict = judge_frame(index, shot, outcomes)
     print("\n".join(failure_lines(frame_set, [verdict], most=sys.maxsize)))
 
 

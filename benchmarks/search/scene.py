@@ -16,7 +16,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
-from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.patch import Patch, PixelWindow, outline_box
 from kgcp.simulation.plate import Plate, PlateImage
 from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
 from kgcp.simulation.shapes import ConvexPolygon, Disc
@@ -240,7 +240,7 @@ def _cover(irradiance: FloatArray, shot: Shot, obstacle: Obstacle, ground: Groun
     margin = shot.optics.reach_px
     column, row = np.floor(corner).astype(int) - margin
     width, height = np.ceil(size).astype(int) + 2 * margin + 1
-    window = Window(int(column), int(row), int(width), int(height))
+    window = PixelWindow(int(column), int(row), int(width), int(height))
     if not window.meets(shot.camera):
         return
     window = window.near(shot.camera, margin)

@@ -22,7 +22,7 @@ _NEAREST_PX = 3.0  # a measurement nearer than this to a plate, or than half its
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class FrameVerdict:
     """What the search made of one frame.
 
     Attributes
@@ -53,7 +53,7 @@ class _Notes:
     wrong: list[tuple[str, str]] = field(default_factory=list)
 
 
-def judge(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> Verdict:
+def judge_frame(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> FrameVerdict:
     """Compare the outcomes of a frame with its plates.
 
     Found is a plate that is measured under its name with its centre within one pixel or six
@@ -76,7 +76,7 @@ def judge(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> Verdict:
     notes.wrong += [_wrong(shot, observation) for observation in left]
     wanted = len(shot.wanted)
     found = wanted - len(notes.missed) - len(notes.off)
-    return Verdict(
+    return FrameVerdict(
         *(index, wanted, found, len(shot.decoys)),
         *(tuple(notes.missed), tuple(notes.off), tuple(notes.wrong)),
     )
@@ -161,7 +161,7 @@ HEADER = (
 )
 
 
-def table_line(frame_set: FrameSet, verdicts: Sequence[Verdict]) -> str:
+def table_line(frame_set: FrameSet, verdicts: Sequence[FrameVerdict]) -> str:
     """Return a set's line of the table."""
     wanted, found = sum(v.wanted for v in verdicts), sum(v.found for v in verdicts)
     off, wrong = sum(len(v.off) for v in verdicts), sum(len(v.wrong) for v in verdicts)
@@ -182,7 +182,9 @@ def table_line(frame_set: FrameSet, verdicts: Sequence[Verdict]) -> str:
     ).rstrip()
 
 
-def failure_lines(frame_set: FrameSet, verdicts: Sequence[Verdict], most: int) -> Iterator[str]:
+def failure_lines(
+    frame_set: FrameSet, verdicts: Sequence[FrameVerdict], most: int
+) -> Iterator[str]:
     """Yield all that is wrong or off, and the first plates of every reason that were missed."""
     told: Counter[str] = Counter()
     for verdict in verdicts:

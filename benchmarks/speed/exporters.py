@@ -14,7 +14,7 @@ import numpy as np
 
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.formats import FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
@@ -28,8 +28,8 @@ def corridor(count: int) -> MapPoints:
     """Return points along 10 m steps of a corridor, each with a prior of its frame."""
     rng = np.random.default_rng(1)
     places = _START + np.outer(np.arange(count), [1.0, 0.5, 0.01])
-    kgcps = tuple(
-        Kgcp(
+    gcps = tuple(
+        Gcp(
             id=f"K{number:04d}",
             frame=f"IMG_{number:05d}.JPG",
             target="A",
@@ -47,9 +47,9 @@ def corridor(count: int) -> MapPoints:
     attitude, cov = np.diag([1.0, -1.0, -1.0]), 1e-3 * np.eye(6)
     priors = tuple(
         CameraPrior(point.frame, point.position_map + np.array([0.0, 0.0, 78.0]), attitude, cov)
-        for point in kgcps
+        for point in gcps
     )
-    return MapPoints("EPSG:25831", kgcps, _CAMERA, priors)
+    return MapPoints("EPSG:25831", gcps, _CAMERA, priors)
 
 
 def time_formats(count: int) -> dict[str, float]:

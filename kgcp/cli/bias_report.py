@@ -43,24 +43,24 @@ def command(
     Example: kgcp bias-report sample_flight
     """
     from kgcp.io.flight.flight import read_flight
-    from kgcp.pipeline.workspace import DETECTIONS, workplace
+    from kgcp.pipeline.workspace import DETECTIONS, open_workspace
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
     from kgcp.pipeline.bias_report import bias_study
 
-    with workplace(flight, out, (DETECTIONS,)) as place:
-        the_flight = read_flight(place.flight)
-        bias = bias_study(the_flight, detections or place.out / DETECTIONS)
+    with open_workspace(flight, out, (DETECTIONS,)) as workspace:
+        the_flight = read_flight(workspace.flight)
+        bias = bias_study(the_flight, detections or workspace.out / DETECTIONS)
         report = bias.write_report(
-            place.out, reexpose=reexpose, stored_frames=place.frames_of(the_flight)
+            workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)
         )
     if as_json:
         import json
 
         summary = report.summary()
-        click.echo(json.dumps({**summary, "files": [*map(place.named, report.files)]}))
+        click.echo(json.dumps({**summary, "files": [*map(workspace.named, report.files)]}))
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:
-        click.echo(f"wrote {place.named(path)}", err=True)
+        click.echo(f"wrote {workspace.named(path)}", err=True)

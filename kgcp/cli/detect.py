@@ -143,7 +143,7 @@ def command(
         raise click.UsageError("--all-candidates needs a contact sheet: give --overlay DIR, too")
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.detect import RunOptions, detect_flight
-    from kgcp.pipeline.workspace import workplace
+    from kgcp.pipeline.workspace import open_workspace
 
     settings = DetectSettings(
         method=Method(method),
@@ -152,8 +152,8 @@ def command(
         false_alarm=false_alarm,
         is_guided=is_guided,
     )
-    with workplace(flight, out) as place:
-        the_flight = read_flight(place.flight)
+    with open_workspace(flight, out) as workspace:
+        the_flight = read_flight(workspace.flight)
         start = time.perf_counter()
         with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
             options = RunOptions(
@@ -164,12 +164,12 @@ def command(
                 scheduler=scheduler,
                 overlay=overlay,
                 all_candidates=all_candidates,
-                stored_frames=place.frames_of(the_flight),
+                stored_frames=workspace.frames_of(the_flight),
             )
             summary = detect_flight(
-                the_flight, settings, out=place.out, options=options, listener=log
+                the_flight, settings, out=workspace.out, options=options, listener=log
             )
     seconds = time.perf_counter() - start
-    report(summary, place.named(summary.table), overlay, seconds, log, as_json=as_json)
+    report(summary, workspace.named(summary.table), overlay, seconds, log, as_json=as_json)
     if is_profiled:
         report_stages(summary)

@@ -18,7 +18,7 @@ import click
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from kgcp.pipeline.run_summary import SurveySummary
+    from kgcp.pipeline.run_summary import DetectionSummary
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
@@ -128,7 +128,7 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
 
 
 def report(
-    summary: SurveySummary,
+    summary: DetectionSummary,
     table: str,
     overlay: Path | None,
     seconds: float,
@@ -151,7 +151,7 @@ def report(
         click.echo(f"wrote {' and '.join(files.values())}", err=True)
 
 
-def report_stages(summary: SurveySummary) -> None:
+def report_stages(summary: DetectionSummary) -> None:
     """Print the time per stage."""
     for stage, seconds in summary.stages_s.items():
         if seconds >= _SHORTEST_STAGE_S:
@@ -163,7 +163,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def _report_in_words(summary: SurveySummary, seconds: float, frames_per_s: float) -> None:
+def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: float) -> None:
     counts = ", ".join(
         f"{count} {status.replace('_', ' ')}" for status, count in summary.status.items()
     )

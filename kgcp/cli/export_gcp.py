@@ -18,7 +18,7 @@ from kgcp.cli.options import (
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
-    from kgcp.georef.target_positions import Carrier
+    from kgcp.georef.target_positions import Vehicle
     from kgcp.io.images.remote import StoredFolder
     from kgcp.pipeline.export import GcpSet
     from kgcp.quality.consistency import Consistency
@@ -90,17 +90,17 @@ def command(
     from kgcp.io.exporters.write import not_renewed
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.export import make_gcps, write_gcps
-    from kgcp.pipeline.workspace import DETECTIONS, workplace
+    from kgcp.pipeline.workspace import DETECTIONS, open_workspace
 
-    with workplace(flight, out, (DETECTIONS,)) as place:
-        the_flight = read_flight(place.flight)
-        source = detections or place.out / DETECTIONS
+    with open_workspace(flight, out, (DETECTIONS,)) as workspace:
+        the_flight = read_flight(workspace.flight)
+        source = detections or workspace.out / DETECTIONS
         made = make_gcps(the_flight, source, selection=Selection(**selection), crs=crs)
-        written = write_gcps(made, place.out)
-        more, left_out = _export(made, formats, place.out)
+        written = write_gcps(made, workspace.out)
+        more, left_out = _export(made, formats, workspace.out)
         written += more
-        older = not_renewed(place.out, written)
-    _report(made, written, left_out, older, place.named, as_json=as_json)
+        older = not_renewed(workspace.out, written)
+    _report(made, written, left_out, older, workspace.named, as_json=as_json)
 
 
 def _export(
@@ -135,7 +135,7 @@ def _report(
 ) -> None:
     from collections import Counter
 
-    reasons = Counter(skip.reason.value for skip in made.skipped)
+    reasons = Counter(skipped.reason.value for skipped in made.skipped)
     checks = sum(point.is_checkpoint for point in made.gcps)
     if as_json:
         import json
@@ -179,12 +179,12 @@ def _named(written: list[Path]) -> list[str]:
     return [*dict.fromkeys(names)]
 
 
-def _report_deviations(carrier: Carrier | None) -> None:
-    if carrier is not None and carrier.motion.sd_position_m is None:
+def _report_deviations(vehicle: Vehicle | None) -> None:
+    if vehicle is not None and vehicle.motion.sd_position_m is None:
         click.echo(
             "the trajectory has no sd_x, sd_y, sd_z: KGCPs have no standard deviations", err=True
         )
-    elif carrier is not None and carrier.motion.sd_attitude_deg is None:
+    elif vehicle is not None and vehicle.motion.sd_attitude_deg is None:
         click.echo(
             "the trajectory has no sd_roll_deg, sd_pitch_deg, sd_heading_deg:"
             " attitude is taken as free of error",

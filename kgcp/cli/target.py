@@ -141,7 +141,7 @@ def command(
     from kgcp.io.flight.target_table import write_target_tables
     from kgcp.io.print.write import check_stems, write_sheets
     from kgcp.pipeline.workspace import results_folder
-    from kgcp.targets.artwork import Plate, draw_target
+    from kgcp.targets.artwork import MountingPlate, draw_target
     from kgcp.targets.code_design import chosen_targets, new_targets
     from kgcp.targets.sheets import Paper, lay_out
 
@@ -160,7 +160,7 @@ def command(
     else:
         targets = chosen_targets(known, names)
     check_stems([target.name for target in targets])
-    plate = None if plate_m is None else Plate(1e3 * plate_m, is_round, hole_mm)
+    plate = None if plate_m is None else MountingPlate(1e3 * plate_m, is_round, hole_mm)
     layouts = [
         lay_out(draw_target(target, plate), target.name, Paper(paper), is_tiled=is_tiled)
         for target in targets

@@ -27,10 +27,10 @@ from kgcp.geometry.attitude import (
     opk_from_rotation,
 )
 from kgcp.geometry.pose import rotation_about
-from kgcp.georef.gcp import Kgcp
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.gcp import Gcp
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Carrier, Whereabouts
+from kgcp.georef.target_positions import TargetPositions, Vehicle
 from kgcp.settings import VehicleSettings
 
 MIN_AMBIGUITY = 2.0 * math.log(100.0)
@@ -97,10 +97,10 @@ def body_from_plate(mount_deg: float) -> FloatArray:
 
 
 def camera_priors(
-    kgcps: Sequence[Kgcp],
+    gcps: Sequence[Gcp],
     sightings: Sequence[Sighting],
-    whereabouts: Whereabouts,
-    frame: MapFrame,
+    target_positions: TargetPositions,
+    local_frame: LocalFrame,
 ) -> tuple[CameraPrior, ...]:
     """Orient the camera in every frame where the plate on the vehicle tells its attitude.
 
@@ -109,29 +109,29 @@ def camera_priors(
 
     Parameters
     ----------
-    kgcps : sequence of Kgcp
+    gcps : sequence of Gcp
     sightings : sequence of Sighting
         Of which the KGCPs were made.
-    whereabouts : Whereabouts
+    target_positions : TargetPositions
         Of the flight's targets; without a vehicle there is no prior.
-    frame : MapFrame
+    local_frame : LocalFrame
         Of the KGCPs' coordinates.
     """
-    carrier = whereabouts.carrier
-    if carrier is None:
+    vehicle = target_positions.vehicle
+    if vehicle is None:
         return ()
     seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
     chosen = [
         (point, seen[point.frame, point.target], point.time_s)
-        for point in kgcps
+        for point in gcps
         if point.time_s is not None
-        and point.target not in whereabouts.static
+        and point.target not in target_positions.static
         and _is_told_apart(seen[point.frame, point.target])
     ]
     if not chosen:
         return ()
     times = np.array([time_s for _, _, time_s in chosen])
-    return _oriented([(point, one) for point, one, _ in chosen], times, carrier, frame)
+    return _oriented([(point, one) for point, one, _ in chosen], times, vehicle, local_frame)
 
 
 def _is_told_apart(seen: Sighting) -> bool:
@@ -140,24 +140,27 @@ def _is_told_apart(seen: Sighting) -> bool:
 
 
 def _oriented(
-    pairs: Sequence[tuple[Kgcp, Sighting]], time_s: FloatArray, carrier: Carrier, frame: MapFrame
+    pairs: Sequence[tuple[Gcp, Sighting]],
+    time_s: FloatArray,
+    vehicle: Vehicle,
+    local_frame: LocalFrame,
 ) -> tuple[CameraPrior, ...]:
     """Orient the camera in frames with a pose, at times (n,) by the trajectory's clock."""
-    states = carrier.motion.states(time_s)
-    level = carrier.frame.level_rotations(states.position_m)
-    plate = frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
+    states = vehicle.motion.states(time_s)
+    level = vehicle.local_frame.level_rotations(states.position_m)
+    plate = local_frame.enu_from_map(np.array([point.position_map for point, _ in pairs]))
     # East, north and up are those of the plate, whatever datum the points' CRS has.
     level_from_body = np.swapaxes(level, -1, -2) @ states.frame_from_body
-    enu_from_body = frame.level_rotations(plate) @ level_from_body
+    enu_from_body = local_frame.level_rotations(plate) @ level_from_body
     poses = [seen.pose for _, seen in pairs if seen.pose is not None]
     plate_from_camera = np.swapaxes(np.array([pose.rotation for pose in poses]), -1, -2)
-    mount = body_from_plate(carrier.settings.mount_deg)
+    mount = body_from_plate(vehicle.settings.mount_deg)
     enu_from_camera = enu_from_body @ mount @ plate_from_camera
     rays = np.array([pose.translation_m for pose in poses])
     camera = plate - np.einsum("nij,nj->ni", enu_from_camera, rays)
-    map_from_enu = np.swapaxes(frame.grid_rotation(camera), -1, -2)
-    to_enu = frame.grid_rotation(plate)
-    positions = frame.map_from_enu(camera)
+    map_from_enu = np.swapaxes(local_frame.grid_rotation(camera), -1, -2)
+    to_enu = local_frame.grid_rotation(plate)
+    positions = local_frame.map_from_enu(camera)
     sds = states.sd_attitude_deg
     priors = []
     for i, (point, seen) in enumerate(pairs):
@@ -165,7 +168,7 @@ def _oriented(
         cov_pose = _whole_pose_cov(seen)
         if point.cov_m2 is not None and cov_pose is not None and sds is not None:
             cov_plate = to_enu[i] @ point.cov_m2 @ to_enu[i].T
-            attitude = _Attitude(enu_from_body[i], sds[i], carrier.settings)
+            attitude = _Attitude(enu_from_body[i], sds[i], vehicle.settings)
             turn = np.kron(np.eye(2), map_from_enu[i])
             cov = turn @ _cov(cov_plate, cov_pose, attitude, enu_from_camera[i], rays[i]) @ turn.T
         attitude_map = map_from_enu[i] @ enu_from_camera[i]

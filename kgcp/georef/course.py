@@ -6,7 +6,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.local_frame import MapFrame, level_axes_ecef
+from kgcp.georef.local_frame import LocalFrame, level_axes_ecef
 
 _HALF_BASE_S = 0.25  # one step of a fast logger is all noise
 _MIN_SPEED_M_S = 0.5  # slower, the noise of positions has a say in the course
@@ -26,8 +26,8 @@ def attitude_from_course(
     KgcpError
         If it never moves.
     """
-    frame = MapFrame.at(crs, position[0])
-    enu = frame.enu_from_map(position)
+    local_frame = LocalFrame.at(crs, position[0])
+    enu = local_frame.enu_from_map(position)
     half_s = max(_HALF_BASE_S, float(np.median(np.diff(time_s))))
     since = time_s - time_s[0]
     start, end = (np.clip(since + step, 0.0, since[-1]) for step in (-half_s, half_s))
@@ -35,7 +35,7 @@ def attitude_from_course(
         [np.interp(end, since, axis) - np.interp(start, since, axis) for axis in enu.T]
     )
     level = level_axes_ecef(crs, position)
-    east, north, _ = np.einsum("nji,nj->in", level, chord @ frame.ecef_from_enu.T)
+    east, north, _ = np.einsum("nji,nj->in", level, chord @ local_frame.ecef_from_enu.T)
     moves = np.hypot(east, north) > _MIN_SPEED_M_S * (end - start)
     if not moves.any():
         raise KgcpError(

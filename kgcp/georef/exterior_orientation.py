@@ -15,13 +15,13 @@ from kgcp.geometry.attitude import (
     rotation_from_opk,
 )
 from kgcp.geometry.camera import Camera
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 
 _FOLD_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Views:
+class ExteriorOrientations:
     """Exterior orientations of n frames.
 
     Attributes
@@ -39,10 +39,10 @@ class Views:
     cov_m2: FloatArray | None
 
     @classmethod
-    def of(cls, poses: ReferencePoses, frame: MapFrame) -> Self:
+    def of(cls, poses: ReferencePoses, local_frame: LocalFrame) -> Self:
         """Bring reference poses from the map into the ENU frame."""
-        centre = frame.enu_from_map(poses.position_map)
-        enu_from_map = frame.grid_rotation(centre)
+        centre = local_frame.enu_from_map(poses.position_map)
+        enu_from_map = local_frame.grid_rotation(centre)
         sd = poses.sd_position_m
         cov = None if sd is None else covariance_along(enu_from_map, sd)
         # diag(1, -1, -1) is its own inverse

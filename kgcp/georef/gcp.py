@@ -1,4 +1,4 @@
-"""Kinematic ground control points: sightings in frames, placed by the carrier's trajectory."""
+"""Kinematic ground control points: sightings in frames, placed by the vehicle's trajectory."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.local_frame import MapChange
+from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Absence, Place, Whereabouts
+from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kgcp:
+class Gcp:
     """One kinematic ground control point: a point of the ground, seen in one frame.
 
     Attributes
@@ -79,7 +79,7 @@ class Flag(StrEnum):
     HEIGHT = "height_jump"
 
 
-class Omission(StrEnum):
+class SkipReason(StrEnum):
     """Why a sighting that could be placed is no KGCP."""
 
     SECOND_PLATE = "second_plate"
@@ -92,97 +92,98 @@ class Omission(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Skip:
+class SkippedSighting:
     """A sighting that did not become a KGCP.
 
     Attributes
     ----------
     frame, target : str
         As in the sighting.
-    reason : Absence or Omission
+    reason : NoPosition or SkipReason
         Why it is not known where the target was, or why the point is left out.
     """
 
     frame: str
     target: str
-    reason: Absence | Omission
+    reason: NoPosition | SkipReason
 
 
-def build_kgcps(
-    sightings: Sequence[Sighting], whereabouts: Whereabouts, camera: Camera
-) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+def build_gcps(
+    sightings: Sequence[Sighting], target_positions: TargetPositions, camera: Camera
+) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
     """Place every sighting on the ground.
 
     Parameters
     ----------
     sightings : sequence of Sighting
         In the frames' order.
-    whereabouts : Whereabouts
+    target_positions : TargetPositions
         Of the flight's targets.
     camera : Camera
         For the rolling shutter.
 
     Returns
     -------
-    kgcps : tuple of Kgcp
+    gcps : tuple of Gcp
         In the sightings' order.
-    skipped : tuple of Skip
+    skipped : tuple of SkippedSighting
         What could not be placed, and why.
 
     Raises
     ------
     KgcpError
-        As `Whereabouts.places`.
+        As `TargetPositions.positions`.
     """
     first = [sighting for sighting in sightings if sighting.instance == 0]
     times = [seen.row_time_s(camera) for seen in first]
-    places = whereabouts.places([seen.target for seen in first], times)
+    positions = target_positions.positions([seen.target for seen in first], times)
     skipped = [
-        Skip(seen.frame, seen.target, Omission.SECOND_PLATE)
+        SkippedSighting(seen.frame, seen.target, SkipReason.SECOND_PLATE)
         for seen in sightings
         if seen.instance > 0
     ]
     placed = []
-    for seen, time_s, place in zip(first, times, places, strict=True):
-        if isinstance(place, Place):
-            placed.append((seen, time_s, place))
+    for seen, time_s, position in zip(first, times, positions, strict=True):
+        if isinstance(position, TargetPosition):
+            placed.append((seen, time_s, position))
         else:
-            skipped.append(Skip(seen.frame, seen.target, place))
-    return _on_the_map(placed, whereabouts), tuple(skipped)
+            skipped.append(SkippedSighting(seen.frame, seen.target, position))
+    return _on_the_map(placed, target_positions), tuple(skipped)
 
 
 def _on_the_map(
-    placed: Sequence[tuple[Sighting, float | None, Place]], whereabouts: Whereabouts
-) -> tuple[Kgcp, ...]:
+    placed: Sequence[tuple[Sighting, float | None, TargetPosition]],
+    target_positions: TargetPositions,
+) -> tuple[Gcp, ...]:
     if not placed:
         return ()
-    frame = whereabouts.frame
+    local_frame = target_positions.local_frame
     positions = np.array([place.position_m for _, _, place in placed])
-    on_map, axes = frame.map_from_enu(positions), frame.grid_rotation(positions)
+    on_map, axes = local_frame.map_from_enu(positions), local_frame.grid_rotation(positions)
     return tuple(
-        _kgcp(*one, position, turn, whereabouts)
+        _gcp(*one, position, turn, target_positions)
         for one, position, turn in zip(placed, on_map, axes, strict=True)
     )
 
 
-def _kgcp(
+def _gcp(
     seen: Sighting,
     time_s: float | None,
-    place: Place,
+    position: TargetPosition,
     position_map: FloatArray,
     axes: FloatArray,
-    whereabouts: Whereabouts,
-) -> Kgcp:
-    moves = seen.target not in whereabouts.static
-    offset_s = whereabouts.carrier.settings.time_offset_s if whereabouts.carrier else 0.0
-    return Kgcp(
+    target_positions: TargetPositions,
+) -> Gcp:
+    moves = seen.target not in target_positions.static
+    offset_s = target_positions.vehicle.settings.time_offset_s if target_positions.vehicle else 0.0
+    return Gcp(
         id=f"K{seen.number:04d}" if moves else seen.target,
         frame=seen.frame,
         target=seen.target,
         time_s=None if time_s is None else time_s + offset_s,
         position_map=position_map,
-        cov_m2=None if place.cov_m2 is None else axes.T @ place.cov_m2 @ axes,
-        common_m=None if place.common_m is None else axes.T @ place.common_m,
+        cov_m2=None if position.cov_m2 is None else axes.T @ position.cov_m2 @ axes,
+        common_m=None if position.common_m is None else axes.T @ position.common_m,
         centre_px=seen.centre_px,
         centre_cov_px2=seen.centre_cov_px2,
         distance_m=seen.distance_m,
@@ -193,21 +194,21 @@ def _kgcp(
     )
 
 
-def on_map(kgcps: Sequence[Kgcp], change: MapChange) -> tuple[Kgcp, ...]:
+def transform_gcps(gcps: Sequence[Gcp], transform: CrsTransform) -> tuple[Gcp, ...]:
     """Return the points with positions and covariances on another map.
 
     Raises
     ------
     KgcpError
-        As `MapChange.positions` and `MapChange.axes`.
+        As `CrsTransform.positions` and `CrsTransform.axes`.
     """
-    if not kgcps:
+    if not gcps:
         return ()
-    here = np.array([point.position_map for point in kgcps])
-    return tuple(map(_moved, kgcps, change.positions(here), change.axes(here)))
+    here = np.array([point.position_map for point in gcps])
+    return tuple(map(_moved, gcps, transform.positions(here), transform.axes(here)))
 
 
-def _moved(point: Kgcp, position_map: FloatArray, axes: FloatArray) -> Kgcp:
+def _moved(point: Gcp, position_map: FloatArray, axes: FloatArray) -> Gcp:
     return replace(
         point,
         position_map=position_map,

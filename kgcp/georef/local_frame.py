@@ -32,7 +32,7 @@ _STEP_M, _STEP_DEG = 10.0, 1e-4  # along a map's y axis, for the same reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapFrame:
+class LocalFrame:
     """A map and a local ENU frame over one point of it.
 
     Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
@@ -225,13 +225,13 @@ def map_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
     parsed = parse_crs(crs, VEHICLE_CRS)
     if parsed.is_geocentric:
         return np.broadcast_to(np.eye(3), (len(position), 3, 3))
-    frame = MapFrame.at(crs, position[0], VEHICLE_CRS)
+    local_frame = LocalFrame.at(crs, position[0], VEHICLE_CRS)
     step = np.array([0.0, _STEP_DEG if parsed.is_geographic else _STEP_M, 0.0])
-    up = frame.level_rotations(frame.enu_from_map(position))[:, :, 2]
-    along_y = frame.enu_from_map(position + step) - frame.enu_from_map(position - step)
+    up = local_frame.level_rotations(local_frame.enu_from_map(position))[:, :, 2]
+    along_y = local_frame.enu_from_map(position + step) - local_frame.enu_from_map(position - step)
     x = np.cross(along_y, up)
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    axes: FloatArray = frame.ecef_from_enu @ np.stack((x, np.cross(up, x), up), axis=-1)
+    axes: FloatArray = local_frame.ecef_from_enu @ np.stack((x, np.cross(up, x), up), axis=-1)
     return axes
 
 
@@ -239,12 +239,12 @@ def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
     """Return east, north, up at positions (n, 3) of a CRS, as columns in ECEF, (n, 3, 3)."""
     parsed = parse_crs(crs, VEHICLE_CRS)
     if parsed.is_geocentric:
-        frame = MapFrame.at(geographic_of(parsed), np.zeros(3), VEHICLE_CRS)
-        enu = (position - frame.origin_ecef_m) @ frame.ecef_from_enu
+        local_frame = LocalFrame.at(geographic_of(parsed), np.zeros(3), VEHICLE_CRS)
+        enu = (position - local_frame.origin_ecef_m) @ local_frame.ecef_from_enu
     else:
-        frame = MapFrame.at(crs, position[0], VEHICLE_CRS)
-        enu = frame.enu_from_map(position)
-    axes: FloatArray = frame.ecef_from_enu @ frame.level_rotations(enu)
+        local_frame = LocalFrame.at(crs, position[0], VEHICLE_CRS)
+        enu = local_frame.enu_from_map(position)
+    axes: FloatArray = local_frame.ecef_from_enu @ local_frame.level_rotations(enu)
     return axes
 
 
@@ -258,24 +258,24 @@ def turn_covariances(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapChange:
+class CrsTransform:
     """The way from the flight's map to another one, datum and geoid included.
 
     Attributes
     ----------
-    source : MapFrame
+    source : LocalFrame
         The flight's.
-    target : MapFrame
+    target : LocalFrame
         Of the other CRS.
     """
 
-    source: MapFrame
-    target: MapFrame
+    source: LocalFrame
+    target: LocalFrame
     _between: Transformer
     _where: str
 
     @classmethod
-    def to(cls, crs: str, source: MapFrame, near_map: FloatArray, where: str = "crs") -> Self:
+    def to(cls, crs: str, source: LocalFrame, near_map: FloatArray, where: str = "crs") -> Self:
         """Prepare the way to `crs` (anything pyproj reads) about the point (3,) of the source map.
 
         `where` is what an error names as the place that the CRS was given in.
@@ -292,7 +292,7 @@ class MapChange:
             f"{where} {crs!r}: the way from {source.crs!r}",
         )
         draft = cls(source, source, between, where)
-        target = MapFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
+        target = LocalFrame.at(crs, draft.positions(np.reshape(near_map, (1, 3)))[0], where)
         return cls(source, target, between, where)
 
     def positions(self, xyz: FloatArray) -> FloatArray:
@@ -321,7 +321,9 @@ class MapChange:
         return turned.reshape(*np.shape(xyz), 3)
 
 
-def _level_from_grid(frame: MapFrame, xyz: FloatArray) -> FloatArray:
-    enu = frame.enu_from_map(xyz)
-    rotations: FloatArray = np.swapaxes(frame.level_rotations(enu), 1, 2) @ frame.grid_rotation(enu)
+def _level_from_grid(local_frame: LocalFrame, xyz: FloatArray) -> FloatArray:
+    enu = local_frame.enu_from_map(xyz)
+    rotations: FloatArray = np.swapaxes(
+        local_frame.level_rotations(enu), 1, 2
+    ) @ local_frame.grid_rotation(enu)
     return rotations

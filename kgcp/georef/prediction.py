@@ -14,9 +14,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
-from kgcp.georef.exterior_orientation import Views, visible_pixel
-from kgcp.georef.target_positions import Place, Whereabouts
-from kgcp.measurement.guided import Expectation
+from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Measurement
 from kgcp.targets.layout import Target
 
@@ -54,7 +54,7 @@ def state_of(observation: Measurement) -> FloatArray:
     return np.append(observation.centre_px, np.log(observation.appearance.radius_px))
 
 
-def expect(track: Track, by_reference: FloatArray | None) -> list[Expectation | None]:
+def predict_position(track: Track, by_reference: FloatArray | None) -> list[Prediction | None]:
     """Return what is expected of the frames (n,) in which a target was not found.
 
     Parameters
@@ -65,12 +65,12 @@ def expect(track: Track, by_reference: FloatArray | None) -> list[Expectation | 
 
     Returns
     -------
-    list of Expectation or None
+    list of Prediction or None
         The surer one of the two sources; None where neither tells, and where it was found.
     """
-    sources = [expect_between(track)]
+    sources = [predict_between(track)]
     if by_reference is not None:
-        sources.append(expect_by_reference(track, by_reference))
+        sources.append(predict_by_reference(track, by_reference))
     return [
         min(
             (one for one in options if one is not None and not found),
@@ -81,8 +81,8 @@ def expect(track: Track, by_reference: FloatArray | None) -> list[Expectation | 
     ]
 
 
-def expect_by_reference(track: Track, predicted: FloatArray) -> list[Expectation | None]:
-    """Turn states (n, 3) by the reference into expectations.
+def predict_by_reference(track: Track, predicted: FloatArray) -> list[Prediction | None]:
+    """Turn states (n, 3) by the reference into predictions.
 
     Their deviations are those of the frames in which the target was found, by medians, so that a
     wrong frame does no harm; a bias counts as deviation. Nothing is expected where fewer than four
@@ -97,21 +97,21 @@ def expect_by_reference(track: Track, predicted: FloatArray) -> list[Expectation
     sd_px = max(float(np.median(off_px)) / _MEDIAN_OF_2D, _FLOOR_PX)
     sd_log = max(float(np.median(np.abs(error[:, 2]))) / _MEDIAN_OF_1D, _FLOOR_LOG)
     return [
-        Expectation(state[:2], sd_px, float(np.exp(state[2])), sd_log, "the reference")
+        Prediction(state[:2], sd_px, float(np.exp(state[2])), sd_log, "the reference")
         if np.isfinite(state).all()
         else None
         for state in predicted
     ]
 
 
-def expect_between(track: Track) -> list[Expectation | None]:
+def predict_between(track: Track) -> list[Prediction | None]:
     """Interpolate between the found frames before and after.
 
     The target moves on a straight line with an unknown acceleration α, so that at a time τ between
     a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
     triples of found frames, of which each predicts its middle one.
     """
-    nothing: list[Expectation | None] = [None] * len(track.time_s)
+    nothing: list[Prediction | None] = [None] * len(track.time_s)
     found = np.flatnonzero(track.is_found & np.isfinite(track.time_s))
     found = found[np.unique(track.time_s[found], return_index=True)[1]]
     time, state = track.time_s[found], track.state[found]
@@ -130,7 +130,7 @@ def expect_between(track: Track) -> list[Expectation | None]:
         )
         near = np.argsort(np.abs(time[1:-1] - now), kind="stable")[:_TRIPLES]
         sd = arm[0] * np.sqrt(acceleration2[near].mean(axis=0))
-        nothing[index] = Expectation(
+        nothing[index] = Prediction(
             here[0, :2],
             float(np.hypot(np.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)), _FLOOR_PX)),
             float(np.exp(here[0, 2])),
@@ -153,7 +153,7 @@ def reference_states(
     time_s: Sequence[float | None],
     target: Target,
     poses: ReferencePoses,
-    whereabouts: Whereabouts,
+    target_positions: TargetPositions,
     camera: Camera,
 ) -> FloatArray:
     """Return the states (n, 3) that reference poses give a target; NaN where it cannot be said.
@@ -161,18 +161,20 @@ def reference_states(
     Raises
     ------
     KgcpError
-        As `Whereabouts.places`.
+        As `TargetPositions.positions`.
     """
     rows: Mapping[str, int] = {frame: row for row, frame in enumerate(poses.frames)}
-    views = Views.of(poses, whereabouts.frame)
+    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
     states = np.full((len(frames), 3), np.nan)
     posed = [index for index, frame in enumerate(frames) if frame in rows]
-    places = whereabouts.places([target.name] * len(posed), [time_s[index] for index in posed])
-    for index, place in zip(posed, places, strict=True):
-        if isinstance(place, Place):
+    positions = target_positions.positions(
+        [target.name] * len(posed), [time_s[index] for index in posed]
+    )
+    for index, position in zip(posed, positions, strict=True):
+        if isinstance(position, TargetPosition):
             row = rows[frames[index]]
-            sight = place.position_m - views.centre_m[row]
+            sight = position.position_m - orientations.centre_m[row]
             radius_px = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
-            states[index, :2] = visible_pixel(camera, sight @ views.enu_from_camera[row])
+            states[index, :2] = visible_pixel(camera, sight @ orientations.enu_from_camera[row])
             states[index, 2] = np.log(radius_px / np.linalg.norm(sight))
     return states

@@ -10,9 +10,9 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.gcp import Flag, Kgcp, Omission, Skip
+from kgcp.georef.gcp import Flag, Gcp, SkippedSighting, SkipReason
 from kgcp.georef.jumps import find_jumps
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 
 
@@ -43,32 +43,32 @@ class Selection:
 
 
 def select(
-    kgcps: Sequence[Kgcp],
+    gcps: Sequence[Gcp],
     sightings: Sequence[Sighting],
-    frame: MapFrame,
+    local_frame: LocalFrame,
     camera: Camera,
     wanted: Selection,
-) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
     """Return the points to hand over, flagged and with their roles, and those left out.
 
     Parameters
     ----------
-    kgcps : sequence of Kgcp
+    gcps : sequence of Gcp
     sightings : sequence of Sighting
         In which they were seen.
-    frame : MapFrame
+    local_frame : LocalFrame
         Of the points' positions.
     camera : Camera
     wanted : Selection
     """
-    good, faulty = pass_gates(flag_jumps(kgcps, sightings, frame), wanted)
-    spaced, close = thin(good, frame, camera, wanted.min_spacing_m)
-    return set_checkpoints(spaced, frame, wanted.checkpoint_share), (*faulty, *close)
+    good, faulty = pass_gates(flag_jumps(gcps, sightings, local_frame), wanted)
+    spaced, close = thin(good, local_frame, camera, wanted.min_spacing_m)
+    return set_checkpoints(spaced, local_frame, wanted.checkpoint_share), (*faulty, *close)
 
 
 def flag_jumps(
-    kgcps: Sequence[Kgcp], sightings: Sequence[Sighting], frame: MapFrame
-) -> tuple[Kgcp, ...]:
+    gcps: Sequence[Gcp], sightings: Sequence[Sighting], local_frame: LocalFrame
+) -> tuple[Gcp, ...]:
     """Flag points whose distance, or camera height, jumps out of a smooth flight.
 
     Both follow parabolas over some frames: the distance between camera and target, and the
@@ -77,26 +77,26 @@ def flag_jumps(
 
     Parameters
     ----------
-    kgcps : sequence of Kgcp
+    gcps : sequence of Gcp
         Those of static targets are passed over.
     sightings : sequence of Sighting
         In which they were seen.
-    frame : MapFrame
+    local_frame : LocalFrame
         Of the points' positions.
     """
     seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
-    moving = [index for index, point in enumerate(kgcps) if _moves(point)]
-    order = sorted(moving, key=lambda index: kgcps[index].time_s or 0.0)
+    moving = [index for index, point in enumerate(gcps) if _moves(point)]
+    order = sorted(moving, key=lambda index: gcps[index].time_s or 0.0)
     if not order:
-        return tuple(kgcps)
-    times = np.array([kgcps[index].time_s for index in order], dtype=np.float64)
-    ups = frame.enu_from_map(np.array([kgcps[index].position_map for index in order]))[:, 2]
-    sights = [seen[kgcps[index].frame, kgcps[index].target] for index in order]
+        return tuple(gcps)
+    times = np.array([gcps[index].time_s for index in order], dtype=np.float64)
+    ups = local_frame.enu_from_map(np.array([gcps[index].position_map for index in order]))[:, 2]
+    sights = [seen[gcps[index].frame, gcps[index].target] for index in order]
     series = {
         Flag.DISTANCE: np.array([(one.distance_m, one.sd_distance_m or 0.0) for one in sights]),
         Flag.HEIGHT: np.array([_height(*pair) for pair in zip(sights, ups, strict=True)]),
     }
-    flagged = list(kgcps)
+    flagged = list(gcps)
     for flag, values in series.items():
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
         for place in known[find_jumps(times[known], *values[known].T)]:
@@ -118,31 +118,31 @@ def _height(seen: Sighting, up_m: float) -> tuple[float, float]:
 
 
 def pass_gates(
-    kgcps: Sequence[Kgcp], gates: Selection
-) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    gcps: Sequence[Gcp], gates: Selection
+) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
     """Return the points that are good enough, and the others with what they failed on.
 
     A value that is not known does not pass the gate that asks for it.
     """
     kept, skipped = [], []
-    for point in kgcps:
+    for point in gcps:
         fault = _fault(point, gates)
         if fault is None:
             kept.append(point)
         else:
-            skipped.append(Skip(point.frame, point.target, fault))
+            skipped.append(SkippedSighting(point.frame, point.target, fault))
     return tuple(kept), tuple(skipped)
 
 
-def _fault(point: Kgcp, gates: Selection) -> Omission | None:
+def _fault(point: Gcp, gates: Selection) -> SkipReason | None:
     if point.flag is not None and not gates.keep_flagged:
-        return Omission(point.flag.value)
+        return SkipReason(point.flag.value)
     if gates.max_sd_m is not None and not longest_semi_axis(point.cov_m2) <= gates.max_sd_m:
-        return Omission.UNCERTAIN
+        return SkipReason.UNCERTAIN
     if gates.min_score is not None and not _or_nan(point.score) >= gates.min_score:
-        return Omission.LOW_SCORE
+        return SkipReason.LOW_SCORE
     if gates.min_ambiguity is not None and not _or_nan(point.ambiguity) >= gates.min_ambiguity:
-        return Omission.AMBIGUOUS
+        return SkipReason.AMBIGUOUS
     return None
 
 
@@ -156,15 +156,15 @@ def longest_semi_axis(cov: FloatArray | None) -> float:
 
 
 def thin(
-    kgcps: Sequence[Kgcp], frame: MapFrame, camera: Camera, min_spacing_m: float
-) -> tuple[tuple[Kgcp, ...], tuple[Skip, ...]]:
+    gcps: Sequence[Gcp], local_frame: LocalFrame, camera: Camera, min_spacing_m: float
+) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
     """Keep points at least `min_spacing_m` apart along the track, of near ones the best.
 
     The best has the least variance on the ground, of position and image point. Along the track
     means along the way: a second pass over the same road has points of its own.
     """
-    along = tracks_m(kgcps, frame)
-    by_quality = sorted(along, key=lambda index: (_sd_on_ground(kgcps[index], camera), index))
+    along = tracks_m(gcps, local_frame)
+    by_quality = sorted(along, key=lambda index: (_sd_on_ground(gcps[index], camera), index))
     taken: list[float] = []
     dropped = set()
     for index in by_quality:
@@ -174,41 +174,43 @@ def thin(
             dropped.add(index)
         else:
             taken.insert(place, along[index])
-    kept = tuple(point for index, point in enumerate(kgcps) if index not in dropped)
-    lost = (kgcps[index] for index in sorted(dropped))
-    return kept, tuple(Skip(point.frame, point.target, Omission.CLOSE) for point in lost)
+    kept = tuple(point for index, point in enumerate(gcps) if index not in dropped)
+    lost = (gcps[index] for index in sorted(dropped))
+    return kept, tuple(
+        SkippedSighting(point.frame, point.target, SkipReason.CLOSE) for point in lost
+    )
 
 
-def _sd_on_ground(point: Kgcp, camera: Camera) -> float:
+def _sd_on_ground(point: Gcp, camera: Camera) -> float:
     of_image = longest_semi_axis(point.centre_cov_px2) * point.distance_m / camera.mean_focal_px
     return float(np.nan_to_num(np.hypot(longest_semi_axis(point.cov_m2), of_image), nan=np.inf))
 
 
-def tracks_m(kgcps: Sequence[Kgcp], frame: MapFrame) -> Mapping[int, float]:
+def tracks_m(gcps: Sequence[Gcp], local_frame: LocalFrame) -> Mapping[int, float]:
     """Return for each moving point, by its index, how far along the vehicle's way it lies [m]."""
     order = sorted(
-        (index for index, point in enumerate(kgcps) if _moves(point)),
-        key=lambda index: (kgcps[index].time_s or 0.0, index),
+        (index for index, point in enumerate(gcps) if _moves(point)),
+        key=lambda index: (gcps[index].time_s or 0.0, index),
     )
     if not order:
         return {}
-    enu = frame.enu_from_map(np.array([kgcps[index].position_map for index in order]))
+    enu = local_frame.enu_from_map(np.array([gcps[index].position_map for index in order]))
     steps = np.linalg.norm(np.diff(enu, axis=0), axis=1)
     along = np.concatenate(([0.0], np.cumsum(steps)))
     return dict(zip(order, along.tolist(), strict=True))
 
 
-def set_checkpoints(kgcps: Sequence[Kgcp], frame: MapFrame, share: float) -> tuple[Kgcp, ...]:
+def set_checkpoints(gcps: Sequence[Gcp], local_frame: LocalFrame, share: float) -> tuple[Gcp, ...]:
     """Make a share of the moving points check points, evenly along the track.
 
     They lie in the middle of as many equal pieces of the way; its first and last point, beyond
     which nothing controls, stay control points.
     """
-    along = tracks_m(kgcps, frame)
+    along = tracks_m(gcps, local_frame)
     inner = sorted(along, key=along.__getitem__)[1:-1]
     count = min(round(share * len(along)), len(inner))
     if not count:
-        return tuple(kgcps)
+        return tuple(gcps)
     length = max(along.values())
     free = np.array([along[index] for index in inner])
     chosen = set()
@@ -216,8 +218,8 @@ def set_checkpoints(kgcps: Sequence[Kgcp], frame: MapFrame, share: float) -> tup
         nearest = int(np.argmin(np.abs(free - (piece + 0.5) / count * length)))
         chosen.add(inner[nearest])
         free[nearest] = np.inf
-    return tuple(replace(point, is_checkpoint=index in chosen) for index, point in enumerate(kgcps))
+    return tuple(replace(point, is_checkpoint=index in chosen) for index, point in enumerate(gcps))
 
 
-def _moves(point: Kgcp) -> bool:
+def _moves(point: Gcp) -> bool:
     return point.common_m is not None and point.time_s is not None

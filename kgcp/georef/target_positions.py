@@ -13,14 +13,14 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import attitude_axes, covariance_along
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ride:
+class VehicleState:
     """How the vehicle moved while it carried a target to its place.
 
     Attributes
@@ -36,7 +36,7 @@ class Ride:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class TargetPosition:
     """Where the centre of a target was.
 
     Attributes
@@ -49,38 +49,38 @@ class Place:
         How one standard deviation of lever arm x, y, z and of the synchronisation moves the
         place, ENU axes, as columns [m]. These four errors are the same in all frames; between
         the places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
-    ride : Ride or None
+    vehicle_state : VehicleState or None
         None: the target stands still.
     """
 
     position_m: FloatArray
     cov_m2: FloatArray | None
     common_m: FloatArray | None = None
-    ride: Ride | None = None
+    vehicle_state: VehicleState | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carrier:
+class Vehicle:
     """The vehicle that carries the target.
 
     Attributes
     ----------
     motion : Motion
-        Its trajectory in the ENU frame of `frame`.
+        Its trajectory in the ENU frame of `local_frame`.
     settings : VehicleSettings
         Lever arm, time offset and their standard deviations.
-    frame : MapFrame
+    local_frame : LocalFrame
     """
 
     motion: Motion
     settings: VehicleSettings
-    frame: MapFrame
+    local_frame: LocalFrame
 
     @classmethod
-    def on(cls, trajectory: Trajectory, settings: VehicleSettings, frame: MapFrame) -> Self:
+    def on(cls, trajectory: Trajectory, settings: VehicleSettings, local_frame: LocalFrame) -> Self:
         """Bring a trajectory from the map into the ENU frame."""
-        position = frame.enu_from_map(trajectory.position_map)
-        frame_from_ned = frame.level_rotations(position) @ ENU_FROM_NED
+        position = local_frame.enu_from_map(trajectory.position_map)
+        frame_from_ned = local_frame.level_rotations(position) @ ENU_FROM_NED
         motion = Motion(
             time_s=trajectory.time_s,
             position_m=position,
@@ -89,14 +89,14 @@ class Carrier:
             sd_attitude_deg=trajectory.sd_attitude_deg,
             cov_position_m2=trajectory.cov_position_m2,
         )
-        return cls(motion, settings, frame)
+        return cls(motion, settings, local_frame)
 
     def coverage(self, time_s: FloatArray) -> list[Coverage]:
         """Return for frame times (n,) whether the trajectory covers them."""
         return self.motion.coverage(time_s + self.settings.time_offset_s)
 
-    def places(self, time_s: FloatArray) -> list[Place]:
-        """Return the target's places at frame times (n,) that the trajectory covers.
+    def positions(self, time_s: FloatArray) -> list[TargetPosition]:
+        """Return the target's positions at frame times (n,) that the trajectory covers.
 
         position = trajectory point + R(frame ← body) · lever arm. The covariance adds up, with
         first-order propagation: trajectory, attitude times lever arm, lever arm, and the target's
@@ -111,12 +111,12 @@ class Carrier:
             own = self._trajectory_cov(states, states.sd_position_m)
             own = own + self._attitude_cov(states, lever)
             cov = list(own + common @ np.swapaxes(common, 1, 2))
-        rides = map(Ride, velocity, states.frame_from_body)
-        return list(map(Place, states.position_m + lever, cov, common, rides))
+        vehicle_states = map(VehicleState, velocity, states.frame_from_body)
+        return list(map(TargetPosition, states.position_m + lever, cov, common, vehicle_states))
 
     def _trajectory_cov(self, states: States, sd_position_m: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of the trajectory point, whose deviations are in map axes."""
-        axes = self.frame.grid_rotation(states.position_m)
+        axes = self.local_frame.grid_rotation(states.position_m)
         if states.cov_position_m2 is None:
             return covariance_along(axes, sd_position_m)
         turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
@@ -126,19 +126,19 @@ class Carrier:
         """Return the share (n, 3, 3) of attitude times lever arm."""
         if states.sd_attitude_deg is None:
             return np.zeros_like(states.frame_from_body)
-        up = self.frame.level_rotations(states.position_m)[:, :, 2]
+        up = self.local_frame.level_rotations(states.position_m)[:, :, 2]
         axes = attitude_axes(states.frame_from_body, -up)
         effects = np.cross(axes, lever[:, :, None], axisa=1, axisb=1, axisc=1)
         return covariance_along(effects, np.radians(states.sd_attitude_deg))
 
     def _common_effects(self, frame_from_body: FloatArray, velocity_m_s: FloatArray) -> FloatArray:
-        """Return what `Place.common_m` holds, (n, 3, 4)."""
+        """Return what `TargetPosition.common_m` holds, (n, 3, 4)."""
         arm = frame_from_body * np.array(self.settings.sd_lever_arm_m)
         shift = velocity_m_s * self.settings.sd_time_s
         return np.concatenate((arm, shift[:, :, None]), axis=2)
 
 
-class Absence(StrEnum):
+class NoPosition(StrEnum):
     """Why it is not known where a target was."""
 
     NO_TIME = "no_time"
@@ -148,22 +148,22 @@ class Absence(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Whereabouts:
+class TargetPositions:
     """Where each target of a flight was at any time.
 
     Attributes
     ----------
-    frame : MapFrame
+    local_frame : LocalFrame
         The flight's map, and the ENU frame of all places.
-    static : mapping of str to Place
+    static : mapping of str to TargetPosition
         Targets that stand still, by name.
-    carrier : Carrier or None
+    vehicle : Vehicle or None
         The vehicle that carries the other one.
     """
 
-    frame: MapFrame
-    static: Mapping[str, Place]
-    carrier: Carrier | None
+    local_frame: LocalFrame
+    static: Mapping[str, TargetPosition]
+    vehicle: Vehicle | None
 
     @classmethod
     def of(
@@ -188,14 +188,14 @@ class Whereabouts:
                 "flight.toml: no target has a position; give a [vehicle] with a trajectory,"
                 " or position_m in [[target]]"
             )
-        frame = MapFrame.at(crs, known[0])
-        carrier = None if trajectory is None else Carrier.on(trajectory, settings, frame)
-        return cls(frame, _static_places(targets, frame), carrier)
+        local_frame = LocalFrame.at(crs, known[0])
+        vehicle = None if trajectory is None else Vehicle.on(trajectory, settings, local_frame)
+        return cls(local_frame, _static_positions(targets, local_frame), vehicle)
 
-    def places(
+    def positions(
         self, targets: Sequence[str], time_s: Sequence[float | None]
-    ) -> list[Place | Absence]:
-        """Return the place of each named target at its time (Unix UTC, frames' clock) [s].
+    ) -> list[TargetPosition | NoPosition]:
+        """Return the position of each named target at its time (Unix UTC, frames' clock) [s].
 
         Raises
         ------
@@ -203,13 +203,13 @@ class Whereabouts:
             If a moving target has no vehicle, two targets would ride on its one lever arm, no
             frame has a time, or none of the times lies within the trajectory.
         """
-        found: list[Place | Absence] = [
-            self.static.get(target, Absence.NO_TIME) for target in targets
+        found: list[TargetPosition | NoPosition] = [
+            self.static.get(target, NoPosition.NO_TIME) for target in targets
         ]
         moving = [index for index, target in enumerate(targets) if target not in self.static]
         if not moving:
             return found
-        carrier = self._carrier_of(sorted({targets[index] for index in moving}))
+        vehicle = self._vehicle_of(sorted({targets[index] for index in moving}))
         timed = [(index, time) for index in moving if (time := time_s[index]) is not None]
         if not timed:
             raise KgcpError(
@@ -217,13 +217,15 @@ class Whereabouts:
                 " 'kgcp detect' again"
             )
         indices = np.array([index for index, _ in timed])
-        for index, place in zip(indices, _ride(carrier, [t for _, t in timed]), strict=True):
-            found[index] = place
+        for index, position in zip(
+            indices, _moving_positions(vehicle, [t for _, t in timed]), strict=True
+        ):
+            found[index] = position
         return found
 
-    def _carrier_of(self, moving: Sequence[str]) -> Carrier:
+    def _vehicle_of(self, moving: Sequence[str]) -> Vehicle:
         names = " and ".join(repr(name) for name in moving)
-        if self.carrier is None:
+        if self.vehicle is None:
             raise KgcpError(
                 f"flight.toml: target {names} has no position; give a [vehicle] with a trajectory,"
                 " or position_m in its [[target]]"
@@ -233,26 +235,30 @@ class Whereabouts:
                 f"flight.toml: targets {names} share one lever_arm_m; give position_m to those"
                 " that stand still and leave out those that are not to be used"
             )
-        return self.carrier
+        return self.vehicle
 
 
-def _ride(carrier: Carrier, time_s: Sequence[float]) -> list[Place | Absence]:
-    """Return the carrier's places at frame times, or why there is none."""
+def _moving_positions(
+    vehicle: Vehicle, time_s: Sequence[float]
+) -> list[TargetPosition | NoPosition]:
+    """Return the target's positions on the vehicle at frame times, or why there is none."""
     times = np.array(time_s)
-    coverage = carrier.coverage(times)
+    coverage = vehicle.coverage(times)
     inside = np.array([kind is Coverage.INSIDE for kind in coverage])
     if not inside.any():
-        raise KgcpError(_no_overlap(carrier, times))
-    places = iter(carrier.places(times[inside]))
-    return [next(places) if kind is Coverage.INSIDE else Absence(kind.value) for kind in coverage]
+        raise KgcpError(_no_overlap(vehicle, times))
+    positions = iter(vehicle.positions(times[inside]))
+    return [
+        next(positions) if kind is Coverage.INSIDE else NoPosition(kind.value) for kind in coverage
+    ]
 
 
-def _no_overlap(carrier: Carrier, time_s: FloatArray) -> str:
-    covered, gap_s = carrier.motion.time_s, carrier.motion.max_gap_s
+def _no_overlap(vehicle: Vehicle, time_s: FloatArray) -> str:
+    covered, gap_s = vehicle.motion.time_s, vehicle.motion.max_gap_s
     return (
         f"none of the {len(time_s)} frames with the target lies within the vehicle's trajectory:"
         f" frames {_utc(time_s.min())} to {_utc(time_s.max())}, time_offset_s ="
-        f" {carrier.settings.time_offset_s:g}, trajectory {_utc(covered[0])} to"
+        f" {vehicle.settings.time_offset_s:g}, trajectory {_utc(covered[0])} to"
         f" {_utc(covered[-1])} without gaps over {gap_s:g} s; correct [vehicle] time_offset_s in"
         " flight.toml (GPS time is 18 s ahead of UTC) or give the trajectory of this flight"
     )
@@ -263,12 +269,14 @@ def _utc(unix_s: float) -> str:
     return f"{moment.isoformat(timespec='milliseconds')}Z"
 
 
-def _static_places(targets: Sequence[Target], frame: MapFrame) -> dict[str, Place]:
-    places = {}
+def _static_positions(
+    targets: Sequence[Target], local_frame: LocalFrame
+) -> dict[str, TargetPosition]:
+    positions = {}
     for target in targets:
         if target.position_m is not None:
-            position = frame.enu_from_map(np.array([target.position_m]))[0]
-            axes = frame.grid_rotation(position)
+            position = local_frame.enu_from_map(np.array([target.position_m]))[0]
+            axes = local_frame.grid_rotation(position)
             cov = covariance_along(axes, np.array(target.sd_position_m))
-            places[target.name] = Place(position, cov)
-    return places
+            positions[target.name] = TargetPosition(position, cov)
+    return positions

@@ -1,4 +1,4 @@
-"""The target carrier's trajectory, and its state between the samples.
+"""The vehicle's trajectory, and its state between the samples.
 
 Body axes are x forward, y right, z down; roll, pitch and heading turn them from north, east, down
 in the order Z-Y-X (docs/conventions.md).
@@ -35,7 +35,7 @@ def body_to_ned(roll_deg: FloatArray, pitch_deg: FloatArray, heading_deg: FloatA
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """A carrier's trajectory as its file gives it: map positions, angles against true north.
+    """A vehicle's trajectory as its file gives it: map positions, angles against true north.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Trajectory:
 
 
 class Coverage(StrEnum):
-    """Whether a trajectory can say where its carrier was at some time."""
+    """Whether a trajectory can say where the vehicle was at some time."""
 
     INSIDE = "inside"
     BEFORE = "before_trajectory"
@@ -73,7 +73,7 @@ class Coverage(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """The carrier at n times, in the Cartesian frame of its `Motion`.
+    """The vehicle at n times, in the Cartesian frame of its `Motion`.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.records import Considered
-from kgcp.measurement.search.template_match import CODE_LIKE, judge, polar_patch
+from kgcp.measurement.search.template_match import CODE_LIKE, match_templates, polar_patch
 from kgcp.measurement.search.templates import SAMPLED_RADII
 from kgcp.targets.layout import Ring
 
@@ -66,12 +66,12 @@ def _plain_cause(
     if outline.b < min_radius_px:
         return Reason.TOO_SMALL, f"{outline.b:.1f} px of {min_radius_px:g} px across"
     patch = polar_patch(grey, outline)
-    verdict = judge(patch, ring)
+    template_match = match_templates(patch, ring)
     unseen = _share_unseen(patch)
     if unseen > _UNSEEN:
         return Reason.HIDDEN, f"{unseen:.0%} of its edge not seen"
-    if verdict.dot_contrast < _FAINT_DOTS:
-        return Reason.TOO_BLURRED, f"dots of {verdict.dot_contrast:.0%} of the contrast"
+    if template_match.dot_contrast < _FAINT_DOTS:
+        return Reason.TOO_BLURRED, f"dots of {template_match.dot_contrast:.0%} of the contrast"
     burnt = _share_burnt(patch, ring, float(np.iinfo(grey.dtype).max))
     if burnt > _BURNT:
         return Reason.CLIPPED, f"{burnt:.0%} of its white burnt out"

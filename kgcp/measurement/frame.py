@@ -21,7 +21,7 @@ from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted
 from kgcp.measurement.search.code_signal import CodeMatch, fixed_lag_score, points_of_code
 from kgcp.measurement.search.false_alarm import check_chance
 from kgcp.measurement.search.initial_pose import initial_pose
-from kgcp.measurement.search.template_match import judge_at
+from kgcp.measurement.search.template_match import match_templates_at
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Ring, Target
 
@@ -204,10 +204,10 @@ def _check_plate(
     ------
     Rejection
     """
-    verdict = judge_at(grey, camera, pose, ring)
-    verdict.check(settings.min_score)
+    template_match = match_templates_at(grey, camera, pose, ring)
+    template_match.check(settings.min_score)
     if ring is target.ring:
-        return verdict.visible
+        return template_match.visible
     return _check_main_ring(grey, camera, target.ring, ring, pose, settings)
 
 
@@ -249,12 +249,12 @@ def _check_main_ring(
     score = fixed_lag_score(grey, points, within, main)
     if score >= _MIN_MAIN_SCORE:
         return None
-    verdict = judge_at(grey, camera, pose, main)  # a part of it may be hidden
-    turn_deg = abs((verdict.lag_deg + 180.0) % 360.0 - 180.0)
-    if verdict.visible is None or turn_deg > _MOST_TURNED_DEG:
+    template_match = match_templates_at(grey, camera, pose, main)  # a part of it may be hidden
+    turn_deg = abs((template_match.lag_deg + 180.0) % 360.0 - 180.0)
+    if template_match.visible is None or turn_deg > _MOST_TURNED_DEG:
         raise Rejection(
             Reason.CODE_MISMATCH,
             f"the ring around the replica {replica.name} is not {main.name}: {score:.2f}",
         )
-    verdict.check(settings.min_score)
-    return verdict.visible
+    template_match.check(settings.min_score)
+    return template_match.visible

@@ -17,13 +17,13 @@ from kgcp.measurement.normal_prior import NormalPrior
 from kgcp.measurement.records import Considered, Measurement
 from kgcp.measurement.search.candidates import find_rings_at
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.template_match import judge, polar_patch
+from kgcp.measurement.search.template_match import match_templates, polar_patch
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
 # Tuning of the second look; its benchmark is the table in docs/method.md, "The second pass": four
 # simulated flights, with what the second look adds to them.
-_SIGMAS = 4.0  # of the expectation, in place and radius
+_SIGMAS = 4.0  # of the prediction, in place and radius
 _SMALLEST_PX = 3.0  # radius of a ring that is looked for
 _FARTHEST = 8.0  # radii that a target may be off: beyond, the expectation is of little use
 _LARGEST_RATIO = 2.0  # of the radius to the expected one
@@ -34,7 +34,7 @@ _TRIES = 4  # per ring, the best candidates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Expectation:
+class Prediction:
     """Where a target must be in a frame, and how large, with deviations.
 
     Attributes
@@ -94,7 +94,7 @@ def look_again(
     grey: GreyArray,
     camera: Camera,
     target: Target,
-    expectation: Expectation,
+    prediction: Prediction,
     settings: DetectSettings,
     prior: NormalPrior | None,
     rivals: Sequence[Measurement],
@@ -102,7 +102,7 @@ def look_again(
     """Look for one target where it must be, however faint its ring is.
 
     Rings are tracked from all possible places and radii, without the ring filter and the ring
-    check. A measurement must agree with the expectation and pass all tests of a first look, with
+    check. A measurement must agree with the prediction and pass all tests of a first look, with
     a slightly lower score of the ring.
 
     Parameters
@@ -118,7 +118,7 @@ def look_again(
     """
     lowered = replace(settings, min_score=max(settings.min_score - _LOWER_SCORE, 0.01))
     considered = []
-    for match in _candidates(grey, target, expectation):
+    for match in _candidates(grey, target, prediction):
         candidate = Considered(
             target.name, match.ring.name, match.outer, match.score, is_match=True
         )
@@ -126,7 +126,7 @@ def look_again(
             continue
         try:
             observation = measure_match(grey, camera, target, match, lowered, prior)
-            expectation.check(observation)
+            prediction.check(observation)
         except Rejection as rejection:
             considered.append(replace(candidate, reason=rejection.reason, detail=rejection.detail))
             continue
@@ -134,41 +134,41 @@ def look_again(
     return None, tuple(considered)
 
 
-def _candidates(grey: GreyArray, target: Target, expectation: Expectation) -> Iterator[CodeMatch]:
+def _candidates(grey: GreyArray, target: Target, prediction: Prediction) -> Iterator[CodeMatch]:
     """Yield the rings most like the target's, ring by ring, best first."""
     for ring in target.rings:
         scale = ring.outer_diameter_m / target.ring.outer_diameter_m
-        if scale * expectation.radius_px < _SMALLEST_PX:
+        if scale * prediction.radius_px < _SMALLEST_PX:
             continue
         matches = [
-            verdict.code_match(ring, outline)
-            for outline in _outlines(grey, expectation, scale)
-            for verdict in (judge(polar_patch(grey, outline), ring),)
-            if verdict.score > _WORTH_A_TRY
+            template_match.code_match(ring, outline)
+            for outline in _outlines(grey, prediction, scale)
+            for template_match in (match_templates(polar_patch(grey, outline), ring),)
+            if template_match.score > _WORTH_A_TRY
         ]
         matches.sort(key=lambda match: -match.score)
         yield from matches[:_TRIES]
 
 
-def _outlines(grey: GreyArray, expectation: Expectation, scale: float) -> list[Ellipse]:
-    """Track rings from all places and radii that the expectation allows."""
-    radius = scale * expectation.radius_px
-    reach = _SIGMAS * expectation.sd_px
+def _outlines(grey: GreyArray, prediction: Prediction, scale: float) -> list[Ellipse]:
+    """Track rings from all places and radii that the prediction allows."""
+    radius = scale * prediction.radius_px
+    reach = _SIGMAS * prediction.sd_px
     steps = math.ceil(reach / (_SPACING * radius))
     line = np.linspace(-reach, reach, 2 * steps + 1)
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     offsets = offsets[np.hypot(*offsets.T) <= reach + 1e-9]
-    widest = _SIGMAS * expectation.sd_log_radius
+    widest = _SIGMAS * prediction.sd_log_radius
     sizes = math.ceil(widest / math.log(_RATIO))
     radii = radius * np.exp(np.linspace(-widest, widest, 2 * sizes + 1))
     outlines = find_rings_at(
         grey,
-        np.repeat(expectation.centre_px + offsets, len(radii), axis=0),
+        np.repeat(prediction.centre_px + offsets, len(radii), axis=0),
         np.tile(radii, len(offsets)),
     )
     return [
         outline
         for outline in outlines
-        if np.linalg.norm(outline.centre - expectation.centre_px) <= reach + _SPACING * radius
+        if np.linalg.norm(outline.centre - prediction.centre_px) <= reach + _SPACING * radius
         and abs(math.log(outline.a / radius)) <= widest + math.log(_RATIO)
     ]

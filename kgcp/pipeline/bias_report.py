@@ -24,7 +24,7 @@ from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import provenance
 from kgcp.measurement.image_model.window import contour_px
-from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.bias_study import BiasStudy, study_bias
@@ -153,7 +153,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     study = study_bias(
         attempts,
         data.reference_poses,
-        data.whereabouts,
+        data.target_positions,
         flight.camera,
         flight.targets,
         settings.method,
@@ -260,7 +260,7 @@ def _look(
             view = _view(flight.camera, target.ring, sighting.pose, sighting.centre_px)
             closeups[row] = draw_closeup(grey, view)
         if row in again:
-            with stops_held():
+            with defer_interrupts():
                 reexposed += measure_again(
                     grey, flight.camera, target, settings, sighting.centre_px, radius, row
                 )
@@ -280,7 +280,7 @@ def _pictures(
     numbers: BiasNumbers, flight: Flight, reexposed: list[Reexposed]
 ) -> Mapping[str, Picture]:
     pictures = {"error": error_against_distance(numbers)}
-    if numbers.chances:
+    if numbers.expected_visible:
         pictures["rate"] = detection_rate(numbers)
     if numbers.influences:
         pictures["exposure"] = error_against_exposure(numbers)

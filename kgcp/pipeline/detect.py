@@ -18,16 +18,16 @@ from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import versions, write_run_record
 from kgcp.measurement.frame import examine
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.normal_prior import NormalPrior, normal_priors
-from kgcp.pipeline.detection_run import Looks, Watcher
-from kgcp.pipeline.execution.executor import Crew, hired
+from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
+from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_task import FrameNote, FrameTask, examine_frame
-from kgcp.pipeline.guidance import expectations, with_expectations
+from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
+from kgcp.pipeline.guidance import predict_missing, with_predictions
 from kgcp.pipeline.overlay import draw_overlay
-from kgcp.pipeline.run_summary import Stopwatch, SurveySummary, Tally
+from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings
@@ -69,8 +69,8 @@ class RunOptions:
     stored_frames: StoredFolder | None = None
 
 
-class Nobody:
-    """A watcher who does not care."""
+class NoProgress:
+    """A listener that ignores everything."""
 
     def note(self, text: str) -> None:
         """Do nothing."""
@@ -91,8 +91,8 @@ def detect_flight(
     *,
     out: Path | str | None = None,
     options: RunOptions = _DEFAULT_OPTIONS,
-    listener: Watcher | None = None,
-) -> SurveySummary:
+    listener: ProgressListener | None = None,
+) -> DetectionSummary:
     """Examine every frame of a flight and write `detections.parquet`, and `run.json` beside it.
 
     Frames without a target are looked at again where the others say that it must be. However the
@@ -102,12 +102,12 @@ def detect_flight(
     ----------
     out : Path, optional
         Folder of the results; by default `kgcp` in the flight's folder.
-    listener : Watcher, optional
+    listener : ProgressListener, optional
         Who is told how the work goes.
 
     Returns
     -------
-    SurveySummary
+    DetectionSummary
         Counts; its `table` is the file of the detections, for `read_detections`.
 
     Raises
@@ -128,9 +128,9 @@ def detect_flight(
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
         data = FlightData(flight, frames)
-        notes = _take_notes(flight, data, frames, times)
+        inputs = _frame_inputs(flight, data, frames, times)
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
-    task = FrameTask(
+    job = DetectionJob(
         frames_folder,
         flight.camera,
         flight.calibration_covariance,
@@ -139,44 +139,46 @@ def detect_flight(
         keeps_dropped=options.overlay is not None and options.all_candidates,
     )
     table = out / DETECTIONS
-    tally = Tally(times)
+    builder = SummaryBuilder(times)
     not_drawn = 0
-    making = _making(task)
+    making = _making(job)
     with Journal(out / ".detections.journal", making, is_new=options.is_restart) as journal:
-        with hired(
+        with open_pool(
             options.jobs,
             options.frame_timeout_s,
             options.scheduler,
             frames_folder,
             _STAGE_CALLERS if options.is_profiled else (),
-        ) as crew:
-            looks = Looks(task, notes, journal, crew, listener or Nobody())
+        ) as pool:
+            run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
             with stopwatch.stage("first look"):
-                looks.look()
-            expected: Mapping[int, Mapping[str, Expectation]] = {}
+                run.first_pass()
+            predictions: Mapping[int, Mapping[str, Prediction]] = {}
             guide_problem = None
             if settings.is_guided:
                 with stopwatch.stage("second look"):
-                    expected, guide_problem = expectations(flight, data, looks.sightings)
-                    looks.look_again(expected)
+                    predictions, guide_problem = predict_missing(flight, data, run.tracks)
+                    run.guided_pass(predictions)
             if sheet is not None:
                 sheet.clear()
             with stopwatch.stage("table"):
-                rows = _rows(looks, expected, tally)
+                rows = _rows(run, predictions, builder)
                 write_table(table, DETECTION_COLUMNS, rows, _provenance(flight, settings))
             if sheet is not None:
                 with stopwatch.stage("overlay"):
-                    not_drawn = draw_overlay(sheet, flight.name, looks, task, expected)
+                    not_drawn = draw_overlay(sheet, flight.name, run, job, predictions)
         is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
-        summary = tally.summary(
+        summary = builder.summary(
             table=table,
-            kept=looks.kept,
-            frames_without_attitude=sum(note.prior is None for note in notes) if is_level else 0,
+            kept=run.kept,
+            frames_without_attitude=sum(frame_input.prior is None for frame_input in inputs)
+            if is_level
+            else 0,
             not_drawn=not_drawn,
             guide_problem=guide_problem,
-            stages_s=_stages_s(stopwatch, journal, crew),
+            stages_s=_stages_s(stopwatch, journal, pool),
         )
-        record = {**summary.numbers(), "jobs": crew.jobs, "settings": asdict(settings)}
+        record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}
         write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
@@ -192,8 +194,8 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
     return ContactSheet(folder)
 
 
-def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, float]:
-    workers = crew.stages_s.most_common()
+def _stages_s(stopwatch: Stopwatch, journal: Journal, pool: WorkerPool) -> dict[str, float]:
+    workers = pool.stages_s.most_common()
     return {
         **stopwatch.stages_s,
         "journal, within these": journal.seconds,
@@ -201,9 +203,9 @@ def _stages_s(stopwatch: Stopwatch, journal: Journal, crew: Crew) -> dict[str, f
     }
 
 
-def _take_notes(
+def _frame_inputs(
     flight: Flight, data: FlightData, frames: Sequence[str], times: Mapping[str, float]
-) -> list[FrameNote]:
+) -> list[FrameInput]:
     """Return what is known of each frame before it is read."""
     priors: Sequence[NormalPrior | None] = [None] * len(frames)
     if flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None:
@@ -214,28 +216,28 @@ def _take_notes(
             plumb_sd_deg=flight.plumb_sd_deg,
         )
     return [
-        FrameNote(frame, times.get(frame), prior)
+        FrameInput(frame, times.get(frame), prior)
         for frame, prior in zip(frames, priors, strict=True)
     ]
 
 
-def _making(task: FrameTask) -> dict[str, str]:
+def _making(job: DetectionJob) -> dict[str, str]:
     """Return what the results of all frames depend on, so that a change can be named."""
     return {
         "the version of kgcp or of a library": to_text(versions()),
-        "the settings": to_text(task.settings),
-        "the camera": fingerprint(task.camera, task.calibration_covariance),
-        "the targets": fingerprint(task.targets),
-        "what is shown of dropped rings": to_text(task.keeps_dropped),
+        "the settings": to_text(job.settings),
+        "the camera": fingerprint(job.camera, job.calibration_covariance),
+        "the targets": fingerprint(job.targets),
+        "what is shown of dropped rings": to_text(job.keeps_dropped),
     }
 
 
 def _rows(
-    looks: Looks, expected: Mapping[int, Mapping[str, Expectation]], tally: Tally
+    run: DetectionRun, predictions: Mapping[int, Mapping[str, Prediction]], builder: SummaryBuilder
 ) -> Iterator[Row]:
-    for row, result in enumerate(looks.results()):
-        tally.add(result)
-        yield from detection_rows(with_expectations(result, expected.get(row, {})))
+    for row, result in enumerate(run.results()):
+        builder.add(result)
+        yield from detection_rows(with_predictions(result, predictions.get(row, {})))
 
 
 def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:

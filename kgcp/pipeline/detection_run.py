@@ -17,28 +17,28 @@ from typing import Protocol, TypeVar
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.images.remote import stamps_of
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, is_unreadable
-from kgcp.pipeline.execution.executor import Crew
+from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
-from kgcp.pipeline.execution.resilient_map import Loss
+from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.frame_task import (
-    FrameNote,
-    FrameTask,
-    SecondLook,
+    DetectionJob,
+    FrameInput,
+    GuidedInput,
     examine_frame,
     examine_frame_again,
     kept_frame,
     lost_frame,
 )
-from kgcp.pipeline.guidance import Sightings
+from kgcp.pipeline.guidance import FrameTracks
 
-_REASONS = {Loss.DIED: Reason.WORKER_DIED, Loss.LATE: Reason.TIMED_OUT}
+_REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
 _Result = TypeVar("_Result")
 
 
-class Watcher(Protocol):
+class ProgressListener(Protocol):
     """Who is told how the work goes."""
 
     def note(self, text: str) -> None:
@@ -48,7 +48,7 @@ class Watcher(Protocol):
         """Hear how many frames of a stage are done, of how many, and how many show a target."""
 
 
-class Looks:
+class DetectionRun:
     """The results of all frames, as far as they are there.
 
     Parameters
@@ -58,7 +58,7 @@ class Looks:
 
     Attributes
     ----------
-    sightings : Sightings
+    tracks : FrameTracks
         Of the results so far.
     kept : int
         Frames whose first look the journal had.
@@ -66,22 +66,24 @@ class Looks:
 
     def __init__(
         self,
-        task: FrameTask,
-        notes: Sequence[FrameNote],
+        job: DetectionJob,
+        inputs: Sequence[FrameInput],
         journal: Journal,
-        crew: Crew,
-        watcher: Watcher,
+        pool: WorkerPool,
+        listener: ProgressListener,
     ) -> None:
-        self._task, self._notes, self._journal = task, notes, journal
-        self._crew, self._watcher = crew, watcher
-        self._rows = {note.frame: row for row, note in enumerate(notes)}
-        stamps = stamps_of(task.frames_folder, [note.frame for note in notes])
-        self._keys = [_key(note, stamp) for note, stamp in zip(notes, stamps, strict=True)]
+        self._job, self._inputs, self._journal = job, inputs, journal
+        self._pool, self._listener = pool, listener
+        self._rows = {frame_input.frame: row for row, frame_input in enumerate(inputs)}
+        stamps = stamps_of(job.frames_folder, [frame_input.frame for frame_input in inputs])
+        self._keys = [
+            _key(frame_input, stamp) for frame_input, stamp in zip(inputs, stamps, strict=True)
+        ]
         self._stage, self._done, self._total = "", 0, 0
-        self.sightings = Sightings(task.targets, [note.frame for note in notes])
+        self.tracks = FrameTracks(job.targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
 
-    def look(self) -> None:
+    def first_pass(self) -> None:
         """Look at all frames that the journal has not."""
         todo = []
         for row, key in enumerate(self._keys):
@@ -89,33 +91,33 @@ class Looks:
             if kept is None:
                 todo.append(row)
             else:
-                self.sightings.add(row, kept)
+                self.tracks.add(row, kept)
         self.kept = len(self._keys) - len(todo)
         self._tell_what_is_kept(todo)
         self._begin("first look", self.kept, len(self._keys))
-        notes = (self._notes[row] for row in todo)
-        with closing(self._crew.map(partial(examine_frame, self._task), notes)) as results:
-            for note, result in results:
-                row = self._rows[note.frame]
-                if isinstance(result, Loss):
+        inputs = (self._inputs[row] for row in todo)
+        with closing(self._pool.map(partial(examine_frame, self._job), inputs)) as results:
+            for frame_input, result in results:
+                row = self._rows[frame_input.frame]
+                if isinstance(result, TaskFailure):
                     self._keys[row] = _key_of_lost(self._keys[row])
-                    self._keep(row, lost_frame(self._task, note, _REASONS[result]))
+                    self._keep(row, lost_frame(self._job, frame_input, _REASONS[result]))
                 else:
                     self._require_frame(result)
                     self._keep(row, result)
 
-    def look_again(self, expected: Mapping[int, Mapping[str, Expectation]]) -> None:
+    def guided_pass(self, predictions: Mapping[int, Mapping[str, Prediction]]) -> None:
         """Look again at the readable frames in which a missing target must be visible.
 
         Parameters
         ----------
-        expected : mapping of mappings
+        predictions : mapping of mappings
             By row and target.
         """
-        visible: dict[int, dict[str, Expectation]] = {}
-        for row, by_target in expected.items():
-            if self.sightings.is_readable[row]:
-                camera = self._task.camera
+        visible: dict[int, dict[str, Prediction]] = {}
+        for row, by_target in predictions.items():
+            if self.tracks.is_readable[row]:
+                camera = self._job.camera
                 named = {name: one for name, one in by_target.items() if one.is_visible(camera)}
                 if named:
                     visible[row] = named
@@ -129,15 +131,17 @@ class Looks:
                 todo.append(row)
             else:
                 self._keys[row] = key
-                self.sightings.add(row, kept)
+                self.tracks.add(row, kept)
         self._begin("second look", len(keys) - len(todo), len(keys))
-        looks = (self._second_look(row, visible[row]) for row in todo)
-        with closing(self._crew.map(partial(examine_frame_again, self._task), looks)) as results:
-            for look, result in results:
-                row = self._rows[look.note.frame]
-                if isinstance(result, Loss):
+        guided_inputs = (self._guided_input(row, visible[row]) for row in todo)
+        with closing(
+            self._pool.map(partial(examine_frame_again, self._job), guided_inputs)
+        ) as results:
+            for guided_input, result in results:
+                row = self._rows[guided_input.input.frame]
+                if isinstance(result, TaskFailure):
                     self._keys[row] = _key_of_lost(keys[row])
-                    self._keep(row, kept_frame(look, _REASONS[result]))
+                    self._keep(row, kept_frame(guided_input, _REASONS[result]))
                 else:
                     self._keys[row] = keys[row]
                     self._keep(row, result)
@@ -146,36 +150,36 @@ class Looks:
         """Yield the last result of every frame, in the frames' order."""
         return map(self._journal.read, self._keys)
 
-    def through(
+    def map_results(
         self, function: Callable[[FrameResult], _Result]
-    ) -> Iterator[tuple[int, FrameResult, _Result | Loss]]:
+    ) -> Iterator[tuple[int, FrameResult, _Result | TaskFailure]]:
         """Yield what workers make of the last result of every frame, with its row, as it comes."""
         self._begin("overlay", 0, len(self._keys))
-        with closing(self._crew.map(function, self.results())) as made:
+        with closing(self._pool.map(function, self.results())) as made:
             for result, one in made:
                 self._advance()
                 yield self._rows[result.frame], result, one
 
-    def _second_look(self, row: int, expected: Mapping[str, Expectation]) -> SecondLook:
-        return SecondLook(self._notes[row], self._journal.read(self._keys[row]), expected)
+    def _guided_input(self, row: int, predictions: Mapping[str, Prediction]) -> GuidedInput:
+        return GuidedInput(self._inputs[row], self._journal.read(self._keys[row]), predictions)
 
     def _keep(self, row: int, result: FrameResult) -> None:
         self._journal.add(self._keys[row], result)
-        self.sightings.add(row, result)
+        self.tracks.add(row, result)
         self._advance()
 
     def _begin(self, stage: str, done: int, total: int) -> None:
         self._stage, self._done, self._total = stage, done, total
         if total:
-            self._watcher.progress(stage, done, total, self.sightings.found)
+            self._listener.progress(stage, done, total, self.tracks.found)
 
     def _advance(self) -> None:
         self._done += 1
-        self._watcher.progress(self._stage, self._done, self._total, self.sightings.found)
+        self._listener.progress(self._stage, self._done, self._total, self.tracks.found)
 
     def _require_frame(self, result: FrameResult) -> None:
         """Stop where frames cannot be read because they are gone, with the disk they were on."""
-        path = self._task.frames_folder / result.frame
+        path = self._job.frames_folder / result.frame
         if not isinstance(path, Path):  # a store says itself why it cannot be read
             return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
@@ -186,21 +190,21 @@ class Looks:
     def _tell_what_is_kept(self, todo: Sequence[int]) -> None:
         if self._journal.changes:
             changes = ", ".join(self._journal.changes)
-            self._watcher.note(
+            self._listener.note(
                 f"starting anew, not with the interrupted run's results: {changes} changed since"
             )
         kept = {_name_of(key) for key in self._journal}
         changed = sum(_name_of(self._keys[row]) in kept for row in todo)
         if self.kept or changed:
-            self._watcher.note(
+            self._listener.note(
                 f"going on with an interrupted run: results of {self.kept} of"
                 f" {len(self._keys)} frames are kept, {changed} have changed since"
             )
 
 
-def _key(note: FrameNote, file: tuple[int, int] | None) -> str:
-    name = fingerprint(note.frame)[:16]
-    return f"first-{name}-{fingerprint(file, note.time_s, note.prior)[:16]}"
+def _key(frame_input: FrameInput, file: tuple[int, int] | None) -> str:
+    name = fingerprint(frame_input.frame)[:16]
+    return f"first-{name}-{fingerprint(file, frame_input.time_s, frame_input.prior)[:16]}"
 
 
 def _name_of(key: str) -> str:

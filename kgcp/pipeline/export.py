@@ -11,10 +11,10 @@ import pandas as pd
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
-from kgcp.georef.gcp import Kgcp, Skip, build_kgcps, on_map
-from kgcp.georef.local_frame import MapChange
+from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
+from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.selection import Selection, select
-from kgcp.georef.target_positions import Carrier
+from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
@@ -22,7 +22,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.consistency import write_consistency
 from kgcp.io.tables.detections import read_attempts
-from kgcp.io.tables.gcps import KGCP_COLUMNS, kgcp_row
+from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import provenance
 from kgcp.pipeline.execution.threads import single_threaded
@@ -42,12 +42,12 @@ class GcpSet:
         Whose points they are.
     crs : str
         Of all coordinates.
-    gcps : tuple of Kgcp
-    skipped : tuple of Skip
+    gcps : tuple of Gcp
+    skipped : tuple of SkippedSighting
         Sightings that made no point, or a point that was not selected.
     camera_priors : tuple of CameraPrior
         Position and attitude of the camera, from plate and vehicle.
-    vehicle : Carrier or None
+    vehicle : Vehicle or None
         None if no target is carried by a vehicle.
     consistency : Consistency or None
         None if there are no reference poses, or too few frames to compare.
@@ -55,16 +55,16 @@ class GcpSet:
 
     flight: Flight
     crs: str
-    gcps: tuple[Kgcp, ...]
-    skipped: tuple[Skip, ...]
+    gcps: tuple[Gcp, ...]
+    skipped: tuple[SkippedSighting, ...]
     camera_priors: tuple[CameraPrior, ...]
-    vehicle: Carrier | None
+    vehicle: Vehicle | None
     consistency: Consistency | None
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the points as a table with the columns of `kgcps.parquet`."""
-        names = [column.name for column in KGCP_COLUMNS]
-        return pd.DataFrame([kgcp_row(point) for point in self.gcps], columns=names)
+        names = [column.name for column in GCP_COLUMNS]
+        return pd.DataFrame([gcp_row(point) for point in self.gcps], columns=names)
 
 
 @single_threaded()
@@ -102,24 +102,24 @@ def make_gcps(
             " see the reasons that 'kgcp detect' gives"
         )
     data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
-    whereabouts = data.whereabouts
-    frame = whereabouts.frame
-    placed, absent = build_kgcps(sightings, whereabouts, flight.camera)
-    kgcps, unwanted = select(placed, sightings, frame, flight.camera, selection)
+    target_positions = data.target_positions
+    local_frame = target_positions.local_frame
+    placed, absent = build_gcps(sightings, target_positions, flight.camera)
+    gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     consistency = None
     if data.has_reference:
         poses = data.reference_poses
-        consistency = study_consistency(sightings, whereabouts, poses, flight.camera)
-    if crs is not None and kgcps:
-        change = MapChange.to(crs, frame, np.asarray(kgcps[0].position_map))
-        kgcps, frame = on_map(kgcps, change), change.target
+        consistency = study_consistency(sightings, target_positions, poses, flight.camera)
+    if crs is not None and gcps:
+        transform = CrsTransform.to(crs, local_frame, np.asarray(gcps[0].position_map))
+        gcps, local_frame = transform_gcps(gcps, transform), transform.target
     return GcpSet(
         flight=flight,
-        crs=frame.crs,
-        gcps=kgcps,
+        crs=local_frame.crs,
+        gcps=gcps,
         skipped=(*absent, *unwanted),
-        camera_priors=camera_priors(kgcps, sightings, whereabouts, frame),
-        vehicle=whereabouts.carrier,
+        camera_priors=camera_priors(gcps, sightings, target_positions, local_frame),
+        vehicle=target_positions.vehicle,
         consistency=consistency,
     )
 
@@ -163,7 +163,7 @@ def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
     """
     about = provenance(gcp_set.flight)
     table = folder / "kgcps.parquet"
-    write_table(table, KGCP_COLUMNS, map(kgcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
+    write_table(table, GCP_COLUMNS, map(gcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
     if gcp_set.consistency is None:
         return [table]
     return [table, *write_consistency(folder, gcp_set.consistency, about)]

@@ -15,7 +15,7 @@ from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
-from kgcp.measurement.guided import Expectation, look_again
+from kgcp.measurement.guided import Prediction, look_again
 from kgcp.measurement.normal_prior import NormalPrior
 from kgcp.measurement.records import (
     Considered,
@@ -36,7 +36,7 @@ _MOST_DROPPED = 24  # rings per frame that are kept to be shown: a texture may h
 
 
 @dataclass(frozen=True, slots=True)
-class FrameTask:
+class DetectionJob:
     """What a worker needs to know to examine any frame of a flight.
 
     Attributes
@@ -54,7 +54,7 @@ class FrameTask:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameNote:
+class FrameInput:
     """What a worker needs to know about one frame.
 
     Attributes
@@ -73,125 +73,125 @@ class FrameNote:
 
 
 @dataclass(frozen=True, slots=True)
-class SecondLook:
+class GuidedInput:
     """A frame that is to be looked at again.
 
     Attributes
     ----------
     first : FrameResult
         Of the first look.
-    expected : mapping of str to Expectation
+    predictions : mapping of str to Prediction
         By the name of the target, which must be visible; those that are looked for.
     """
 
-    note: FrameNote
+    input: FrameInput
     first: FrameResult
-    expected: Mapping[str, Expectation]
+    predictions: Mapping[str, Prediction]
 
 
 @single_threaded()
-def examine_frame(task: FrameTask, note: FrameNote) -> FrameResult:
+def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
     """Read and measure one frame; whatever a frame can do wrong becomes its result."""
-    place = task.frames_folder / note.frame
+    place = job.frames_folder / frame_input.frame
     exif = Exif()
     outcomes: tuple[Outcome, ...]
     dropped: tuple[Considered, ...] = ()
     try:
-        with at_hand(task.frames_folder, note.frame) as path:
+        with at_hand(job.frames_folder, frame_input.frame) as path:
             exif = read_exif(path)
-            grey = read_grey(path, task.camera)
-        examination = examine(grey, task.camera, task.targets, task.settings, note.prior)
-        outcomes = tuple(_with_common_uncertainty(task, one) for one in examination.outcomes)
-        if task.keeps_dropped:
+            grey = read_grey(path, job.camera)
+        examination = examine(grey, job.camera, job.targets, job.settings, frame_input.prior)
+        outcomes = tuple(_with_common_uncertainty(job, one) for one in examination.outcomes)
+        if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
         outcomes = tuple(
-            Miss(target.name, rejection.reason, rejection.detail) for target in task.targets
+            Miss(target.name, rejection.reason, rejection.detail) for target in job.targets
         )
-    time_s = exif.time_s if note.time_s is None else note.time_s
-    reference = task.camera.time_reference
+    time_s = exif.time_s if frame_input.time_s is None else frame_input.time_s
+    reference = job.camera.time_reference
     if time_s is not None and reference is not TimeReference.MIDDLE:
         is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
         time_s = _mid_exposure_s(time_s, exif.exposure, reference, place) if is_readable else None
-    return FrameResult(note.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped)
+    return FrameResult(frame_input.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped)
 
 
 @single_threaded()
-def examine_frame_again(task: FrameTask, look: SecondLook) -> FrameResult:
+def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
     try:
-        with at_hand(task.frames_folder, look.note.frame) as path:
-            grey = read_grey(path, task.camera)
+        with at_hand(job.frames_folder, guided_input.input.frame) as path:
+            grey = read_grey(path, job.camera)
     except Rejection as rejection:
         raise KgcpError(
-            f"{task.frames_folder / look.note.frame}: could be read, and cannot any more"
+            f"{job.frames_folder / guided_input.input.frame}: could be read, and cannot any more"
             f" ({rejection.detail}); put it back, and the same command goes on"
         ) from rejection
     found = {
         outcome.target: outcome
-        for outcome in look.first.outcomes
+        for outcome in guided_input.first.outcomes
         if isinstance(outcome, Measurement) and outcome.instance == 0
     }
     considered: list[Considered] = []
-    for target in task.targets:
-        if target.name in look.expected:
+    for target in job.targets:
+        if target.name in guided_input.predictions:
             seen, more = look_again(
-                *(grey, task.camera, target, look.expected[target.name], task.settings),
-                look.note.prior if target.position_m is None else None,
+                *(grey, job.camera, target, guided_input.predictions[target.name], job.settings),
+                guided_input.input.prior if target.position_m is None else None,
                 tuple(found.values()),
             )
             considered += more
             if seen is not None:
                 found[target.name] = seen
-    outcomes = _merged(task, look, grey, found, considered)
-    dropped = look.first.dropped
-    if task.keeps_dropped:
+    outcomes = _merged(job, guided_input, grey, found, considered)
+    dropped = guided_input.first.dropped
+    if job.keeps_dropped:
         dropped = _best_dropped((*dropped, *considered))
-    return replace(look.first, outcomes=outcomes, dropped=dropped)
+    return replace(guided_input.first, outcomes=outcomes, dropped=dropped)
 
 
-def lost_frame(task: FrameTask, note: FrameNote, reason: Reason) -> FrameResult:
+def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> FrameResult:
     """Return the result of a frame that cannot be examined without the end of the process."""
-    outcomes = tuple(Miss(target.name, reason) for target in task.targets)
-    is_known = task.camera.time_reference is TimeReference.MIDDLE
-    time_s = note.time_s if is_known else None
-    return FrameResult(note.frame, time_s, ExposureSettings(), outcomes)
+    outcomes = tuple(Miss(target.name, reason) for target in job.targets)
+    is_known = job.camera.time_reference is TimeReference.MIDDLE
+    time_s = frame_input.time_s if is_known else None
+    return FrameResult(frame_input.frame, time_s, ExposureSettings(), outcomes)
 
 
-def kept_frame(look: SecondLook, reason: Reason) -> FrameResult:
+def kept_frame(guided_input: GuidedInput, reason: Reason) -> FrameResult:
     """Return the result of the first look, where the second one ended its process."""
     outcomes = tuple(
         replace(one, detail="; ".join(filter(None, (one.detail, f"second look: {reason}"))))
         if isinstance(one, Miss)
         else one
-        for one in look.first.outcomes
+        for one in guided_input.first.outcomes
     )
-    return replace(look.first, outcomes=outcomes)
+    return replace(guided_input.first, outcomes=outcomes)
 
 
 def _merged(
-    task: FrameTask,
-    look: SecondLook,
+    job: DetectionJob,
+    guided_input: GuidedInput,
     grey: GreyArray,
     found: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
     """Put what was found in the place of misses, and explain the others by what is known now."""
-    first = {one.target: one for one in look.first.outcomes if isinstance(one, Miss)}
-    missed = tuple(target for target in task.targets if target.name not in found)
+    first = {one.target: one for one in guided_input.first.outcomes if isinstance(one, Miss)}
+    missed = tuple(target for target in job.targets if target.name not in found)
     if first.keys() & found.keys():  # rings on those plates explain no other's miss any more
         others = tuple(found.values())
-        again = examine(grey, task.camera, missed, task.settings, look.note.prior, others)
+        again = examine(grey, job.camera, missed, job.settings, guided_input.input.prior, others)
         first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
     instead: dict[str, Outcome] = {}
     for target in missed:
         there = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
-        known = miss_of(grey, target, there, task.settings) if there else first[target.name]
+        known = miss_of(grey, target, there, job.settings) if there else first[target.name]
         instead[target.name] = known
     for name in first.keys() & found.keys():
-        instead[name] = _with_common_uncertainty(task, found[name])
+        instead[name] = _with_common_uncertainty(job, found[name])
     return tuple(
-        instead[one.target] if isinstance(one, Miss) else one for one in look.first.outcomes
+        instead[one.target] if isinstance(one, Miss) else one for one in guided_input.first.outcomes
     )
 
 
@@ -219,9 +219,9 @@ def _mid_exposure_s(
     return time_s + reference.to_middle_s(exposure.exposure_time_s)
 
 
-def _with_common_uncertainty(task: FrameTask, outcome: Outcome) -> Outcome:
+def _with_common_uncertainty(job: DetectionJob, outcome: Outcome) -> Outcome:
     if isinstance(outcome, Miss):
         return outcome
-    ring = next(target.ring for target in task.targets if target.name == outcome.target)
-    common = common_uncertainty(task.camera, task.calibration_covariance, ring, outcome.pose)
+    ring = next(target.ring for target in job.targets if target.name == outcome.target)
+    common = common_uncertainty(job.camera, job.calibration_covariance, ring, outcome.pose)
     return replace(outcome, common=common)

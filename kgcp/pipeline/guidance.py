@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from kgcp.errors import KgcpError
-from kgcp.georef.prediction import Track, expect, reference_states, state_of
+from kgcp.georef.prediction import Track, predict_position, reference_states, state_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.targets.layout import Target
 
 
-class Sightings:
+class FrameTracks:
     """What all frames must know of each other for a second look: few numbers of every frame.
 
     Attributes
@@ -52,9 +52,9 @@ class Sightings:
                 self.states[observation.target][row] = state_of(observation)
 
 
-def expectations(
-    flight: Flight, data: FlightData, sightings: Sightings
-) -> tuple[dict[int, dict[str, Expectation]], str | None]:
+def predict_missing(
+    flight: Flight, data: FlightData, tracks: FrameTracks
+) -> tuple[dict[int, dict[str, Prediction]], str | None]:
     """Return, for each frame, where its missing targets must be, as far as that is sure.
 
     Returns
@@ -64,36 +64,36 @@ def expectations(
     problem : str or None
         What is wrong with reference poses or trajectory. To detect needs neither: it is no error.
     """
-    expected: dict[int, dict[str, Expectation]] = {}
+    predictions: dict[int, dict[str, Prediction]] = {}
     problem = None
     for target in flight.targets:
-        track = Track(sightings.time_s, sightings.states[target.name])
-        if not 0 < track.is_found.sum() < len(sightings.frames):
+        track = Track(tracks.time_s, tracks.states[target.name])
+        if not 0 < track.is_found.sum() < len(tracks.frames):
             continue
         states = None
         try:
             if data.has_reference and data.has_position_of(target):
                 states = reference_states(
-                    sightings.frames,
-                    [None if math.isnan(time_s) else float(time_s) for time_s in sightings.time_s],
+                    tracks.frames,
+                    [None if math.isnan(time_s) else float(time_s) for time_s in tracks.time_s],
                     target,
                     data.reference_poses,
-                    data.whereabouts,
+                    data.target_positions,
                     flight.camera,
                 )
         except KgcpError as error:
             problem = str(error)
-        for row, one in enumerate(expect(track, states)):
+        for row, one in enumerate(predict_position(track, states)):
             if one is not None and one.is_sure:
-                expected.setdefault(row, {})[target.name] = one
-    return expected, problem
+                predictions.setdefault(row, {})[target.name] = one
+    return predictions, problem
 
 
-def with_expectations(result: FrameResult, expected: Mapping[str, Expectation]) -> FrameResult:
+def with_predictions(result: FrameResult, predictions: Mapping[str, Prediction]) -> FrameResult:
     """Add to the misses where the target must have been."""
     outcomes = tuple(
-        replace(one, detail="; ".join(filter(None, (one.detail, str(expected[one.target])))))
-        if isinstance(one, Miss) and one.target in expected and not is_unreadable(one)
+        replace(one, detail="; ".join(filter(None, (one.detail, str(predictions[one.target])))))
+        if isinstance(one, Miss) and one.target in predictions and not is_unreadable(one)
         else one
         for one in result.outcomes
     )

@@ -13,17 +13,20 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
-from kgcp.measurement.adjustment.residual_image import contours_px, residuals_of
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.adjustment.residual_image import contours_px, residual_image_of
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Considered, FrameResult, Measurement, Miss, Outcome
-from kgcp.pipeline.detection_run import Looks
-from kgcp.pipeline.execution.resilient_map import Loss
-from kgcp.pipeline.frame_task import FrameTask
+from kgcp.pipeline.detection_run import DetectionRun
+from kgcp.pipeline.execution.resilient_map import TaskFailure
+from kgcp.pipeline.frame_task import DetectionJob
 from kgcp.quality.number_text import minus
 from kgcp.report.contact_sheet import DROPPED, Card, ContactSheet
 from kgcp.report.ring_picture import Pictures, RingView, draw_ring
 
-_LOSSES = {Loss.DIED: "the process that drew it ended twice", Loss.LATE: "it took too long"}
+_LOSSES = {
+    TaskFailure.CRASHED: "the process that drew it ended twice",
+    TaskFailure.TIMED_OUT: "it took too long",
+}
 _MISSES = {Status.NOT_FOUND.value, Status.REJECTED.value}
 _TURN = np.linspace(0.0, 2.0 * np.pi, 97)
 
@@ -50,9 +53,9 @@ class Sketch:
 def draw_overlay(
     sheet: ContactSheet,
     flight_name: str,
-    looks: Looks,
-    task: FrameTask,
-    expected: Mapping[int, Mapping[str, Expectation]],
+    run: DetectionRun,
+    job: DetectionJob,
+    predictions: Mapping[int, Mapping[str, Prediction]],
 ) -> int:
     """Draw the last result of every frame, and write the page.
 
@@ -62,9 +65,9 @@ def draw_overlay(
     ----------
     sheet : ContactSheet
     flight_name : str
-    looks : Looks
-    task : FrameTask
-    expected : mapping of mappings
+    run : DetectionRun
+    job : DetectionJob
+    predictions : mapping of mappings
         Where targets must be, by row and target: added to what is said of misses.
 
     Returns
@@ -79,12 +82,12 @@ def draw_overlay(
     """
     cards: dict[int, list[Card]] = {}
     lost = 0
-    for row, result, made in looks.through(partial(sketch_frame, task)):
-        sketches = _lost(result, _LOSSES[made]) if isinstance(made, Loss) else made
+    for row, result, made in run.map_results(partial(sketch_frame, job)):
+        sketches = _lost(result, _LOSSES[made]) if isinstance(made, TaskFailure) else made
         lost += sum(sketch.is_lost for sketch in sketches)
         cards[row] = []
         for place, sketch in enumerate(sketches):
-            card = _with_expectation(sketch.card, expected.get(row, {}))
+            card = _with_prediction(sketch.card, predictions.get(row, {}))
             if sketch.pictures is not None:
                 stem = f"{row + 1:06d}-{place}"
                 sheet.add(stem, sketch.pictures)
@@ -94,14 +97,14 @@ def draw_overlay(
     return lost
 
 
-def _with_expectation(card: Card, expected: Mapping[str, Expectation]) -> Card:
+def _with_prediction(card: Card, predictions: Mapping[str, Prediction]) -> Card:
     """Add to the card of a miss where its target must have been."""
-    if card.target not in expected or card.status not in _MISSES:
+    if card.target not in predictions or card.status not in _MISSES:
         return card
-    return replace(card, text=_joined(card.text, str(expected[card.target])))
+    return replace(card, text=_joined(card.text, str(predictions[card.target])))
 
 
-def sketch_frame(task: FrameTask, result: FrameResult) -> list[Sketch]:
+def sketch_frame(job: DetectionJob, result: FrameResult) -> list[Sketch]:
     """Read a frame again and draw all rings of its result, in the order of the table's rows.
 
     Rings that were dropped follow, those that came farthest first.
@@ -110,11 +113,11 @@ def sketch_frame(task: FrameTask, result: FrameResult) -> list[Sketch]:
     if not any(_has_place(ring) for ring in rings):
         return [Sketch(_card(result.frame, ring)) for ring in rings]
     try:
-        with at_hand(task.frames_folder, result.frame) as path:
-            grey = read_grey(path, task.camera)
+        with at_hand(job.frames_folder, result.frame) as path:
+            grey = read_grey(path, job.camera)
     except Rejection as rejection:
         return _lost(result, str(rejection))
-    return [_sketch(task, grey, result.frame, ring) for ring in rings]
+    return [_sketch(job, grey, result.frame, ring) for ring in rings]
 
 
 def _rings(result: FrameResult) -> list[Outcome | Considered]:
@@ -140,20 +143,20 @@ def _lost(result: FrameResult, why: str) -> list[Sketch]:
     ]
 
 
-def _sketch(task: FrameTask, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
+def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
     if not isinstance(ring, Measurement):
         pictures = None if ring.outline is None else draw_ring(grey, _outlined(ring.outline))
         return Sketch(_card(frame, ring), pictures)
-    target = next(target for target in task.targets if target.name == ring.target)
+    target = next(target for target in job.targets if target.name == ring.target)
     appearance = ring.appearance
-    note, residuals = "", None
+    note, residual_image = "", None
     try:
-        residuals = residuals_of(grey, task.camera, target, ring.pose, appearance.blur_px)
+        residual_image = residual_image_of(grey, job.camera, target, ring.pose, appearance.blur_px)
     except Rejection as rejection:
         note = f"no residuals: {rejection}"
-    curves = tuple(contours_px(task.camera, target, ring.pose))
-    view = RingView(ring.centre_px, appearance.radius_px, curves, residuals)
-    share = None if residuals is None else 100.0 * residuals.edge_noise
+    curves = tuple(contours_px(job.camera, target, ring.pose))
+    view = RingView(ring.centre_px, appearance.radius_px, curves, residual_image)
+    share = None if residual_image is None else 100.0 * residual_image.edge_noise
     return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
 
 

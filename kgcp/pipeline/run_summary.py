@@ -14,7 +14,7 @@ from kgcp.measurement.records import FrameResult, Miss
 
 
 @dataclass(frozen=True, slots=True)
-class SurveySummary:
+class DetectionSummary:
     """Counts over a flight.
 
     Attributes
@@ -89,7 +89,7 @@ class Stopwatch:
             self.stages_s[name] += time.perf_counter() - start_s
 
 
-class Tally:
+class SummaryBuilder:
     """Counts of rows and frames, one frame after the other.
 
     Parameters
@@ -130,9 +130,9 @@ class Tally:
         not_drawn: int,
         guide_problem: str | None,
         stages_s: Mapping[str, float],
-    ) -> SurveySummary:
+    ) -> DetectionSummary:
         """Return the counts, with what else there is to say."""
-        return SurveySummary(
+        return DetectionSummary(
             table=table,
             frames=self._frames,
             status={kind.value: self._status[kind] for kind in Status},

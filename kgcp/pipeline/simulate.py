@@ -24,8 +24,8 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.target_table import target_lines
-from kgcp.pipeline.execution.executor import hired
-from kgcp.pipeline.execution.resilient_map import Loss
+from kgcp.pipeline.execution.executor import open_pool
+from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import VehicleSettings
 from kgcp.simulation.effects import Effects
@@ -179,9 +179,9 @@ def write_simulated_flight(
         shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
         (partial / "frames").mkdir(parents=True)
         write_frame = functools.partial(_write_frame, plan, partial / "frames")
-        with hired(0 if jobs == 1 else jobs, math.inf, None, partial) as crew:
-            for index, result in crew.map(write_frame, range(len(plan.frames))):
-                if isinstance(result, Loss):
+        with open_pool(0 if jobs == 1 else jobs, math.inf, None, partial) as pool:
+            for index, result in pool.map(write_frame, range(len(plan.frames))):
+                if isinstance(result, TaskFailure):
                     raise KgcpError(
                         f"{out}: the process that rendered frame {index} has ended twice; free"
                         " memory, or use fewer processes",

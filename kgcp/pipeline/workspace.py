@@ -52,7 +52,7 @@ def results_folder(flight: Path) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Workplace:
+class Workspace:
     """Folders of this machine, and what they stand for.
 
     Attributes
@@ -86,9 +86,9 @@ class Workplace:
 
 
 @contextmanager
-def workplace(
+def open_workspace(
     flight: Path | StoredFolder, out: Path | StoredFolder | None, needs: Sequence[str] = ()
-) -> Iterator[Workplace]:
+) -> Iterator[Workspace]:
     """Have a place to work at until the block ends, and put the results where they belong.
 
     Parameters
@@ -112,19 +112,19 @@ def workplace(
             where = flight
         results = out or _results_of(flight)
         stored_out = results if isinstance(results, StoredFolder) else None
-        place = Workplace(
+        workspace = Workspace(
             where,
             results if isinstance(results, Path) else _cache_of(results),
             stored_flight,
             stored_out,
         )
-        fetched = [] if stored_out is None else _fetched(stored_out, place.out, needs)
+        fetched = [] if stored_out is None else _fetched(stored_out, workspace.out, needs)
         try:
-            yield place
+            yield workspace
         except KgcpError as error:
-            raise KgcpError(place.named(error), option=error.option) from error
+            raise KgcpError(workspace.named(error), option=error.option) from error
         if stored_out is not None:
-            _deliver(place.out, stored_out, fetched)
+            _deliver(workspace.out, stored_out, fetched)
 
 
 def _results_of(flight: Path | StoredFolder) -> Path | StoredFolder:

@@ -166,14 +166,14 @@ def _fit(
 
 
 def _terms(names: Sequence[str], result: RegressionFit) -> tuple[Term, ...]:
-    chances = [
+    p_values = [
         two_sided(float(value / sd), result.freedom)
         for value, sd in zip(result.values, result.sds, strict=True)
     ]
     return tuple(
         Term(name, float(value), float(sd), chance)
         for name, value, sd, chance in zip(
-            names, result.values, result.sds, holm(chances), strict=True
+            names, result.values, result.sds, holm(p_values), strict=True
         )
     )
 

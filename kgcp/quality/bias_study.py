@@ -13,9 +13,9 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
-from kgcp.georef.exterior_orientation import Views, visible_pixels
+from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixels
 from kgcp.georef.sighting import Attempt
-from kgcp.georef.target_positions import Absence, Place, Whereabouts
+from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 from kgcp.settings import Method
 from kgcp.targets.layout import Target
 
@@ -45,19 +45,25 @@ class ReferenceSds:
         return math.hypot(self.pose_m, self.place_m, self.common_m)
 
     @classmethod
-    def along(cls, direction: FloatArray, place: Place, views: Views, row: int) -> Self | None:
+    def along(
+        cls,
+        direction: FloatArray,
+        position: TargetPosition,
+        orientations: ExteriorOrientations,
+        row: int,
+    ) -> Self | None:
         """Return those along a line of sight: a unit vector (3,) in the ENU frame.
 
         `row` is that of the frame among the reference poses. None where trajectory or poses have
         no standard deviations.
         """
-        if place.cov_m2 is None or views.cov_m2 is None:
+        if position.cov_m2 is None or orientations.cov_m2 is None:
             return None
-        pose = float(direction @ views.cov_m2[row] @ direction)
-        whole = float(direction @ place.cov_m2 @ direction)
+        pose = float(direction @ orientations.cov_m2[row] @ direction)
+        whole = float(direction @ position.cov_m2 @ direction)
         common = whole  # of a static target
-        if place.common_m is not None:
-            common = min(whole, float(np.sum((direction @ place.common_m) ** 2)))
+        if position.common_m is not None:
+            common = min(whole, float(np.sum((direction @ position.common_m) ** 2)))
         return cls(math.sqrt(pose), math.sqrt(whole - common), math.sqrt(common))
 
 
@@ -102,7 +108,7 @@ class Comparison:
         return None if residual is None else 100.0 * residual / self.reference_distance_m
 
     @property
-    def is_astray(self) -> bool:
+    def is_misplaced(self) -> bool:
         """Whether something was measured that is not where the target must be.
 
         The limit is one radius of the ring.
@@ -127,27 +133,29 @@ class BiasStudy:
     ----------
     measured : tuple of Comparison
         With a residual, in the frames' order.
-    chances : tuple of Comparison
+    expected_visible : tuple of Comparison
         Frames in which the target must be wholly visible, measured or not.
     attitudes_agree : bool
         Whether most measured centres lie where the reference attitudes put them. If not, nothing
-        is called astray, and every frame with a pose counts as a chance.
+        is called misplaced, and every frame with a pose counts as one that shows it.
     frames_without_pose : tuple of str
         Frames that the reference does not name.
-    absences : tuple of Absence
+    absences : tuple of NoPosition
         Of the frames whose target cannot be placed.
     """
 
     method: Method
     measured: tuple[Comparison, ...]
-    chances: tuple[Comparison, ...]
+    expected_visible: tuple[Comparison, ...]
     attitudes_agree: bool
     frames_without_pose: tuple[str, ...]
-    absences: tuple[Absence, ...]
+    absences: tuple[NoPosition, ...]
 
     def trusts(self, pair: Comparison) -> bool:
         """Whether a comparison holds a measurement, and one of this target."""
-        return pair.attempt.sighting is not None and not (self.attitudes_agree and pair.is_astray)
+        return pair.attempt.sighting is not None and not (
+            self.attitudes_agree and pair.is_misplaced
+        )
 
     @property
     def trusted(self) -> tuple[Comparison, ...]:
@@ -158,7 +166,7 @@ class BiasStudy:
 def study_bias(
     attempts: Sequence[Attempt],
     poses: ReferencePoses,
-    whereabouts: Whereabouts,
+    target_positions: TargetPositions,
     camera: Camera,
     targets: Sequence[Target],
     method: Method,
@@ -175,7 +183,7 @@ def study_bias(
     Raises
     ------
     KgcpError
-        If nothing was measured, no measured frame has a pose, or as `Whereabouts.places`.
+        If nothing was measured, no measured frame has a pose, or as `TargetPositions.positions`.
     """
     ours = _with_measured_target(attempts)
     rows = {frame: row for row, frame in enumerate(poses.frames)}
@@ -186,39 +194,39 @@ def study_bias(
         attempt.sighting.row_time_s(camera) if attempt.sighting else attempt.time_s
         for attempt in posed
     ]
-    places = whereabouts.places([attempt.target for attempt in posed], times)
-    views = Views.of(poses, whereabouts.frame)
+    positions = target_positions.positions([attempt.target for attempt in posed], times)
+    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
     diameters = {target.name: target.ring.outer_diameter_m for target in targets}
     placed = [
-        (attempt, place, rows[attempt.frame])
-        for attempt, place in zip(posed, places, strict=True)
-        if isinstance(place, Place)
+        (attempt, position, rows[attempt.frame])
+        for attempt, position in zip(posed, positions, strict=True)
+        if isinstance(position, TargetPosition)
     ]
     in_camera = [
-        (place.position_m - views.centre_m[row]) @ views.enu_from_camera[row]
-        for _, place, row in placed
+        (position.position_m - orientations.centre_m[row]) @ orientations.enu_from_camera[row]
+        for _, position, row in placed
     ]
     pixels = visible_pixels(camera, np.reshape(in_camera, (-1, 3)))
     compared = [
         _compare(
             attempt,
-            place,
-            views,
+            position,
+            orientations,
             row,
             pixel,
             0.5 * diameters[attempt.target] * camera.mean_focal_px,
         )
-        for (attempt, place, row), pixel in zip(placed, pixels, strict=True)
+        for (attempt, position, row), pixel in zip(placed, pixels, strict=True)
     ]
     measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
-    agree = 2 * sum(pair.is_astray for pair in measured) < len(measured)
+    agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
     return BiasStudy(
         method=method,
         measured=measured,
-        chances=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
+        expected_visible=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
         attitudes_agree=agree,
         frames_without_pose=tuple(sorted({attempt.frame for attempt in ours} - rows.keys())),
-        absences=tuple(place for place in places if isinstance(place, Absence)),
+        absences=tuple(position for position in positions if isinstance(position, NoPosition)),
     )
 
 
@@ -248,20 +256,20 @@ def _no_pose(attempts: Sequence[Attempt], poses: ReferencePoses) -> str:
 
 def _compare(
     attempt: Attempt,
-    place: Place,
-    views: Views,
+    position: TargetPosition,
+    orientations: ExteriorOrientations,
     row: int,
     expected_px: FloatArray,
     radius_px_m: float,
 ) -> Comparison:
     """Compare one attempt with the pose in `row`."""
-    sight = place.position_m - views.centre_m[row]
+    sight = position.position_m - orientations.centre_m[row]
     distance = float(np.linalg.norm(sight))
     return Comparison(
         attempt=attempt,
-        camera_m=views.centre_m[row],
-        place_m=place.position_m,
-        sds=ReferenceSds.along(sight / distance, place, views, row),
+        camera_m=orientations.centre_m[row],
+        place_m=position.position_m,
+        sds=ReferenceSds.along(sight / distance, position, orientations, row),
         expected_px=expected_px,
         expected_radius_px=radius_px_m / distance,
     )

@@ -11,9 +11,9 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
-from kgcp.georef.exterior_orientation import Views
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Place, Whereabouts
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import Meeting, System
 from kgcp.quality.corrections import UNKNOWN_LIMITS, Estimate, estimate
 from kgcp.quality.robust_gls import ErrorModel, find_outliers, weighted_products
@@ -77,7 +77,7 @@ class Consistency:
 
 def study_consistency(
     sightings: Sequence[Sighting],
-    whereabouts: Whereabouts,
+    target_positions: TargetPositions,
     poses: ReferencePoses,
     camera: Camera,
 ) -> Consistency | None:
@@ -99,13 +99,15 @@ def study_consistency(
     Raises
     ------
     KgcpError
-        As `Whereabouts.places`.
+        As `TargetPositions.positions`.
     """
-    meetings = _meet(sightings, whereabouts, poses, camera)
-    if len(meetings) < MIN_POINTS or whereabouts.carrier is None:
+    meetings = _meet(sightings, target_positions, poses, camera)
+    if len(meetings) < MIN_POINTS or target_positions.vehicle is None:
         return None
-    views = Views.of(poses, whereabouts.frame)
-    equations = System.of(meetings, views, poses, camera, whereabouts.carrier.settings.sd_time_s)
+    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+    equations = System.of(
+        meetings, orientations, poses, camera, target_positions.vehicle.settings.sd_time_s
+    )
     outlier = find_outliers(
         -equations.design,
         equations.offset,
@@ -118,7 +120,7 @@ def study_consistency(
     fitted, correlation_s = _adjust(
         np.array([meeting.time_s for meeting in meetings]), equations, ~outlier
     )
-    settings = whereabouts.carrier.settings
+    settings = target_positions.vehicle.settings
     return Consistency(
         _discrepancies(meetings, equations, outlier, fitted, settings.time_offset_s),
         fitted,
@@ -158,7 +160,7 @@ def _adjust(time_s: FloatArray, equations: System, kept: BoolArray) -> tuple[Est
 
 def _meet(
     sightings: Sequence[Sighting],
-    whereabouts: Whereabouts,
+    target_positions: TargetPositions,
     poses: ReferencePoses,
     camera: Camera,
 ) -> list[Meeting]:
@@ -167,17 +169,22 @@ def _meet(
         sighting
         for sighting in sightings
         if not sighting.instance
-        and sighting.target not in whereabouts.static
+        and sighting.target not in target_positions.static
         and sighting.frame in rows
     ]
     if not moving:
         return []
     times = [sighting.row_time_s(camera) for sighting in moving]
-    places = whereabouts.places([sighting.target for sighting in moving], times)
+    positions = target_positions.positions([sighting.target for sighting in moving], times)
     meetings = [
-        Meeting(sighting, sighting.pose, time_s, place, place.ride, rows[sighting.frame])
-        for sighting, time_s, place in zip(moving, times, places, strict=True)
-        if isinstance(place, Place) and place.ride and sighting.pose and time_s is not None
+        Meeting(
+            sighting, sighting.pose, time_s, position, position.vehicle_state, rows[sighting.frame]
+        )
+        for sighting, time_s, position in zip(moving, times, positions, strict=True)
+        if isinstance(position, TargetPosition)
+        and position.vehicle_state
+        and sighting.pose
+        and time_s is not None
     ]
     return sorted(meetings, key=lambda meeting: (meeting.time_s, meeting.sighting.frame))
 

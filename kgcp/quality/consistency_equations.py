@@ -13,9 +13,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.exterior_orientation import Views
+from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Place, Ride
+from kgcp.georef.target_positions import TargetPosition, VehicleState
 
 _MODEL_SD_M = 0.001  # interpolation and rounding; keeps covariances regular
 _UNSTATED_SD_M = 0.01  # of what states none; the residuals set the scale then
@@ -33,7 +33,7 @@ class Meeting:
         Of the sighting, target → camera.
     time_s : float
         When the target's row was exposed, by the frames' clock, Unix UTC [s].
-    place : Place
+    position : TargetPosition
         By the vehicle.
     row : int
         Of the reference pose.
@@ -42,8 +42,8 @@ class Meeting:
     sighting: Sighting
     pose: Pose
     time_s: float
-    place: Place
-    ride: Ride
+    position: TargetPosition
+    vehicle_state: VehicleState
     row: int
 
 
@@ -80,59 +80,62 @@ class System:
     def of(
         cls,
         meetings: Sequence[Meeting],
-        views: Views,
+        orientations: ExteriorOrientations,
         poses: ReferencePoses,
         camera: Camera,
         sd_time_s: float,
     ) -> Self:
         """Set up the system of meetings, in their order in time."""
         rows = [meeting.row for meeting in meetings]
-        attitude = views.enu_from_camera[rows]
+        attitude = orientations.enu_from_camera[rows]
         in_camera = np.array([meeting.pose.translation_m for meeting in meetings])
         sight = np.einsum("nij,nj->ni", attitude, in_camera)
-        velocity = np.array([meeting.ride.velocity_m_s for meeting in meetings])
-        body = np.array([meeting.ride.frame_from_body for meeting in meetings])
+        velocity = np.array([meeting.vehicle_state.velocity_m_s for meeting in meetings])
+        body = np.array([meeting.vehicle_state.frame_from_body for meeting in meetings])
         since_middle = np.array(
             [meeting.sighting.rows_since_middle(camera) for meeting in meetings]
         )[:, None]
-        moved = _camera_velocity(meetings, views.centre_m[rows], velocity)
-        centre = views.centre_m[rows] + moved * since_middle * camera.readout_s
-        offset = np.array([meeting.place.position_m for meeting in meetings]) - centre - sight
+        moved = _camera_velocity(meetings, orientations.centre_m[rows], velocity)
+        centre = orientations.centre_m[rows] + moved * since_middle * camera.readout_s
+        offset = np.array([meeting.position.position_m for meeting in meetings]) - centre - sight
         columns = (velocity[:, :, None], body, (since_middle * (velocity - moved))[:, :, None])
         design = np.concatenate((*columns, attitude @ cross_matrix(in_camera)), axis=2)
-        fading = np.array([_fading_m2(meeting.place) for meeting in meetings])
-        white = _white_m2(meetings, views, poses, sight)
+        fading = np.array([_fading_m2(meeting.position) for meeting in meetings])
+        white = _white_m2(meetings, orientations, poses, sight)
         shift = sd_time_s * velocity
         white = white + shift[:, :, None] * shift[:, None, :]
         common_m = np.array([meeting.sighting.sd_common_distance_m or 0.0 for meeting in meetings])
         unit = sight / np.linalg.norm(sight, axis=1, keepdims=True)
         stated = (
-            all(meeting.place.cov_m2 is not None for meeting in meetings)
-            and views.cov_m2 is not None
+            all(meeting.position.cov_m2 is not None for meeting in meetings)
+            and orientations.cov_m2 is not None
         )
         return cls(
             offset, design, fading, white, unit * common_m[:, None], stated, _track(velocity, body)
         )
 
 
-def _fading_m2(place: Place) -> FloatArray:
-    if place.cov_m2 is None or place.common_m is None:
+def _fading_m2(position: TargetPosition) -> FloatArray:
+    if position.cov_m2 is None or position.common_m is None:
         return _UNSTATED_SD_M**2 * np.eye(3)
-    return place.cov_m2 - place.common_m @ place.common_m.T
+    return position.cov_m2 - position.common_m @ position.common_m.T
 
 
 def _white_m2(
-    meetings: Sequence[Meeting], views: Views, poses: ReferencePoses, sight: FloatArray
+    meetings: Sequence[Meeting],
+    orientations: ExteriorOrientations,
+    poses: ReferencePoses,
+    sight: FloatArray,
 ) -> FloatArray:
     """Return the covariance (n, 3, 3) of reference poses and measured poses, in ENU axes."""
     rows = [meeting.row for meeting in meetings]
-    attitude = views.enu_from_camera[rows]
+    attitude = orientations.enu_from_camera[rows]
     total = np.broadcast_to(_MODEL_SD_M**2 * np.eye(3), attitude.shape)
     measured = [meeting.sighting.pose_cov for meeting in meetings]
     of_pose = np.array([np.zeros((3, 3)) if cov is None else cov[:3, :3] for cov in measured])
     total = total + attitude @ of_pose @ np.swapaxes(attitude, 1, 2)
     unstated = _UNSTATED_SD_M**2 * np.eye(3)
-    total = total + (unstated if views.cov_m2 is None else views.cov_m2[rows])
+    total = total + (unstated if orientations.cov_m2 is None else orientations.cov_m2[rows])
     if poses.sd_angle_deg is not None:
         effect = cross_matrix(sight) * np.radians(poses.sd_angle_deg[rows])[:, None, None]
         total = total + effect @ np.swapaxes(effect, 1, 2)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.measurement.adjustment.residual_image import Residuals
+from kgcp.measurement.adjustment.residual_image import ResidualImage
 
 FULL_SCALE = 0.1
 """Residuals, in shares of the contrast, that have the full colour."""
@@ -46,14 +46,14 @@ class RingView:
         Of its outer edge [px].
     curves : sequence of (m, 2) array
         Contours, fitted or of the outline that was dropped [px].
-    residuals : Residuals or None
+    residual_image : ResidualImage or None
         What the fit leaves; None: there is no fit.
     """
 
     centre_px: FloatArray
     radius_px: float
     curves: Sequence[FloatArray]
-    residuals: Residuals | None = None
+    residual_image: ResidualImage | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def draw_ring(grey: GreyArray, view: RingView) -> Pictures:
     """
     cut = _Cut.around(view, _REACH)
     plain = _stretched(cut.of(grey, math.nan))
-    beside = plain if view.residuals is None else _coloured(view.residuals, cut)
+    beside = plain if view.residual_image is None else _coloured(view.residual_image, cut)
     picture, thumbnail = (
         _encoded(np.hstack((_with_contours(_sized(plain, size), cut, view), _sized(beside, size))))
         for size in (PICTURE_PX, THUMBNAIL_PX)
@@ -138,9 +138,9 @@ def _stretched(cut: FloatArray) -> _Picture:
     return picture
 
 
-def _coloured(residuals: Residuals, cut: _Cut) -> _Picture:
-    moved = _Cut(cut.x0 - residuals.x0, cut.y0 - residuals.y0, cut.side)
-    share = moved.of(residuals.share, math.nan)
+def _coloured(residual_image: ResidualImage, cut: _Cut) -> _Picture:
+    moved = _Cut(cut.x0 - residual_image.x0, cut.y0 - residual_image.y0, cut.side)
+    share = moved.of(residual_image.share, math.nan)
     strength = np.nan_to_num(np.minimum(np.abs(share) / FULL_SCALE, 1.0))[:, :, None]
     ink = np.where(share[:, :, None] > 0.0, _BRIGHTER, _DARKER)
     picture = np.rint(255.0 + strength * (ink - 255.0)).astype(np.uint8)
@@ -158,7 +158,7 @@ def _sized(picture: _Picture, size: int) -> _Picture:
 
 
 def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
-    colour = _DROPPED if view.residuals is None else _FITTED
+    colour = _DROPPED if view.residual_image is None else _FITTED
     arm = np.array([0.03 * cut.side, 0.0])
     cross = [view.centre_px + np.array([-tip, tip]) for tip in (arm, arm[::-1])]
     for lines, ink in ((view.curves, colour), (cross, _CENTRE)):

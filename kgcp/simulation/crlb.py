@@ -19,7 +19,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.patch import Patch, PixelWindow, outline_box
 from kgcp.simulation.plate import Plate
 from kgcp.simulation.shapes import Disc
 
@@ -91,10 +91,10 @@ def bound_of(shot: Shot) -> Bound:
     weight = np.sqrt(_information(view, share))
     nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view, white, share)])
     pose = weight[:, None] * _pose_derivatives(view)
-    return _in_words(shot.camera, shot.pose, pose_covariance(pose, nuisances))
+    return _in_words(shot.camera, shot.pose, pose_bound(pose, nuisances))
 
 
-def pose_covariance(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
+def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
     """Return the inverse (6, 6) of the information about the pose that the nuisances leave.
 
     Parameters
@@ -117,7 +117,7 @@ class _View:
     """A window on the plate: how much white every pixel sees, 0 (ink) … 1."""
 
     shot: Shot
-    window: Window
+    window: PixelWindow
 
     def white(self, pose: Pose) -> FloatArray:
         """Return the share of white in the sub-pixels, on a plate without end."""
@@ -155,14 +155,14 @@ class _View:
         return int(np.clip(self.shot.sub_pixels // longest, 2, 8))
 
 
-def _ring_window(shot: Shot) -> Window:
+def _ring_window(shot: Shot) -> PixelWindow:
     """Return the window with everything that the edges of the main ring send light to."""
     edge = Disc((0.0, 0.0), 0.5 * shot.plate.target.ring.outer_diameter_m)
     corner, size = outline_box(shot.camera, shot.pose, edge)
     margin = shot.optics.reach_px
     column, row = np.floor(corner).astype(int) - margin
     width, height = np.ceil(size).astype(int) + 2 * margin + 2
-    return Window(int(column), int(row), int(width), int(height))
+    return PixelWindow(int(column), int(row), int(width), int(height))
 
 
 def _information(view: _View, share: FloatArray) -> FloatArray:

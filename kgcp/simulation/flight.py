@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.pose import Pose
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
 from kgcp.simulation.ground import Ground
@@ -132,11 +132,11 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
     The same settings and seed give the same plan. Random numbers come from one stream per
     purpose and frame, so that a frame does not depend on the others.
     """
-    map_frame = MapFrame.at(CRS, ORIGIN_MAP)
+    local_frame = LocalFrame.at(CRS, ORIGIN_MAP)
     rng = _stream(seed, "survey")
     lever_arm_m = LEVER_ARM_M + settings.sd_lever_arm_m * rng.standard_normal(3)
     elapsed_s = _LEAD_S + np.linspace(0.0, 1.0, settings.frames) * _duration_s(settings)
-    frames = _plan_frames(settings, seed, map_frame, elapsed_s, lever_arm_m)
+    frames = _plan_frames(settings, seed, local_frame, elapsed_s, lever_arm_m)
     names = tuple(frame_name(settings, index) for index in range(settings.frames))
     cameras = tuple(frame.camera for frame in frames)
     trajectory_s = _duration_s(settings) + 2.0 * _LEAD_S
@@ -144,7 +144,7 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
         settings,
         seed,
         frames,
-        map_frame.map_from_enu(np.array([frame.target_enu_m for frame in frames])),
+        local_frame.map_from_enu(np.array([frame.target_enu_m for frame in frames])),
         np.array([_middle_row_time_s(settings, frame) for frame in frames])
         + settings.sd_time_s * rng.standard_normal(settings.frames),
         VehicleSettings(
@@ -152,8 +152,8 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
             sd_lever_arm_m=(settings.sd_lever_arm_m,) * 3,
             sd_time_s=settings.sd_time_s,
         ),
-        record_trajectory(settings, map_frame, START_S, trajectory_s, rng),
-        adjust_reference(settings, map_frame, names, cameras, rng),
+        record_trajectory(settings, local_frame, START_S, trajectory_s, rng),
+        adjust_reference(settings, local_frame, names, cameras, rng),
     )
 
 
@@ -224,12 +224,12 @@ def _duration_s(settings: SimulationSettings) -> float:
 def _plan_frames(
     settings: SimulationSettings,
     seed: int,
-    map_frame: MapFrame,
+    local_frame: LocalFrame,
     elapsed_s: FloatArray,
     lever_arm_m: FloatArray,
 ) -> tuple[FramePlan, ...]:
     states = drive(elapsed_s)
-    enu_from_body = map_frame.level_rotations(states.position_enu_m) @ states.level_from_body
+    enu_from_body = local_frame.level_rotations(states.position_enu_m) @ states.level_from_body
     target_enu_m = states.position_enu_m + enu_from_body @ lever_arm_m
     absent = _share_of(settings.frames, settings.absent_share, _stream(seed, "absent"))
     decoy = _share_of(settings.frames, settings.decoy_share, _stream(seed, "decoy"))

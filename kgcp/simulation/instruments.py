@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.simulation.path import CameraState, drive
 from kgcp.simulation.presets import SimulationSettings
@@ -19,7 +19,7 @@ _CORRELATION_S = 4.0  # of trajectory errors: neighbouring epochs share them, as
 
 def record_trajectory(
     settings: SimulationSettings,
-    map_frame: MapFrame,
+    local_frame: LocalFrame,
     start_s: float,
     duration_s: float,
     rng: np.random.Generator,
@@ -29,7 +29,7 @@ def record_trajectory(
     Parameters
     ----------
     settings : SimulationSettings
-    map_frame : MapFrame
+    local_frame : LocalFrame
     start_s : float
         Unix time of the first sample [s].
     duration_s : float
@@ -38,7 +38,7 @@ def record_trajectory(
     """
     elapsed_s = np.arange(0.0, duration_s + _TRAJECTORY_INTERVAL_S, _TRAJECTORY_INTERVAL_S)
     states = drive(elapsed_s)
-    position_map = map_frame.map_from_enu(states.position_enu_m)
+    position_map = local_frame.map_from_enu(states.position_enu_m)
     attitude_deg = np.column_stack((states.roll_deg, states.pitch_deg, states.heading_deg))
     errors = _gauss_markov(rng, len(elapsed_s), 6)
     attitude_deg += errors[:, 3:] * settings.sd_attitude_deg
@@ -62,7 +62,7 @@ def _gauss_markov(rng: np.random.Generator, count: int, columns: int) -> FloatAr
 
 def adjust_reference(
     settings: SimulationSettings,
-    map_frame: MapFrame,
+    local_frame: LocalFrame,
     frames: tuple[str, ...],
     cameras: tuple[CameraState, ...],
     rng: np.random.Generator,
@@ -72,7 +72,7 @@ def adjust_reference(
     Parameters
     ----------
     settings : SimulationSettings
-    map_frame : MapFrame
+    local_frame : LocalFrame
     frames : tuple of str
         Names of the frames.
     cameras : tuple of CameraState
@@ -82,7 +82,7 @@ def adjust_reference(
     position_enu_m = np.array([camera.position_enu_m for camera in cameras])
     grid_from_camera = np.array(
         [
-            map_frame.grid_rotation(camera.position_enu_m).T @ camera.enu_from_camera
+            local_frame.grid_rotation(camera.position_enu_m).T @ camera.enu_from_camera
             for camera in cameras
         ]
     )
@@ -94,7 +94,7 @@ def adjust_reference(
     error_m = settings.sd_reference_m * rng.standard_normal((n, 3))
     return ReferencePoses(
         frames=frames,
-        position_map=map_frame.map_from_enu(position_enu_m) + error_m,
+        position_map=local_frame.map_from_enu(position_enu_m) + error_m,
         opk_deg=opk_from_rotation(rotation.as_matrix()),
         sd_position_m=np.full((n, 3), settings.sd_reference_m),
         sd_angle_deg=np.full(n, settings.sd_reference_deg),

@@ -14,7 +14,7 @@ from kgcp.simulation.shapes import Shape
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class PixelWindow:
     """A rectangle of whole pixels; it may reach beyond the frame.
 
     Attributes
@@ -38,12 +38,12 @@ class Window:
         """Whether the window is wider or higher than the camera's frame."""
         return self.width > camera.width or self.height > camera.height
 
-    def near(self, camera: Camera, margin_px: int) -> Window:
+    def near(self, camera: Camera, margin_px: int) -> PixelWindow:
         """Return the part of the window that is at most `margin_px` outside the camera's frame."""
         column, row = max(self.column, -margin_px), max(self.row, -margin_px)
         last_column = min(self.column + self.width, camera.width + margin_px)
         last_row = min(self.row + self.height, camera.height + margin_px)
-        return Window(column, row, last_column - column, last_row - row)
+        return PixelWindow(column, row, last_column - column, last_row - row)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class Patch:
     camera : Camera
     pose : Pose
         Plane → camera; the plane is z = 0.
-    window : Window
+    window : PixelWindow
     oversampling : int
         Sub-pixels per pixel and axis.
     x_m, y_m : (height · oversampling, width · oversampling) arrays
@@ -64,13 +64,13 @@ class Patch:
 
     camera: Camera
     pose: Pose
-    window: Window
+    window: PixelWindow
     oversampling: int
     x_m: FloatArray
     y_m: FloatArray
 
     @classmethod
-    def of(cls, camera: Camera, pose: Pose, window: Window, oversampling: int = 1) -> Patch:
+    def of(cls, camera: Camera, pose: Pose, window: PixelWindow, oversampling: int = 1) -> Patch:
         """Cast rays through the distorted camera onto the plane of `pose`."""
         columns = _sub_pixels(window.column, window.width, oversampling)
         rows = _sub_pixels(window.row, window.height, oversampling)

@@ -30,7 +30,7 @@ _ENU_FROM_NADIR = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CarrierStates:
+class VehicleStates:
     """The vehicle at n times.
 
     Attributes
@@ -55,7 +55,7 @@ class CarrierStates:
         return attitude
 
 
-def drive(elapsed_s: FloatArray) -> CarrierStates:
+def drive(elapsed_s: FloatArray) -> VehicleStates:
     """Return the vehicle at times (n,) since the start [s].
 
     It follows the ring road anticlockwise at a slowly changing speed, over gentle waves of the
@@ -68,7 +68,7 @@ def drive(elapsed_s: FloatArray) -> CarrierStates:
     position = np.column_stack(
         (ROAD_RADIUS_M * np.cos(angle), ROAD_RADIUS_M * np.sin(angle), height_m)
     )
-    return CarrierStates(
+    return VehicleStates(
         position,
         roll_deg=1.1 * np.sin(0.43 * elapsed_s) + 0.4,
         pitch_deg=np.degrees(np.arctan(slope)) + 0.5 * np.sin(0.61 * elapsed_s),

@@ -12,7 +12,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.light_field import LightField
-from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.patch import Patch, PixelWindow, outline_box
 from kgcp.simulation.shapes import ConvexPolygon, Disc, Shape
 from kgcp.targets.layout import Ring, Target
 
@@ -55,14 +55,14 @@ class PlateImage:
 
     Attributes
     ----------
-    window : Window
+    window : PixelWindow
     opacity : (height, width) array
         How much of what lies behind the plate is hidden, 0…1.
     irradiance : (height, width) array
         Light that comes from the plate.
     """
 
-    window: Window
+    window: PixelWindow
     opacity: FloatArray
     irradiance: FloatArray
 
@@ -96,25 +96,27 @@ class ExpectedWindow:
 
     Attributes
     ----------
-    window : Window
+    window : PixelWindow
     grey : (height, width) array
         0…255, not rounded.
     variance : (height, width) array
         Of the grey values, rounding included.
     """
 
-    window: Window
+    window: PixelWindow
     grey: FloatArray
     variance: FloatArray
 
 
-def plate_window(camera: Camera, plate: Plate, pose: Pose, optics: Optics) -> Window:
+def plate_window(camera: Camera, plate: Plate, pose: Pose, optics: Optics) -> PixelWindow:
     """Return the window that holds everything the plate sends light to."""
     corner, size = outline_box(camera, pose, plate.outline)
     margin = optics.reach_px
     column, row = np.floor(corner).astype(int) - margin
     last_column, last_row = np.ceil(corner + size).astype(int) + margin
-    return Window(int(column), int(row), int(last_column - column) + 1, int(last_row - row) + 1)
+    return PixelWindow(
+        int(column), int(row), int(last_column - column) + 1, int(last_row - row) + 1
+    )
 
 
 def image_plate(
@@ -122,7 +124,7 @@ def image_plate(
     plate: Plate,
     pose: Pose,
     optics: Optics,
-    window: Window | None = None,
+    window: PixelWindow | None = None,
     field: LightField | None = None,
 ) -> PlateImage:
     """Ray-cast a plate through the full distorted camera.
@@ -134,7 +136,7 @@ def image_plate(
     pose : Pose
         Target → camera.
     optics : Optics
-    window : Window, optional
+    window : PixelWindow, optional
         Where to look; default: everything that the plate sends light to.
     field : LightField, optional
         Default: the same light everywhere.
@@ -167,7 +169,7 @@ def expected_window(
     gain: float,
     *,
     background: float = 0.2,
-    window: Window | None = None,
+    window: PixelWindow | None = None,
 ) -> ExpectedWindow:
     """Return what a frame shows of a plate without noise, and the variance of the noise.
 
@@ -183,7 +185,7 @@ def expected_window(
         Exposure relative to the one at which radiance 1 fills the well.
     background : float
         Radiance around the plate.
-    window : Window, optional
+    window : PixelWindow, optional
         Default: everything that the plate sends light to.
     """
     image = image_plate(camera, plate, pose, optics, window)

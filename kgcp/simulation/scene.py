@@ -13,7 +13,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import LightField
-from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.patch import Patch, PixelWindow, outline_box
 from kgcp.simulation.plate import Plate, image_plate, plate_window
 from kgcp.simulation.shapes import Annulus, ConvexPolygon, Disc, Shape, polygon, rectangle
 
@@ -62,7 +62,7 @@ def render_irradiance(
     Everything but the plates is painted at one ray per pixel (with exact coverage at edges) and
     then spread; the plates are painted on fine sub-pixels and lie over it.
     """
-    patch = Patch.of(camera, scene.ground, Window(0, 0, camera.width, camera.height))
+    patch = Patch.of(camera, scene.ground, PixelWindow(0, 0, camera.width, camera.height))
     light = ground.radiance(patch)
     _scatter_clutter(patch, light, rng)
     if scene.carrier is not None:
@@ -139,6 +139,6 @@ def _paint_plane(
     if np.any(last - first < 2):
         return
     width, height = (int(extent) for extent in last - first)
-    window = Window(int(first[0]), int(first[1]), width, height)
+    window = PixelWindow(int(first[0]), int(first[1]), width, height)
     piece = light[window.row : window.row + height, window.column : window.column + width]
     Patch.of(frame.camera, pose, window).paint(piece, shape, value)

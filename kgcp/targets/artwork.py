@@ -9,7 +9,18 @@ from dataclasses import dataclass
 from kgcp.errors import SettingError
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.rulers import across, down, ruler_mm
-from kgcp.targets.shapes import Area, Artwork, Box, Circle, Disc, Layer, Line, Point, Shape, Text
+from kgcp.targets.shapes import (
+    Area,
+    Artwork,
+    Box,
+    Circle,
+    FilledCircle,
+    Layer,
+    Line,
+    Point,
+    Shape,
+    Text,
+)
 
 MARGIN = 0.125
 """White around the ring, of its diameter: the search looks at 0.08, blur and tilt take some."""
@@ -22,7 +33,7 @@ _LEGEND_FROM, _LEGEND_TO = 190.0, 800.0  # widths between which the legend grows
 
 
 @dataclass(frozen=True, slots=True)
-class Plate:
+class MountingPlate:
     """What the target is mounted on.
 
     Attributes
@@ -63,7 +74,7 @@ def margin_radius_mm(target: Target) -> float:
     return 1e3 * target.ring.outer_diameter_m * (0.5 + MARGIN)
 
 
-def draw_target(target: Target, plate: Plate | None) -> Artwork:
+def draw_target(target: Target, plate: MountingPlate | None) -> Artwork:
     """Return a target with its legend, on its plate if there is one.
 
     Raises
@@ -89,7 +100,7 @@ def draw_target(target: Target, plate: Plate | None) -> Artwork:
     return Artwork(tuple(shapes), Box(box.left, box.top, box.right, bottom))
 
 
-def _check_plate(plate: Plate, radius_mm: float) -> None:
+def _check_plate(plate: MountingPlate, radius_mm: float) -> None:
     if 0.5 * plate.width_mm < radius_mm:
         raise SettingError(
             "plate",
@@ -107,13 +118,13 @@ def _check_plate(plate: Plate, radius_mm: float) -> None:
 
 
 def _draw_ring(ring: Ring) -> Iterator[Shape]:
-    yield Disc(Layer.INK, (0.0, 0.0), 500.0 * ring.outer_diameter_m)
-    yield Disc(Layer.WHITE, (0.0, 0.0), 500.0 * ring.inner_diameter_m)
+    yield FilledCircle(Layer.INK, (0.0, 0.0), 500.0 * ring.outer_diameter_m)
+    yield FilledCircle(Layer.WHITE, (0.0, 0.0), 500.0 * ring.inner_diameter_m)
     for x, y in 1e3 * ring.dot_centres_m():
-        yield Disc(Layer.WHITE, (float(x), float(y)), 500.0 * ring.dot_diameter_m)
+        yield FilledCircle(Layer.WHITE, (float(x), float(y)), 500.0 * ring.dot_diameter_m)
 
 
-def _draw_plate(plate: Plate) -> Iterator[Shape]:
+def _draw_plate(plate: MountingPlate) -> Iterator[Shape]:
     if plate.is_round:
         yield Circle(Layer.PLATE, (0.0, 0.0), 0.5 * plate.width_mm)
     else:
@@ -130,7 +141,7 @@ def _draw_plate(plate: Plate) -> Iterator[Shape]:
     yield from _axes(plate)
 
 
-def _plate_name(target: Target, plate: Plate, radius_mm: float) -> Iterator[Text]:
+def _plate_name(target: Target, plate: MountingPlate, radius_mm: float) -> Iterator[Text]:
     """Yield what stays on a square plate once it is cut, where there is room for it."""
     unit, half = _unit(plate.width_mm), 0.5 * plate.width_mm
     aside = 2.0 * plate.inset_mm if plate.hole_mm else 4.0 * unit
@@ -143,7 +154,7 @@ def _plate_name(target: Target, plate: Plate, radius_mm: float) -> Iterator[Text
         yield Text(words, (aside - half, baseline), size, room)
 
 
-def _axes(plate: Plate) -> Iterator[Line]:
+def _axes(plate: MountingPlate) -> Iterator[Line]:
     """Yield short lines outside the plate that point at its centre."""
     near = 0.5 * plate.width_mm + _CROP_START * _unit(plate.width_mm)
     far = 0.5 * plate.width_mm + _CROP_END * _unit(plate.width_mm)
@@ -167,7 +178,7 @@ def _up_mark(box: Box, radius_mm: float) -> Area:
     return _arrow(box.left + 0.5 * height, box.top, height)
 
 
-def _up_mark_on(plate: Plate) -> Area:
+def _up_mark_on(plate: MountingPlate) -> Area:
     """Return an arrow above the plate, at the end of its axis."""
     unit = _unit(plate.width_mm)
     return _arrow(4.0 * unit, -0.5 * plate.width_mm - _CROP_END * unit, 6.0 * unit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kgcp.targets.shapes import Box, Layer, Line, Point, Shape, Text, rectangle
+from kgcp.targets.shapes import Box, Layer, Line, Point, Shape, Text, filled_rectangle
 
 _LENGTHS_MM = (1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0)
 _PIECES = 10
@@ -23,7 +23,7 @@ def across(corner: Point, length_mm: float, unit: float, *, is_marked: bool = Tr
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - thick, x + length_mm, y)
     shapes: list[Shape] = [
-        rectangle(Layer.RULER, Box(x + i * step, outline.top, x + (i + 1) * step, y))
+        filled_rectangle(Layer.RULER, Box(x + i * step, outline.top, x + (i + 1) * step, y))
         for i in range(0, _PIECES, 2)
     ]
     shapes.append(_frame(outline))
@@ -43,7 +43,7 @@ def down(corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - length_mm, x + thick, y)
     shapes: list[Shape] = [
-        rectangle(Layer.RULER, Box(x, y - (i + 1) * step, outline.right, y - i * step))
+        filled_rectangle(Layer.RULER, Box(x, y - (i + 1) * step, outline.right, y - i * step))
         for i in range(0, _PIECES, 2)
     ]
     shapes.append(_frame(outline))

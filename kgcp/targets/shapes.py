@@ -30,7 +30,7 @@ class Layer(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Disc:
+class FilledCircle:
     """A filled circle."""
 
     layer: Layer
@@ -84,7 +84,7 @@ class Text:
     is_bold: bool = False
 
 
-Shape = Disc | Circle | Line | Area | Text
+Shape = FilledCircle | Circle | Line | Area | Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class Box:
         return float((dx * dx + dy * dy) ** 0.5)
 
 
-def rectangle(layer: Layer, box: Box) -> Area:
+def filled_rectangle(layer: Layer, box: Box) -> Area:
     """Return a filled box."""
     return Area(layer, box.corners)
 

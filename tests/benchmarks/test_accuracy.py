@@ -17,7 +17,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.report.bias.reexposure import reexposed
 from kgcp.settings import DetectSettings
-from kgcp.simulation.crlb import censored_information, pose_covariance
+from kgcp.simulation.crlb import censored_information, pose_bound
 from kgcp.simulation.flight import TARGET_PLATE, FramePlan, plan_flight
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.presets import SimulationSettings, preset
@@ -48,7 +48,7 @@ def test_unknowns_of_no_interest_cost_what_the_whole_inverse_says() -> None:
     whole = np.column_stack((pose, nuisances))
     expected = np.linalg.inv(whole.T @ whole)[:6, :6]
     with_idle = np.column_stack((nuisances, np.zeros(200)))
-    np.testing.assert_allclose(pose_covariance(pose, with_idle), expected, rtol=1e-8)
+    np.testing.assert_allclose(pose_bound(pose, with_idle), expected, rtol=1e-8)
 
 
 def frame_of_even_noise(distance_m: float) -> tuple[SimulationSettings, FramePlan]:

@@ -14,7 +14,7 @@ from benchmarks.search import false_alarms, hard_frames
 from benchmarks.search.plates import DECOYS, TARGET_A, TARGETS
 from benchmarks.search.scene import Shot, radius_px, stream, tilt_deg
 from benchmarks.search.sets import SETS, SETS_BY_NAME
-from benchmarks.search.verdict import judge, wilson
+from benchmarks.search.verdict import judge_frame, wilson
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose, image_heading_deg
@@ -113,20 +113,22 @@ def observed(shot: Shot, seen: PlatePose, pose: Pose | None = None) -> Measureme
 def test_the_judge_tells_found_missed_off_and_wrong_apart() -> None:
     shot = next(shot for shot in shots("two_targets") if len(shot.wanted) == 2)
     first, second = shot.wanted
-    right = judge(0, shot, [observed(shot, first), observed(shot, second)])
+    right = judge_frame(0, shot, [observed(shot, first), observed(shot, second)])
     assert (right.wanted, right.found, right.wrong) == (2, 2, ())
     reason = Reason.NO_CANDIDATE
-    missed = judge(0, shot, [observed(shot, first), Miss(second.plate.target.name, reason)])
+    missed = judge_frame(0, shot, [observed(shot, first), Miss(second.plate.target.name, reason)])
     assert (missed.found, missed.missed[0][0]) == (1, "no_candidate")
     far = Pose(first.pose.rotation, 1.03 * first.pose.translation_m)
     for badly in (far, first.pose.turned(35.0)):
-        off = judge(0, shot, [observed(shot, first, badly), observed(shot, second)])
+        off = judge_frame(0, shot, [observed(shot, first, badly), observed(shot, second)])
         assert (off.found, len(off.off), off.wrong) == (1, 1, ())
     swapped = observed(shot, first, second.pose)
-    wrong = judge(0, shot, [swapped, observed(shot, second)])
+    wrong = judge_frame(0, shot, [swapped, observed(shot, second)])
     assert (wrong.found, len(wrong.missed), len(wrong.wrong)) == (1, 1, 1)
     assert wrong.wrong[0][0] == second.plate.target.name
-    twice = judge(0, shot, [observed(shot, first), observed(shot, first), observed(shot, second)])
+    twice = judge_frame(
+        0, shot, [observed(shot, first), observed(shot, first), observed(shot, second)]
+    )
     assert (twice.found, len(twice.wrong)) == (2, 1)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kgcp.cli.detect_log import log_to_stderr, report
-from kgcp.pipeline.run_summary import Tally
+from kgcp.pipeline.run_summary import SummaryBuilder
 
 
 def test_a_wait_is_explained_until_a_frame_is_done(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,7 +52,7 @@ def test_the_bar_begins_anew_with_every_stage() -> None:
 def test_a_speed_is_told_of_frames_that_were_worked_on(
     kept: int, speed: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    summary = Tally({}).summary(
+    summary = SummaryBuilder({}).summary(
         table=tmp_path,
         kept=kept,
         frames_without_attitude=0,

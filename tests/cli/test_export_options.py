@@ -14,11 +14,11 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.columns import time_cell
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
-from kgcp.io.tables.gcps import KGCP_COLUMNS
+from kgcp.io.tables.gcps import GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
 
 _TOML = """\
@@ -48,7 +48,7 @@ lever_arm_m = [0.0, 0.0, -2.0]
 poses = "reference.csv"
 """
 _ORIGIN = np.array([430606.1, 4583523.0, 120.0])
-_FRAME = MapFrame.at("EPSG:25831", _ORIGIN)
+_LOCAL_FRAME = LocalFrame.at("EPSG:25831", _ORIGIN)
 _UNIX_S, _LATE_S, _FRAMES = 1777887000.0, 0.025, 40
 _NULL_ROW: dict[str, object] = {column.name: None for column in DETECTION_COLUMNS}
 
@@ -57,7 +57,7 @@ def _drive(time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Positions (n, 3) in the map and headings [deg], with some 12 m/s."""
     angle = (12.0 * time_s + 10.0 * np.sin(0.3 * time_s)) / 60.0
     enu = 60.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
-    return _FRAME.map_from_enu(enu), -np.degrees(angle)
+    return _LOCAL_FRAME.map_from_enu(enu), -np.degrees(angle)
 
 
 @pytest.fixture
@@ -89,8 +89,8 @@ def folder(tmp_path: Path) -> Path:
 
 def _in_camera(camera: FloatArray, target: FloatArray) -> FloatArray:
     """The target in a camera that looks down with the grid's north up."""
-    ends = _FRAME.enu_from_map(np.array([camera, target]))
-    grid = _FRAME.grid_rotation(ends[0])
+    ends = _LOCAL_FRAME.enu_from_map(np.array([camera, target]))
+    grid = _LOCAL_FRAME.grid_rotation(ends[0])
     sight: FloatArray = np.diag([1.0, -1.0, -1.0]) @ grid.T @ (ends[1] - ends[0])
     return sight
 
@@ -159,7 +159,7 @@ def test_jumps_are_left_out_counted_and_may_be_kept(folder: Path) -> None:
     assert summary["kgcps"] == _FRAMES - 1
     result = _export(folder, "--keep-flagged")
     assert f"{_FRAMES} KGCPs, 0 sightings left out" in result.stderr
-    table = read_table(folder / "kgcp" / "kgcps.parquet", KGCP_COLUMNS)
+    table = read_table(folder / "kgcp" / "kgcps.parquet", GCP_COLUMNS)
     assert list(table.loc[table["flag"] != "", "frame"]) == ["f_20.jpg"]
     with (folder / "kgcp" / "kgcps.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -173,7 +173,7 @@ def test_gates_spacing_and_check_points(folder: Path) -> None:
     summary = json.loads(_export(folder, *options).stdout)
     assert summary["skipped"]["low_score"] == 1
     assert summary["skipped"]["too_close"] > 10
-    table = read_table(folder / "kgcp" / "kgcps.parquet", KGCP_COLUMNS)
+    table = read_table(folder / "kgcp" / "kgcps.parquet", GCP_COLUMNS)
     assert len(table) == summary["kgcps"]
     assert (table["role"] == "check").sum() == round(0.25 * len(table)) == summary["checkpoints"]
     steps = np.linalg.norm(np.diff(table[["x", "y"]].to_numpy(), axis=0), axis=1)
@@ -190,14 +190,14 @@ def test_gates_spacing_and_check_points(folder: Path) -> None:
 def test_points_in_another_crs_are_the_same_places(folder: Path) -> None:
     _export(folder)
     path = folder / "kgcp" / "kgcps.parquet"
-    here = read_table(path, KGCP_COLUMNS)
+    here = read_table(path, GCP_COLUMNS)
     _export(folder, "--crs", "EPSG:4326")
-    there = read_table(path, KGCP_COLUMNS)
+    there = read_table(path, GCP_COLUMNS)
     assert pq.read_schema(path).metadata[b"kgcp.crs"] == b"EPSG:4326"
     assert there["x"].between(2.16, 2.18).all()  # longitude first
     degrees = there[["x", "y", "z"]].to_numpy()
-    world = MapFrame.at("EPSG:4326", degrees[0])
-    local = MapFrame.at("EPSG:25831", here[["x", "y", "z"]].to_numpy()[0])
+    world = LocalFrame.at("EPSG:4326", degrees[0])
+    local = LocalFrame.at("EPSG:25831", here[["x", "y", "z"]].to_numpy()[0])
     np.testing.assert_allclose(
         world.enu_from_map(degrees),
         local.enu_from_map(here[["x", "y", "z"]].to_numpy()),

@@ -19,7 +19,7 @@ from click.testing import CliRunner, Result
 from kgcp.cli import main
 from kgcp.io.tables.columns import time_cell
 from kgcp.io.tables.detections import DETECTION_COLUMNS
-from kgcp.io.tables.gcps import BIAS_COLUMNS, KGCP_COLUMNS
+from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
 from kgcp.report.bias.reexposure import Reexposed
 
@@ -145,7 +145,7 @@ def test_export_writes_the_contracts_table_and_the_formats(flight: FlightFolder)
         "gcp_list.txt",
         "HOWTO.txt",
     ]
-    table = read_table(flight.out / "kgcps.parquet", KGCP_COLUMNS)
+    table = read_table(flight.out / "kgcps.parquet", GCP_COLUMNS)
     assert list(table["id"]) == ["K0001", "K0002", "K0003", "K0004", "K0006"]  # by frame number
     expected = _START + np.outer([0, 1, 2, 3, 5], [10.0, 0.0, 0.0]) + [0.0, 0.0, 2.0]
     np.testing.assert_allclose(table[["x", "y", "z"]].to_numpy(), expected, atol=2e-4)
@@ -159,7 +159,7 @@ def test_plain_csv_agrees_with_the_table(flight: FlightFolder) -> None:
     assert not (flight.out / "gcp_list.txt").exists()
     with (flight.out / "kgcps.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    table = read_table(flight.out / "kgcps.parquet", KGCP_COLUMNS)
+    table = read_table(flight.out / "kgcps.parquet", GCP_COLUMNS)
     for name in ("x", "y", "z", "sd_x", "distance_m", "x_px", "sd_y_px"):
         np.testing.assert_allclose([float(row[name]) for row in rows], table[name], rtol=1e-4)
     assert float(rows[0]["x"]) == pytest.approx(table["x"][0], abs=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, down_in_camera, rotation_from_opk
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 
 
 @pytest.mark.parametrize(
@@ -19,9 +19,9 @@ from kgcp.georef.local_frame import MapFrame
 )
 def test_down_is_the_local_vertical_of_any_map(crs: str, origin: tuple[float, ...]) -> None:
     opk_deg = np.array([[3.0, -8.0, 71.0], [-12.0, 1.0, -160.0]])
-    frame = MapFrame.at(crs, np.array(origin))
+    local_frame = LocalFrame.at(crs, np.array(origin))
     camera_from_enu = CAMERA_FROM_PHOTO @ np.swapaxes(
-        frame.grid_rotation(np.zeros(3)) @ rotation_from_opk(opk_deg), 1, 2
+        local_frame.grid_rotation(np.zeros(3)) @ rotation_from_opk(opk_deg), 1, 2
     )
     expected = camera_from_enu @ np.array([0.0, 0.0, -1.0])
     assert np.allclose(down_in_camera(opk_deg), expected, atol=1e-8)

@@ -20,10 +20,10 @@ from kgcp.georef.camera_priors import (
     opk_covs,
     opk_deg,
 )
-from kgcp.georef.gcp import build_kgcps
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.gcp import build_gcps
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Carrier, Whereabouts
+from kgcp.georef.target_positions import TargetPosition, TargetPositions, Vehicle
 from kgcp.georef.trajectory import Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Ring, Target
@@ -36,7 +36,7 @@ _OPK = np.array([4.0, -7.0, 33.0])
 _CRS = "EPSG:25831"
 _START = np.array([290000.0, 4583523.0, 120.0])  # 2.5° off the meridian: 1.7° of convergence
 _SD_POSITION, _SD_RPY_DEG = np.array([0.02, 0.03, 0.05]), np.array([0.1, 0.2, 0.4])
-_FRAME = MapFrame.at(_CRS, _START)
+_LOCAL_FRAME = LocalFrame.at(_CRS, _START)
 _POSE_COV = np.diag([0.004, 0.003, 0.02, 0.006, 0.008, 0.002]) ** 2
 
 
@@ -45,30 +45,30 @@ def _settings(**changes: object) -> VehicleSettings:
     return replace(base, **changes)  # type: ignore[arg-type] # keywords of a test
 
 
-def _whereabouts(settings: VehicleSettings, rpy: FloatArray, offset: FloatArray) -> Whereabouts:
+def _whereabouts(settings: VehicleSettings, rpy: FloatArray, offset: FloatArray) -> TargetPositions:
     time_s = np.arange(0.0, 2.01, 0.1)
     position = _START + offset + np.outer(time_s, [7.0, 3.0, 0.0])
     every = np.ones((len(time_s), 1))
     trajectory = Trajectory(
         time_s, position, every * rpy, every * _SD_POSITION, every * _SD_RPY_DEG
     )
-    return Whereabouts(_FRAME, {}, Carrier.on(trajectory, settings, _FRAME))
+    return TargetPositions(_LOCAL_FRAME, {}, Vehicle.on(trajectory, settings, _LOCAL_FRAME))
 
 
 def _scene(settings: VehicleSettings) -> tuple[FloatArray, FloatArray, Sighting]:
     """The camera's map position and attitude (camera → grid), and the plate as it is seen."""
-    frame = _FRAME
-    whereabouts = _whereabouts(settings, _RPY, np.zeros(3))
-    place = whereabouts.places(["A"], [1.0])[0]
-    plate_map = frame.map_from_enu(
-        frame.enu_from_map(whereabouts.frame.map_from_enu(place.position_m[None]))  # type: ignore[union-attr] # the time is inside
-    )[0]
+    local_frame = _LOCAL_FRAME
+    target_positions = _whereabouts(settings, _RPY, np.zeros(3))
+    position = target_positions.positions(["A"], [1.0])[0]
+    assert isinstance(position, TargetPosition)  # the time is inside
+    there = target_positions.local_frame.map_from_enu(position.position_m[None])
+    plate_map = local_frame.map_from_enu(local_frame.enu_from_map(there))[0]
     camera_map = plate_map + np.array([12.0, -9.0, 61.0])
-    plate, camera = frame.enu_from_map(np.array([plate_map, camera_map]))
+    plate, camera = local_frame.enu_from_map(np.array([plate_map, camera_map]))
     map_from_camera = rotation_from_opk(_OPK[None])[0] @ CAMERA_FROM_PHOTO
-    enu_from_camera = frame.grid_rotation(camera) @ map_from_camera
+    enu_from_camera = local_frame.grid_rotation(camera) @ map_from_camera
     ned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    enu_from_body = frame.level_rotations(plate[None])[0] @ ned @ body_to_ned(*_RPY)
+    enu_from_body = local_frame.level_rotations(plate[None])[0] @ ned @ body_to_ned(*_RPY)
     enu_from_plate = enu_from_body @ body_from_plate(settings.mount_deg)
     pose = Pose(enu_from_camera.T @ enu_from_plate, enu_from_camera.T @ (plate - camera))
     seen = Sighting(
@@ -89,9 +89,9 @@ def _scene(settings: VehicleSettings) -> tuple[FloatArray, FloatArray, Sighting]
     return camera_map, map_from_camera, seen
 
 
-def _priors(seen: Sighting, whereabouts: Whereabouts) -> tuple[CameraPrior, ...]:
-    kgcps, _ = build_kgcps([seen], whereabouts, _CAMERA)
-    return camera_priors(kgcps, [seen], whereabouts, _FRAME)
+def _priors(seen: Sighting, target_positions: TargetPositions) -> tuple[CameraPrior, ...]:
+    gcps, _ = build_gcps([seen], target_positions, _CAMERA)
+    return camera_priors(gcps, [seen], target_positions, _LOCAL_FRAME)
 
 
 def test_the_default_mount_lies_level_with_its_up_forward() -> None:
@@ -116,22 +116,22 @@ def test_the_camera_is_where_it_was_and_looks_where_it_looked(mount_deg: float) 
 def test_another_crs_for_the_points_needs_no_other_vehicle() -> None:
     settings = _settings()
     camera_map, _, seen = _scene(settings)
-    whereabouts = _whereabouts(settings, _RPY, np.zeros(3))
-    kgcps, _ = build_kgcps([seen], whereabouts, _CAMERA)
-    degrees = MapFrame.at("EPSG:4258", np.array([0.5, 41.37, 120.0]))
-    grid = _FRAME
+    target_positions = _whereabouts(settings, _RPY, np.zeros(3))
+    gcps, _ = build_gcps([seen], target_positions, _CAMERA)
+    degrees = LocalFrame.at("EPSG:4258", np.array([0.5, 41.37, 120.0]))
+    grid = _LOCAL_FRAME
     in_degrees = replace(
-        kgcps[0],
+        gcps[0],
         position_map=degrees.map_from_enu(
             (
-                grid.enu_from_map(kgcps[0].position_map[None]) @ grid.ecef_from_enu.T
+                grid.enu_from_map(gcps[0].position_map[None]) @ grid.ecef_from_enu.T
                 + grid.origin_ecef_m
                 - degrees.origin_ecef_m
             )
             @ degrees.ecef_from_enu
         )[0],
     )
-    (prior,) = camera_priors([in_degrees], [seen], whereabouts, degrees)
+    (prior,) = camera_priors([in_degrees], [seen], target_positions, degrees)
     back = degrees.enu_from_map(prior.position_map[None]) @ degrees.ecef_from_enu.T
     ecef = back + degrees.origin_ecef_m
     expected = grid.enu_from_map(camera_map[None]) @ grid.ecef_from_enu.T + grid.origin_ecef_m
@@ -185,10 +185,10 @@ def test_opk_covariance_is_that_of_small_turns() -> None:
 def test_common_errors_are_part_of_a_prior() -> None:
     settings = _settings()
     _, _, seen = _scene(settings)
-    whereabouts = _whereabouts(settings, _RPY, np.zeros(3))
-    (own,) = _priors(seen, whereabouts)
-    (both,) = _priors(replace(seen, common_pose_cov=3.0 * _POSE_COV), whereabouts)
-    (large,) = _priors(replace(seen, pose_cov=4.0 * _POSE_COV), whereabouts)
+    target_positions = _whereabouts(settings, _RPY, np.zeros(3))
+    (own,) = _priors(seen, target_positions)
+    (both,) = _priors(replace(seen, common_pose_cov=3.0 * _POSE_COV), target_positions)
+    (large,) = _priors(replace(seen, pose_cov=4.0 * _POSE_COV), target_positions)
     assert own.cov is not None
     assert both.cov is not None
     assert large.cov is not None
@@ -199,28 +199,28 @@ def test_common_errors_are_part_of_a_prior() -> None:
 def test_no_prior_without_a_pose_that_can_be_told_apart() -> None:
     settings = _settings()
     _, _, seen = _scene(settings)
-    whereabouts = _whereabouts(settings, _RPY, np.zeros(3))
-    assert _priors(replace(seen, ambiguity=MIN_AMBIGUITY - 0.1), whereabouts) == ()
-    assert len(_priors(replace(seen, ambiguity=None), whereabouts)) == 1
-    assert _priors(replace(seen, pose=None), whereabouts) == ()
+    target_positions = _whereabouts(settings, _RPY, np.zeros(3))
+    assert _priors(replace(seen, ambiguity=MIN_AMBIGUITY - 0.1), target_positions) == ()
+    assert len(_priors(replace(seen, ambiguity=None), target_positions)) == 1
+    assert _priors(replace(seen, pose=None), target_positions) == ()
 
 
 def test_unknown_deviations_make_no_covariance() -> None:
     settings = _settings()
     _, _, seen = _scene(settings)
-    whereabouts = _whereabouts(settings, _RPY, np.zeros(3))
-    (prior,) = _priors(replace(seen, pose_cov=None), whereabouts)
+    target_positions = _whereabouts(settings, _RPY, np.zeros(3))
+    (prior,) = _priors(replace(seen, pose_cov=None), target_positions)
     assert prior.cov is None
     assert opk_covs([prior]) == [None]
-    assert whereabouts.carrier is not None
-    silent = replace(whereabouts.carrier.motion, sd_attitude_deg=None)
-    carrier = Carrier(silent, settings, whereabouts.frame)
-    (prior,) = _priors(seen, replace(whereabouts, carrier=carrier))
+    assert target_positions.vehicle is not None
+    silent = replace(target_positions.vehicle.motion, sd_attitude_deg=None)
+    vehicle = Vehicle(silent, settings, target_positions.local_frame)
+    (prior,) = _priors(seen, replace(target_positions, vehicle=vehicle))
     assert prior.cov is None
 
 
 def test_static_targets_orient_no_camera() -> None:
     static = Target(_RING, position_m=tuple(_START), sd_position_m=(0.01, 0.01, 0.01))
-    whereabouts = Whereabouts.of(_CRS, [static], None, VehicleSettings())
+    target_positions = TargetPositions.of(_CRS, [static], None, VehicleSettings())
     _, _, seen = _scene(_settings())
-    assert _priors(seen, whereabouts) == ()
+    assert _priors(seen, target_positions) == ()

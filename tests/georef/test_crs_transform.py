@@ -14,16 +14,16 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import best_transformer, parse_crs
-from kgcp.georef.gcp import Kgcp, on_map
-from kgcp.georef.local_frame import MapChange, MapFrame
+from kgcp.georef.gcp import Gcp, transform_gcps
+from kgcp.georef.local_frame import CrsTransform, LocalFrame
 
 _UTM31 = np.array([430606.1, 4583523.0, 120.0])
 _LONGITUDE, _LATITUDE = 2.1698408834, 41.4002533376  # of that point, by the series below
 _US_FOOT_M = 1200.0 / 3937.0  # by definition
 
 
-def _change(source: str, target: str, xyz: FloatArray) -> MapChange:
-    return MapChange.to(target, MapFrame.at(source, xyz), xyz)
+def _change(source: str, target: str, xyz: FloatArray) -> CrsTransform:
+    return CrsTransform.to(target, LocalFrame.at(source, xyz), xyz)
 
 
 def _utm(longitude_deg: float, latitude_deg: float, meridian_deg: float) -> tuple[float, float]:
@@ -67,16 +67,16 @@ def test_longitude_comes_first_and_agrees_with_kruegers_series() -> None:
 def test_x_points_east_whatever_the_authority_says(
     crs: str, xyz: tuple[float, float, float]
 ) -> None:
-    frame = MapFrame.at(crs, np.array(xyz))
-    east, north, up = frame.grid_rotation(np.zeros(3)).T
+    local_frame = LocalFrame.at(crs, np.array(xyz))
+    east, north, up = local_frame.grid_rotation(np.zeros(3)).T
     assert east[0] > 0.99
     assert north[1] > 0.99
     assert up[2] > 0.9999
 
 
 def test_axes_turn_by_the_difference_of_the_meridian_convergences() -> None:
-    change = _change("EPSG:25831", "EPSG:25830", _UTM31)
-    axes = change.axes(_UTM31)
+    transform = _change("EPSG:25831", "EPSG:25830", _UTM31)
+    axes = transform.axes(_UTM31)
     sine = math.sin(math.radians(_LATITUDE))
     gamma = [
         math.degrees(math.atan(math.tan(math.radians(_LONGITUDE - meridian)) * sine))
@@ -90,8 +90,8 @@ def test_axes_turn_by_the_difference_of_the_meridian_convergences() -> None:
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
-def _point(cov_m2: FloatArray) -> Kgcp:
-    return Kgcp(
+def _point(cov_m2: FloatArray) -> Gcp:
+    return Gcp(
         id="K0001",
         frame="f.jpg",
         target="A",
@@ -111,20 +111,20 @@ def test_a_covariance_is_the_same_ellipsoid_on_either_map() -> None:
     half = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [0.005, -0.01, 0.05]])
     point = _point(half @ half.T)
     for crs in ("EPSG:25830", "EPSG:4326"):
-        change = _change("EPSG:25831", crs, _UTM31)
-        (moved,) = on_map([point], change)
+        transform = _change("EPSG:25831", crs, _UTM31)
+        (moved,) = transform_gcps([point], transform)
         physical = []
-        for frame, one in ((change.source, point), (change.target, moved)):
+        for local_frame, one in ((transform.source, point), (transform.target, moved)):
             assert one.cov_m2 is not None
             assert one.common_m is not None
-            enu = frame.enu_from_map(one.position_map[None])
-            axes = frame.level_rotations(enu)[0].T @ frame.grid_rotation(enu[0])
+            enu = local_frame.enu_from_map(one.position_map[None])
+            axes = local_frame.level_rotations(enu)[0].T @ local_frame.grid_rotation(enu[0])
             physical.append((axes @ one.cov_m2 @ axes.T, axes @ one.common_m))
         np.testing.assert_allclose(physical[0][0], physical[1][0], atol=1e-12)
         np.testing.assert_allclose(physical[0][1], physical[1][1], atol=1e-12)
         assert moved.cov_m2 is not None  # metres, also where the CRS counts degrees
         assert np.trace(moved.cov_m2) == pytest.approx(np.trace(half @ half.T), rel=1e-9)
-    assert on_map([], change) == ()
+    assert transform_gcps([], transform) == ()
 
 
 def test_feet_become_metres_by_the_legal_ratio_in_plan_and_height() -> None:
@@ -155,16 +155,16 @@ pyproj.network.set_network_enabled(False)
 pyproj.datadir.append_data_dir({folder!r})
 import json, numpy as np
 from kgcp.errors import KgcpError
-from kgcp.georef.local_frame import MapChange
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import CrsTransform
+from kgcp.georef.local_frame import LocalFrame
 xyz = np.array({xyz!r})
 def result(source, target):
     try:
-        frame = MapFrame.at(source, xyz)
+        frame = LocalFrame.at(source, xyz)
         if target is None:
-            plain = MapFrame.at(source.partition("+")[0], xyz)
+            plain = LocalFrame.at(source.partition("+")[0], xyz)
             return float((frame.origin_ecef_m - plain.origin_ecef_m) @ plain.ecef_from_enu[:, 2])
-        return MapChange.to(target, frame, xyz).positions(xyz[None])[0].tolist()
+        return CrsTransform.to(target, frame, xyz).positions(xyz[None])[0].tolist()
     except KgcpError as error:
         return str(error)
 print(json.dumps([result(*pair) for pair in {pairs!r}]))

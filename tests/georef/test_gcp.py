@@ -7,10 +7,10 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.gcp import Omission, Skip, build_kgcps
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.gcp import SkippedSighting, SkipReason, build_gcps
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Absence, Place, Whereabouts
+from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Ring, Target
@@ -36,31 +36,31 @@ def _sighting(number: int, target: str, time_s: float | None, instance: int = 0)
     )
 
 
-def _whereabouts(settings: VehicleSettings) -> Whereabouts:
+def _whereabouts(settings: VehicleSettings) -> TargetPositions:
     time_s = np.arange(0.0, 10.01, 0.1)
     position = np.array([430606.1, 4583523.0, 120.0]) + np.outer(time_s, [10.0, 0.0, 0.0])
     sd = np.full((len(time_s), 3), 0.02)
     trajectory = Trajectory(time_s, position, np.zeros_like(position), sd, None)
     static = Target(_GROUND, position_m=_POSITION, sd_position_m=(0.01, 0.02, 0.03))
-    return Whereabouts.of("EPSG:25831", [Target(_RING), static], trajectory, settings)
+    return TargetPositions.of("EPSG:25831", [Target(_RING), static], trajectory, settings)
 
 
 def test_moving_points_are_named_by_frame_and_static_ones_by_target() -> None:
     sightings = [_sighting(3, "A", 1.0), _sighting(3, "G", 1.0), _sighting(7, "G", None)]
-    kgcps, skipped = build_kgcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
-    assert [point.id for point in kgcps] == ["K0003", "G", "G"]
+    gcps, skipped = build_gcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
+    assert [point.id for point in gcps] == ["K0003", "G", "G"]
     assert skipped == ()
-    np.testing.assert_allclose(kgcps[0].position_map, [430616.1, 4583523.0, 120.0], atol=1e-4)
-    for static in kgcps[1:]:
+    np.testing.assert_allclose(gcps[0].position_map, [430616.1, 4583523.0, 120.0], atol=1e-4)
+    for static in gcps[1:]:
         np.testing.assert_allclose(static.position_map, _POSITION, atol=1e-6)
         assert static.cov_m2 is not None
         np.testing.assert_allclose(np.sqrt(np.diag(static.cov_m2)), [0.01, 0.02, 0.03])
 
 
 def test_covariance_is_given_along_the_maps_axes() -> None:
-    kgcps, _ = build_kgcps([_sighting(1, "A", 5.0)], _whereabouts(VehicleSettings()), _CAMERA)
-    assert kgcps[0].cov_m2 is not None
-    np.testing.assert_allclose(kgcps[0].cov_m2, 0.02**2 * np.eye(3), atol=1e-12)
+    gcps, _ = build_gcps([_sighting(1, "A", 5.0)], _whereabouts(VehicleSettings()), _CAMERA)
+    assert gcps[0].cov_m2 is not None
+    np.testing.assert_allclose(gcps[0].cov_m2, 0.02**2 * np.eye(3), atol=1e-12)
 
 
 def test_frames_outside_and_second_plates_are_counted_not_lost() -> None:
@@ -70,17 +70,17 @@ def test_frames_outside_and_second_plates_are_counted_not_lost() -> None:
         _sighting(2, "A", 5.0, instance=1),
         _sighting(3, "A", None),
     ]
-    kgcps, skipped = build_kgcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
-    assert [point.id for point in kgcps] == ["K0002"]
+    gcps, skipped = build_gcps(sightings, _whereabouts(VehicleSettings()), _CAMERA)
+    assert [point.id for point in gcps] == ["K0002"]
     assert set(skipped) == {
-        Skip("f_0001.png", "A", Absence.BEFORE_TRAJECTORY),
-        Skip("f_0002.png", "A", Omission.SECOND_PLATE),
-        Skip("f_0003.png", "A", Absence.NO_TIME),
+        SkippedSighting("f_0001.png", "A", NoPosition.BEFORE_TRAJECTORY),
+        SkippedSighting("f_0002.png", "A", SkipReason.SECOND_PLATE),
+        SkippedSighting("f_0003.png", "A", NoPosition.NO_TIME),
     }
 
 
 def test_no_sightings_make_no_points() -> None:
-    assert build_kgcps([], _whereabouts(VehicleSettings()), _CAMERA) == ((), ())
+    assert build_gcps([], _whereabouts(VehicleSettings()), _CAMERA) == ((), ())
 
 
 def test_a_rolling_shutter_reads_the_middle_row_at_mid_exposure() -> None:
@@ -94,9 +94,9 @@ def test_a_rolling_shutter_reads_the_middle_row_at_mid_exposure() -> None:
 
 def test_the_target_is_where_it_was_when_its_row_was_read() -> None:
     rolling = Camera(640, 481, 900.0, 900.0, 320.0, 240.0, readout_s=0.03)
-    whereabouts = _whereabouts(VehicleSettings())
-    (late,), _ = build_kgcps([_sighting(1, "A", 5.0)], whereabouts, rolling)
-    (plain,), _ = build_kgcps([_sighting(1, "A", 5.0)], whereabouts, _CAMERA)
+    target_positions = _whereabouts(VehicleSettings())
+    (late,), _ = build_gcps([_sighting(1, "A", 5.0)], target_positions, rolling)
+    (plain,), _ = build_gcps([_sighting(1, "A", 5.0)], target_positions, _CAMERA)
     np.testing.assert_allclose(
         late.position_map - plain.position_map, [0.15, 0.0, 0.0], atol=1e-4
     )  # 10 m/s for half of 30 ms
@@ -104,21 +104,21 @@ def test_the_target_is_where_it_was_when_its_row_was_read() -> None:
 
 
 def test_time_is_that_of_the_trajectorys_clock() -> None:
-    whereabouts = _whereabouts(VehicleSettings(time_offset_s=-18.0))
-    (point,), _ = build_kgcps([_sighting(1, "A", 23.0)], whereabouts, _CAMERA)
+    target_positions = _whereabouts(VehicleSettings(time_offset_s=-18.0))
+    (point,), _ = build_gcps([_sighting(1, "A", 23.0)], target_positions, _CAMERA)
     assert point.time_s == pytest.approx(5.0)
 
 
-def _bend(settings: VehicleSettings) -> Whereabouts:
+def _bend(settings: VehicleSettings) -> TargetPositions:
     """15 m/s on a circle of 100 m, level, heading along the track."""
     time_s = np.arange(0.0, 30.01, 0.05)
-    frame = MapFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
+    local_frame = LocalFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
     angle = 0.15 * time_s
     enu = 100.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
     attitude = np.column_stack((0.0 * angle, 0.0 * angle, -np.degrees(angle)))
     sd = np.full((len(time_s), 3), 0.02)
-    trajectory = Trajectory(time_s, frame.map_from_enu(enu), attitude, sd, None)
-    return Whereabouts.of("EPSG:25831", [Target(_RING)], trajectory, settings)
+    trajectory = Trajectory(time_s, local_frame.map_from_enu(enu), attitude, sd, None)
+    return TargetPositions.of("EPSG:25831", [Target(_RING)], trajectory, settings)
 
 
 def test_common_effects_are_the_covariance_between_points() -> None:
@@ -128,7 +128,7 @@ def test_common_effects_are_the_covariance_between_points() -> None:
     )
     sightings = [_sighting(1, "A", 5.0), _sighting(2, "A", 14.0)]
     right = _bend(settings)
-    reported, _ = build_kgcps(sightings, right, _CAMERA)
+    reported, _ = build_gcps(sightings, right, _CAMERA)
 
     def error() -> FloatArray:
         arm = settings.lever_arm_m + settings.sd_lever_arm_m * rng.standard_normal(3)
@@ -137,9 +137,9 @@ def test_common_effects_are_the_covariance_between_points() -> None:
             lever_arm_m=(arm[0], arm[1], arm[2]),
             time_offset_s=settings.sd_time_s * rng.standard_normal(),
         )
-        assert right.carrier is not None
-        moved = replace(right, carrier=replace(right.carrier, settings=wrong))
-        placed, _ = build_kgcps(sightings, moved, _CAMERA)
+        assert right.vehicle is not None
+        moved = replace(right, vehicle=replace(right.vehicle, settings=wrong))
+        placed, _ = build_gcps(sightings, moved, _CAMERA)
         return np.concatenate(
             [a.position_map - b.position_map for a, b in zip(placed, reported, strict=True)]
         )
@@ -158,7 +158,7 @@ def test_common_effects_are_the_covariance_between_points() -> None:
 
 
 def test_a_static_targets_covariance_is_one_error_in_all_frames() -> None:
-    (point,), _ = build_kgcps([_sighting(1, "G", None)], _whereabouts(VehicleSettings()), _CAMERA)
+    (point,), _ = build_gcps([_sighting(1, "G", None)], _whereabouts(VehicleSettings()), _CAMERA)
     assert point.common_m is None
     assert point.cov_common_m2 is point.cov_m2
 
@@ -169,12 +169,12 @@ def test_rows_of_a_rolling_shutter_are_up_to_22_cm_apart_at_15_m_s() -> None:
     for row in (0.0, 120.0, 480.0):
         seen = replace(_sighting(1, "A", 10.0), centre_px=np.array([320.0, row]))
         when = 10.0 + (row / 480.0 - 0.5) * 0.03
-        (there,) = truth.places(["A"], [when])
-        assert isinstance(there, Place)
-        (point,), _ = build_kgcps([seen], truth, rolling)
-        expected = truth.frame.map_from_enu(there.position_m[None])[0]
+        (there,) = truth.positions(["A"], [when])
+        assert isinstance(there, TargetPosition)
+        (point,), _ = build_gcps([seen], truth, rolling)
+        expected = truth.local_frame.map_from_enu(there.position_m[None])[0]
         np.testing.assert_allclose(point.position_map, expected, atol=1e-6)
-        (still,), _ = build_kgcps([seen], truth, _CAMERA)
+        (still,), _ = build_gcps([seen], truth, _CAMERA)
         apart = np.linalg.norm(point.position_map - still.position_map)
         assert apart == pytest.approx(15.0 * 0.03 * abs(row / 480.0 - 0.5), rel=2e-3)
     assert apart == pytest.approx(0.225, abs=1e-3)

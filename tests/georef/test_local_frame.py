@@ -8,20 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kgcp.errors import KgcpError
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 
-_UTM31 = MapFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
+_UTM31 = LocalFrame.at("EPSG:25831", np.array([430606.1, 4583523.0, 120.0]))
 
 
 def test_80_m_on_the_grid_of_a_central_meridian_are_32_mm_longer_on_the_ellipsoid() -> None:
-    frame = MapFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 0.0]))
-    ends = frame.enu_from_map(np.array([[500080.0, 4583000.0, 0.0], [500000.0, 4583080.0, 0.0]]))
+    local_frame = LocalFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 0.0]))
+    ends = local_frame.enu_from_map(
+        np.array([[500080.0, 4583000.0, 0.0], [500000.0, 4583080.0, 0.0]])
+    )
     np.testing.assert_allclose(np.linalg.norm(ends, axis=1), 80.0 + 0.032, atol=1e-4)
 
 
 def test_height_stretches_horizontal_lengths_by_the_earths_radius() -> None:
-    low = MapFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 0.0]))
-    high = MapFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 1000.0]))
+    low = LocalFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 0.0]))
+    high = LocalFrame.at("EPSG:25831", np.array([500000.0, 4583000.0, 1000.0]))
     on_low = low.enu_from_map(np.array([[500100.0, 4583000.0, 0.0]]))
     on_high = high.enu_from_map(np.array([[500100.0, 4583000.0, 1000.0]]))
     stretch = np.linalg.norm(on_high) / np.linalg.norm(on_low) - 1.0
@@ -57,28 +59,34 @@ def test_map_and_enu_undo_each_other(east: float, north: float, up: float, crs: 
     origin = {"EPSG:25831": (430606.1, 4583523.0), "EPSG:4326": (2.17, 41.4)}.get(
         crs, (650000.0, 6860000.0)
     )
-    frame = MapFrame.at(crs, np.array([*origin, 120.0]))
+    local_frame = LocalFrame.at(crs, np.array([*origin, 120.0]))
     enu = np.array([[east, north, up]])
-    np.testing.assert_allclose(frame.enu_from_map(frame.map_from_enu(enu)), enu, atol=1e-6)
+    np.testing.assert_allclose(
+        local_frame.enu_from_map(local_frame.map_from_enu(enu)), enu, atol=1e-6
+    )
 
 
 def test_longitude_comes_first_whatever_the_authority_says() -> None:
-    frame = MapFrame.at("EPSG:4326", np.array([2.17, 41.4, 0.0]))
-    east = frame.enu_from_map(np.array([[2.171, 41.4, 0.0]]))[0]
+    local_frame = LocalFrame.at("EPSG:4326", np.array([2.17, 41.4, 0.0]))
+    east = local_frame.enu_from_map(np.array([[2.171, 41.4, 0.0]]))[0]
     assert east[0] == pytest.approx(83.62, abs=0.01)
     assert abs(east[1]) < 0.01
 
 
 def test_us_survey_feet_are_converted_but_ellipsoidal_heights_are_metres() -> None:
-    frame = MapFrame.at("EPSG:2263", np.array([987000.0, 200000.0, 100.0]))
-    moved = frame.enu_from_map(np.array([[988000.0, 200000.0, 100.0], [987000.0, 200000.0, 101.0]]))
+    local_frame = LocalFrame.at("EPSG:2263", np.array([987000.0, 200000.0, 100.0]))
+    moved = local_frame.enu_from_map(
+        np.array([[988000.0, 200000.0, 100.0], [987000.0, 200000.0, 101.0]])
+    )
     assert np.linalg.norm(moved[0]) == pytest.approx(304.8006, abs=0.02)
     assert moved[1, 2] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_grads_and_another_prime_meridian_make_no_difference_to_lengths() -> None:
-    frame = MapFrame.at("EPSG:4807", np.array([2.0, 50.0, 0.0]))  # NTF (Paris), 50 gon = 45 deg
-    north = frame.enu_from_map(np.array([[2.0, 50.01, 0.0]]))[0]
+    local_frame = LocalFrame.at(
+        "EPSG:4807", np.array([2.0, 50.0, 0.0])
+    )  # NTF (Paris), 50 gon = 45 deg
+    north = local_frame.enu_from_map(np.array([[2.0, 50.01, 0.0]]))[0]
     meridian_radius_m = 6367345.0  # Clarke 1880 (IGN) at 45 deg
     assert north[1] == pytest.approx(math.radians(0.009) * meridian_radius_m, rel=1e-4)
 
@@ -92,8 +100,8 @@ def test_the_vertical_turns_with_the_earth() -> None:
 
 
 def test_a_shift_to_wgs84_in_the_crs_is_not_applied() -> None:
-    plain = MapFrame.at("+proj=utm +zone=31 +ellps=GRS80", _UTM31_ORIGIN)
-    shifted = MapFrame.at("+proj=utm +zone=31 +ellps=GRS80 +towgs84=100,200,300", _UTM31_ORIGIN)
+    plain = LocalFrame.at("+proj=utm +zone=31 +ellps=GRS80", _UTM31_ORIGIN)
+    shifted = LocalFrame.at("+proj=utm +zone=31 +ellps=GRS80 +towgs84=100,200,300", _UTM31_ORIGIN)
     np.testing.assert_allclose(shifted.origin_ecef_m, plain.origin_ecef_m, atol=1e-6)
 
 
@@ -113,19 +121,19 @@ _UTM31_ORIGIN = np.array([430606.1, 4583523.0, 120.0])
 )
 def test_an_unusable_crs_is_one_line_that_says_why(crs: str, word: str) -> None:
     with pytest.raises(KgcpError) as caught:
-        MapFrame.at(crs, _UTM31_ORIGIN)
+        LocalFrame.at(crs, _UTM31_ORIGIN)
     assert word in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_heights_above_a_geoid_are_transformed_or_refused_but_never_taken_as_ellipsoidal() -> None:
-    plain = MapFrame.at("EPSG:25831", _UTM31_ORIGIN)
+    plain = LocalFrame.at("EPSG:25831", _UTM31_ORIGIN)
     try:
-        frame = MapFrame.at("EPSG:25831+5773", _UTM31_ORIGIN)
+        local_frame = LocalFrame.at("EPSG:25831+5773", _UTM31_ORIGIN)
     except KgcpError as error:  # the usual machine: the grid is not installed
         message = str(error)
     else:
-        shift = np.linalg.norm(frame.origin_ecef_m - plain.origin_ecef_m)
+        shift = np.linalg.norm(local_frame.origin_ecef_m - plain.origin_ecef_m)
         assert 45.0 < shift < 55.0  # the geoid at Barcelona
         return
     assert "us_nga_egm96_15.tif" in message
@@ -134,10 +142,10 @@ def test_heights_above_a_geoid_are_transformed_or_refused_but_never_taken_as_ell
 
 def test_coordinates_outside_the_projection_are_an_error() -> None:
     with pytest.raises(KgcpError, match="cannot hold the point"):
-        MapFrame.at("EPSG:25831", np.array([1e30, 0.0, 0.0]))
+        LocalFrame.at("EPSG:25831", np.array([1e30, 0.0, 0.0]))
 
 
 def test_left_handed_axes_are_refused() -> None:
-    frame = MapFrame.at("EPSG:2065", np.array([700000.0, 1100000.0, 200.0]))
+    local_frame = LocalFrame.at("EPSG:2065", np.array([700000.0, 1100000.0, 200.0]))
     with pytest.raises(KgcpError, match="left-handed"):
-        frame.grid_rotation(np.zeros(3))
+        local_frame.grid_rotation(np.zeros(3))

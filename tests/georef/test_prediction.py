@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.georef.prediction import Track, expect, expect_between, expect_by_reference
+from kgcp.georef.prediction import Track, predict_between, predict_by_reference, predict_position
 
 FRAMES = 200
 
@@ -33,9 +33,9 @@ def test_errors_between_neighbours_are_those_stated() -> None:
         time_s = np.cumsum(rng.uniform(0.5, 1.5, FRAMES))
         state = wander(rng, time_s, 8.0)
         missing = np.arange(3, FRAMES - 3, 5)
-        expected = expect_between(Track(time_s, without(state, missing)))
+        predictions = predict_between(Track(time_s, without(state, missing)))
         for row in missing:
-            one = expected[row]
+            one = predictions[row]
             assert one is not None
             z.append([*((one.centre_px - state[row, :2]) / one.sd_px), np.log(one.radius_px)])
             z[-1][2] = (z[-1][2] - state[row, 2]) / one.sd_log_radius
@@ -48,7 +48,7 @@ def test_errors_between_neighbours_are_those_stated() -> None:
 def test_an_even_motion_is_known_to_the_floor() -> None:
     time_s = np.arange(10.0)
     state = np.column_stack((100.0 + 30.0 * time_s, 50.0 + 7.0 * time_s, np.full(10, 3.0)))
-    (one,) = [e for e in expect_between(Track(time_s, without(state, np.array([4])))) if e]
+    (one,) = [e for e in predict_between(Track(time_s, without(state, np.array([4])))) if e]
     np.testing.assert_allclose(one.centre_px, state[4, :2])
     assert one.radius_px == pytest.approx(np.exp(3.0))
     assert (one.sd_px, one.sd_log_radius) == pytest.approx((0.5, 0.02))
@@ -58,19 +58,19 @@ def test_a_wild_motion_is_not_sure() -> None:
     rng = np.random.default_rng(2)
     time_s = np.arange(40.0)
     state = np.column_stack((rng.uniform(0, 1600, 40), rng.uniform(0, 1200, 40), np.full(40, 2.5)))
-    expected = expect_between(Track(time_s, without(state, np.arange(2, 38, 4))))
-    assert not any(one.is_sure for one in expected if one is not None)
+    predictions = predict_between(Track(time_s, without(state, np.arange(2, 38, 4))))
+    assert not any(one.is_sure for one in predictions if one is not None)
 
 
 def test_nothing_is_extrapolated_nor_made_of_few_frames() -> None:
     time_s = np.arange(8.0)
     state = np.column_stack((30.0 * time_s, time_s, np.full(8, 3.0)))
-    ends = expect_between(Track(time_s, without(state, np.array([0, 7]))))
+    ends = predict_between(Track(time_s, without(state, np.array([0, 7]))))
     assert ends == [None] * 8
-    few = expect_between(Track(time_s, without(state, np.array([1, 3, 4, 6]))))
+    few = predict_between(Track(time_s, without(state, np.array([1, 3, 4, 6]))))
     assert few == [None] * 8
     timeless = np.where(np.arange(8) == 4, np.nan, time_s)
-    assert expect_between(Track(timeless, without(state, np.array([4])))) == [None] * 8
+    assert predict_between(Track(timeless, without(state, np.array([4])))) == [None] * 8
 
 
 def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
@@ -79,8 +79,8 @@ def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
     predicted = truth + rng.normal(0.0, 1.0, truth.shape) * (3.0, 3.0, 0.04)
     seen = without(truth, np.arange(0, 90, 3))
     seen[4, :2] += 400.0  # a wrong one does no harm
-    expected = expect_by_reference(Track(np.full(90, np.nan), seen), predicted)
-    one = expected[3]
+    predictions = predict_by_reference(Track(np.full(90, np.nan), seen), predicted)
+    one = predictions[3]
     assert one is not None
     assert one.sd_px == pytest.approx(3.0, rel=0.25)
     assert one.sd_log_radius == pytest.approx(0.04, rel=0.3)
@@ -91,16 +91,16 @@ def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
 def test_a_reference_without_proof_or_far_off_says_nothing(found: int, shift_px: float) -> None:
     truth = np.column_stack((np.arange(50.0), np.arange(50.0), np.full(50, 3.0)))
     seen = without(truth, np.arange(found, 50))
-    expected = expect_by_reference(
+    predictions = predict_by_reference(
         Track(np.arange(50.0), seen), truth + np.array([shift_px, 0.0, 0.0])
     )
-    assert expected == [None] * 50
+    assert predictions == [None] * 50
 
 
 def test_a_bias_of_the_reference_counts_as_its_deviation() -> None:
     truth = np.column_stack((np.arange(50.0), np.arange(50.0), np.full(50, 3.0)))
     seen = without(truth, np.arange(40, 50))
-    one = expect_by_reference(Track(np.arange(50.0), seen), truth + np.array([12.0, 0.0, 0.0]))[45]
+    one = predict_by_reference(Track(np.arange(50.0), seen), truth + np.array([12.0, 0.0, 0.0]))[45]
     assert one is not None
     assert one.sd_px == pytest.approx(12.0 / 1.177, rel=0.01)
 
@@ -110,7 +110,7 @@ def test_the_surer_source_is_taken_and_found_frames_are_left() -> None:
     truth = np.column_stack((100.0 + 30.0 * time_s, 9.0 * time_s, np.full(12, 3.0)))
     track = Track(time_s, without(truth, np.array([5, 11])))
     reference = truth + np.array([2.0, 0.0, 0.0])
-    expected = expect(track, reference)
-    assert [one is not None for one in expected] == [row in {5, 11} for row in range(12)]
-    by = [one.source for one in expected if one is not None]
+    predictions = predict_position(track, reference)
+    assert [one is not None for one in predictions] == [row in {5, 11} for row in range(12)]
+    by = [one.source for one in predictions if one is not None]
     assert by == ["its neighbours", "the reference"]

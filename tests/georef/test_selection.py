@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.gcp import Flag, Kgcp, Omission
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.gcp import Flag, Gcp, SkipReason
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.selection import (
     Selection,
     flag_jumps,
@@ -24,14 +24,14 @@ from kgcp.georef.selection import (
 from kgcp.georef.sighting import Sighting
 
 _ORIGIN = np.array([430606.1, 4583523.0, 120.0])
-_FRAME = MapFrame.at("EPSG:25831", _ORIGIN)
+_LOCAL_FRAME = LocalFrame.at("EPSG:25831", _ORIGIN)
 _CAMERA = Camera(2048, 1536, 2900.0, 2900.0, 1020.0, 770.0)
 
 
-def _point(index: int, along_m: float, sd_m: float = 0.02) -> Kgcp:
+def _point(index: int, along_m: float, sd_m: float = 0.02) -> Gcp:
     """A point of a vehicle that drives east at 10 m/s."""
-    position = _FRAME.map_from_enu(np.array([[along_m, 0.0, 0.0]]))[0]
-    return Kgcp(
+    position = _LOCAL_FRAME.map_from_enu(np.array([[along_m, 0.0, 0.0]]))[0]
+    return Gcp(
         id=f"K{index + 1:04d}",
         frame=f"f{index:04d}.jpg",
         target="A",
@@ -49,11 +49,11 @@ def _point(index: int, along_m: float, sd_m: float = 0.02) -> Kgcp:
     )
 
 
-def _line(count: int, step_m: float = 15.0) -> tuple[Kgcp, ...]:
+def _line(count: int, step_m: float = 15.0) -> tuple[Gcp, ...]:
     return tuple(_point(index, index * step_m) for index in range(count))
 
 
-def _sighting(point: Kgcp, distance_m: float) -> Sighting:
+def _sighting(point: Gcp, distance_m: float) -> Sighting:
     return Sighting(
         frame=point.frame,
         number=1,
@@ -77,15 +77,15 @@ def test_a_wrong_distance_and_a_wrong_height_are_flagged_by_name() -> None:
     lifted = points[20].position_map + np.array([0.0, 0.0, 0.7])
     points[20] = replace(points[20], position_map=lifted)
     sightings = [_sighting(*pair) for pair in zip(points, distances, strict=True)]
-    flags = [point.flag for point in flag_jumps(points, sightings, _FRAME)]
+    flags = [point.flag for point in flag_jumps(points, sightings, _LOCAL_FRAME)]
     assert {i: flag for i, flag in enumerate(flags) if flag} == {
         12: Flag.DISTANCE,
         20: Flag.HEIGHT,
     }
-    kept, skipped = select(points, sightings, _FRAME, _CAMERA, Selection())
+    kept, skipped = select(points, sightings, _LOCAL_FRAME, _CAMERA, Selection())
     assert len(kept) == 28
     assert sorted(skip.reason for skip in skipped) == ["distance_jump", "height_jump"]
-    kept, skipped = select(points, sightings, _FRAME, _CAMERA, Selection(keep_flagged=True))
+    kept, skipped = select(points, sightings, _LOCAL_FRAME, _CAMERA, Selection(keep_flagged=True))
     assert (len(kept), skipped) == (30, ())
     assert kept[12].flag is Flag.DISTANCE
 
@@ -94,18 +94,18 @@ def test_gates_hold_back_what_is_bad_and_what_is_not_known() -> None:
     good = _point(0, 0.0)
     tilted = np.diag([0.001, 0.001, 0.09**2])
     cases = [
-        (replace(good, cov_m2=tilted), Omission.UNCERTAIN),
-        (replace(good, cov_m2=None), Omission.UNCERTAIN),
-        (replace(good, score=0.9), Omission.LOW_SCORE),
-        (replace(good, score=None), Omission.LOW_SCORE),
-        (replace(good, ambiguity=3.0), Omission.AMBIGUOUS),
-        (replace(good, ambiguity=None), Omission.AMBIGUOUS),
+        (replace(good, cov_m2=tilted), SkipReason.UNCERTAIN),
+        (replace(good, cov_m2=None), SkipReason.UNCERTAIN),
+        (replace(good, score=0.9), SkipReason.LOW_SCORE),
+        (replace(good, score=None), SkipReason.LOW_SCORE),
+        (replace(good, ambiguity=3.0), SkipReason.AMBIGUOUS),
+        (replace(good, ambiguity=None), SkipReason.AMBIGUOUS),
     ]
     gates = Selection(max_sd_m=0.08, min_score=0.95, min_ambiguity=9.0)
     for point, reason in cases:
-        kept, (skip,) = pass_gates([point], gates)
+        kept, (skipped,) = pass_gates([point], gates)
         assert kept == ()
-        assert skip.reason is reason
+        assert skipped.reason is reason
         assert pass_gates([point], Selection()) == ((point,), ())
     assert pass_gates([good], gates) == ((good,), ())
 
@@ -121,10 +121,10 @@ def test_thinned_points_keep_their_distance_and_no_gap_could_be_filled(
 ) -> None:
     sds = np.random.default_rng(seed).uniform(0.01, 0.1, len(along_m))
     points = [_point(i, s, float(sd)) for i, (s, sd) in enumerate(zip(along_m, sds, strict=True))]
-    kept, skipped = thin(points, _FRAME, _CAMERA, spacing_m)
+    kept, skipped = thin(points, _LOCAL_FRAME, _CAMERA, spacing_m)
     ids = {point.id for point in kept}
     assert len(kept) + len(skipped) == len(points)
-    track = {points[i].id: s for i, s in tracks_m(points, _FRAME).items()}
+    track = {points[i].id: s for i, s in tracks_m(points, _LOCAL_FRAME).items()}
     places = sorted(track[name] for name in ids)
     assert all(b - a >= spacing_m for a, b in pairwise(places))
     best = min(range(len(points)), key=lambda i: (sds[i], i))
@@ -139,7 +139,7 @@ def test_a_second_pass_of_the_same_road_is_not_thinned_away() -> None:
         replace(point, id=f"B{i}", frame=f"b{i}.jpg", time_s=2000.0 + i)
         for i, point in enumerate(reversed(there))
     )
-    kept, _ = thin((*there, *back), _FRAME, _CAMERA, 14.0)
+    kept, _ = thin((*there, *back), _LOCAL_FRAME, _CAMERA, 14.0)
     assert len(kept) == 19  # the turning point itself is seen twice
 
 
@@ -149,7 +149,7 @@ def test_a_second_pass_of_the_same_road_is_not_thinned_away() -> None:
 def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
     count: int, share: float, expected: int
 ) -> None:
-    points = set_checkpoints(_line(count), _FRAME, share)
+    points = set_checkpoints(_line(count), _LOCAL_FRAME, share)
     chosen = [index for index, point in enumerate(points) if point.is_checkpoint]
     assert len(chosen) == expected
     assert 0 not in chosen
@@ -157,12 +157,12 @@ def test_checkpoints_are_spread_evenly_and_never_at_the_ends(
     if expected > 1:
         assert np.diff(chosen).min() >= 3
         assert np.diff(chosen).max() <= 5
-    assert [p.is_checkpoint for p in set_checkpoints(_line(count), _FRAME, share)] == [
+    assert [p.is_checkpoint for p in set_checkpoints(_line(count), _LOCAL_FRAME, share)] == [
         p.is_checkpoint for p in points
     ]
 
 
 def test_static_targets_are_neither_thinned_nor_checked() -> None:
     static = [replace(_point(i, 0.0), id="G", common_m=None) for i in range(5)]
-    assert thin(static, _FRAME, _CAMERA, 100.0) == (tuple(static), ())
-    assert not any(point.is_checkpoint for point in set_checkpoints(static, _FRAME, 0.5))
+    assert thin(static, _LOCAL_FRAME, _CAMERA, 100.0) == (tuple(static), ())
+    assert not any(point.is_checkpoint for point in set_checkpoints(static, _LOCAL_FRAME, 0.5))

@@ -7,9 +7,9 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.camera_priors import camera_priors, opk_deg
-from kgcp.georef.gcp import build_kgcps
+from kgcp.georef.gcp import build_gcps
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Place, Whereabouts
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.simulation.flight import CRS, frame_name, plan_flight
 from kgcp.simulation.presets import SimulationSettings, preset
 
@@ -17,12 +17,12 @@ from kgcp.simulation.presets import SimulationSettings, preset
 def _errors(settings: SimulationSettings, seed: int) -> tuple[FloatArray, FloatArray]:
     """Return errors (n, 3) and covariances (n, 3, 3) of frames well apart in time."""
     plan = plan_flight(settings, seed)
-    whereabouts = Whereabouts.of(CRS, [], plan.trajectory, plan.vehicle)
+    target_positions = TargetPositions.of(CRS, [], plan.trajectory, plan.vehicle)
     chosen = slice(0, None, 15)  # the trajectory's errors last for seconds
     times = [float(time_s) for time_s in plan.recorded_times_s[chosen]]
-    places = whereabouts.places(["A"] * len(times), times)
-    truth = whereabouts.frame.enu_from_map(plan.target_map[chosen])
-    known = [place for place in places if isinstance(place, Place)]
+    positions = target_positions.positions(["A"] * len(times), times)
+    truth = target_positions.local_frame.enu_from_map(plan.target_map[chosen])
+    known = [place for place in positions if isinstance(place, TargetPosition)]
     assert len(known) == len(times)
     position = np.array([place.position_m for place in known])
     return position - truth, np.array([place.cov_m2 for place in known])
@@ -47,7 +47,7 @@ def test_with_survey_errors_deviations_are_honest() -> None:
 def test_the_camera_is_oriented_as_it_was_simulated() -> None:
     """The simulator turns the plate onto its vehicle on its own."""
     plan = plan_flight(preset("clean").without_survey_errors(), seed=1)
-    whereabouts = Whereabouts.of(CRS, [], plan.trajectory, plan.vehicle)
+    target_positions = TargetPositions.of(CRS, [], plan.trajectory, plan.vehicle)
     chosen = [frame for frame in plan.frames if frame.present][::8]
     sightings = [
         Sighting(
@@ -65,8 +65,8 @@ def test_the_camera_is_oriented_as_it_was_simulated() -> None:
         )
         for frame in chosen
     ]
-    kgcps, _ = build_kgcps(sightings, whereabouts, plan.settings.camera)
-    priors = camera_priors(kgcps, sightings, whereabouts, whereabouts.frame)
+    gcps, _ = build_gcps(sightings, target_positions, plan.settings.camera)
+    priors = camera_priors(gcps, sightings, target_positions, target_positions.local_frame)
     assert len(priors) == len(chosen) > 5
     rows = [frame.index for frame in chosen]
     positions = np.array([prior.position_map for prior in priors])

@@ -11,7 +11,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
-from kgcp.georef.target_positions import Absence, Carrier, Place, Whereabouts
+from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions, Vehicle
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.files.time_text import parse_time
 from kgcp.io.flight.flight import read_flight
@@ -49,17 +49,17 @@ def _straight(
     )
 
 
-def _only_place(places: list[Place | Absence]) -> Place:
-    (place,) = places
-    assert isinstance(place, Place)
-    return place
+def _only_place(positions: list[TargetPosition | NoPosition]) -> TargetPosition:
+    (position,) = positions
+    assert isinstance(position, TargetPosition)
+    return position
 
 
 def test_a_lever_arm_turns_with_heading_against_true_north() -> None:
     settings = VehicleSettings(lever_arm_m=(2.0, 0.0, -1.5))
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], _straight(90.0), settings)
-    place = _only_place(whereabouts.places(["A"], [5.0]))
-    on_map = whereabouts.frame.map_from_enu(place.position_m[None])[0] - _ORIGIN
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(90.0), settings)
+    position = _only_place(target_positions.positions(["A"], [5.0]))
+    on_map = target_positions.local_frame.map_from_enu(position.position_m[None])[0] - _ORIGIN
     # 2 m to the true east, seen on a grid whose north leans west of true north
     np.testing.assert_allclose(
         on_map - [0.0, 50.0, 1.5],
@@ -73,11 +73,11 @@ def test_rolled_and_pitched_lever_arms() -> None:
     still = np.tile(_ORIGIN, (3, 1))
     trajectory = Trajectory(time_s, still, np.tile([90.0, 0.0, 0.0], (3, 1)), None, None)
     settings = VehicleSettings(lever_arm_m=(0.0, 0.0, -2.0))
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], trajectory, settings)
-    place = _only_place(whereabouts.places(["A"], [1.0]))
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], trajectory, settings)
+    position = _only_place(target_positions.positions(["A"], [1.0]))
     # rolled right side down by 90 deg: what was 2 m above is now 2 m to the right, the east
-    np.testing.assert_allclose(place.position_m, [2.0, 0.0, 0.0], atol=1e-9)
-    assert place.cov_m2 is None
+    np.testing.assert_allclose(position.position_m, [2.0, 0.0, 0.0], atol=1e-9)
+    assert position.cov_m2 is None
 
 
 def test_covariance_of_a_level_vehicle_adds_up_as_by_hand() -> None:
@@ -86,11 +86,11 @@ def test_covariance_of_a_level_vehicle_adds_up_as_by_hand() -> None:
     )
     sd_position, sd_attitude = np.array([0.015, 0.016, 0.03]), np.array([0.5, 0.25, 1.0])
     trajectory = _straight(math.degrees(_CONVERGENCE), sd_position, sd_attitude)  # along the grid
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], trajectory, settings)
-    place = _only_place(whereabouts.places(["A"], [5.0]))
-    assert place.cov_m2 is not None
-    grid = whereabouts.frame.grid_rotation(place.position_m)
-    cov = grid.T @ place.cov_m2 @ grid
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], trajectory, settings)
+    position = _only_place(target_positions.positions(["A"], [5.0]))
+    assert position.cov_m2 is not None
+    grid = target_positions.local_frame.grid_rotation(position.position_m)
+    cov = grid.T @ position.cov_m2 @ grid
     expected = [
         0.015**2 + (2.0 * math.radians(0.5)) ** 2 + 0.02**2,  # across: roll, arm's y
         0.016**2 + (2.0 * math.radians(0.25)) ** 2 + 0.01**2 + 0.01**2,  # along: pitch, x, time
@@ -113,8 +113,8 @@ def test_scatter_of_perturbed_trajectories_is_the_reported_covariance() -> None:
         np.tile(attitude, (len(base.time_s), 1)),
         *(base.sd_position_m, base.sd_attitude_deg),
     )
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], tilted, settings)
-    reported = _only_place(whereabouts.places(["A"], [5.0]))
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], tilted, settings)
+    reported = _only_place(target_positions.positions(["A"], [5.0]))
     assert reported.cov_m2 is not None
 
     def perturbed() -> FloatArray:
@@ -127,9 +127,9 @@ def test_scatter_of_perturbed_trajectories_is_the_reported_covariance() -> None:
         )
         arm = np.array(settings.lever_arm_m) + settings.sd_lever_arm_m * rng.standard_normal(3)
         wrong = VehicleSettings(lever_arm_m=(arm[0], arm[1], arm[2]))
-        there = Carrier.on(moved, wrong, whereabouts.frame)
-        (place,) = there.places(np.array([5.0 + settings.sd_time_s * rng.standard_normal()]))
-        error: FloatArray = place.position_m - reported.position_m
+        there = Vehicle.on(moved, wrong, target_positions.local_frame)
+        (position,) = there.positions(np.array([5.0 + settings.sd_time_s * rng.standard_normal()]))
+        error: FloatArray = position.position_m - reported.position_m
         return error
 
     errors = np.array([perturbed() for _ in range(400)])
@@ -143,41 +143,41 @@ def test_a_static_target_needs_neither_vehicle_nor_time() -> None:
     target = Target(
         _RING, position_m=(430610.0, 4583523.0, 121.0), sd_position_m=(0.01, 0.02, 0.03)
     )
-    whereabouts = Whereabouts.of(_CRS, [target], None, VehicleSettings())
-    place = _only_place(whereabouts.places(["A"], [None]))
-    np.testing.assert_allclose(place.position_m, 0.0, atol=1e-8)  # it is the frame's origin
-    assert place.cov_m2 is not None
-    grid = whereabouts.frame.grid_rotation(place.position_m)
+    target_positions = TargetPositions.of(_CRS, [target], None, VehicleSettings())
+    position = _only_place(target_positions.positions(["A"], [None]))
+    np.testing.assert_allclose(position.position_m, 0.0, atol=1e-8)  # it is the frame's origin
+    assert position.cov_m2 is not None
+    grid = target_positions.local_frame.grid_rotation(position.position_m)
     np.testing.assert_allclose(
-        np.sqrt(np.diag(grid.T @ place.cov_m2 @ grid)), [0.01, 0.02, 0.03], rtol=1e-9
+        np.sqrt(np.diag(grid.T @ position.cov_m2 @ grid)), [0.01, 0.02, 0.03], rtol=1e-9
     )
 
 
 def test_single_frames_outside_the_trajectory_are_named_not_placed() -> None:
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)
-    places = whereabouts.places(["A"] * 4, [-1.0, None, 5.0, 11.0])
-    assert [place for place in places if isinstance(place, Absence)] == [
-        Absence.BEFORE_TRAJECTORY,
-        Absence.NO_TIME,
-        Absence.AFTER_TRAJECTORY,
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)
+    positions = target_positions.positions(["A"] * 4, [-1.0, None, 5.0, 11.0])
+    assert [position for position in positions if isinstance(position, NoPosition)] == [
+        NoPosition.BEFORE_TRAJECTORY,
+        NoPosition.NO_TIME,
+        NoPosition.AFTER_TRAJECTORY,
     ]
 
 
 def test_a_time_offset_moves_frames_onto_the_trajectory() -> None:
     shifted = VehicleSettings(time_offset_s=-18.0)
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], _straight(0.0), shifted)
-    plain = Whereabouts.of(_CRS, [Target(_RING)], _straight(0.0), VehicleSettings())
-    late = _only_place(whereabouts.places(["A"], [23.0]))
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), shifted)
+    plain = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), VehicleSettings())
+    late = _only_place(target_positions.positions(["A"], [23.0]))
     np.testing.assert_allclose(
-        late.position_m, _only_place(plain.places(["A"], [5.0])).position_m, atol=1e-6
+        late.position_m, _only_place(plain.positions(["A"], [5.0])).position_m, atol=1e-6
     )
 
 
 def test_no_overlap_is_one_line_with_both_intervals_and_the_offset() -> None:
     settings = VehicleSettings(time_offset_s=2.5)
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], _straight(0.0), settings)
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), settings)
     with pytest.raises(KgcpError) as caught:
-        whereabouts.places(["A", "A"], [3600.0, 3660.0])
+        target_positions.positions(["A", "A"], [3600.0, 3660.0])
     message = str(caught.value)
     for number in ("01:00:00", "01:01:00", "00:00:00", "00:00:10", "2.5"):
         assert number in message
@@ -186,12 +186,12 @@ def test_no_overlap_is_one_line_with_both_intervals_and_the_offset() -> None:
 
 def test_what_cannot_be_placed_at_all_is_an_error_with_a_remedy() -> None:
     with pytest.raises(KgcpError, match="no target has a position"):
-        Whereabouts.of(_CRS, [Target(_RING)], None, VehicleSettings())
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)
+        TargetPositions.of(_CRS, [Target(_RING)], None, VehicleSettings())
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], _straight(0.0), _LEVER)
     with pytest.raises(KgcpError, match="no frame has a time"):
-        whereabouts.places(["A"], [None])
+        target_positions.positions(["A"], [None])
     with pytest.raises(KgcpError, match="'A' and 'B' share one lever_arm_m"):
-        whereabouts.places(["A", "B"], [1.0, 1.0])
+        target_positions.positions(["A", "B"], [1.0, 1.0])
 
 
 @pytest.mark.skipif(not _FLIGHTS.is_dir(), reason="needs the shared test flights")
@@ -206,22 +206,26 @@ def test_positions_and_reference_poses_agree_with_an_independent_truth(name: str
         truth = list(csv.DictReader(stream))
     with flight.times_file.open() as stream:
         times: list[float | None] = [parse_time(row["time"]) for row in csv.DictReader(stream)]
-    whereabouts = Whereabouts.of(
+    target_positions = TargetPositions.of(
         flight.crs,
         flight.targets,
         read_trajectory(flight.vehicle.trajectory_file, flight.crs),
         flight.vehicle.settings,
     )
-    places = whereabouts.places(["A"] * len(truth), times)
-    enu = np.array([place.position_m for place in places if isinstance(place, Place)])
+    positions = target_positions.positions(["A"] * len(truth), times)
+    enu = np.array(
+        [position.position_m for position in positions if isinstance(position, TargetPosition)]
+    )
     expected = np.array([[float(row[axis]) for axis in "XYZ"] for row in truth])
     assert len(enu) == len(truth)
-    np.testing.assert_allclose(whereabouts.frame.map_from_enu(enu), expected, atol=0.5e-3)
+    np.testing.assert_allclose(
+        target_positions.local_frame.map_from_enu(enu), expected, atol=0.5e-3
+    )
 
     poses = read_reference_poses(flight.reference.file)
     assert poses.frames == tuple(row["frame"] for row in truth)
-    centres = whereabouts.frame.enu_from_map(poses.position_map)
-    grids = np.array([whereabouts.frame.grid_rotation(centre) for centre in centres])
+    centres = target_positions.local_frame.enu_from_map(poses.position_map)
+    grids = np.array([target_positions.local_frame.grid_rotation(centre) for centre in centres])
     enu_from_camera = grids @ rotation_from_opk(poses.opk_deg) @ CAMERA_FROM_PHOTO
     in_camera = np.einsum("nji,nj->ni", enu_from_camera, enu - centres)
     seen = np.array([row["present"] == "1" for row in truth])
@@ -241,8 +245,8 @@ def test_a_full_covariance_of_the_trajectory_keeps_its_correlations() -> None:
     n = len(base.time_s)
     growing = cov * np.linspace(1.0, 3.0, n)[:, None, None]  # threefold after 10 s
     trajectory = dataclasses.replace(base, cov_position_m2=growing)
-    whereabouts = Whereabouts.of(_CRS, [Target(_RING)], trajectory, VehicleSettings())
-    place = _only_place(whereabouts.places(["A"], [5.03]))
-    assert place.cov_m2 is not None
-    grid = whereabouts.frame.grid_rotation(place.position_m)
-    np.testing.assert_allclose(grid.T @ place.cov_m2 @ grid, cov * 2.006, atol=1e-12)
+    target_positions = TargetPositions.of(_CRS, [Target(_RING)], trajectory, VehicleSettings())
+    position = _only_place(target_positions.positions(["A"], [5.03]))
+    assert position.cov_m2 is not None
+    grid = target_positions.local_frame.grid_rotation(position.position_m)
+    np.testing.assert_allclose(grid.T @ position.cov_m2 @ grid, cov * 2.006, atol=1e-12)

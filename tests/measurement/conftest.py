@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.noise import find_censoring
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
@@ -120,14 +120,14 @@ def _on_plate(camera: Camera, pose: Pose, pixels: FloatArray) -> FloatArray:
 
 
 @pytest.fixture(scope="session")
-def imaging_of() -> Callable[..., Imaging]:
+def imaging_of() -> Callable[..., FitProblem]:
     """What the adjustment of a drawn or photographed target starts from."""
 
-    def collect(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+    def collect(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> FitProblem:
         radius_m = 0.5 * target.ring.outer_diameter_m
         window = cut_window(grey, camera, contour_px(camera, pose, radius_m), 12.0)
         circles = circles_of(target.rings)
-        return Imaging(
+        return FitProblem(
             window=window,
             circles=circles,
             measured_count=len(circles.radii_m),

@@ -14,8 +14,8 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pixel_grid import normalised_grid
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.fit_target import imaging_of
-from kgcp.measurement.adjustment.residual_image import residuals_of
+from kgcp.measurement.adjustment.fit_target import fit_problem_of
+from kgcp.measurement.adjustment.residual_image import residual_image_of
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window
 from kgcp.measurement.records import Measurement
@@ -138,8 +138,10 @@ def test_bins_are_means_and_know_which_share_is_clipped(count: int, dtype: type)
 
 def test_residuals_of_bins_lie_where_their_pixels_are() -> None:
     shot = shoot(Response.LINEAR, 0.9, np.random.default_rng(2))
-    assert imaging_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose).window.binning == 2
-    left = residuals_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
+    assert (
+        fit_problem_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose).window.binning == 2
+    )
+    left = residual_image_of(shot.grey, shot.camera, TARGET_PLATE.target, shot.pose, shot.psf_px)
     rows, columns = np.nonzero(np.isfinite(left.share))
     centre = np.array([left.x0 + columns.mean(), left.y0 + rows.mean()])
     seen = shot.camera.project(shot.pose.translation_m[None])[0]

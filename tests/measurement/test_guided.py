@@ -11,7 +11,7 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.guided import Expectation, look_again
+from kgcp.measurement.guided import Prediction, look_again
 from kgcp.measurement.records import Measurement, Miss
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
@@ -25,14 +25,14 @@ OTHER_CODES = ((0.0, 60.0, 150.0, 240.0), (0.0, 43.0, 130.0, 180.0), (0.0, 78.0,
 
 def expected_at(
     x: float, y: float, radius_px: float, sd_px: float = 2.0, sd_log_radius: float = 0.04
-) -> Expectation:
-    return Expectation(np.array([x, y]), sd_px, radius_px, sd_log_radius, "a test")
+) -> Prediction:
+    return Prediction(np.array([x, y]), sd_px, radius_px, sd_log_radius, "a test")
 
 
 def look(
-    grey: GreyArray, camera: Camera, target: Target, expectation: Expectation
+    grey: GreyArray, camera: Camera, target: Target, prediction: Prediction
 ) -> Measurement | None:
-    return look_again(grey, camera, target, expectation, SETTINGS, None, ())[0]
+    return look_again(grey, camera, target, prediction, SETTINGS, None, ())[0]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_what_does_not_agree_is_refused(
     camera: Camera,
     place_plate: PlacePlate,
     draw_frame: DrawFrame,
-    expectation: Expectation,
+    expectation: Prediction,
 ) -> None:
     grey = draw_frame((target, place_plate((201.0, 150.0), 12.0, turn_deg=20.0)))
     assert look(grey, camera, target, expectation) is None
@@ -163,6 +163,6 @@ def test_what_was_considered_says_why_it_was_dropped(
     ],
 )
 def test_only_what_is_known_well_and_can_be_seen_is_looked_for(
-    camera: Camera, expectation: Expectation, *, is_visible: bool, is_sure: bool
+    camera: Camera, expectation: Prediction, *, is_visible: bool, is_sure: bool
 ) -> None:
     assert (expectation.is_visible(camera), expectation.is_sure) == (is_visible, is_sure)

@@ -19,7 +19,7 @@ from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.detect import RunOptions, detect_flight
-from kgcp.pipeline.run_summary import SurveySummary
+from kgcp.pipeline.run_summary import DetectionSummary
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import plan_flight
@@ -47,7 +47,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> SurveySummary:
+def detect(folder: Path, out: Path, *edits: tuple[str, str], jobs: int = 0) -> DetectionSummary:
     original = (folder / "flight.toml").read_text(encoding="utf-8")
     text = original
     for old, new in edits:

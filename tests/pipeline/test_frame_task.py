@@ -12,12 +12,12 @@ import pytest
 from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss
 from kgcp.pipeline.frame_task import (
-    FrameNote,
-    FrameTask,
-    SecondLook,
+    DetectionJob,
+    FrameInput,
+    GuidedInput,
     examine_frame,
     examine_frame_again,
 )
@@ -31,9 +31,9 @@ CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
 A = Target(replace(TARGET_PLATE.target.ring, sd_outer_diameter_m=1e-3))
 B = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 60.0, 150.0, 240.0)))
 POSE = Pose(np.eye(3), np.array([0.5, -0.4, 30.0]))
-NOTE = FrameNote("a.png", 12.0, None)
+FRAME_INPUT = FrameInput("a.png", 12.0, None)
 STRICT = DetectSettings(min_score=1.0)  # more than any ring in a frame has
-EXPECTED = Expectation(CAMERA.project(POSE.translation_m), 1.0, 13.5, 0.03, "a test")
+PREDICTION = Prediction(CAMERA.project(POSE.translation_m), 1.0, 13.5, 0.03, "a test")
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +50,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def look_twice(
-    folder: Path, expected: dict[str, Expectation], settings: DetectSettings = STRICT
+    folder: Path, expected: dict[str, Prediction], settings: DetectSettings = STRICT
 ) -> tuple[FrameResult, FrameResult]:
-    task = FrameTask(folder, CAMERA, None, (A, B), settings)
-    first = examine_frame(task, NOTE)
-    return first, examine_frame_again(task, SecondLook(NOTE, first, expected))
+    job = DetectionJob(folder, CAMERA, None, (A, B), settings)
+    first = examine_frame(job, FRAME_INPUT)
+    return first, examine_frame_again(job, GuidedInput(FRAME_INPUT, first, expected))
 
 
 def test_what_is_found_again_explains_no_other_s_miss(folder: Path) -> None:
-    first, second = look_twice(folder, {"A": EXPECTED})
+    first, second = look_twice(folder, {"A": PREDICTION})
     assert all(isinstance(one, Miss) and one.candidates == 2 for one in first.outcomes)
     found, missed = second.outcomes
     assert isinstance(found, Measurement)
@@ -71,22 +71,22 @@ def test_what_is_found_again_explains_no_other_s_miss(folder: Path) -> None:
 
 
 def test_a_miss_is_explained_by_the_ring_at_the_expected_place(folder: Path) -> None:
-    _, second = look_twice(folder, {"B": EXPECTED})
+    _, second = look_twice(folder, {"B": PREDICTION})
     _, missed = second.outcomes
     assert isinstance(missed, Miss)
     assert missed.reason is Reason.OTHER_CODE
-    x, y = EXPECTED.centre_px
+    x, y = PREDICTION.centre_px
     assert missed.detail.startswith(f"ring at ({x:.0f}, {y:.0f}), radius 13.")
 
 
 def test_where_nothing_is_the_first_reason_stays(folder: Path) -> None:
-    away = replace(EXPECTED, centre_px=np.array([400.0, 60.0]))
+    away = replace(PREDICTION, centre_px=np.array([400.0, 60.0]))
     first, second = look_twice(folder, {"A": away, "B": away})
     assert second.outcomes == first.outcomes
 
 
 def test_a_measured_target_is_left_as_it_is(folder: Path) -> None:
-    first, second = look_twice(folder, {"B": EXPECTED}, DetectSettings())
+    first, second = look_twice(folder, {"B": PREDICTION}, DetectSettings())
     assert isinstance(first.outcomes[0], Measurement)
     assert second.outcomes[0] is first.outcomes[0]
     missed = second.outcomes[1]

@@ -23,15 +23,15 @@ from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.detect import RunOptions, detect_flight
-from kgcp.pipeline.execution.resilient_map import Loss
+from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.frame_task import (
-    FrameNote,
-    FrameTask,
-    SecondLook,
+    DetectionJob,
+    FrameInput,
+    GuidedInput,
     examine_frame,
     examine_frame_again,
 )
-from kgcp.pipeline.run_summary import SurveySummary
+from kgcp.pipeline.run_summary import DetectionSummary
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
@@ -58,7 +58,7 @@ code_deg = [0, 43, 78, 180]
 
 
 class Stop:
-    """A watcher who presses Ctrl-C after some looks, and remembers what was said."""
+    """A listener that presses Ctrl-C after some looks, and remembers what was said."""
 
     def __init__(self, after: int = 1000) -> None:
         self.after = after
@@ -107,13 +107,13 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Count what is looked at, and how often."""
     counter: Counter[str] = Counter()
 
-    def counted(task: FrameTask, note: FrameNote) -> FrameResult:
-        counter[note.frame] += 1
-        return examine_frame(task, note)
+    def counted(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
+        counter[frame_input.frame] += 1
+        return examine_frame(job, frame_input)
 
-    def counted_again(task: FrameTask, look: SecondLook) -> FrameResult:
-        counter[f"{look.note.frame} again"] += 1
-        return examine_frame_again(task, look)
+    def counted_again(job: DetectionJob, look: GuidedInput) -> FrameResult:
+        counter[f"{look.input.frame} again"] += 1
+        return examine_frame_again(job, look)
 
     monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame", counted)
     monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame_again", counted_again)
@@ -122,16 +122,16 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 def detect(
     folder: Path,
-    watcher: Stop | None = None,
+    listener: Stop | None = None,
     *,
     is_restart: bool = False,
     min_radius_px: float = 6.0,
-) -> SurveySummary:
+) -> DetectionSummary:
     return detect_flight(
         read_flight(folder),
         DetectSettings(min_radius_px=min_radius_px),
         options=RunOptions(jobs=0, is_restart=is_restart),
-        listener=watcher,
+        listener=listener,
     )
 
 
@@ -160,13 +160,13 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
 ) -> None:
     after, total = 1, FRAMES
     while after <= total:  # which the second look increases
-        watcher = Stop(after)
+        listener = Stop(after)
         with pytest.raises(KeyboardInterrupt):
-            detect(flight, watcher)
-        after, total = after + 1, sum(watcher.totals.values())
+            detect(flight, listener)
+        after, total = after + 1, sum(listener.totals.values())
         assert files(flight) == [".detections.journal"]
-    watcher = Stop()
-    summary = detect(flight, watcher)
+    listener = Stop()
+    summary = detect(flight, listener)
     assert set(looks.values()) == {1}
     assert looks.keys() >= {
         *(f"f_{number}.png" for number in range(FRAMES)),
@@ -176,10 +176,10 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
     assert files(flight) == ["detections.parquet", "run.json"]
     assert summary.kept == FRAMES
     rows = read_table(flight / "kgcp" / "detections.parquet", DETECTION_COLUMNS)
-    assert watcher.totals == {"first look": FRAMES, "second look": len(EMPTY)}
-    assert watcher.done == FRAMES + len(EMPTY)
-    assert watcher.found == (rows["status"] == "measured").sum() > FRAMES // 2
-    (note,) = watcher.notes
+    assert listener.totals == {"first look": FRAMES, "second look": len(EMPTY)}
+    assert listener.done == FRAMES + len(EMPTY)
+    assert listener.found == (rows["status"] == "measured").sum() > FRAMES // 2
+    (note,) = listener.notes
     assert note == (
         f"going on with an interrupted run: results of {FRAMES} of {FRAMES} frames are kept,"
         " 0 have changed since"
@@ -187,19 +187,19 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
 
 
 def test_a_finished_run_leaves_nothing_to_go_on_with(flight: Path, looks: Counter[str]) -> None:
-    watchers = [Stop(), Stop()]
-    for watcher in watchers:
-        detect(flight, watcher)
+    listeners = [Stop(), Stop()]
+    for listener in listeners:
+        detect(flight, listener)
     assert looks["f_0.png"] == 2
-    assert not watchers[1].notes
+    assert not listeners[1].notes
 
 
 def test_restart_forgets(flight: Path, undisturbed: bytes, looks: Counter[str]) -> None:
     stop(flight, FRAMES)
-    watcher = Stop()
-    detect(flight, watcher, is_restart=True)
+    listener = Stop()
+    detect(flight, listener, is_restart=True)
     assert looks["f_0.png"] == 2
-    assert not watcher.notes
+    assert not listener.notes
     assert table(flight) == undisturbed
 
 
@@ -213,16 +213,16 @@ def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
     text = (flight / "frames.csv").read_text(encoding="utf-8")
     (flight / "frames.csv").write_text(text.replace("08:15:07", "08:15:07.1"), encoding="utf-8")
     for after in (FRAMES - 2, 1000):
-        watcher = Stop(after)
+        listener = Stop(after)
         if after < 1000:
             with pytest.raises(KeyboardInterrupt):
-                detect(flight, watcher)
-            assert watcher.notes[0].startswith(
+                detect(flight, listener)
+            assert listener.notes[0].startswith(
                 "going on with an interrupted run: results of 5 of 9 frames are kept, 3 have"
             )
         else:
-            detect(flight, watcher)
-            assert watcher.notes[0].startswith(
+            detect(flight, listener)
+            assert listener.notes[0].startswith(
                 "going on with an interrupted run: results of 7 of 9 frames are kept, 1 have"
             )
     twice = {"f_1.png", "f_2.png", "f_7.png"}
@@ -251,9 +251,9 @@ def test_what_all_depends_on_starts_anew(
     stop(flight, 3)
     text = (flight / "flight.toml").read_text(encoding="utf-8")
     (flight / "flight.toml").write_text(text.replace(*edit), encoding="utf-8")
-    watcher = Stop()
-    detect(flight, watcher, min_radius_px=min_radius_px)
-    assert watcher.notes == [
+    listener = Stop()
+    detect(flight, listener, min_radius_px=min_radius_px)
+    assert listener.notes == [
         f"starting anew, not with the interrupted run's results: {what} changed since"
     ]
     assert looks["f_0.png"] == 2
@@ -301,10 +301,10 @@ def test_one_run_at_a_time(flight: Path, undisturbed: bytes) -> None:
     assert table(flight) == undisturbed
 
 
-def examine_or_die(task: FrameTask, note: FrameNote) -> FrameResult:
-    if note.frame == "f_8.png":
+def examine_or_die(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
+    if frame_input.frame == "f_8.png":
         os.kill(os.getpid(), signal.SIGKILL)
-    return examine_frame(task, note)
+    return examine_frame(job, frame_input)
 
 
 def test_a_frame_that_kills_its_worker_costs_no_other(
@@ -331,14 +331,21 @@ def test_who_is_lost_is_tried_again_by_the_next_run(
 ) -> None:
     def lossy(
         function: Callable[[Any], FrameResult], items: Iterable[Any], *_: object
-    ) -> Generator[tuple[Any, FrameResult | Loss]]:
+    ) -> Generator[tuple[Any, FrameResult | TaskFailure]]:
         for item in items:
-            is_deadly = isinstance(item, FrameNote) and item.frame == "f_2.png"
-            is_hopeless = isinstance(item, SecondLook) and item.note.frame == "f_6.png"
-            yield item, Loss.DIED if is_deadly else Loss.LATE if is_hopeless else function(item)
+            is_deadly = isinstance(item, FrameInput) and item.frame == "f_2.png"
+            is_hopeless = isinstance(item, GuidedInput) and item.input.frame == "f_6.png"
+            yield (
+                item,
+                TaskFailure.CRASHED
+                if is_deadly
+                else TaskFailure.TIMED_OUT
+                if is_hopeless
+                else function(item),
+            )
 
     with monkeypatch.context() as patch:
-        patch.setattr("kgcp.pipeline.execution.executor.careful_map", lossy)
+        patch.setattr("kgcp.pipeline.execution.executor.resilient_map", lossy)
         stop(flight, FRAMES)
         summary = detect(flight)
     assert summary.kept == FRAMES - 1, "who has died is tried again by the next run"

@@ -19,11 +19,11 @@ from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.guided import Expectation
+from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Considered, ExposureSettings, FrameResult, Miss
-from kgcp.pipeline.detection_run import Looks
-from kgcp.pipeline.execution.resilient_map import Loss
-from kgcp.pipeline.frame_task import FrameTask
+from kgcp.pipeline.detection_run import DetectionRun
+from kgcp.pipeline.execution.resilient_map import TaskFailure
+from kgcp.pipeline.frame_task import DetectionJob
 from kgcp.pipeline.overlay import draw_overlay, sketch_frame
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.report.ring_picture import PICTURE_PX
@@ -190,9 +190,9 @@ def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
         Considered("A", "A-inner", outline, 0.4, is_match=False, reason=Reason.CODE_MISMATCH)
         for outline in (Ellipse(20.0, 30.0, 6.0, 5.0, 0.1), Ellipse(80.0, 60.0, 9.0, 8.0, 0.1))
     )
-    task = FrameTask(flight / "frames", CAMERA, None, (), DetectSettings())
+    job = DetectionJob(flight / "frames", CAMERA, None, (), DetectSettings())
     result = FrameResult(EMPTY, None, ExposureSettings(), (miss,), None, dropped)
-    first, second = sketch_frame(task, result)
+    first, second = sketch_frame(job, result)
     assert (first.card.status, first.card.reason) == ("rejected", "cut")
     assert (second.card.status, second.card.reason) == ("candidate", "code_mismatch")
     assert second.card.text == (
@@ -203,25 +203,25 @@ def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
 
 
 class _OneLost:
-    """Stands for `Looks`: its only frame ends every process that would draw it."""
+    """Stands for `DetectionRun`: its only frame ends every process that would draw it."""
 
-    def through(self, _: object) -> Iterator[tuple[int, FrameResult, Loss]]:
+    def map_results(self, _: object) -> Iterator[tuple[int, FrameResult, TaskFailure]]:
         outline = Ellipse(20.0, 30.0, 6.0, 5.0, 0.1)
         miss = Miss("A", Reason.CUT, "ring at (20, 30)", 0.9, 1, outline)
-        yield 0, FrameResult("a.png", None, ExposureSettings(), (miss,)), Loss.DIED
+        yield 0, FrameResult("a.png", None, ExposureSettings(), (miss,)), TaskFailure.CRASHED
 
 
 def test_a_frame_that_ends_its_process_is_a_line(tmp_path: Path) -> None:
     sheet = ContactSheet(tmp_path / "sheet")
-    task = FrameTask(tmp_path, CAMERA, None, (), DetectSettings())
-    assert draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task, {}) == 1
+    job = DetectionJob(tmp_path, CAMERA, None, (), DetectSettings())
+    assert draw_overlay(sheet, "<b>Süd</b>", cast("DetectionRun", _OneLost()), job, {}) == 1
     (card,) = cards(tmp_path / "sheet")
     assert "ring at (20, 30) · not drawn: the process that drew it ended twice" in card
 
 
 def test_where_a_missing_target_must_be_is_said(tmp_path: Path) -> None:
     sheet = ContactSheet(tmp_path / "sheet")
-    task = FrameTask(tmp_path, CAMERA, None, (), DetectSettings())
-    expected = {0: {"A": Expectation(np.array([20.0, 30.0]), 2.0, 6.0, 0.04, "its neighbours")}}
-    draw_overlay(sheet, "<b>Süd</b>", cast("Looks", _OneLost()), task, expected)
+    job = DetectionJob(tmp_path, CAMERA, None, (), DetectSettings())
+    predictions = {0: {"A": Prediction(np.array([20.0, 30.0]), 2.0, 6.0, 0.04, "its neighbours")}}
+    draw_overlay(sheet, "<b>Süd</b>", cast("DetectionRun", _OneLost()), job, predictions)
     assert "expected by its neighbours at (20, 30) ± 2.0 px" in cards(tmp_path / "sheet")[0]

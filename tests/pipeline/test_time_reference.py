@@ -10,7 +10,7 @@ from PIL.ExifTags import IFD, Base
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, TimeReference
-from kgcp.pipeline.frame_task import FrameNote, FrameTask, examine_frame
+from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -20,8 +20,8 @@ _TARGET = Target(Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0
 
 def _time_s(folder: Path, reference: str, name: str = "f.jpg") -> float | None:
     camera = replace(_CAMERA, time_reference=TimeReference(reference))
-    task = FrameTask(folder, camera, None, (_TARGET,), DetectSettings())
-    return examine_frame(task, FrameNote(name, 1000.0, None)).time_s
+    job = DetectionJob(folder, camera, None, (_TARGET,), DetectSettings())
+    return examine_frame(job, FrameInput(name, 1000.0, None)).time_s
 
 
 @pytest.fixture

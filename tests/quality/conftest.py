@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ndtri
 
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
-from kgcp.georef.target_positions import Whereabouts
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.settings import Method
 from kgcp.simulation.flight import CRS, TARGET_PLATE, FramePlan, frame_name, plan_flight
@@ -88,8 +88,10 @@ def fly() -> Fly:
         ]
         forward, right, down = plan.vehicle.lever_arm_m
         vehicle = replace(plan.vehicle, lever_arm_m=(forward, right, down - offset_m))
-        whereabouts = Whereabouts.of(CRS, [TARGET_PLATE.target], plan.trajectory, vehicle)
+        target_positions = TargetPositions.of(CRS, [TARGET_PLATE.target], plan.trajectory, vehicle)
         targets = [TARGET_PLATE.target]
-        return study_bias(attempts, plan.reference, whereabouts, settings.camera, targets, method)
+        return study_bias(
+            attempts, plan.reference, target_positions, settings.camera, targets, method
+        )
 
     return flight

@@ -10,7 +10,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
-from kgcp.georef.target_positions import Absence, Whereabouts
+from kgcp.georef.target_positions import NoPosition, TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.quality.bias_study import edge_distances, study_bias
 from kgcp.settings import Method, VehicleSettings
@@ -30,7 +30,7 @@ _TRAJECTORY = Trajectory(
     np.full((len(_TIME_S), 3), 0.03),
     None,
 )
-_WHEREABOUTS = Whereabouts.of("EPSG:25831", [_TARGET], _TRAJECTORY, VehicleSettings())
+_TARGET_POSITIONS = TargetPositions.of("EPSG:25831", [_TARGET], _TRAJECTORY, VehicleSettings())
 
 
 def _frame(index: int) -> str:
@@ -42,14 +42,16 @@ def _nadir_poses(
 ) -> ReferencePoses:
     """Cameras straight above the vehicle at times 0, 1, …, looking down, x to the true east."""
     n = len(above_m)
-    places = _WHEREABOUTS.places(["A"] * n, [float(i) for i in range(n)])
-    enu = np.array([place.position_m for place in places if not isinstance(place, Absence)])
+    positions = _TARGET_POSITIONS.positions(["A"] * n, [float(i) for i in range(n)])
+    enu = np.array(
+        [position.position_m for position in positions if not isinstance(position, NoPosition)]
+    )
     centre = enu + np.column_stack((np.full(n, aside_m), np.zeros(n), above_m))
-    grids = np.array([_WHEREABOUTS.frame.grid_rotation(point) for point in centre])
+    grids = np.array([_TARGET_POSITIONS.local_frame.grid_rotation(point) for point in centre])
     enu_from_photo = np.diag([1.0, -1.0, -1.0]) @ CAMERA_FROM_PHOTO
     return ReferencePoses(
         frames=tuple(_frame(index) for index in range(n)),
-        position_map=_WHEREABOUTS.frame.map_from_enu(centre),
+        position_map=_TARGET_POSITIONS.local_frame.map_from_enu(centre),
         opk_deg=opk_from_rotation(np.swapaxes(grids, 1, 2) @ enu_from_photo),
         sd_position_m=None if sd_m is None else np.full((n, 3), sd_m),
         sd_angle_deg=None,
@@ -84,7 +86,7 @@ def _attempts(scale: float = 1.0) -> list[Attempt]:
 
 def test_residuals_are_measured_minus_reference() -> None:
     study = study_bias(
-        _attempts(1.002), _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+        _attempts(1.002), _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
     )
     assert study.attitudes_agree
     assert len(study.trusted) == 4
@@ -103,12 +105,12 @@ def test_residuals_are_measured_minus_reference() -> None:
 
 def test_unknown_deviations_stay_unknown() -> None:
     study = study_bias(
-        _attempts(), _nadir_poses(_ABOVE, sd_m=None), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+        _attempts(), _nadir_poses(_ABOVE, sd_m=None), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
     )
     assert study.measured[0].sds is None
 
 
-def test_only_frames_that_must_show_the_whole_target_are_chances() -> None:
+def test_only_frames_that_must_show_the_whole_target_count() -> None:
     camera = Camera(1600, 1200, 2300.0, 2300.0, 800.0, 600.0)
     poses = _nadir_poses(_ABOVE, aside_m=-13.8)  # the target lies 13.8 m to the camera's east
     at_x = [800.0 + 2300.0 * 13.8 / above for above in _ABOVE]
@@ -117,24 +119,28 @@ def test_only_frames_that_must_show_the_whole_target_are_chances() -> None:
         *(_attempt(i, None, _MIDDLE) for i in range(3)),
         _attempt(3, 81.2, (at_x[3], 600.0)),
     ]
-    study = study_bias(attempts, poses, _WHEREABOUTS, camera, [_TARGET], _METHOD)
-    assert [one.attempt.frame for one in study.chances] == [_frame(2), _frame(3)]
-    assert [study.trusts(one) for one in study.chances] == [False, True]
+    study = study_bias(attempts, poses, _TARGET_POSITIONS, camera, [_TARGET], _METHOD)
+    assert [one.attempt.frame for one in study.expected_visible] == [_frame(2), _frame(3)]
+    assert [study.trusts(one) for one in study.expected_visible] == [False, True]
 
 
-def test_what_is_not_where_it_must_be_is_astray() -> None:
+def test_what_is_not_where_it_must_be_is_misplaced() -> None:
     attempts = [*_attempts()[:3], _attempt(3, 75.0, (400.0, 300.0))]
-    study = study_bias(attempts, _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
-    assert [one.is_astray for one in study.measured] == [False, False, False, True]
+    study = study_bias(
+        attempts, _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
+    )
+    assert [one.is_misplaced for one in study.measured] == [False, False, False, True]
     assert len(study.trusted) == 3
 
 
 def test_wrong_attitudes_do_not_hide_the_distances() -> None:
     poses = _nadir_poses(_ABOVE)
     upside_down = replace(poses, opk_deg=poses.opk_deg + np.array([180.0, 0.0, 0.0]))
-    study = study_bias(_attempts(1.001), upside_down, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    study = study_bias(
+        _attempts(1.001), upside_down, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
+    )
     assert not study.attitudes_agree
-    assert len(study.trusted) == len(study.chances) == 4
+    assert len(study.trusted) == len(study.expected_visible) == 4
     assert study.measured[0].residual_percent == pytest.approx(0.1, abs=1e-4)
 
 
@@ -144,13 +150,13 @@ def test_frames_without_pose_or_place_are_counted() -> None:
     study = study_bias(
         [*attempts[:2], late, attempts[3]],
         _nadir_poses(_ABOVE),
-        _WHEREABOUTS,
+        _TARGET_POSITIONS,
         _CAMERA,
         [_TARGET],
         _METHOD,
     )
     assert study.frames_without_pose == (_frame(77),)
-    assert study.absences == (Absence.AFTER_TRAJECTORY,)
+    assert study.absences == (NoPosition.AFTER_TRAJECTORY,)
     assert len(study.measured) == 2
 
 
@@ -160,7 +166,7 @@ def test_second_plates_are_not_compared() -> None:
     assert sighting is not None
     second = replace(attempts[0], sighting=replace(sighting, instance=1, distance_m=99.0))
     study = study_bias(
-        [*attempts, second], _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD
+        [*attempts, second], _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
     )
     assert len(study.measured) == 4
 
@@ -168,16 +174,20 @@ def test_second_plates_are_not_compared() -> None:
 def test_nothing_to_compare_is_an_error_with_a_remedy() -> None:
     poses = _nadir_poses(_ABOVE)
     with pytest.raises(KgcpError, match="no target was measured"):
-        study_bias([_attempt(0, None, _MIDDLE)], poses, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+        study_bias(
+            [_attempt(0, None, _MIDDLE)], poses, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
+        )
     renamed = replace(poses, frames=("a.jpg", "b.jpg", "c.jpg", "d.jpg"))
     with pytest.raises(KgcpError, match=r"'f_0000\.png'.*'a\.jpg'.*relative to the frames folder"):
-        study_bias(_attempts(), renamed, _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+        study_bias(_attempts(), renamed, _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD)
 
 
 def test_errors_that_all_frames_share_stand_apart() -> None:
     settings = VehicleSettings(sd_lever_arm_m=(0.0, 0.0, 0.02), sd_time_s=0.001)
-    whereabouts = Whereabouts.of("EPSG:25831", [_TARGET], _TRAJECTORY, settings)
-    study = study_bias(_attempts(), _nadir_poses(_ABOVE), whereabouts, _CAMERA, [_TARGET], _METHOD)
+    target_positions = TargetPositions.of("EPSG:25831", [_TARGET], _TRAJECTORY, settings)
+    study = study_bias(
+        _attempts(), _nadir_poses(_ABOVE), target_positions, _CAMERA, [_TARGET], _METHOD
+    )
     sds = study.measured[0].sds
     assert sds is not None
     assert sds.common_m == pytest.approx(0.02, rel=1e-3)  # what is horizontal does not count
@@ -185,10 +195,12 @@ def test_errors_that_all_frames_share_stand_apart() -> None:
 
 
 def test_of_a_static_target_all_of_its_place_is_shared() -> None:
-    position = tuple(_WHEREABOUTS.frame.map_from_enu(np.zeros((1, 3)))[0].tolist())
+    position = tuple(_TARGET_POSITIONS.local_frame.map_from_enu(np.zeros((1, 3)))[0].tolist())
     static = replace(_TARGET, position_m=position, sd_position_m=(0.01, 0.01, 0.05))
-    whereabouts = Whereabouts.of("EPSG:25831", [static], _TRAJECTORY, VehicleSettings())
-    study = study_bias(_attempts(), _nadir_poses(_ABOVE), whereabouts, _CAMERA, [static], _METHOD)
+    target_positions = TargetPositions.of("EPSG:25831", [static], _TRAJECTORY, VehicleSettings())
+    study = study_bias(
+        _attempts(), _nadir_poses(_ABOVE), target_positions, _CAMERA, [static], _METHOD
+    )
     sds = study.measured[0].sds
     assert sds is not None
     assert sds.place_m == 0.0
@@ -202,7 +214,9 @@ def test_one_edge_is_displaced_and_two_are_not(method: Method) -> None:
     seen_px, seen_m = (radius, true_m) if method is Method.MODEL else (radius - delta, displaced_m)
     exposure = replace(_NOTHING, edge_shift_px=delta, radius_px=seen_px)
     attempt = replace(_attempt(0, seen_m, _MIDDLE), exposure=exposure)
-    study = study_bias([attempt], _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], method)
+    study = study_bias(
+        [attempt], _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], method
+    )
     found = edge_distances(study.measured[0], method)
     assert found is not None
     assert found.one_m == pytest.approx(displaced_m, rel=1e-12)
@@ -210,5 +224,7 @@ def test_one_edge_is_displaced_and_two_are_not(method: Method) -> None:
 
 
 def test_without_edge_shift_there_are_no_edge_distances() -> None:
-    study = study_bias(_attempts(), _nadir_poses(_ABOVE), _WHEREABOUTS, _CAMERA, [_TARGET], _METHOD)
+    study = study_bias(
+        _attempts(), _nadir_poses(_ABOVE), _TARGET_POSITIONS, _CAMERA, [_TARGET], _METHOD
+    )
     assert edge_distances(study.measured[0], _METHOD) is None

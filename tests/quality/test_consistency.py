@@ -13,9 +13,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, opk_from_rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.georef.target_positions import Whereabouts
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import ENU_FROM_NED, Trajectory, body_to_ned
 from kgcp.quality.advice import advice
 from kgcp.quality.consistency import Consistency, study_consistency
@@ -32,7 +32,7 @@ _TO_THE_RIGHT = np.array([0.0, 0.08, 0.0])
 _STEP_S, _LEAD_S, _CORRELATION_S = 0.05, 5.0, 20.0
 _SD_POSITION_M, _SD_REFERENCE_M, _SD_REFERENCE_DEG = 0.02, 0.01, 0.005
 _SD_CENTRE_PX, _SD_DISTANCE = 0.05, 3e-4
-_FRAME = MapFrame.at(_CRS, _ORIGIN)
+_LOCAL_FRAME = LocalFrame.at(_CRS, _ORIGIN)
 _SETTINGS = VehicleSettings(lever_arm_m=(-0.8, 0.15, -1.95), correlation_s=_CORRELATION_S)
 
 
@@ -64,7 +64,7 @@ class Flight:
             heading_deg = -np.degrees(angle)
         wave = np.sin(0.3 * time_s)
         attitude = ENU_FROM_NED @ body_to_ned(1.0 * wave, 0.7 * wave, heading_deg)
-        level = _FRAME.level_rotations(position)
+        level = _LOCAL_FRAME.level_rotations(position)
         return position, level @ attitude
 
     def target(self, time_s: FloatArray) -> FloatArray:
@@ -101,13 +101,13 @@ class Flight:
         if not self.has_sds:
             trajectory = replace(trajectory, sd_position_m=None)
             poses = replace(poses, sd_position_m=None, sd_angle_deg=None)
-        whereabouts = Whereabouts.of(_CRS, [_TARGET], trajectory, self.settings)
+        target_positions = TargetPositions.of(_CRS, [_TARGET], trajectory, self.settings)
         # the frames' clock is behind the trajectory's
         late = [
             replace(one, time_s=float(t) - self.time_offset_s)
             for one, t in zip(sightings, time_s, strict=True)
         ]
-        return study_consistency(late, whereabouts, poses, camera)
+        return study_consistency(late, target_positions, poses, camera)
 
     def _seen(
         self, time_s: FloatArray, enu_from_camera: FloatArray, rng: np.random.Generator
@@ -132,12 +132,12 @@ class Flight:
         drive = rng.standard_normal((len(time_s), 3))
         drive[1:] *= math.sqrt(1.0 - keep**2)
         error = _SD_POSITION_M * lfilter([1.0], [1.0, -keep], drive, axis=0)
-        level = _FRAME.level_rotations(position) @ ENU_FROM_NED
+        level = _LOCAL_FRAME.level_rotations(position) @ ENU_FROM_NED
         body = np.swapaxes(level, 1, 2) @ axes
         heading, pitch, roll = Rotation.from_matrix(body).as_euler("ZYX", degrees=True).T
         return Trajectory(
             time_s,
-            _FRAME.map_from_enu(position) + error,
+            _LOCAL_FRAME.map_from_enu(position) + error,
             np.column_stack((roll, pitch, heading)),
             np.full((len(time_s), 3), _SD_POSITION_M),
             None,
@@ -178,14 +178,14 @@ def _reference(
     n = len(names)
     turn = Rotation.from_rotvec(_SD_REFERENCE_DEG * rng.standard_normal((n, 3)), degrees=True)
     photo = (
-        np.swapaxes(_FRAME.grid_rotation(centre), 1, 2)
+        np.swapaxes(_LOCAL_FRAME.grid_rotation(centre), 1, 2)
         @ turn.as_matrix()
         @ attitude
         @ CAMERA_FROM_PHOTO
     )
     return ReferencePoses(
         names,
-        _FRAME.map_from_enu(centre) + _SD_REFERENCE_M * rng.standard_normal((n, 3)),
+        _LOCAL_FRAME.map_from_enu(centre) + _SD_REFERENCE_M * rng.standard_normal((n, 3)),
         opk_from_rotation(photo),
         np.full((n, 3), _SD_REFERENCE_M),
         np.full(n, _SD_REFERENCE_DEG),

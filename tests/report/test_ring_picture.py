@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.measurement.adjustment.residual_image import Residuals
+from kgcp.measurement.adjustment.residual_image import ResidualImage
 from kgcp.report.ring_picture import FULL_SCALE, PICTURE_PX, THUMBNAIL_PX, RingView, draw_ring
 
 TURN = np.linspace(0.0, 2.0 * np.pi, 97)
@@ -33,10 +33,10 @@ def decoded(content: bytes) -> _Picture:
     return read.astype(np.int16)
 
 
-def residuals(value: float) -> Residuals:
+def residuals(value: float) -> ResidualImage:
     """A patch of 31 pixels around the centre, all alike."""
     x, y = np.rint(CENTRE).astype(int).tolist()
-    return Residuals(x - 15, y - 15, np.full((31, 31), value), 0.01)
+    return ResidualImage(x - 15, y - 15, np.full((31, 31), value), 0.01)
 
 
 def test_contours_lie_where_they_were_fitted() -> None:

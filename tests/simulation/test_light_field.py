@@ -18,7 +18,7 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade, Stain
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
-from kgcp.simulation.patch import Patch, Window
+from kgcp.simulation.patch import Patch, PixelWindow
 from kgcp.simulation.plate import image_plate
 from kgcp.simulation.shapes import ConvexPolygon, rectangle
 
@@ -32,7 +32,7 @@ POSE = Pose(
 FLAT = Camera(width=64, height=48, fx=1000.0, fy=1000.0, cx=31.3, cy=23.6)
 PIXEL_M = 0.01
 FACING = Pose(np.eye(3), np.array([0.0, 0.0, 1000.0 * PIXEL_M]))
-WINDOW = Window(0, 0, 64, 48)
+WINDOW = PixelWindow(0, 0, 64, 48)
 
 
 def half_plane(direction_deg: float, edge_m: float, penumbra_m: float) -> Shade:

@@ -10,7 +10,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pixel_grid import normalised_grid
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.patch import Patch, Window, outline_box
+from kgcp.simulation.patch import Patch, PixelWindow, outline_box
 from kgcp.simulation.shapes import Disc, Shape, rectangle, regular_polygon
 
 PLAIN = Camera(width=640, height=480, fx=1000.0, fy=1000.0, cx=320.3, cy=240.7)
@@ -18,7 +18,7 @@ LENS = Camera(
     width=900, height=700, fx=1210.0, fy=1206.0, cx=441.2, cy=361.7,
     k1=-0.09, k2=0.06, p1=0.0008, p2=-0.0006, k3=-0.01,
 )  # fmt: skip
-WINDOW = Window(280, 200, 80, 80)
+WINDOW = PixelWindow(280, 200, 80, 80)
 
 
 def facing(x_px: float, y_px: float) -> Pose:
@@ -33,7 +33,7 @@ def render(shape: Shape, pose: Pose, oversampling: int, camera: Camera = PLAIN) 
     return image
 
 
-def moments(image: FloatArray, window: Window) -> tuple[float, float, float]:
+def moments(image: FloatArray, window: PixelWindow) -> tuple[float, float, float]:
     area = float(image.sum())
     x = float(image.sum(axis=0) @ (window.column + np.arange(window.width))) / area
     y = float(image.sum(axis=1) @ (window.row + np.arange(window.height))) / area
@@ -81,7 +81,7 @@ def test_oblique_discs_through_a_lens_agree_with_opencv() -> None:
         corner, size = outline_box(LENS, pose, Disc((0.0, 0.0), 0.4))
         column, row = np.floor(corner).astype(int) - 4
         width, height = np.ceil(size).astype(int) + 9
-        window = Window(int(column), int(row), int(width), int(height))
+        window = PixelWindow(int(column), int(row), int(width), int(height))
         patch = Patch.of(LENS, pose, window, 4)
         image = np.zeros_like(patch.x_m)
         patch.paint(image, Disc((0.0, 0.0), 0.4), 1.0)

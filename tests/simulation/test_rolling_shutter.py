@@ -10,14 +10,14 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.flight import TARGET_PLATE, plan_flight
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.patch import Patch, Window
+from kgcp.simulation.patch import Patch, PixelWindow
 from kgcp.simulation.plate import image_plate
 from kgcp.simulation.presets import preset
 from kgcp.simulation.rolling_shutter import ImageMotion, RowMotion
 from kgcp.simulation.shapes import Disc, Shape, rectangle
 
 CAMERA = Camera(width=640, height=480, fx=1000.0, fy=1000.0, cx=320.3, cy=240.7)
-WINDOW = Window(280, 200, 80, 90)
+WINDOW = PixelWindow(280, 200, 80, 90)
 FACING = Pose(np.eye(3), np.array([0.0, 0.0, 1000.0]))  # one metre is one pixel
 
 

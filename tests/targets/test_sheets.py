@@ -7,10 +7,10 @@ import pytest
 
 from kgcp.errors import SettingError
 from kgcp.simulation.flight import TARGET_PLATE
-from kgcp.targets.artwork import Plate, draw_target, margin_radius_mm
+from kgcp.targets.artwork import MountingPlate, draw_target, margin_radius_mm
 from kgcp.targets.code_design import chosen_targets, new_targets
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Area, Circle, Disc, Layer, Line, Shape, Text
+from kgcp.targets.shapes import Area, Circle, FilledCircle, Layer, Line, Shape, Text
 from kgcp.targets.sheets import Paper, lay_out
 
 LARGE = TARGET_PLATE.target
@@ -19,7 +19,7 @@ SMALL = Target(Ring("Südtor", 0.15, 0.075, 0.107, 0.021, (0.0, 40.0, 90.0, 255.
 
 def points(shape: Shape) -> list[tuple[float, float]]:
     """Points of a shape's outline; of a text, the corners of what it may take at most."""
-    if isinstance(shape, Disc | Circle):
+    if isinstance(shape, FilledCircle | Circle):
         (x, y), r = shape.centre_mm, shape.radius_mm
         angles = [math.radians(a) for a in range(0, 360, 5)]
         return [(x + r * math.cos(a), y + r * math.sin(a)) for a in angles]
@@ -40,9 +40,9 @@ def points(shape: Shape) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("ratio", [None, (1.26, False), (1.6, False), (1.7, True)], ids=str)
 def test_nothing_touches_the_white_margin(target: Target, ratio: tuple[float, bool] | None) -> None:
     diameter_mm = 1e3 * target.ring.outer_diameter_m
-    plate = None if ratio is None else Plate(ratio[0] * diameter_mm, ratio[1], hole_mm=6.0)
+    plate = None if ratio is None else MountingPlate(ratio[0] * diameter_mm, ratio[1], hole_mm=6.0)
     artwork = draw_target(target, plate)
-    around = [s for s in artwork.shapes if s.__class__ is not Disc]
+    around = [s for s in artwork.shapes if s.__class__ is not FilledCircle]
     assert any(isinstance(shape, Text) and target.name in shape.words for shape in around)
     for shape in around:
         for x, y in points(shape):
@@ -52,7 +52,7 @@ def test_nothing_touches_the_white_margin(target: Target, ratio: tuple[float, bo
 
 
 def test_the_rings_are_those_of_flight_toml() -> None:
-    discs = [shape for shape in draw_target(LARGE, None).shapes if isinstance(shape, Disc)]
+    discs = [shape for shape in draw_target(LARGE, None).shapes if isinstance(shape, FilledCircle)]
     radii = [(disc.layer, round(disc.radius_mm, 3)) for disc in discs]
     assert radii[:2] == [(Layer.INK, 450.0), (Layer.WHITE, 225.0)]
     assert radii[2:6] == [(Layer.WHITE, 64.286)] * 4
@@ -130,9 +130,9 @@ def test_impossible_sheets_say_what_helps() -> None:
 
 def test_plates_that_are_too_small_are_refused() -> None:
     with pytest.raises(SettingError, match=r"plate: 1 m .* at least 1\.125 m"):
-        draw_target(LARGE, Plate(1000.0))
+        draw_target(LARGE, MountingPlate(1000.0))
     with pytest.raises(SettingError, match="holes: of 8 mm reach"):
-        draw_target(LARGE, Plate(1130.0, is_round=True, hole_mm=8.0))
+        draw_target(LARGE, MountingPlate(1130.0, is_round=True, hole_mm=8.0))
 
 
 def test_new_targets_have_the_proportions_of_the_first() -> None:

@@ -28,7 +28,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     KgcpError
         If the CRS has no known way to WGS 84.
     """
-    positions = [point.position_map for point in points.kgcps]
+    positions = [point.position_map for point in points.gcps]
     geodetic = wgs84_from_map(points.crs, positions, "geojson")
     features = [
         {
@@ -39,7 +39,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
             },
             "properties": {**attributes(point), "crs": points.crs},
         }
-        for point, (lon, lat, height) in zip(points.kgcps, geodetic.tolist(), strict=True)
+        for point, (lon, lat, height) in zip(points.gcps, geodetic.tolist(), strict=True)
     ]
     text = ",\n".join(json.dumps(feature, ensure_ascii=False) for feature in features)
     collection = f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'

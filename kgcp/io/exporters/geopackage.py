@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pyproj import CRS
 from pyproj.enums import WktVersion
 
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.shared import ATTRIBUTES, attributes
 
@@ -58,7 +58,7 @@ def files(points: MapPoints) -> Mapping[str, str | bytes]:
         connection.executescript(_SCHEMA)
         crs = points.parsed_crs
         srs_id = _add_systems(connection, points.crs, crs if crs.is_compound else crs.to_2d())
-        _add_layer(connection, points.kgcps, srs_id)
+        _add_layer(connection, points.gcps, srs_id)
         connection.commit()
         content = connection.serialize()
     finally:
@@ -88,13 +88,13 @@ def _add_systems(connection: sqlite3.Connection, text: str, crs: CRS) -> int:
     return srs_id
 
 
-def _add_layer(connection: sqlite3.Connection, kgcps: tuple[Kgcp, ...], srs_id: int) -> None:
+def _add_layer(connection: sqlite3.Connection, gcps: tuple[Gcp, ...], srs_id: int) -> None:
     columns = ", ".join(f'"{name}" {kind}' for name, kind in ATTRIBUTES.items())
     connection.execute(
         f"CREATE TABLE {_TABLE} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom POINT,"
         f" {columns})"
     )
-    xs, ys = zip(*(point.position_map[:2].tolist() for point in kgcps), strict=True)
+    xs, ys = zip(*(point.position_map[:2].tolist() for point in gcps), strict=True)
     connection.execute(
         "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, ?, ?, ?, ?, ?)",
         (_TABLE, _TABLE, _NO_TIME, min(xs), min(ys), max(xs), max(ys), srs_id),
@@ -106,11 +106,11 @@ def _add_layer(connection: sqlite3.Connection, kgcps: tuple[Kgcp, ...], srs_id: 
     marks = ", ".join("?" * (len(ATTRIBUTES) + 1))
     connection.executemany(
         f"INSERT INTO {_TABLE} (geom, {names}) VALUES ({marks})",  # noqa: S608 - names of ours
-        ((_geometry(point, srs_id), *attributes(point).values()) for point in kgcps),
+        ((_geometry(point, srs_id), *attributes(point).values()) for point in gcps),
     )
 
 
-def _geometry(point: Kgcp, srs_id: int) -> bytes:
+def _geometry(point: Gcp, srs_id: int) -> bytes:
     """Return header (magic, version 0, little-endian without envelope, system) and WKB point Z."""
     x, y, z = point.position_map.tolist()
     return struct.pack("<2sBBi", b"GP", 0, 1, srs_id) + struct.pack("<BI3d", 1, 1001, x, y, z)

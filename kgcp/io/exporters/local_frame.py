@@ -14,7 +14,7 @@ import numpy as np
 from pyproj.enums import WktVersion
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.exporters.points import MapPoints
 
 _ROUND_MAP, _ROUND_DEGREES, _ROUND_HEIGHT = 100.0, 0.001, 10.0
@@ -34,7 +34,7 @@ class LocalPoints:
         From the map's axes at each point to east, north, up.
     """
 
-    frame: MapFrame
+    local_frame: LocalFrame
     origin_map: FloatArray
     position_m: FloatArray
     enu_from_map: FloatArray
@@ -53,23 +53,23 @@ def local_points(points: MapPoints) -> LocalPoints:
     Raises
     ------
     KgcpError
-        As `MapFrame.at`.
+        As `LocalFrame.at`.
     """
     step = _ROUND_DEGREES if points.parsed_crs.is_geographic else _ROUND_MAP
     steps = np.array([step, step, _ROUND_HEIGHT])
-    positions = np.array([point.position_map for point in points.kgcps])
+    positions = np.array([point.position_map for point in points.gcps])
     origin = np.round(positions[0] / steps) * steps
-    frame = MapFrame.at(points.crs, origin)
-    position_m = frame.enu_from_map(positions)
-    return LocalPoints(frame, origin, position_m, frame.grid_rotation(position_m))
+    local_frame = LocalFrame.at(points.crs, origin)
+    position_m = local_frame.enu_from_map(positions)
+    return LocalPoints(local_frame, origin, position_m, local_frame.grid_rotation(position_m))
 
 
 def local_cameras(points: MapPoints) -> tuple[FloatArray, FloatArray]:
     """Return the priors' positions (n, 3) [m] and map axes (n, 3, 3) there, in the local frame."""
-    frame = local_points(points).frame
+    local_frame = local_points(points).local_frame
     positions = np.array([prior.position_map for prior in points.priors]).reshape(-1, 3)
-    position_m = frame.enu_from_map(positions)
-    return position_m, frame.grid_rotation(position_m)
+    position_m = local_frame.enu_from_map(positions)
+    return position_m, local_frame.grid_rotation(position_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +92,9 @@ class Origin:
 
 def origin_of(points: MapPoints) -> Origin:
     """Return the origin of the points' local frame."""
-    frame = local_points(points).frame
-    longitude, latitude, height = frame.geodetic_deg(np.zeros((1, 3)))[0]
-    a, b = frame.semi_axes_m
+    local_frame = local_points(points).local_frame
+    longitude, latitude, height = local_frame.geodetic_deg(np.zeros((1, 3)))[0]
+    a, b = local_frame.semi_axes_m
     return Origin(f"{longitude:.13f}", f"{latitude:.13f}", f"{height:.7f}", f"+a={a!r} +b={b!r}")
 
 

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior, opk_covs, opk_deg
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -62,14 +62,14 @@ def files(points: MapPoints) -> Mapping[str, str]:
     KgcpError
         If an image's name has a comma or quote, or two images have the same name.
     """
-    names = image_names((point.frame for point in points.kgcps), _FOLDER, ',"')
-    label = labels(points.kgcps, _FOLDER)
+    names = image_names((point.frame for point in points.gcps), _FOLDER, ',"')
+    label = labels(points.gcps, _FOLDER)
     script = resources("kgcp.io.exporters").joinpath("scripts/metashape_scale_bars.txt")
     texts = {
         "HOWTO.txt": _HOWTO.format(
             crs=points.crs,
             heights=points.heights,
-            mark_px=_rms_mark_px(points.kgcps),
+            mark_px=_rms_mark_px(points.gcps),
             focal_length=focal_length_note(points.controls),
         ),
         "markers.csv": _markers(points, label),
@@ -86,18 +86,18 @@ def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
     return "".join(f"{line}\n" for line in (columns, *map(",".join, rows)))
 
 
-def _rms_mark_px(kgcps: Iterable[Kgcp]) -> str:
-    traces = [point.centre_cov_px2.trace() for point in kgcps if point.centre_cov_px2 is not None]
+def _rms_mark_px(gcps: Iterable[Gcp]) -> str:
+    traces = [point.centre_cov_px2.trace() for point in gcps if point.centre_cov_px2 is not None]
     return f"{(0.5 * sum(traces) / len(traces)) ** 0.5:.3f}" if traces else "unknown"
 
 
 def _markers(points: MapPoints, label: Mapping[str, str]) -> str:
-    def row(point: Kgcp) -> tuple[str, ...]:
+    def row(point: Gcp) -> tuple[str, ...]:
         sds = ("",) * 3 if point.cov_m2 is None else map(decimals, deviations(point.cov_m2))
         enabled = "0" if point.is_checkpoint else "1"
         return (label[point.id], *points.xyz(point.position_map), *sds, enabled)
 
-    rows = [row(group[0]) for group in by_id(points.kgcps).values()]
+    rows = [row(group[0]) for group in by_id(points.gcps).values()]
     return _table("label,x,y,z,accuracy_x_m,accuracy_y_m,accuracy_z_m,enabled", rows)
 
 
@@ -114,7 +114,7 @@ def _cameras(points: MapPoints, names: Mapping[str, str]) -> str:
     )
 
 
-def _scale_bars(kgcps: Iterable[Kgcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
+def _scale_bars(gcps: Iterable[Gcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
     rows = (
         (
             label[point.id],
@@ -122,7 +122,7 @@ def _scale_bars(kgcps: Iterable[Kgcp], names: Mapping[str, str], label: Mapping[
             decimals(point.distance_m),
             "" if point.sd_distance_m is None else decimals(point.sd_distance_m),
         )
-        for point in kgcps
+        for point in gcps
     )
     return _table("marker,camera,distance_m,accuracy_m", rows)
 
@@ -132,13 +132,13 @@ def _markers_xml(points: MapPoints, names: Mapping[str, str], label: Mapping[str
     chunk = ET.SubElement(document, "chunk")
     _add_sensor(ET.SubElement(chunk, "sensors"), points.camera)
     cameras = ET.SubElement(chunk, "cameras")
-    camera_ids = {frame: str(number) for number, frame in enumerate(by_frame(points.kgcps))}
+    camera_ids = {frame: str(number) for number, frame in enumerate(by_frame(points.gcps))}
     for frame, camera_id in camera_ids.items():
         ET.SubElement(cameras, "camera", id=camera_id, label=names[frame], sensor_id="0")
     markers = ET.SubElement(chunk, "markers")
     frames = ET.SubElement(chunk, "frames")
     seen = ET.SubElement(ET.SubElement(frames, "frame", id="0"), "markers")
-    for number, (point_id, group) in enumerate(by_id(points.kgcps).items()):
+    for number, (point_id, group) in enumerate(by_id(points.gcps).items()):
         marker = ET.SubElement(markers, "marker", id=str(number), label=label[point_id])
         x, y, z = points.xyz(group[0].position_map)
         enabled = "false" if group[0].is_checkpoint else "true"

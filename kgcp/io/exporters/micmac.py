@@ -52,7 +52,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If an image's name has white space, two images have the same name, or a point or image
         point has no standard deviations.
     """
-    label = labels(points.kgcps, _FOLDER)
+    label = labels(points.gcps, _FOLDER)
     texts = {
         "gcps.xml": _gcps(points, label),
         "marks.xml": _marks(points, label),
@@ -74,7 +74,7 @@ def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:
 
 
 def _marks(points: MapPoints, label: Mapping[str, str]) -> str:
-    names = image_names((point.frame for point in points.kgcps), _FOLDER, r"\s")
+    names = image_names((point.frame for point in points.gcps), _FOLDER, r"\s")
     root = ET.Element("SetOfMesureAppuisFlottants")
     for frame, group in by_frame(points.controls).items():
         image = ET.SubElement(root, "MesureAppuiFlottant1Im")

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.local_frame import describe_frame, local_points, origin_of
 from kgcp.io.exporters.points import (
     MapPoints,
@@ -62,8 +62,8 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If an image's name has white space, a quote or an asterisk, two images have the same name,
         or a point or image point has no standard deviations.
     """
-    label = labels(points.kgcps, _FOLDER)
-    names = image_names((point.frame for point in points.kgcps), _FOLDER, r'\s*"')
+    label = labels(points.gcps, _FOLDER)
+    names = image_names((point.frame for point in points.gcps), _FOLDER, r'\s*"')
     texts = {
         "HOWTO.txt": _HOWTO.format(
             frame=describe_frame(points), focal_length=focal_length_note(points.controls)
@@ -114,7 +114,7 @@ def _gcps(points: MapPoints, label: Mapping[str, str]) -> str:
     return _document(root)
 
 
-def _measures(image: str, group: Iterable[Kgcp], label: Mapping[str, str]) -> str:
+def _measures(image: str, group: Iterable[Gcp], label: Mapping[str, str]) -> str:
     root = ET.Element("SetMesIm")
     add_text(root, "NameIm", f'"{image}"')
     measures = ET.SubElement(root, "Measures")
@@ -126,12 +126,12 @@ def _measures(image: str, group: Iterable[Kgcp], label: Mapping[str, str]) -> st
     return _document(root)
 
 
-def _distances(kgcps: Iterable[Kgcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
+def _distances(gcps: Iterable[Gcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
     lines = ["* distances from projection centres to points: code, image, point, metres, sigma"]
     lines += [
         f"{_DISTANCE} {names[point.frame]} {label[point.id]}"
         f" {decimals(point.distance_m)} {decimals(point.sd_distance_m)}"
-        for point in kgcps
+        for point in gcps
         if point.sd_distance_m is not None
     ]
     return "\n".join(lines) + "\n"

@@ -80,8 +80,8 @@ def files(points: MapPoints) -> Mapping[str, str]:
 
 
 def _gcp_list(points: MapPoints) -> str:
-    names = image_names((point.frame for point in points.kgcps), FILE_NAME, r"\s")
-    label = labels(points.kgcps, FILE_NAME)
+    names = image_names((point.frame for point in points.gcps), FILE_NAME, r"\s")
+    label = labels(points.gcps, FILE_NAME)
     height_factor = _metres_per_height_unit(points.parsed_crs)
     lines = [_header(points.crs, points.parsed_crs), _NOTE]
     owners: dict[tuple[str, str, str], str] = {}
@@ -122,7 +122,7 @@ def _yaw_pitch_roll_deg(points: MapPoints) -> FloatArray:
     """
     position_m, enu_from_map = local_cameras(points)
     map_from_camera = np.array([prior.map_from_camera for prior in points.priors])
-    level = local_points(points).frame.level_rotations(position_m)
+    level = local_points(points).local_frame.level_rotations(position_m)
     level_from_camera = np.swapaxes(level, -1, -2) @ enu_from_map @ map_from_camera
     ned_from_body = ENU_FROM_NED.T @ level_from_camera @ _CAMERA_FROM_BODY
     angles: FloatArray = Rotation.from_matrix(ned_from_body).as_euler("ZYX", degrees=True)

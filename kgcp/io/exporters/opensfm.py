@@ -14,7 +14,7 @@ import numpy as np
 
 from kgcp.geometry.camera import Camera
 from kgcp.georef.crs import wgs84_from_map
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints, by_id, image_names, largest_sd
 
 _FOLDER = "opensfm"
@@ -57,7 +57,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
 
 
 def _control(points: MapPoints) -> str:
-    names = image_names((point.frame for point in points.kgcps), _FOLDER, "")
+    names = image_names((point.frame for point in points.gcps), _FOLDER, "")
     groups = by_id(points.controls)
     heads = [group[0] for group in groups.values()]
     geodetic = wgs84_from_map(points.crs, [point.position_map for point in heads], _FOLDER)
@@ -77,7 +77,7 @@ def _control(points: MapPoints) -> str:
     return json.dumps({"points": entries}, indent=1, ensure_ascii=False) + "\n"
 
 
-def _normalised(point: Kgcp, camera: Camera) -> list[float]:
+def _normalised(point: Gcp, camera: Camera) -> list[float]:
     middle = 0.5 * (np.array([camera.width, camera.height]) - 1.0)
     projection: list[float] = (
         (point.centre_px - middle) / max(camera.width, camera.height)

@@ -16,7 +16,7 @@ from uuid import NAMESPACE_URL, uuid5
 from pyproj.enums import WktVersion
 
 from kgcp import __version__
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -54,7 +54,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     KgcpError
         If a point or an image point has no standard deviations.
     """
-    camera_ids = {frame: number for number, frame in enumerate(by_frame(points.kgcps), start=1)}
+    camera_ids = {frame: number for number, frame in enumerate(by_frame(points.gcps), start=1)}
     parts = {
         "camera_list": {
             "format": "application/opf-camera-list+json",
@@ -89,11 +89,11 @@ def _gcps(points: MapPoints, camera_ids: Mapping[str, int]) -> list[dict[str, ob
             "marks": [_mark(point, camera_ids[point.frame]) for point in group],
             "is_checkpoint": group[0].is_checkpoint,
         }
-        for point_id, group in by_id(points.kgcps).items()
+        for point_id, group in by_id(points.gcps).items()
     ]
 
 
-def _mark(point: Kgcp, camera_id: int) -> dict[str, object]:
+def _mark(point: Gcp, camera_id: int) -> dict[str, object]:
     return {
         "camera_id": camera_id,
         "position_px": (point.centre_px + CORNER_PX).tolist(),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import (
     CORNER_PX,
     MapPoints,
@@ -50,7 +50,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If an image's name has a comma or quote, two images have the same name, or an image point
         has no deviations.
     """
-    checks = [point for point in points.kgcps if point.is_checkpoint]
+    checks = [point for point in points.gcps if point.is_checkpoint]
     order = "latitude or northing" if points.is_north_first else "longitude or easting"
     texts = {
         "HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights, order=order),
@@ -62,10 +62,10 @@ def files(points: MapPoints) -> Mapping[str, str]:
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 
 
-def _points(points: MapPoints, kgcps: Iterable[Kgcp]) -> str:
-    label = labels(points.kgcps, _FOLDER)
+def _points(points: MapPoints, gcps: Iterable[Gcp]) -> str:
+    label = labels(points.gcps, _FOLDER)
     lines = []
-    for point_id, group in by_id(kgcps).items():
+    for point_id, group in by_id(gcps).items():
         cells = [label[point_id], *points.own_axes(points.xyz(group[0].position_map))]
         cov = group[0].cov_m2
         if cov is not None:
@@ -76,10 +76,10 @@ def _points(points: MapPoints, kgcps: Iterable[Kgcp]) -> str:
 
 
 def _marks(points: MapPoints) -> str:
-    names = image_names((point.frame for point in points.kgcps), _FOLDER, ',"')
-    label = labels(points.kgcps, _FOLDER)
+    names = image_names((point.frame for point in points.gcps), _FOLDER, ',"')
+    label = labels(points.gcps, _FOLDER)
     lines = []
-    for point in points.kgcps:
+    for point in points.gcps:
         accuracy = decimals(largest_sd(known_centre_cov(point, _FOLDER)))
         cells = (names[point.frame], label[point.id], *pixel(point, CORNER_PX), accuracy)
         lines.append(",".join(cells) + "\n")

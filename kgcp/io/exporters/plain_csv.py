@@ -25,7 +25,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for point in points.kgcps:
+    for point in points.gcps:
         writer.writerow(
             (
                 *(point.id, point.frame, point.target),

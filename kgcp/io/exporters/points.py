@@ -17,7 +17,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 
 Cell = TypeVar("Cell", str, float)
 
@@ -42,7 +42,7 @@ class MapPoints:
     """
 
     crs: str
-    kgcps: tuple[Kgcp, ...]
+    gcps: tuple[Gcp, ...]
     camera: Camera
     priors: tuple[CameraPrior, ...] = ()
 
@@ -60,15 +60,15 @@ class MapPoints:
         return f"{kind} [{unit}]"
 
     @property
-    def controls(self) -> tuple[Kgcp, ...]:
+    def controls(self) -> tuple[Gcp, ...]:
         """The points that are not kept for checking."""
-        return tuple(point for point in self.kgcps if not point.is_checkpoint)
+        return tuple(point for point in self.gcps if not point.is_checkpoint)
 
     @property
-    def distinct_controls(self) -> tuple[tuple[int, Kgcp], ...]:
+    def distinct_controls(self) -> tuple[tuple[int, Gcp], ...]:
         """The controls, static ones once, with their places among all points."""
-        firsts: dict[str, tuple[int, Kgcp]] = {}
-        for index, point in enumerate(self.kgcps):
+        firsts: dict[str, tuple[int, Gcp]] = {}
+        for index, point in enumerate(self.gcps):
             if not point.is_checkpoint:
                 firsts.setdefault(point.id, (index, point))
         return tuple(firsts.values())
@@ -115,29 +115,29 @@ def decimals(value: float, places: int = 9) -> str:
     return f"{value:.{places}f}"
 
 
-def pixel(point: Kgcp, shift_px: float = 0.0) -> tuple[str, str]:
+def pixel(point: Gcp, shift_px: float = 0.0) -> tuple[str, str]:
     """Return image coordinates as text, moved by `shift_px`."""
     x, y = point.centre_px + shift_px
     return decimals(x, PIXEL_DECIMALS), decimals(y, PIXEL_DECIMALS)
 
 
-def by_id(kgcps: Iterable[Kgcp]) -> Mapping[str, list[Kgcp]]:
+def by_id(gcps: Iterable[Gcp]) -> Mapping[str, list[Gcp]]:
     """Group observations by point: many for a static target, one for each kinematic point."""
-    groups: dict[str, list[Kgcp]] = {}
-    for point in kgcps:
+    groups: dict[str, list[Gcp]] = {}
+    for point in gcps:
         groups.setdefault(point.id, []).append(point)
     return groups
 
 
-def by_frame(kgcps: Iterable[Kgcp]) -> Mapping[str, list[Kgcp]]:
+def by_frame(gcps: Iterable[Gcp]) -> Mapping[str, list[Gcp]]:
     """Group points by the frame that saw them."""
-    groups: dict[str, list[Kgcp]] = {}
-    for point in kgcps:
+    groups: dict[str, list[Gcp]] = {}
+    for point in gcps:
         groups.setdefault(point.frame, []).append(point)
     return groups
 
 
-def labels(kgcps: Iterable[Kgcp], where: str) -> Mapping[str, str]:
+def labels(gcps: Iterable[Gcp], where: str) -> Mapping[str, str]:
     """Return the points' ids without what separates or quotes in a text file.
 
     Raises
@@ -147,7 +147,7 @@ def labels(kgcps: Iterable[Kgcp], where: str) -> Mapping[str, str]:
     """
     owners: dict[str, str] = {}
     names: dict[str, str] = {}
-    for point in kgcps:
+    for point in gcps:
         label = re.sub(r"[\s,;\"*#]+", "_", point.id)
         if owners.setdefault(label, point.id) != point.id:
             raise KgcpError(
@@ -196,7 +196,7 @@ def image_names(
     return names
 
 
-def known_cov(point: Kgcp, where: str) -> FloatArray:
+def known_cov(point: Gcp, where: str) -> FloatArray:
     """Return a point's covariance (3, 3) in map axes [m²]; `KgcpError` if it has none."""
     if point.cov_m2 is None:
         raise KgcpError(
@@ -207,7 +207,7 @@ def known_cov(point: Kgcp, where: str) -> FloatArray:
     return point.cov_m2
 
 
-def known_centre_cov(point: Kgcp, where: str) -> FloatArray:
+def known_centre_cov(point: Gcp, where: str) -> FloatArray:
     """Return the covariance (2, 2) of an image point [px²]; `KgcpError` if it has none."""
     if point.centre_cov_px2 is None:
         raise KgcpError(

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.files.time_text import format_time
 from kgcp.io.tables.columns import ColumnType
-from kgcp.io.tables.gcps import KGCP_COLUMNS
+from kgcp.io.tables.gcps import GCP_COLUMNS
 
-_COLUMNS = {column.name: column for column in KGCP_COLUMNS}
+_COLUMNS = {column.name: column for column in GCP_COLUMNS}
 _NAMES = (
     *("id", "frame", "target", "time", "role", "x", "y", "z", "sd_x", "sd_y", "sd_z"),
     *("x_px", "y_px", "distance_m", "sd_distance_m"),
@@ -31,17 +31,17 @@ is another one, put the new calibration into flight.toml and begin again with kg
 """
 
 
-def attributes(point: Kgcp) -> dict[str, object]:
+def attributes(point: Gcp) -> dict[str, object]:
     """Return the attributes of a point, as in `kgcps.parquet`; None where unknown."""
     cells = {name: _COLUMNS[name].get(point) for name in _NAMES}
     return {**cells, "time": None if point.time_s is None else format_time(point.time_s)}
 
 
-def focal_length_note(kgcps: Iterable[Kgcp]) -> str:
+def focal_length_note(gcps: Iterable[Gcp]) -> str:
     """Return lines for a HOWTO: how distances hang on the focal length, and how much in these."""
     shares = [
         point.sd_common_distance_m / point.distance_m
-        for point in kgcps
+        for point in gcps
         if point.sd_common_distance_m is not None
     ]
     if not shares:

@@ -49,7 +49,7 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
     KgcpError
         If there are no points, the format cannot hold them, or a file cannot be written.
     """
-    if not points.kgcps:
+    if not points.gcps:
         raise KgcpError(f"{name}: no points left after selection; select less strictly")
     files: Mapping[str, str | bytes] = _WRITERS[name].files(points)
     contents = {

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
-from kgcp.georef.target_positions import Whereabouts
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
@@ -60,11 +60,11 @@ class FlightData:
                 " 'reference.csv' with the camera's poses from an adjustment"
             )
         return read_reference_poses(
-            flight.reference.file, flight.reference.notation, crs=flight.crs, frames=self._frames
+            flight.reference.file, flight.reference.options, crs=flight.crs, frames=self._frames
         )
 
     @cached_property
-    def whereabouts(self) -> Whereabouts:
+    def target_positions(self) -> TargetPositions:
         """Where the flight's targets were, by the vehicle's trajectory if it has one.
 
         Raises
@@ -81,6 +81,6 @@ class FlightData:
             )
         trajectory, settings = None, VehicleSettings()
         if (vehicle := flight.vehicle) is not None:
-            trajectory = read_trajectory(vehicle.trajectory_file, flight.crs, vehicle.notation)
+            trajectory = read_trajectory(vehicle.trajectory_file, flight.crs, vehicle.options)
             settings = vehicle.settings
-        return Whereabouts.of(flight.crs, flight.targets, trajectory, settings)
+        return TargetPositions.of(flight.crs, flight.targets, trajectory, settings)

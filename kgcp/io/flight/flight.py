@@ -20,10 +20,10 @@ from kgcp.io.flight.camera_table import (
 )
 from kgcp.io.flight.target_table import read_targets
 from kgcp.io.flight.toml_table import TomlTable
-from kgcp.io.flight.vehicle_table import Vehicle, read_vehicle
+from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 from kgcp.targets.layout import Target
 
 REFERENCE_KEYS = ("poses", "format", "crs", "offset")
@@ -55,7 +55,7 @@ class Reference:
     """
 
     file: Path
-    notation: PoseNotation
+    options: OrientationFileOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Flight:
     calibration_covariance: CalibrationCovariance | None
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
-    vehicle: Vehicle | None
+    vehicle: VehicleTable | None
     reference: Reference | None
     toml_text: str
 
@@ -204,9 +204,9 @@ def _read_reference(flight: TomlTable, folder: Path) -> Reference | None:
     if "reference" not in flight:
         return None
     table = flight.table("reference", REFERENCE_KEYS)
-    notation = PoseNotation(
+    options = OrientationFileOptions(
         form=table.optional("format", lambda key: table.choice(key, POSE_FORMATS.names)),
         crs=table.optional("crs", table.text),
         offset_file=table.optional("offset", lambda key: table.existing_file(key, folder)),
     )
-    return Reference(folder / table.text("poses"), notation)
+    return Reference(folder / table.text("poses"), options)

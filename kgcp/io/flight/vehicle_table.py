@@ -8,7 +8,7 @@ from pathlib import Path
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.trajectories import FORMATS
-from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 from kgcp.settings import VehicleSettings
 
 VEHICLE_KEYS = (
@@ -20,8 +20,8 @@ _COURSE = "course"
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
-    """The target's carrier.
+class VehicleTable:
+    """The [vehicle] table of flight.toml.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class Vehicle:
 
     settings: VehicleSettings
     trajectory_file: Path
-    notation: TrajectoryNotation
+    options: TrajectoryFileOptions
 
 
-def read_vehicle(flight: TomlTable, folder: Path) -> Vehicle | None:
+def read_vehicle(flight: TomlTable, folder: Path) -> VehicleTable | None:
     """Read the table of the vehicle, if the flight has one.
 
     Raises
@@ -58,7 +58,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> Vehicle | None:
             correlation_s=table.number("correlation_s", 60.0),
         )
     accuracies = table.optional("accuracies", table.text)
-    notation = TrajectoryNotation(
+    options = TrajectoryFileOptions(
         format=table.optional("format", lambda key: table.choice(key, FORMATS.names)),
         crs=table.optional("crs", table.text),
         time_system=table.optional("time_system", lambda key: table.choice(key, TimeSystem)),
@@ -67,7 +67,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> Vehicle | None:
         wander=table.optional("wander", lambda key: table.choice(key, Wander)),
         course_sd_deg=_read_course(table),
     )
-    return Vehicle(settings, folder / table.text("trajectory"), notation)
+    return VehicleTable(settings, folder / table.text("trajectory"), options)
 
 
 def _read_course(table: TomlTable) -> tuple[float, float, float] | None:

@@ -23,7 +23,7 @@ from PIL import Image
 
 from kgcp.errors import SettingError
 from kgcp.io.print.typeface import fit_text, font
-from kgcp.targets.shapes import LINE_MM, Area, Circle, Disc, Shape, Sheet, Text
+from kgcp.targets.shapes import LINE_MM, Area, Circle, FilledCircle, Shape, Sheet, Text
 
 _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
@@ -122,13 +122,13 @@ def _artist(figure: Figure, shape: Shape, transform: Transform) -> Artist:
             fontsize=_PT_PER_MM * size_mm,
             parse_math=False,
         )
-    if isinstance(shape, Disc | Circle):
+    if isinstance(shape, FilledCircle | Circle):
         place = Affine2D().scale(shape.radius_mm).translate(*shape.centre_mm)
         outline = _UNIT_CIRCLE.transformed(place)
     else:
         outline = Outline(np.array(shape.points_mm), closed=False)
     ink = str(shape.layer.grey)
-    is_filled = isinstance(shape, Disc | Area)
+    is_filled = isinstance(shape, FilledCircle | Area)
     patch = PathPatch(
         outline,
         facecolor=ink if is_filled else "none",

@@ -9,7 +9,7 @@ from ezdxf import units
 from ezdxf.layouts import Modelspace
 
 from kgcp.io.print.typeface import CAP_HEIGHT, fit_text
-from kgcp.targets.shapes import Area, Artwork, Circle, Disc, Layer, Shape, Text
+from kgcp.targets.shapes import Area, Artwork, Circle, FilledCircle, Layer, Shape, Text
 
 _STYLE = "SANS"
 _COLOURS = {Layer.PLATE: 3, Layer.HOLES: 5, Layer.CROP: 8, Layer.WHITE: 1}  # AutoCAD's indices
@@ -43,7 +43,7 @@ def _add(space: Modelspace, shape: Shape) -> None:
         space.add_text(words, height=CAP_HEIGHT * size_mm, dxfattribs=look)
         return
     on_layer = {"layer": shape.layer.value}
-    if isinstance(shape, Disc | Circle):
+    if isinstance(shape, FilledCircle | Circle):
         x, y = shape.centre_mm
         space.add_circle((x, -y), shape.radius_mm, dxfattribs=on_layer)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields
 
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.georef.sighting import Exposure, Sighting
 from kgcp.io.tables.columns import (
     NUMBER,
@@ -22,7 +22,7 @@ from kgcp.io.tables.columns import (
 from kgcp.quality.bias_study import Comparison, EdgeDistances, edge_distances
 from kgcp.settings import Method
 
-KGCP_COLUMNS: tuple[Column[Kgcp], ...] = (
+GCP_COLUMNS: tuple[Column[Gcp], ...] = (
     Column("id", TEXT, lambda point: point.id),
     Column("frame", TEXT, lambda point: point.frame),
     Column("target", TEXT, lambda point: point.target),
@@ -88,9 +88,9 @@ BIAS_COLUMNS: tuple[Column[_Compared], ...] = (
 )
 
 
-def kgcp_row(point: Kgcp) -> Row:
+def gcp_row(point: Gcp) -> Row:
     """Return the row of one KGCP."""
-    return row_of(KGCP_COLUMNS, point)
+    return row_of(GCP_COLUMNS, point)
 
 
 def bias_row(measured: Comparison, method: Method) -> Row:

@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
-from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import plateau_levels
 from kgcp.measurement.records import Measurement
@@ -27,14 +27,14 @@ _MOVED = 0.2  # of a dot's contrast: so much more light on one side of a dot and
 _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
 
 
-def edge_noise(fit: Fit) -> float:
+def edge_noise(fit: TargetFit) -> float:
     """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
-    black, white = plateau_levels(fit.parameters.light, fit.sample.imaging.response)
+    black, white = plateau_levels(fit.parameters.light, fit.sample.problem.response)
     residual = median_at_edges(fit.sd, fit.prediction.share, 0.2, 0.8, math.nan)
     return residual / (white - black) if residual > 0.0 and white > black else _NO_SENSE
 
 
-def check_fit(fit: Fit) -> None:
+def check_fit(fit: TargetFit) -> None:
     """Refuse a fit that leaves too many outliers or too large residuals.
 
     Raises
@@ -70,7 +70,7 @@ def check_precision(observation: Measurement) -> None:
         raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
 
 
-def check_code(fit: Fit, ring: Ring) -> None:
+def check_code(fit: TargetFit, ring: Ring) -> None:
     """Refuse a ring that shows a dot where this code has none, or lacks more than a dirty one.
 
     The residuals of the fit are averaged over discs of a dot's size all around the code circle.
@@ -113,19 +113,19 @@ def _largest_displacement(excess: FloatArray, sides: BoolArray) -> float:
     return float(np.minimum(most, lack[::-1]).max())
 
 
-def _light_around_code_circle(fit: Fit, ring: Ring) -> FloatArray:
+def _light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:
     """Return what the fit lacks of light all around the code circle, 1: a whole dot.
 
     0, which says nothing, where too few pixels are seen.
     """
     sample, clip = fit.sample, fit.sample.censoring.high
-    black, white = plateau_levels(fit.parameters.light, sample.imaging.response)
+    black, white = plateau_levels(fit.parameters.light, sample.problem.response)
     lack = sample.levels - np.minimum(fit.prediction.levels, clip)
-    lack = lack / max(min(white, clip) - black, sample.imaging.window.levels_per_count)
+    lack = lack / max(min(white, clip) - black, sample.problem.window.levels_per_count)
     code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m
     counts, sums = np.zeros(_POSITIONS), np.zeros(_POSITIONS)
     _gather_around(fit.prediction.points_m, lack, code_m, dot_m, counts, sums)
-    px_per_m = sample.imaging.outer_radius_px / sample.imaging.outer_radius_m
+    px_per_m = sample.problem.outer_radius_px / sample.problem.outer_radius_m
     ratio = dot_m * px_per_m / fit.parameters.blur.mean_sd_px
     visible = 0.85 * (1.0 - math.exp(-0.5 * ratio * ratio))  # of a dot's light after the blur
     return np.where(counts >= _MIN_PIXELS, sums / np.maximum(counts, 1.0) / visible, 0.0)

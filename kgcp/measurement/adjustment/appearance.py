@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.blur import variance_in_pixels
 from kgcp.measurement.image_model.photometry import plateau_levels, share_at
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
@@ -16,13 +16,13 @@ from kgcp.measurement.records import Appearance
 from kgcp.targets.layout import Target
 
 
-def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
+def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
     """Return levels, clipping, blur and edge displacement of a fitted target."""
-    imaging = fit.sample.imaging
-    black, white = plateau_levels(fit.parameters.light, imaging.response)
+    problem = fit.sample.problem
+    black, white = plateau_levels(fit.parameters.light, problem.response)
     x, y = fit.prediction.points_m
-    inside = x * x + y * y < imaging.outer_radius_m**2
-    binning, clipped = imaging.window.binning, fit.sample.clipped
+    inside = x * x + y * y < problem.outer_radius_m**2
+    binning, clipped = problem.window.binning, fit.sample.clipped
     blur_px, shift_px = fit.parameters.blur.mean_sd_px, _edge_shift_px(fit)
     if binning > 1:
         blur_px = math.sqrt(variance_in_pixels(blur_px * blur_px, binning))
@@ -38,13 +38,13 @@ def appearance_of(camera: Camera, target: Target, fit: Fit) -> Appearance:
     )
 
 
-def _edge_shift_px(fit: Fit) -> float:
+def _edge_shift_px(fit: TargetFit) -> float:
     """Return how far a straight edge seems displaced towards the dark side.
 
     The apparent edge is where the grey value passes midway between the plateaus as they are seen,
     clipped; the true one is where half the light comes from either side.
     """
-    light, imaging = fit.parameters.light, fit.sample.imaging
-    black, white = plateau_levels(light, imaging.response)
-    crossing = share_at(0.5 * (black + min(white, imaging.censoring.high)), light, imaging.response)
+    light, problem = fit.parameters.light, fit.sample.problem
+    black, white = plateau_levels(light, problem.response)
+    crossing = share_at(0.5 * (black + min(white, problem.censoring.high)), light, problem.response)
     return float(-fit.parameters.blur.mean_sd_px * ndtri(min(max(crossing, 1e-3), 1.0 - 1e-3)))

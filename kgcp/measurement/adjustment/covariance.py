@@ -22,7 +22,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
-from kgcp.measurement.adjustment.solver import Fit, noise_of
+from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import plateau_levels, share_at
 from kgcp.measurement.records import Uncertainty
@@ -58,7 +58,7 @@ class PoseCovariance:
     inflation: float
 
 
-def pose_covariance(fit: Fit) -> PoseCovariance:
+def pose_covariance(fit: TargetFit) -> PoseCovariance:
     """Return the covariance of the pose of a fit.
 
     From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
@@ -93,12 +93,12 @@ def pose_covariance(fit: Fit) -> PoseCovariance:
     if field is not None and len(field.edges):
         pose_cov *= _ACROSS_SHADOW
     if fit.parameters.has_skew:
-        across_m = _skew_displacement_px(fit) * depth_m / fit.sample.imaging.focal_px
+        across_m = _skew_displacement_px(fit) * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     return PoseCovariance(pose_cov, max(1.0, mean))
 
 
-def _skew_displacement_px(fit: Fit) -> float:
+def _skew_displacement_px(fit: TargetFit) -> float:
     """Return the standard deviation of the centre by what skew spreads displace it [px].
 
     A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
@@ -109,53 +109,53 @@ def _skew_displacement_px(fit: Fit) -> float:
     return _SKEW_SHARE * largest / (6.0 * blur.mean_sd_px**2)
 
 
-def _common_displacement_px(fit: Fit) -> float:
+def _common_displacement_px(fit: TargetFit) -> float:
     """Return the standard deviation of the displacement that all of a circle's edge shares [px].
 
     From the residuals: what edges scatter beyond the noise of the plateaus (coarse sampling of a
     print, compression, tails of what is not modelled) averages out along a circle only in part. And
     of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
     """
-    imaging = fit.sample.imaging
-    is_plain = imaging.window.binning == 1 or imaging.response is Response.LINEAR
-    floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / imaging.window.binning
+    problem = fit.sample.problem
+    is_plain = problem.window.binning == 1 or problem.response is Response.LINEAR
+    floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / problem.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction)
     excess = noise.sd**2 - noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
-    black, white = plateau_levels(fit.parameters.light, imaging.response)
+    black, white = plateau_levels(fit.parameters.light, problem.response)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
     return max(floor_px, _COMMON_SHARE * math.sqrt(at_edges) / slope_per_px)
 
 
-def _clipped_reach_px(fit: Fit) -> float:
+def _clipped_reach_px(fit: TargetFit) -> float:
     """Return how far the middle of a straight edge is within what is clipped [px]."""
-    light, imaging = fit.parameters.light, fit.sample.imaging
-    burnt = share_at(imaging.censoring.high, light, imaging.response)
-    sunk = share_at(imaging.censoring.low, light, imaging.response)
+    light, problem = fit.parameters.light, fit.sample.problem
+    burnt = share_at(problem.censoring.high, light, problem.response)
+    sunk = share_at(problem.censoring.low, light, problem.response)
     hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
     return float(fit.parameters.blur.mean_sd_px * ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
 
 
-def _edge_pull(fit: Fit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
+def _edge_pull(fit: TargetFit, scaled: FloatArray, circle: IndexArray) -> FloatArray:
     """Return the gradient (p, 2) by one pixel's growth of the outer and of the inner circle.
 
     Coming nearer by the share 1/r grows a circle of r pixels by one pixel.
     """
-    imaging = fit.sample.imaging
-    per_pixel = -fit.misfit.weight / (fit.sd * imaging.outer_radius_px / imaging.outer_radius_m)
+    problem = fit.sample.problem
+    per_pixel = -fit.misfit.weight / (fit.sd * problem.outer_radius_px / problem.outer_radius_m)
     by_approach = per_pixel * (fit.parameters.pose.translation_m @ fit.jacobian[:3])
     pulls = np.zeros((2, len(by_approach)))
-    for index, radius_m in enumerate(imaging.circles.radii_m[:2]):
+    for index, radius_m in enumerate(problem.circles.radii_m[:2]):
         np.divide(by_approach, radius_m, out=pulls[index], where=circle == index)
     return np.asarray(scaled @ pulls.T)
 
 
-def _nearest_edges(fit: Fit) -> tuple[IndexArray, IndexArray]:
+def _nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
     """Return, for every pixel, the circle of its nearest edge and the number of the arc there."""
-    imaging = fit.sample.imaging
-    circles = imaging.circles.part(slice(0, imaging.measured_count))
-    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
+    problem = fit.sample.problem
+    circles = problem.circles.part(slice(0, problem.measured_count))
+    px_per_m = problem.outer_radius_px / problem.outer_radius_m
     counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
     return _number_arcs(fit.prediction.points_m, circles.centres_m, circles.radii_m, counts)
 

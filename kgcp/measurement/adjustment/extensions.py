@@ -21,7 +21,7 @@ from kgcp.measurement.adjustment.plateaus import (
     look_at_plateaus,
     step_across,
 )
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import asks_for_levels, even_field, fit_levels
 from kgcp.measurement.adjustment.skewed import asks_for_skew, loss_per_pixel, with_skew
 from kgcp.measurement.adjustment.solver import adjust
@@ -35,7 +35,7 @@ _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
 
 
-def fit_in_any_light(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
+def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
     """Adjust both poses by the plain model, and by what its residuals ask for beyond it.
 
     Raises
@@ -44,24 +44,24 @@ def fit_in_any_light(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
         As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; and `POOR_FIT` where levels that
         vary explain nothing either.
     """
-    is_small = imaging.outer_radius_px < _SMALLEST_UNEVEN_PX
+    is_small = problem.outer_radius_px < _SMALLEST_UNEVEN_PX
     try:
-        plain = _with_skew(imaging, fit_both_poses(imaging, pose, blur))
+        plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
-        plateaus = None if is_small else look_at_plateaus(imaging, pose, blur.mean_sd_px)
+        plateaus = None if is_small else look_at_plateaus(problem, pose, blur.mean_sd_px)
         if plateaus is None or not plateaus.is_uneven:
             raise
     else:
         if is_small or not asks_for_levels(plain.best):
             return plain
-        plateaus = look_at_plateaus(imaging, pose, blur.mean_sd_px)
+        plateaus = look_at_plateaus(problem, pose, blur.mean_sd_px)
         if plateaus is None or not plateaus.is_uneven:
-            return _with_levels(imaging, plain)
-    poses = fit_both_poses(evened_window(imaging, plateaus), pose, blur)
-    return _with_skew(imaging, _with_seen_levels(imaging, poses, plateaus))
+            return _with_levels(problem, plain)
+    poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)
+    return _with_skew(problem, _with_seen_levels(problem, poses, plateaus))
 
 
-def _with_skew(imaging: Imaging, poses: TwoPoses) -> TwoPoses:
+def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     """Let the point spread be skew, where the residuals ask for it."""
     best, other = poses.best, poses.other
     if not asks_for_skew(best):
@@ -73,44 +73,46 @@ def _with_skew(imaging: Imaging, poses: TwoPoses) -> TwoPoses:
             best.parameters.pose, Blur(*blur.total_covariance), best.parameters.light
         )
         gaussian = replace(gaussian, field=best.parameters.field)
-        spreads.append((gaussian, unknowns_of(imaging, has_streak=False)))
+        spreads.append((gaussian, unknowns_of(problem, has_streak=False)))
     skewed = [
-        _fit_skewed(imaging, parameters, other.parameters.pose, with_skew(unknowns))
+        _fit_skewed(problem, parameters, other.parameters.pose, with_skew(unknowns))
         for parameters, unknowns in spreads
     ]
     return replace(min(skewed, key=lambda both: loss_per_pixel(both.best)), even=poses.even)
 
 
-def _fit_skewed(imaging: Imaging, start: Parameters, other: Pose, unknowns: Unknowns) -> TwoPoses:
+def _fit_skewed(
+    problem: FitProblem, start: Parameters, other: Pose, unknowns: Unknowns
+) -> TwoPoses:
     nudged = replace(start, vector=start.vector + _NUDGE)
     if nudged.field is not None:
-        return TwoPoses(*fit_levels(imaging, [nudged], other, unknowns))
-    skewed = adjust(imaging, nudged, unknowns)
+        return TwoPoses(*fit_levels(problem, [nudged], other, unknowns))
+    skewed = adjust(problem, nudged, unknowns)
     return TwoPoses(skewed, fit_at(skewed, other))
 
 
-def _with_levels(imaging: Imaging, poses: TwoPoses) -> TwoPoses:
+def _with_levels(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     """Let levels vary that are even but for little: from the plain fit, and from a shadow."""
     first = poses.best.parameters
-    plateaus = look_at_plateaus(imaging, first.pose, first.blur.mean_sd_px)
-    shadows = [] if plateaus is None else _shadow_across(imaging, first, plateaus)
-    return _fitted(imaging, poses, [*shadows, first])
+    plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px)
+    shadows = [] if plateaus is None else _shadow_across(problem, first, plateaus)
+    return _fitted(problem, poses, [*shadows, first])
 
 
-def _with_seen_levels(imaging: Imaging, poses: TwoPoses, plateaus: Plateaus) -> TwoPoses:
+def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) -> TwoPoses:
     """Let the levels vary from those seen on ink and plate, and from a shadow."""
     first = poses.best.parameters
-    plateaus = look_at_plateaus(imaging, first.pose, first.blur.mean_sd_px) or plateaus
+    plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = plateaus.extremes
     light = replace(first.light, black=black, white=white)
-    field = field_of(even_field(imaging), imaging, plateaus, light)
+    field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
-    return _fitted(imaging, poses, [*_shadow_across(imaging, first, plateaus), smooth])
+    return _fitted(problem, poses, [*_shadow_across(problem, first, plateaus), smooth])
 
 
-def _shadow_across(imaging: Imaging, first: Parameters, plateaus: Plateaus) -> list[Parameters]:
+def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -> list[Parameters]:
     """Return the start with a shadow's straight edge across the plate, if there may be one."""
-    edge = step_across(imaging, plateaus)
+    edge = step_across(problem, plateaus)
     if edge is None:
         return []
     black, white = plateaus.typical
@@ -119,9 +121,9 @@ def _shadow_across(imaging: Imaging, first: Parameters, plateaus: Plateaus) -> l
     light = replace(first.light, black=black - 0.5 * edge[3], white=white - 0.5 * edge[4])
     edge[3:] /= light.white - light.black
     edged = Parameters.of(first.pose, first.blur, light)
-    return [replace(edged, field=replace(even_field(imaging), edges=edge[None]))]
+    return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
 
 
-def _fitted(imaging: Imaging, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
-    best, other = fit_levels(imaging, starts, poses.other.parameters.pose, poses.best.unknowns)
+def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
+    best, other = fit_levels(problem, starts, poses.other.parameters.pose, poses.best.unknowns)
     return TwoPoses(best, other, poses.best)

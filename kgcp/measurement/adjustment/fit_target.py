@@ -20,7 +20,7 @@ from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_
 from kgcp.measurement.adjustment.appearance import appearance_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
-from kgcp.measurement.adjustment.problem import Imaging, apparent_response
+from kgcp.measurement.adjustment.problem import FitProblem, apparent_response
 from kgcp.measurement.adjustment.two_poses import (
     TwoPoses,
     advantage,
@@ -70,10 +70,10 @@ def measure_by_model(
         `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
     pose = _without_edge_shift(start)
-    imaging = replace(imaging_of(grey, camera, target, pose), visible=visible)
-    poses = fit_in_any_light(imaging, pose, _start_blur(start, imaging.window.binning))
+    problem = replace(fit_problem_of(grey, camera, target, pose), visible=visible)
+    poses = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
     if prior is not None:
-        poses = choose_by_prior(imaging, poses, prior)
+        poses = choose_by_prior(problem, poses, prior)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
     if poses.even is not None:
@@ -92,7 +92,7 @@ def _without_edge_shift(start: InitialPose) -> Pose:
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
-def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> Imaging:
+def fit_problem_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> FitProblem:
     """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
     count = 0
     for ring in target.rings:
@@ -111,7 +111,7 @@ def imaging_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> I
             cut = rejection
             continue
         is_plain = binning > 1 or camera.response is Response.LINEAR
-        return Imaging(
+        return FitProblem(
             window=window,
             circles=circles_of(target.rings),
             measured_count=count,

@@ -18,11 +18,11 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
 from kgcp.measurement.image_model.photometry import Light, light_of_levels, plateau_levels
 from kgcp.measurement.image_model.plate import blur_on_plate, largest_metres_per_px
-from kgcp.measurement.image_model.unblurred import BarePlate, look_at_plate
+from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
 # Tuning of the masks, in units of the blur's σ and of the contrast. Benchmarks: the sets `hidden`
 # and `cut` of `benchmarks.search.hard_frames`, for what hides a part;
@@ -51,50 +51,50 @@ class SeenPlate:
 
     Attributes
     ----------
-    imaging : Imaging
+    problem : FitProblem
     metres_per_px : float
         Largest length on the plate that a pixel spans.
     blur : Blur
     spread : (3,) array
         By `blur_on_plate`.
-    bare : BarePlate
+    unblurred : UnblurredPlate
         Under every pixel, with small discs and edges in reach by `see_plate`.
     """
 
-    imaging: Imaging
+    problem: FitProblem
     metres_per_px: float
     blur: Blur
     spread: FloatArray
-    bare: BarePlate
+    unblurred: UnblurredPlate
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:
         """Return pixels (n,) with all that a kernel around them covers."""
-        shape = self.imaging.window.height, self.imaging.window.width
+        shape = self.problem.window.height, self.problem.window.width
         reached = cv2.dilate(pixels.reshape(shape).view(np.uint8), kernel)
         return np.asarray(reached.ravel().view(np.bool_))
 
 
-def see_plate(imaging: Imaging, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
+def see_plate(problem: FitProblem, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
     """Prepare a window for what is asked of it; the pose may be off by so many pixels."""
-    rays, sd_px = imaging.window.rays, blur.largest_sd_px
+    rays, sd_px = problem.window.rays, blur.largest_sd_px
     step = max(1, rays.shape[1] // _SCALE_PIXELS)
     scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
     reach_px = max(REACH_SIGMAS * sd_px, _CLEAR_SIGMAS * sd_px + slack_px)
-    middle = imaging.window.nearest(imaging.centre_px)
+    middle = problem.window.nearest(problem.centre_px)
     spread = blur_on_plate(pose, rays[:, middle].copy(), blur.total_covariance, sd_px * scale)
-    bare = look_at_plate(
-        imaging.circles,
-        imaging.measured_count,
+    unblurred = unblurred_plate(
+        problem.circles,
+        problem.measured_count,
         pose,
         rays,
         small_m=_SMALL_SIGMAS * sd_px * scale,
         reach_m=reach_px * scale,
         spread=spread,
     )
-    return SeenPlate(imaging, scale, blur, spread, bare)
+    return SeenPlate(problem, scale, blur, spread, unblurred)
 
 
-def first_levels(imaging: Imaging, pose: Pose) -> Light:
+def first_levels(problem: FitProblem, pose: Pose) -> Light:
     """Return black and white as medians of what an approximate pose takes for ink and plate.
 
     Raises
@@ -102,17 +102,19 @@ def first_levels(imaging: Imaging, pose: Pose) -> Light:
     Rejection
         `NO_CONTRAST` if ink is not darker than the plate.
     """
-    window = imaging.window
+    window = problem.window
     some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
     levels = np.ascontiguousarray(window.levels[some])
-    outer_m, inner_m = imaging.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
+    outer_m, inner_m = problem.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
     rays = np.ascontiguousarray(window.rays[:, some])
-    circles, count = imaging.circles, imaging.measured_count
-    bare = look_at_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
-    black, white = _plateaus(levels, bare.rho_m, bare.share, bare.off_edge_m, outer_m)
+    circles, count = problem.circles, problem.measured_count
+    unblurred = unblurred_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
+    black, white = _plateaus(
+        levels, unblurred.rho_m, unblurred.share, unblurred.off_edge_m, outer_m
+    )
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
-    return light_of_levels(black, white, imaging.response)
+    return light_of_levels(black, white, problem.response)
 
 
 def _uneven(step: int, width: int) -> int:
@@ -151,17 +153,17 @@ def _median_of_clearest(levels: FloatArray, off_edge_m: FloatArray) -> float:
     return float(np.median(levels[off_edge_m >= np.partition(off_edge_m, first)[first]]))
 
 
-def reached_by_surroundings(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
+def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> BoolArray:
     """Tell which pixels (n,) of the window blur may mix with something that is not plate.
 
     The pose may be off by `slack_px`.
     """
-    imaging, blur, bare, scale = seen.imaging, seen.blur, seen.bare, seen.metres_per_px
-    black, white = plateau_levels(light, imaging.response)
-    foreign = np.empty(len(bare.rho_m), dtype=np.bool_)
+    problem, blur, unblurred, scale = seen.problem, seen.blur, seen.unblurred, seen.metres_per_px
+    black, white = plateau_levels(light, problem.response)
+    foreign = np.empty(len(unblurred.rho_m), dtype=np.bool_)
     if not _mark_foreign(
-        *(imaging.window.smooth, bare.points_m, bare.rho_m, seen.spread, black, white),
-        *(imaging.outer_radius_m, blur.largest_sd_px * scale, slack_px * scale),
+        *(problem.window.smooth, unblurred.points_m, unblurred.rho_m, seen.spread, black, white),
+        *(problem.outer_radius_m, blur.largest_sd_px * scale, slack_px * scale),
         foreign,
     ):
         return foreign
@@ -169,8 +171,8 @@ def reached_by_surroundings(seen: SeenPlate, light: Light, slack_px: float = 0.0
     half = math.ceil(reach_px)
     kernel = np.empty((2 * half + 1, 2 * half + 1), dtype=np.uint8)
     _fill_ellipse(*blur.total_covariance, _FOREIGN_SIGMAS, kernel)
-    inmost_m = (1.0 - 2.0 * reach_px / imaging.outer_radius_px) * imaging.outer_radius_m
-    return np.asarray(seen.dilated(foreign, kernel) & (bare.rho_m > inmost_m))
+    inmost_m = (1.0 - 2.0 * reach_px / problem.outer_radius_px) * problem.outer_radius_m
+    return np.asarray(seen.dilated(foreign, kernel) & (unblurred.rho_m > inmost_m))
 
 
 @compiled
@@ -218,7 +220,7 @@ def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyAr
             kernel[row + half, column + half] = 1 if distance2 <= limit else 0
 
 
-def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
+def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     """Tell which pixels (n,) of the window show something other than ink and plate.
 
     By levels that are neither ink nor plate where the plate is flat, and by missing edges: grey
@@ -226,15 +228,22 @@ def hidden_pixels(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     is more than half of all that is tested, it is rather the light or the pose that is wrong, and
     nothing is left out.
     """
-    imaging, sd_px, bare = seen.imaging, seen.blur.largest_sd_px, seen.bare
-    other = np.zeros(len(bare.rho_m), dtype=np.bool_)
-    if imaging.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
+    problem, sd_px, unblurred = seen.problem, seen.blur.largest_sd_px, seen.unblurred
+    other = np.zeros(len(unblurred.rho_m), dtype=np.bool_)
+    if problem.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
         return other
-    black, white = plateau_levels(light, imaging.response)
+    black, white = plateau_levels(light, problem.response)
     contrast, scale = min(white, 1.0) - black, seen.metres_per_px
     found, tested = _mark_other(
-        *(imaging.window.smooth, bare.share, bare.off_edge_m, bare.rho_m, black, contrast),
-        *(imaging.outer_radius_m, slack_px * scale, sd_px * scale),
+        *(
+            problem.window.smooth,
+            unblurred.share,
+            unblurred.off_edge_m,
+            unblurred.rho_m,
+            black,
+            contrast,
+        ),
+        *(problem.outer_radius_m, slack_px * scale, sd_px * scale),
         other,
     )
     if found:
@@ -252,7 +261,7 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
 
     Such a patch is evidence of another code. Masked, it would not count against the target.
     """
-    radii_m, rho_m, window = seen.imaging.circles.radii_m, seen.bare.rho_m, seen.imaging.window
+    radii_m, rho_m, window = seen.problem.circles.radii_m, seen.unblurred.rho_m, seen.problem.window
     mask = other.reshape(window.height, window.width).view(np.uint8)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
     beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])

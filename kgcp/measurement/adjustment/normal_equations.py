@@ -80,7 +80,7 @@ def _normal_matrix(scaled: FloatArray, weight: FloatArray, precision: FloatArray
     return normal
 
 
-def propose(
+def gauss_newton_step(
     scaled: FloatArray,
     normal: FloatArray,
     current: Misfit,

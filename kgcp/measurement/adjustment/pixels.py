@@ -13,15 +13,26 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.masks import (
     SeenPlate,
-    hidden_pixels,
-    reached_by_surroundings,
+    background_mask,
+    occluded_mask,
     see_plate,
 )
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur, EdgePairs, pair_edges, reach_px
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.image_model.blur import (
+    REACH_SIGMAS,
+    Blur,
+    EdgeIncidence,
+    find_edge_incidence,
+    reach_px,
+)
 from kgcp.measurement.image_model.blurred_plate import white_level
 from kgcp.measurement.image_model.noise import Censoring
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Imager, Light, plateau_levels
+from kgcp.measurement.image_model.photometry import (
+    PARAM_COUNT,
+    Light,
+    PhotometricModel,
+    plateau_levels,
+)
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 
 _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
@@ -38,7 +49,7 @@ class Sample:
 
     Attributes
     ----------
-    imaging : Imaging
+    problem : FitProblem
     index : (n,) array of int
         The pixels, in the flattened window.
     is_thinned : bool
@@ -46,31 +57,31 @@ class Sample:
     levels : (n,) array
     rays : (6, n) array
         As in `Window`.
-    imager : Imager
+    photometry : PhotometricModel
     censoring : Censoring
-    pairs : EdgePairs
+    incidence : EdgeIncidence
     """
 
-    imaging: Imaging
+    problem: FitProblem
     index: IndexArray
     is_thinned: bool
     levels: FloatArray
     rays: FloatArray
-    imager: Imager
+    photometry: PhotometricModel
     censoring: Censoring
-    pairs: EdgePairs
+    incidence: EdgeIncidence
 
     @property
     def clipped(self) -> FloatArray | BoolArray:
         """Share of clipped pixels (n,) in each."""
-        bins = self.imaging.window.clipped
+        bins = self.problem.window.clipped
         if bins is None:
             return self.censoring.at_high | self.censoring.at_low
         return bins[self.index]
 
 
-def choose_sample(
-    imaging: Imaging,
+def select_pixels(
+    problem: FitProblem,
     pose: Pose,
     blur: Blur,
     light: Light | None,
@@ -93,13 +104,13 @@ def choose_sample(
     Rejection
         `EDGES_LOST` if too little of the target is within the frame.
     """
-    seen = see_plate(imaging, pose, blur, slack_px)
-    unused = np.zeros(len(seen.bare.rho_m), dtype=np.bool_)
+    seen = see_plate(problem, pose, blur, slack_px)
+    unused = np.zeros(len(seen.unblurred.rho_m), dtype=np.bool_)
     if light is not None:
-        unused = reached_by_surroundings(seen, light, slack_px)
-        unused |= hidden_pixels(seen, light, slack_px)
-    if imaging.visible is not None:
-        unused |= ~imaging.visible[_steps_about(seen.bare.points_m, len(imaging.visible))]
+        unused = background_mask(seen, light, slack_px)
+        unused |= occluded_mask(seen, light, slack_px)
+    if problem.visible is not None:
+        unused |= ~problem.visible[_steps_about(seen.unblurred.points_m, len(problem.visible))]
     index = _useful_pixels(seen, unused, plateau)
     is_thinned = most is not None and len(index) > most
     if most is not None and is_thinned:
@@ -109,34 +120,34 @@ def choose_sample(
     return _sample(seen, pose, light, index, is_thinned=is_thinned)
 
 
-def whole_plate(imaging: Imaging, pose: Pose, blur: Blur, light: Light) -> Sample:
+def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
     """Return all pixels of the ring and its border, hidden ones too: to be looked at.
 
     Those that blur mixes with what surrounds the plate are left out, but for what shows only if the
     pose is right.
     """
-    seen = see_plate(imaging, pose, blur)
-    reach_m = (1.0 + _BORDER_RADII) * imaging.outer_radius_m
-    unused = reached_by_surroundings(seen, light, slack_px=math.inf)
-    index = np.flatnonzero((seen.bare.rho_m < reach_m) & ~unused)
+    seen = see_plate(problem, pose, blur)
+    reach_m = (1.0 + _BORDER_RADII) * problem.outer_radius_m
+    unused = background_mask(seen, light, slack_px=math.inf)
+    index = np.flatnonzero((seen.unblurred.rho_m < reach_m) & ~unused)
     return _sample(seen, pose, light, index, is_thinned=False)
 
 
 def _sample(
     seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, *, is_thinned: bool
 ) -> Sample:
-    imaging = seen.imaging
-    window, clip = imaging.window, imaging.censoring
+    problem = seen.problem
+    window, clip = problem.window, problem.censoring
     rays = np.take(window.rays, index, axis=1)
     return Sample(
-        imaging=imaging,
+        problem=problem,
         index=index,
         is_thinned=is_thinned,
         levels=window.levels[index],
         rays=rays,
-        imager=_imager(seen, pose, light, index),
+        photometry=_photometric_model(seen, pose, light, index),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
-        pairs=_pairs(seen, pose, rays, index),
+        incidence=_edge_incidence(seen, pose, rays, index),
     )
 
 
@@ -151,15 +162,15 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArr
 
     Within circles that are not measured none is used.
     """
-    imaging, sd_px, scale = seen.imaging, seen.blur.largest_sd_px, seen.metres_per_px
+    problem, sd_px, scale = seen.problem, seen.blur.largest_sd_px, seen.metres_per_px
     tail_m = REACH_SIGMAS * sd_px * scale
     border_px = _BORDER_SIGMAS * sd_px + _BORDER_PX
-    limit = 1.0 + min(_BORDER_RADII, border_px / imaging.outer_radius_px)
+    limit = 1.0 + min(_BORDER_RADII, border_px / problem.outer_radius_px)
     index = np.empty(len(unused), dtype=np.intp)
     count = _choose(
-        *(seen.bare.rho_m, seen.bare.off_measured_m, unused),
+        *(seen.unblurred.rho_m, seen.unblurred.off_measured_m, unused),
         *((_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale, tail_m),
-        *(_unmeasured_m(seen), limit * imaging.outer_radius_m),
+        *(_unmeasured_m(seen), limit * problem.outer_radius_m),
         plateau,
         index,
     )
@@ -168,8 +179,8 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArr
 
 def _unmeasured_m(seen: SeenPlate) -> float:
     """Return how far from the target's centre the edges of what is not measured are felt."""
-    imaging = seen.imaging
-    radii_m = imaging.circles.radii_m[imaging.measured_count :]
+    problem = seen.problem
+    radii_m = problem.circles.radii_m[problem.measured_count :]
     reach_m = reach_px(seen.blur) * seen.metres_per_px
     return float(radii_m.max()) + reach_m if len(radii_m) else 0.0
 
@@ -205,15 +216,17 @@ def _choose(
     return count
 
 
-def _imager(seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray) -> Imager:
-    imaging, window = seen.imaging, seen.imaging.window
-    offsets = (window.pixels(index) - imaging.centre_px[:, None]) / imaging.outer_radius_px
-    if imaging.sharpening_px == 0.0 or light is None:
-        return Imager(offsets, imaging.response, None)
-    is_small = imaging.outer_radius_px < _SMALL_PX
-    shown = _shown(seen, pose, light, index) if is_small else seen.bare.share
-    mask = unsharp_mask((window.height, window.width), index, shown, imaging.sharpening_px)
-    return Imager(offsets, imaging.response, mask)
+def _photometric_model(
+    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray
+) -> PhotometricModel:
+    problem, window = seen.problem, seen.problem.window
+    offsets = (window.pixels(index) - problem.centre_px[:, None]) / problem.outer_radius_px
+    if problem.sharpening_px == 0.0 or light is None:
+        return PhotometricModel(offsets, problem.response, None)
+    is_small = problem.outer_radius_px < _SMALL_PX
+    shown = _shown(seen, pose, light, index) if is_small else seen.unblurred.share
+    mask = unsharp_mask((window.height, window.width), index, shown, problem.sharpening_px)
+    return PhotometricModel(offsets, problem.response, mask)
 
 
 def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
@@ -221,28 +234,32 @@ def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> Floa
 
     Under this pose, blur and light, for what sharpening takes from them.
     """
-    imaging, scale, shown = seen.imaging, seen.metres_per_px, seen.bare.share.copy()
-    is_other = seen.bare.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
+    problem, scale, shown = seen.problem, seen.metres_per_px, seen.unblurred.share.copy()
+    is_other = seen.unblurred.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale
     is_other[index] = False
     others = np.flatnonzero(is_other)
-    rays, points_m = (np.take(a, others, axis=1) for a in (imaging.window.rays, seen.bare.points_m))
-    pairs = pair_edges(points_m, scale, imaging.circles, seen.blur, seen.spread)
-    share = white_level(pose.matrix, rays, seen.blur.vector, pairs).value
-    even = Imager(np.zeros((2, len(others))), imaging.response, None)
-    black, white = plateau_levels(light, imaging.response)
+    rays, points_m = (
+        np.take(a, others, axis=1) for a in (problem.window.rays, seen.unblurred.points_m)
+    )
+    incidence = find_edge_incidence(points_m, scale, problem.circles, seen.blur, seen.spread)
+    share = white_level(pose.matrix, rays, seen.blur.vector, incidence).value
+    even = PhotometricModel(np.zeros((2, len(others))), problem.response, None)
+    black, white = plateau_levels(light, problem.response)
     shown[others] = (even.levels(share, light) - black) / (white - black)
     return shown
 
 
-def _pairs(seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray) -> EdgePairs:
+def _edge_incidence(
+    seen: SeenPlate, pose: Pose, rays: FloatArray, index: IndexArray
+) -> EdgeIncidence:
     """Pair the pixels with the measured circles; the others are as they are for this pose."""
-    imaging, blur, scale = seen.imaging, seen.blur, seen.metres_per_px
-    points_m = np.take(seen.bare.points_m, index, axis=1)
-    measured = imaging.circles.part(slice(0, imaging.measured_count))
-    pairs = pair_edges(points_m, scale, measured, blur, seen.spread)
-    if seen.bare.rho_m[index].min() > _unmeasured_m(seen):
-        return pairs
-    others = imaging.circles.part(slice(imaging.measured_count, None))
-    replicas = pair_edges(points_m, scale, others, blur, seen.spread)
+    problem, blur, scale = seen.problem, seen.blur, seen.metres_per_px
+    points_m = np.take(seen.unblurred.points_m, index, axis=1)
+    measured = problem.circles.part(slice(0, problem.measured_count))
+    incidence = find_edge_incidence(points_m, scale, measured, blur, seen.spread)
+    if seen.unblurred.rho_m[index].min() > _unmeasured_m(seen):
+        return incidence
+    others = problem.circles.part(slice(problem.measured_count, None))
+    replicas = find_edge_incidence(points_m, scale, others, blur, seen.spread)
     added = white_level(pose.matrix, rays, blur.vector, replicas).value - 1.0
-    return replace(pairs, background=pairs.background + added)
+    return replace(incidence, background=incidence.background + added)

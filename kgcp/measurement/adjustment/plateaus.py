@@ -10,10 +10,10 @@ import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.light_field import INK, PLATE, LightField
 from kgcp.measurement.image_model.photometry import Light
-from kgcp.measurement.image_model.unblurred import BarePlate, look_at_plate
+from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
 # Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`; lengths in radii, light in
 # contrasts, where nothing else is said.
@@ -63,15 +63,15 @@ class Plateaus:
         return self.uneven > _UNEVEN
 
 
-def look_at_plateaus(imaging: Imaging, pose: Pose, sd_px: float) -> Plateaus | None:
+def look_at_plateaus(problem: FitProblem, pose: Pose, sd_px: float) -> Plateaus | None:
     """Smooth ink and plate each over what is seen of them; None if too little is."""
-    window = imaging.window
-    bare = look_at_plate(imaging.circles, imaging.measured_count, pose, window.rays)
-    clear = _clear_of_edges(imaging, bare, sd_px)
-    ink, plate = (np.flatnonzero(kind) for kind in _kinds(imaging, bare, clear))
+    window = problem.window
+    unblurred = unblurred_plate(problem.circles, problem.measured_count, pose, window.rays)
+    clear = _clear_of_edges(problem, unblurred, sd_px)
+    ink, plate = (np.flatnonzero(kind) for kind in _kinds(problem, unblurred, clear))
     if min(len(ink), len(plate)) < 2 * _FEWEST_PIXELS:
         return None
-    levels = np.array([_smoothed_over(imaging, flat) for flat in (ink, plate)])
+    levels = np.array([_smoothed_over(problem, flat) for flat in (ink, plate)])
     black, white = (float(np.median(window.smooth[flat])) for flat in (ink, plate))
     if white <= black:
         return None
@@ -86,79 +86,83 @@ def look_at_plateaus(imaging: Imaging, pose: Pose, sd_px: float) -> Plateaus | N
     )
 
 
-def _clear_of_edges(imaging: Imaging, bare: BarePlate, sd_px: float) -> BoolArray:
-    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
-    clear_px = min(_CLEAR_SIGMAS * sd_px + _CLEAR_PX, _MOST_CLEAR * imaging.outer_radius_px)
-    within = bare.rho_m < (1.0 + _BORDER) * imaging.outer_radius_m
-    if imaging.visible is not None:
-        turns = np.arctan2(bare.points_m[1], bare.points_m[0]) / (2.0 * math.pi)
-        count = len(imaging.visible)
-        within &= imaging.visible[np.rint(turns * count).astype(np.intp) % count]
-    return np.asarray(within & (bare.off_edge_m >= clear_px / px_per_m))
+def _clear_of_edges(problem: FitProblem, unblurred: UnblurredPlate, sd_px: float) -> BoolArray:
+    px_per_m = problem.outer_radius_px / problem.outer_radius_m
+    clear_px = min(_CLEAR_SIGMAS * sd_px + _CLEAR_PX, _MOST_CLEAR * problem.outer_radius_px)
+    within = unblurred.rho_m < (1.0 + _BORDER) * problem.outer_radius_m
+    if problem.visible is not None:
+        turns = np.arctan2(unblurred.points_m[1], unblurred.points_m[0]) / (2.0 * math.pi)
+        count = len(problem.visible)
+        within &= problem.visible[np.rint(turns * count).astype(np.intp) % count]
+    return np.asarray(within & (unblurred.off_edge_m >= clear_px / px_per_m))
 
 
-def _kinds(imaging: Imaging, bare: BarePlate, clear: BoolArray) -> tuple[BoolArray, BoolArray]:
+def _kinds(
+    problem: FitProblem, unblurred: UnblurredPlate, clear: BoolArray
+) -> tuple[BoolArray, BoolArray]:
     """Tell what is ink and what is plate.
 
     Ink as bright as plate is a dot of another code, and so is dark plate: neither may pass for
     light. Glare makes ink brighter, but the plate around it, too.
     """
-    values = imaging.window.smooth
-    is_ink, is_plate = clear & (bare.share < 0.5), clear & (bare.share > 0.5)
+    values = problem.window.smooth
+    is_ink, is_plate = clear & (unblurred.share < 0.5), clear & (unblurred.share > 0.5)
     if is_ink.any() and is_plate.any():
         ink, plate = (float(np.median(values[kind])) for kind in (is_ink, is_plate))
         contrast = plate - ink
-        around = _plate_around(imaging, is_plate)
+        around = _plate_around(problem, is_plate)
         limit = np.where(around > plate + _GLARE * contrast, around, plate)
         is_ink &= values < limit - _DARKER_INK * contrast
         is_plate &= values > ink + _DARKEST_PLATE * contrast
     return is_ink, is_plate
 
 
-def _plate_around(imaging: Imaging, is_plate: BoolArray) -> FloatArray:
+def _plate_around(problem: FitProblem, is_plate: BoolArray) -> FloatArray:
     """Return the level of the plate near every pixel; 0 where there is none near."""
-    sigma_px = _GLARE_REACH * _smoothing_px(imaging)
+    sigma_px = _GLARE_REACH * _smoothing_px(problem)
     weight = is_plate.astype(np.float64)
     near, total = (
-        _blurred(imaging, values, sigma_px) for values in (weight, weight * imaging.window.smooth)
+        _blurred(problem, values, sigma_px) for values in (weight, weight * problem.window.smooth)
     )
     return np.where(near > _SEEN, total / np.maximum(near, _SEEN), 0.0)
 
 
-def _smoothed_over(imaging: Imaging, flat: IndexArray) -> FloatArray:
+def _smoothed_over(problem: FitProblem, flat: IndexArray) -> FloatArray:
     """Smooth the window over some of its pixels (n,)."""
-    weight = np.zeros(len(imaging.window.smooth))
+    weight = np.zeros(len(problem.window.smooth))
     weight[flat] = 1.0
-    light = weight * imaging.window.smooth
-    sigma_px = _smoothing_px(imaging)
-    near, total = (_blurred(imaging, values, sigma_px) for values in (weight, light))
-    wide, broad = (_blurred(imaging, values, _WIDE * sigma_px) for values in (weight, light))
+    light = weight * problem.window.smooth
+    sigma_px = _smoothing_px(problem)
+    near, total = (_blurred(problem, values, sigma_px) for values in (weight, light))
+    wide, broad = (_blurred(problem, values, _WIDE * sigma_px) for values in (weight, light))
     return np.asarray((total + _WIDE_SHARE * broad) / (near + _WIDE_SHARE * wide + 1e-9))
 
 
-def _smoothing_px(imaging: Imaging) -> float:
-    return max(2.0, _SMOOTHED * imaging.outer_radius_px)
+def _smoothing_px(problem: FitProblem) -> float:
+    return max(2.0, _SMOOTHED * problem.outer_radius_px)
 
 
-def _blurred(imaging: Imaging, values: FloatArray, sigma_px: float) -> FloatArray:
-    image = values.reshape(imaging.window.height, imaging.window.width)
+def _blurred(problem: FitProblem, values: FloatArray, sigma_px: float) -> FloatArray:
+    image = values.reshape(problem.window.height, problem.window.width)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float64).ravel()
 
 
-def evened_window(imaging: Imaging, plateaus: Plateaus) -> Imaging:
+def evened_window(problem: FitProblem, plateaus: Plateaus) -> FitProblem:
     """Return the window as it would be in even light, by the levels seen."""
-    window = imaging.window
+    window = problem.window
     (black, white), (ink, plate) = plateaus.typical, plateaus.levels
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     factor = (white - black) / contrast
     levels = black + (window.levels - ink) * factor
     smooth = black + (window.smooth - ink) * factor
-    return replace(imaging, window=replace(window, levels=levels, smooth=smooth))
+    return replace(problem, window=replace(window, levels=levels, smooth=smooth))
 
 
-def field_of(field: LightField, imaging: Imaging, plateaus: Plateaus, light: Light) -> LightField:
+def field_of(
+    field: LightField, problem: FitProblem, plateaus: Plateaus, light: Light
+) -> LightField:
     """Return a field whose finest knots have the levels seen."""
-    knots, window = field.knots, imaging.window
+    knots, window = field.knots, problem.window
     spacing, columns, rows = knots.spacings_px[-1], knots.columns[-1], knots.rows[-1]
     x = np.clip(spacing * (np.arange(columns) - 0.5) - 0.5, 0, window.width - 1)
     y = np.clip(spacing * (np.arange(rows) - 0.5) - 0.5, 0, window.height - 1)
@@ -169,19 +173,19 @@ def field_of(field: LightField, imaging: Imaging, plateaus: Plateaus, light: Lig
     return replace(field, values=values)
 
 
-def step_across(imaging: Imaging, plateaus: Plateaus) -> FloatArray | None:
+def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:
     """Return the straight edge that explains most of how the levels vary; None if that is little.
 
     As in `LightField.edges` (5,), but with grey values for the levels of ink and plate.
     """
-    window = imaging.window
+    window = problem.window
     step = max(1, sum(map(len, plateaus.flat)) // _MOST_PIXELS)
     chosen = [flat[::step] for flat in plateaus.flat]
-    offsets = [window.pixels(flat) - imaging.centre_px[:, None] for flat in chosen]
+    offsets = [window.pixels(flat) - problem.centre_px[:, None] for flat in chosen]
     values = [window.smooth[flat] for flat in chosen]
     noise = [max(float(np.median(np.abs(np.diff(v)))) ** 2, 1e-8) for v in values]
     whole = sum(float(np.var(v)) * len(v) / n for v, n in zip(values, noise, strict=True))
-    radius_px = _REACH * imaging.outer_radius_px
+    radius_px = _REACH * problem.outer_radius_px
     bins = np.linspace(-radius_px, radius_px, _OFFSETS)
     best, edge = 0.0, None
     for angle in math.pi * np.arange(_TURNS) / _TURNS:

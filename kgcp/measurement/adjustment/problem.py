@@ -17,7 +17,7 @@ _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Imaging:
+class FitProblem:
     """A window with a target in it, and what it is seen with.
 
     Attributes

@@ -24,9 +24,15 @@ from kgcp.measurement.adjustment.level_equations import (
 )
 from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix, scaled_rows
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, choose_sample
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.adjustment.solver import Fit, Prediction, linearise, noise_of, predict
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import (
+    PredictedImage,
+    TargetFit,
+    linearise,
+    noise_of,
+    predict,
+)
 from kgcp.measurement.image_model.light_field import (
     EDGE_MEAN,
     EDGE_PRECISION,
@@ -61,9 +67,9 @@ _ASKS = 2.5
 _ENOUGH_POWER = 0.05  # of the cell that tells most
 
 
-def even_field(imaging: Imaging) -> LightField:
+def even_field(problem: FitProblem) -> LightField:
     """Return a field that adds nothing yet: a fine grid, and a coarse one if that is coarser."""
-    radius, window = imaging.outer_radius_px, imaging.window
+    radius, window = problem.outer_radius_px, problem.window
     fine, coarse = max(_FINEST_PX, radius / _FINE), _COARSE * radius
     spacings_px = (coarse, fine) if coarse > 1.5 * fine else (fine,)
     knots = knots_over(window.x0, window.y0, window.width, window.height, spacings_px)
@@ -73,15 +79,15 @@ def even_field(imaging: Imaging) -> LightField:
         values=np.zeros((2, count)),
         precision=np.full((2, count), _FIRST_SD**-2),
         edges=np.empty((0, 5)),
-        centre_px=imaging.centre_px,
+        centre_px=problem.centre_px,
     )
 
 
-def excess_of_cells(fit: Fit) -> float:
+def excess_of_cells(fit: TargetFit) -> float:
     """Return the mean square of sums over cells, of what independent residuals make it."""
     sample, light = fit.sample, fit.parameters.light
-    field = even_field(sample.imaging)
-    knots, weights = field.knots.weights(sample.imaging.window.pixels(sample.index))
+    field = even_field(sample.problem)
+    knots, weights = field.knots.weights(sample.problem.window.pixels(sample.index))
     finest = AtKnots(knots[:, -SPAN * SPAN :], weights[:, -SPAN * SPAN :])
     contrast = light.white - light.black
     by_level = contrast * fit.jacobian[[int(Param.BLACK), int(Param.WHITE)]] / fit.sd
@@ -93,34 +99,34 @@ def excess_of_cells(fit: Fit) -> float:
     return float(np.mean(sums[telling] ** 2 / power[telling]))
 
 
-def asks_for_levels(fit: Fit) -> bool:
+def asks_for_levels(fit: TargetFit) -> bool:
     """Tell whether residuals go together over the cells of the finest grid."""
     return excess_of_cells(fit) > _ASKS
 
 
 def fit_levels(
-    imaging: Imaging, starts: list[Parameters], other: Pose, unknowns: Unknowns
-) -> tuple[Fit, Fit]:
+    problem: FitProblem, starts: list[Parameters], other: Pose, unknowns: Unknowns
+) -> tuple[TargetFit, TargetFit]:
     """Adjust with a field from the first start that leads anywhere, and so at another pose.
 
     Returns
     -------
-    best, other : Fit
+    best, other : TargetFit
         The better and the worse one.
 
     Raises
     ------
     Rejection
-        `POOR_FIT`, or as `choose_sample`, if no start leads anywhere.
+        `POOR_FIT`, or as `select_pixels`, if no start leads anywhere.
     """
     for start in starts:
         try:
-            first = _adjust_levels(imaging, start, unknowns)
+            first = _adjust_levels(problem, start, unknowns)
             break
         except Rejection as failure:
-            problem = failure
+            rejection = failure
     else:
-        raise problem
+        raise rejection
     second = _minimise(
         first.sample,
         first.parameters.at(other),
@@ -132,46 +138,46 @@ def fit_levels(
     return (second, first) if second.total < first.total else (first, second)
 
 
-def _adjust_levels(imaging: Imaging, start: Parameters, unknowns: Unknowns) -> Fit:
+def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -> TargetFit:
     """Adjust with a field of levels, in rounds: pixels are chosen anew in each."""
-    parameters = start if start.field is not None else replace(start, field=even_field(imaging))
+    parameters = start if start.field is not None else replace(start, field=even_field(problem))
     for _ in range(_ROUNDS):
-        sample = choose_sample(
-            _evened(imaging, parameters),
+        sample = select_pixels(
+            _evened(problem, parameters),
             parameters.pose,
             parameters.blur,
             parameters.light,
             slack_px=_SLACK_PX,
             plateau=_PLATEAU_PIXELS,
         )
-        fit = _adjust_on(replace(sample, imaging=imaging), parameters, unknowns)
+        fit = _adjust_on(replace(sample, problem=problem), parameters, unknowns)
         before, parameters = parameters.matrix[:, 3], fit.parameters
         shift = np.linalg.norm(parameters.matrix[:, 3] - before) / parameters.matrix[2, 3]
-        if shift * imaging.focal_px < _SETTLED_PX:
+        if shift * problem.focal_px < _SETTLED_PX:
             break
     return fit
 
 
-def _evened(imaging: Imaging, parameters: Parameters) -> Imaging:
+def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
     """Return a window of which the smooth image is as if the light were even."""
-    field, window = parameters.field, imaging.window
+    field, window = parameters.field, problem.window
     if field is None:
-        return imaging
+        return problem
     added = field.added(window.pixels(np.arange(len(window.levels))))
     light = parameters.light
-    black, white = plateau_levels(light, imaging.response)
+    black, white = plateau_levels(light, problem.response)
     ink, plate = (
-        encoded(toned(x, light.values), imaging.response) for x in (added[0], 1.0 + added[1])
+        encoded(toned(x, light.values), problem.response) for x in (added[0], 1.0 + added[1])
     )
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     smooth = black + (window.smooth - ink) * (white - black) / contrast
-    return replace(imaging, window=replace(window, smooth=smooth))
+    return replace(problem, window=replace(window, smooth=smooth))
 
 
-def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Fit:
+def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> TargetFit:
     """Adjust on a sample; noise, and the prior of the levels, come from the phase before."""
     field = _field_of(parameters)
-    at_knots = AtKnots(*field.knots.weights(sample.imaging.window.pixels(sample.index)))
+    at_knots = AtKnots(*field.knots.weights(sample.problem.window.pixels(sample.index)))
     linear = linearise(sample, parameters)
     for phase in range(_PHASES):
         sd = noise_of(sample, linear[0]).sd
@@ -183,7 +189,7 @@ def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Fi
     return fit
 
 
-def _with_variances(fit: Fit) -> LightField:
+def _with_variances(fit: TargetFit) -> LightField:
     """Return the field with the prior that its values ask for (MacKay's fixed point).
 
     The variance of a group is Σ c² / γ, with γ the number of values that the pixels determine;
@@ -209,14 +215,14 @@ def _minimise(
     at_knots: AtKnots,
     *,
     steps: int,
-    linear: tuple[Prediction, FloatArray] | None = None,
-) -> Fit:
+    linear: tuple[PredictedImage, FloatArray] | None = None,
+) -> TargetFit:
     """Minimise the negative log-likelihood with all priors, as `solver.minimise` does."""
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     total = _total(current, unknowns, parameters)
     light = parameters.light
-    contrast = max(light.white - light.black, sample.imaging.window.levels_per_count)
+    contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
     relative_sd = float(np.mean(sd)) / contrast
     damping = _DAMPING
     equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
@@ -245,7 +251,7 @@ def _minimise(
         if gain < _ENOUGH:
             break
     equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
-    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns, equations)
+    return TargetFit(sample, parameters, prediction, jacobian, sd, current, unknowns, equations)
 
 
 def _total(current: Misfit, unknowns: Unknowns, parameters: Parameters) -> float:
@@ -257,7 +263,7 @@ def _field_of(parameters: Parameters) -> LightField:
     return cast("LightField", parameters.field)
 
 
-def _equations_of(fit: Fit) -> LevelEquations:
+def _equations_of(fit: TargetFit) -> LevelEquations:
     return cast("LevelEquations", fit.varied)
 
 
@@ -276,7 +282,7 @@ def _equations(
     scaled = scaled_rows(jacobian, unknowns.free, sd)
     precision = unknowns.free_precision
     if len(field.edges):
-        pixels = sample.imaging.window.pixels(sample.index)
+        pixels = sample.problem.window.pixels(sample.index)
         scaled = np.vstack((scaled, field.edge_rows(pixels, by_level)))
         precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
     normal = normal_matrix(scaled, current, replace(unknowns, free_precision=precision))

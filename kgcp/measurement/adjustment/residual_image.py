@@ -10,7 +10,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import edge_noise
-from kgcp.measurement.adjustment.fit_target import imaging_of
+from kgcp.measurement.adjustment.fit_target import fit_problem_of
 from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import whole_plate
@@ -27,7 +27,7 @@ _USUAL_BLUR_PX = 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Residuals:
+class ResidualImage:
     """Residuals around one target, in shares of the contrast between plate and ink.
 
     Attributes
@@ -46,9 +46,9 @@ class Residuals:
     edge_noise: float
 
 
-def residuals_of(
+def residual_image_of(
     grey: GreyArray, camera: Camera, target: Target, pose: Pose, blur_px: float | None
-) -> Residuals:
+) -> ResidualImage:
     """Return what the image of a target at this pose leaves of the grey values.
 
     Blur and light are adjusted, the pose is not, whoever measured it.
@@ -69,24 +69,24 @@ def residuals_of(
     Rejection
         As `kgcp.measurement.adjustment.fit_target.measure_by_model`.
     """
-    imaging = imaging_of(grey, camera, target, pose)
-    binning = imaging.window.binning
+    problem = fit_problem_of(grey, camera, target, pose)
+    binning = problem.window.binning
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
-    start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(imaging, pose))
-    fit = adjust_with_streak(imaging, start, moves=False)
+    start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
+    fit = adjust_with_streak(problem, start, moves=False)
     light = fit.parameters.light
-    sample = whole_plate(imaging, pose, fit.parameters.blur, light)
-    black, white = plateau_levels(light, imaging.response)
-    limits = imaging.censoring
+    sample = whole_plate(problem, pose, fit.parameters.blur, light)
+    black, white = plateau_levels(light, problem.response)
+    limits = problem.censoring
     levels = np.clip(predict(sample, fit.parameters).levels, limits.low, limits.high)
-    window = imaging.window
+    window = problem.window
     share = np.full(window.width * window.height, np.nan)
     share[sample.index] = (levels - np.clip(sample.levels, limits.low, limits.high)) / (
         min(white, limits.high) - black
     )
     shape = (window.height, window.width)
     of_pixels = np.kron(share.reshape(shape), np.ones((binning, binning)))
-    return Residuals(binning * window.x0, binning * window.y0, of_pixels, edge_noise(fit))
+    return ResidualImage(binning * window.x0, binning * window.y0, of_pixels, edge_noise(fit))
 
 
 def contours_px(camera: Camera, target: Target, pose: Pose) -> FloatArray:

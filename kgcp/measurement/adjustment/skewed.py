@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
-from kgcp.measurement.adjustment.solver import Fit, added_levels
+from kgcp.measurement.adjustment.solver import TargetFit, added_levels
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
 from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, Param
 from kgcp.measurement.image_model.skew import skew_rows
@@ -20,9 +20,9 @@ _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 _ASKS = 25.0
 
 
-def asks_for_skew(fit: Fit) -> bool:
+def asks_for_skew(fit: TargetFit) -> bool:
     """Tell whether third moments would take more of the residuals than chance (score test)."""
-    if fit.sample.imaging.window.binning > 1 or fit.unknowns.free[-1] >= _SKEW[0]:
+    if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= _SKEW[0]:
         return False
     scaled = np.vstack((fit.scaled_jacobian, _by_skew(fit) / fit.sd))
     precision = np.append(fit.unknowns.free_precision, np.zeros(len(_SKEW)))
@@ -34,14 +34,16 @@ def asks_for_skew(fit: Fit) -> bool:
     return bool(score @ np.linalg.solve(own, score) > _ASKS)
 
 
-def _by_skew(fit: Fit) -> FloatArray:
+def _by_skew(fit: TargetFit) -> FloatArray:
     """Return the derivatives (4, n) of the grey values by the skew; the others are known."""
     sample, parameters = fit.sample, fit.parameters
-    rows = skew_rows(parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.pairs)
+    rows = skew_rows(
+        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
+    )
     by_geometry = np.vstack((np.zeros((GEOMETRY_ROWS, rows.shape[1])), rows))
     share = WhiteShare(fit.prediction.points_m, fit.prediction.share, by_geometry)
     added = added_levels(sample, parameters)
-    return sample.imager.linearised(share, parameters.light, added)[1][_SKEW]
+    return sample.photometry.linearised(share, parameters.light, added)[1][_SKEW]
 
 
 def with_skew(unknowns: Unknowns) -> Unknowns:
@@ -52,7 +54,7 @@ def with_skew(unknowns: Unknowns) -> Unknowns:
     return Unknowns(free, unknowns.mean, precision, precision[free])
 
 
-def loss_per_pixel(fit: Fit) -> float:
+def loss_per_pixel(fit: TargetFit) -> float:
     """Return the negative log-likelihood with the priors, noise included, by pixel.
 
     Fits with spreads of other shapes use other pixels: their sums do not compare.

@@ -11,15 +11,15 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.level_equations import LevelEquations
 from kgcp.measurement.adjustment.normal_equations import (
     Unknowns,
+    gauss_newton_step,
     normal_matrix,
-    propose,
     scaled_rows,
 )
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, choose_sample
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, white_share
-from kgcp.measurement.image_model.noise import Misfit, Noise, estimate_noise, misfit
+from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
 from kgcp.measurement.image_model.photometry import Param
 from kgcp.measurement.image_model.skew import skew_rows
 
@@ -38,7 +38,7 @@ _MAX_DAMPING = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class PredictedImage:
     """A sample under given parameters.
 
     Attributes
@@ -57,16 +57,16 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class TargetFit:
     """The state of an adjustment.
 
     Attributes
     ----------
     sample : Sample
     parameters : Parameters
-    prediction : Prediction
+    prediction : PredictedImage
     jacobian : (19, n), (23, n) or (25, n) array
-        As of `Imager.linearised`.
+        As of `PhotometricModel.linearised`.
     sd : (n,) array
         Noise of every pixel, as level.
     misfit : Misfit
@@ -78,7 +78,7 @@ class Fit:
 
     sample: Sample
     parameters: Parameters
-    prediction: Prediction
+    prediction: PredictedImage
     jacobian: FloatArray
     sd: FloatArray
     misfit: Misfit
@@ -98,27 +98,29 @@ class Fit:
         return self.misfit.total + self.unknowns.penalty(self.parameters) + of_field
 
 
-def predict(sample: Sample, parameters: Parameters) -> Prediction:
+def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
     """Model the grey values of a sample."""
-    share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
+    share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
     if parameters.has_skew:
         share = _skewed(share, sample, parameters)
-    levels = sample.imager.levels(share.value, parameters.light, added_levels(sample, parameters))
-    return Prediction(share.points_m, share.value, levels)
+    levels = sample.photometry.levels(
+        share.value, parameters.light, added_levels(sample, parameters)
+    )
+    return PredictedImage(share.points_m, share.value, levels)
 
 
-def linearise(sample: Sample, parameters: Parameters) -> tuple[Prediction, FloatArray]:
+def linearise(sample: Sample, parameters: Parameters) -> tuple[PredictedImage, FloatArray]:
     """Model the grey values of a sample, and return their Jacobian with them.
 
-    It is that of `Imager.linearised`. Derivatives by the point spread's skew are left out where
-    there is none.
+    It is that of `PhotometricModel.linearised`. Derivatives by the point spread's skew are left out
+    where there is none.
     """
-    share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.pairs)
+    share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
     if parameters.has_skew:
         share = _skewed(share, sample, parameters)
     added = added_levels(sample, parameters)
-    levels, jacobian = sample.imager.linearised(share, parameters.light, added)
-    return Prediction(share.points_m, share.value, levels), jacobian
+    levels, jacobian = sample.photometry.linearised(share, parameters.light, added)
+    return PredictedImage(share.points_m, share.value, levels), jacobian
 
 
 def _skewed(share: WhiteShare, sample: Sample, parameters: Parameters) -> WhiteShare:
@@ -126,7 +128,9 @@ def _skewed(share: WhiteShare, sample: Sample, parameters: Parameters) -> WhiteS
 
     Those by pose and blur stay as they are: the skew changes them by a few per cent.
     """
-    rows = skew_rows(parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.pairs)
+    rows = skew_rows(
+        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
+    )
     value = share.value + parameters.vector[Param.SKEW_XXX :] @ rows
     jacobian = np.vstack((share.jacobian, rows)) if len(share.jacobian) else share.jacobian
     return WhiteShare(share.points_m, value, jacobian)
@@ -136,17 +140,19 @@ def added_levels(sample: Sample, parameters: Parameters) -> FloatArray | None:
     """Return what the levels of ink and plate (2, n) have more where the light is uneven."""
     if parameters.field is None:
         return None
-    return parameters.field.added(sample.imaging.window.pixels(sample.index))
+    return parameters.field.added(sample.problem.window.pixels(sample.index))
 
 
-def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> Fit:
+def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:
     """Come near the minimum from a rough start, on pixels chosen for that start."""
     return _fit_with_noise(
         sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN, is_near=False
     )
 
 
-def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | None = None) -> Fit:
+def adjust(
+    problem: FitProblem, start: Parameters, unknowns: Unknowns, most: int | None = None
+) -> TargetFit:
     """Estimate the unknowns, in rounds: pixels, noise and outliers are settled anew in each.
 
     With at most so many pixels, where `most` is given; where there are more, only roughly.
@@ -154,12 +160,12 @@ def adjust(imaging: Imaging, start: Parameters, unknowns: Unknowns, most: int | 
     Raises
     ------
     Rejection
-        As `choose_sample`; `POOR_FIT` if the steps diverge.
+        As `select_pixels`; `POOR_FIT` if the steps diverge.
     """
     parameters = start
     for _ in range(_MAX_ROUNDS):
         pose, blur, light = parameters.pose, parameters.blur, parameters.light
-        sample = choose_sample(imaging, pose, blur, light, most=most, slack_px=_SLACK_PX)
+        sample = select_pixels(problem, pose, blur, light, most=most, slack_px=_SLACK_PX)
         enough = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
         fit = _fit_with_noise(
             sample, parameters, unknowns, steps=_STEPS, enough=enough, is_near=True
@@ -178,7 +184,7 @@ def _fit_with_noise(
     steps: int,
     enough: float,
     is_near: bool,
-) -> Fit:
+) -> TargetFit:
     """Minimise until the noise that the residuals show is the one that they were weighed by.
 
     A start that is near need not be followed to the minimum for the noise to show; one that is not
@@ -204,21 +210,21 @@ def _fit_with_noise(
     return fit
 
 
-def _is_settled(before: Parameters, fit: Fit) -> bool:
+def _is_settled(before: Parameters, fit: TargetFit) -> bool:
     """Tell whether the pixels of a round are right for what it found.
 
     They follow blur, direction and size: off the axis, too, a move along the ray is growth alone.
     """
-    imaging, after = fit.sample.imaging, fit.parameters
+    problem, after = fit.sample.problem, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
     (x, y, depth), (x0, y0, depth0) = after.matrix[:, 3].tolist(), before.matrix[:, 3].tolist()
-    across_px = math.hypot(x / depth - x0 / depth0, y / depth - y0 / depth0) * imaging.focal_px
-    growth_px = abs(depth / depth0 - 1.0) * imaging.outer_radius_px
+    across_px = math.hypot(x / depth - x0 / depth0, y / depth - y0 / depth0) * problem.focal_px
+    growth_px = abs(depth / depth0 - 1.0) * problem.outer_radius_px
     enough = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
     return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
 
 
-def noise_of(sample: Sample, prediction: Prediction) -> Noise:
+def noise_of(sample: Sample, prediction: PredictedImage) -> GreyNoise:
     """Return the noise of every pixel of a sample, from its residuals.
 
     Of pixels that are clipped, or should be, there are none: a white that is not bounded would make
@@ -230,7 +236,7 @@ def noise_of(sample: Sample, prediction: Prediction) -> Noise:
         sample.levels - prediction.levels,
         prediction.share,
         usable,
-        sample.imaging.window.levels_per_count,
+        sample.problem.window.levels_per_count,
     )
 
 
@@ -242,9 +248,9 @@ def minimise(
     *,
     steps: int,
     enough: float,
-    linear: tuple[Prediction, FloatArray] | None = None,
+    linear: tuple[PredictedImage, FloatArray] | None = None,
     pauses: bool = False,
-) -> Fit:
+) -> TargetFit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
     At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
@@ -252,7 +258,7 @@ def minimise(
     change, and cost most. With `pauses`, one that is made anew ends it.
     """
     damping, light = _DAMPING, parameters.light
-    contrast = max(light.white - light.black, sample.imaging.window.levels_per_count)
+    contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
     relative_sd = float(sd.mean()) / contrast
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     scaled = scaled_rows(jacobian, unknowns.free, sd)
@@ -261,7 +267,9 @@ def minimise(
     normal = normal_matrix(scaled, current, unknowns)
     for number in range(steps):
         while True:
-            step, promised = propose(scaled, normal, current, parameters, unknowns, damping)
+            step, promised = gauss_newton_step(
+                scaled, normal, current, parameters, unknowns, damping
+            )
             candidate = parameters.moved(step)
             change = relative_sd * math.sqrt(2.0 * promised / len(sd))
             if change > _LARGE_CHANGE and number < steps - 1:
@@ -287,4 +295,4 @@ def minimise(
         damping = max(0.1 * damping, 1e-9)
         if gain < enough or abs(gain - promised) < _AS_PROMISED:
             break
-    return Fit(sample, parameters, prediction, jacobian, sd, current, unknowns)
+    return TargetFit(sample, parameters, prediction, jacobian, sd, current, unknowns)

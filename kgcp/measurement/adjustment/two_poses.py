@@ -16,9 +16,9 @@ from kgcp.measurement.adjustment.acceptance import edge_noise
 from kgcp.measurement.adjustment.covariance import PoseCovariance, pose_covariance
 from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import choose_sample
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.adjustment.solver import Fit, adjust, approach, minimise, predict
+from kgcp.measurement.adjustment.pixels import select_pixels
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import TargetFit, adjust, approach, minimise, predict
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak, unknowns_of
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import misfit
@@ -39,36 +39,36 @@ class TwoPoses:
 
     Attributes
     ----------
-    best, other : Fit
+    best, other : TargetFit
         The better and the worse one, on the same pixels with the same noise.
-    even : Fit, optional
+    even : TargetFit, optional
         The better one before levels were let vary, which may hide a dot; None if they do not vary.
     """
 
-    best: Fit
-    other: Fit
-    even: Fit | None = None
+    best: TargetFit
+    other: TargetFit
+    even: TargetFit | None = None
 
 
-def fit_both_poses(imaging: Imaging, pose: Pose, blur: Blur) -> TwoPoses:
+def fit_both_poses(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
     """Adjust the better one of a start pose and its mirror image about the ray, then the other."""
-    rough = _off_the_saddle(_rough_fit(imaging, pose, blur))
+    rough = _off_the_saddle(_rough_fit(problem, pose, blur))
     other = _mirrored_fit(rough, _UNLIKELY)
     near, far = (other, rough) if other.total < rough.total else (rough, other)
-    best = adjust_with_streak(imaging, _with_sharpening(imaging, near.parameters))
+    best = adjust_with_streak(problem, _with_sharpening(problem, near.parameters))
     other = fit_at(best, far.parameters.pose)
     if other.total < best.total:
-        best = adjust(imaging, other.parameters, best.unknowns)
+        best = adjust(problem, other.parameters, best.unknowns)
         other = _mirrored_fit(best)
     return TwoPoses(best, other) if best.total <= other.total else TwoPoses(other, best)
 
 
-def _off_the_saddle(rough: Fit) -> Fit:
+def _off_the_saddle(rough: TargetFit) -> TargetFit:
     """Try a tilt across the one that was found, if that is slight.
 
     A start that is tilted the wrong way comes near the tilt of 0, where nothing pulls it across.
     """
-    parameters, radius_px = rough.parameters, rough.sample.imaging.outer_radius_px
+    parameters, radius_px = rough.parameters, rough.sample.problem.outer_radius_px
     pose = parameters.pose
     if radius_px * (1.0 - pose.normal @ pose.translation_m / pose.distance_m) > _SLIGHT_TILT_PX:
         return rough
@@ -84,46 +84,46 @@ def _off_the_saddle(rough: Fit) -> Fit:
     return other if other.total < rough.total else rough
 
 
-def _with_sharpening(imaging: Imaging, parameters: Parameters) -> Parameters:
+def _with_sharpening(problem: FitProblem, parameters: Parameters) -> Parameters:
     """Go half the way to what usual sharpening does, if there may be any: it was left out."""
-    if not imaging.sharpening_px:
+    if not problem.sharpening_px:
         return parameters
     light = replace(parameters.light, sharpening=_HALF_SHARPENED)
     return Parameters.of(parameters.pose, parameters.blur.scaled(_NARROWED), light)
 
 
-def _rough_fit(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
+def _rough_fit(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
     """Come near the minimum; from other distances if there is none near the start pose.
 
     Where the plate is burnt white its light spills over the edges, and the start may be far off.
     """
-    rough = _approach(imaging, pose, blur)
+    rough = _approach(problem, pose, blur)
     for shift_px in _SPILT_PX:
         if edge_noise(rough) <= _DOUBTFUL_EDGE_NOISE:
             break
-        closer = imaging.outer_radius_px / (imaging.outer_radius_px + shift_px)
+        closer = problem.outer_radius_px / (problem.outer_radius_px + shift_px)
         with contextlib.suppress(Rejection):
-            other = _approach(imaging, Pose(pose.rotation, closer * pose.translation_m), blur)
+            other = _approach(problem, Pose(pose.rotation, closer * pose.translation_m), blur)
             rough = min(rough, other, key=edge_noise)
     return rough
 
 
-def _approach(imaging: Imaging, pose: Pose, blur: Blur) -> Fit:
+def _approach(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
     """Fit few pixels, without an unsharp mask: that would need all, and displaces little."""
-    light = first_levels(imaging, pose)
-    plain = replace(imaging, sharpening_px=0.0)
+    light = first_levels(problem, pose)
+    plain = replace(problem, sharpening_px=0.0)
     few = plain.few_pixels
-    sample = choose_sample(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
-    unknowns = unknowns_of(imaging, has_streak=False)
+    sample = select_pixels(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
+    unknowns = unknowns_of(problem, has_streak=False)
     return approach(sample, Parameters.of(pose, blur, light), unknowns)
 
 
-def choose_by_prior(imaging: Imaging, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
+def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) -> TwoPoses:
     """Let the poses change places where the prior outweighs the image; adjust the new best one."""
     if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
         return poses
     if poses.best.varied is None:
-        best = adjust(imaging, poses.other.parameters, poses.best.unknowns)
+        best = adjust(problem, poses.other.parameters, poses.best.unknowns)
         turned = TwoPoses(best, _mirrored_fit(best))
     else:
         turned = TwoPoses(poses.other, poses.best, poses.even)
@@ -147,7 +147,7 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
     return of_image + worse - better
 
 
-def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
+def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
     parameters = fit.parameters
     mirrored = parameters.at(parameters.pose.mirrored())
     linear = None
@@ -167,7 +167,7 @@ def _mirrored_fit(fit: Fit, hopeless: float = _HOPELESS) -> Fit:
     return other
 
 
-def fit_at(fit: Fit, pose: Pose) -> Fit:
+def fit_at(fit: TargetFit, pose: Pose) -> TargetFit:
     """Fit another pose to the pixels of a fit, unless it is hopeless."""
     parameters = fit.parameters.at(pose)
     prediction = predict(fit.sample, parameters)

@@ -10,8 +10,8 @@ import numpy as np
 from kgcp.geometry.camera import Response
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.adjustment.solver import Fit, adjust
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param
 
@@ -41,25 +41,25 @@ _OF_RESPONSE = {
 _OF_BINS = [Param.TONE_1]  # how far edges are displaced; their shape is that of the bins
 
 
-def adjust_with_streak(imaging: Imaging, start: Parameters, *, moves: bool = True) -> Fit:
+def adjust_with_streak(problem: FitProblem, start: Parameters, *, moves: bool = True) -> TargetFit:
     """Adjust with a Gaussian blur, or with an elongated one as a streak; the pose if it `moves`."""
     streak = _streak_of(start.blur)
     if streak is None:
-        best = adjust(imaging, start, unknowns_of(imaging, has_streak=False, moves=moves))
+        best = adjust(problem, start, unknowns_of(problem, has_streak=False, moves=moves))
         streak, start = _streak_of(best.parameters.blur), best.parameters
         if streak is None:
             return best
-    unknowns = unknowns_of(imaging, has_streak=True, moves=moves)
+    unknowns = unknowns_of(problem, has_streak=True, moves=moves)
     streaked = Parameters.of(start.pose, streak, start.light)
-    is_large = imaging.outer_radius_px > _MANY_PIXELS_RADIUS_PX
-    near = adjust(imaging, streaked, unknowns, imaging.few_pixels if is_large else None)
-    return adjust(imaging, near.parameters, unknowns) if near.sample.is_thinned else near
+    is_large = problem.outer_radius_px > _MANY_PIXELS_RADIUS_PX
+    near = adjust(problem, streaked, unknowns, problem.few_pixels if is_large else None)
+    return adjust(problem, near.parameters, unknowns) if near.sample.is_thinned else near
 
 
-def unknowns_of(imaging: Imaging, *, has_streak: bool, moves: bool = True) -> Unknowns:
+def unknowns_of(problem: FitProblem, *, has_streak: bool, moves: bool = True) -> Unknowns:
     """Return which parameters are free, with weak priors on what one frame hardly tells."""
-    is_binned = imaging.window.binning > 1
-    return _unknowns(imaging.response, is_binned=is_binned, has_streak=has_streak, moves=moves)
+    is_binned = problem.window.binning > 1
+    return _unknowns(problem.response, is_binned=is_binned, has_streak=has_streak, moves=moves)
 
 
 @cache

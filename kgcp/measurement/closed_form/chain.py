@@ -21,7 +21,7 @@ from kgcp.geometry.circle import (
 )
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic, fit_ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.closed_form.edges import EdgeFit, fit_edge, patch_around
+from kgcp.measurement.closed_form.edges import EdgeFit, fit_edge, spline_patch_around
 from kgcp.measurement.records import Alternative, Appearance, Measurement
 from kgcp.measurement.search.code_signal import (
     CODE_ANGLES_RAD,
@@ -105,7 +105,7 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
     circle. The poses of the outer circle say where to look for its edge points.
     """
     ring = match.ring
-    patch = patch_around(grey, match.outer)
+    patch = spline_patch_around(grey, match.outer)
     outer = fit_edge(
         patch,
         camera,

@@ -23,7 +23,7 @@ _TWIN_RADIUS_PX = 1.1
 
 
 @dataclass(frozen=True, slots=True)
-class Cluster:
+class ConcentricCircles:
     """Concentric circles, as preliminary ellipses in the raw frame.
 
     Attributes
@@ -99,7 +99,7 @@ def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
     return ellipse if ellipse.a <= _MAX_AXIS_RATIO * ellipse.b else None
 
 
-def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[Cluster, ...]:
+def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[ConcentricCircles, ...]:
     """Group ellipses with a common centre, largest representative first.
 
     Both contours along one edge are one circle: of ellipses that agree within a pixel's fraction
@@ -117,7 +117,7 @@ def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[Cluster, ...]:
             continue
         members = free & (np.linalg.norm(centres - centres[first], axis=1) <= reach)
         free &= ~members
-        clusters.append(Cluster(_distinct([ordered[i] for i in np.flatnonzero(members)])))
+        clusters.append(ConcentricCircles(_distinct([ordered[i] for i in np.flatnonzero(members)])))
     return tuple(clusters)
 
 

@@ -49,10 +49,10 @@ class Contours:
 
     def chosen(self, indices: IndexArray) -> Contours:
         """Contours of the given indices (k,) alone."""
-        return joined([self.contour(int(index)) for index in indices])
+        return repair_contours([self.contour(int(index)) for index in indices])
 
 
-def joined(contours: Sequence[npt.NDArray[Any]]) -> Contours:
+def repair_contours(contours: Sequence[npt.NDArray[Any]]) -> Contours:
     """Put contours, each (k, 2), end to end."""
     starts = np.zeros(len(contours) + 1, dtype=np.intp)
     np.cumsum([len(contour) for contour in contours], out=starts[1:])
@@ -77,7 +77,7 @@ def find_contours(grey: GreyArray, settings: DetectSettings) -> Contours:
     contours, _ = cv2.findContours(edges, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     # A digital circle has at least 4 √2 pixels per pixel of radius.
     shortest = max(6, int(4.0 * np.sqrt(2.0) * settings.min_radius_px))
-    return joined([contour[:, 0] for contour in contours if len(contour) >= shortest])
+    return repair_contours([contour[:, 0] for contour in contours if len(contour) >= shortest])
 
 
 def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatArray]:

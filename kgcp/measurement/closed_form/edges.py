@@ -54,7 +54,7 @@ class EdgeFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Patch:
+class SplinePatch:
     """A part of the frame as a cubic spline, in the frame's pixel coordinates."""
 
     spline: FloatArray
@@ -71,7 +71,7 @@ class Patch:
         )
 
 
-def patch_around(grey: GreyArray, ellipse: Ellipse) -> Patch:
+def spline_patch_around(grey: GreyArray, ellipse: Ellipse) -> SplinePatch:
     """Cut out what the edge points of `ellipse`, and of any smaller one inside, can need."""
     reach = ellipse.a + _MARGIN_PX
     left, top = max(0, int(ellipse.x - reach)), max(0, int(ellipse.y - reach))
@@ -79,11 +79,11 @@ def patch_around(grey: GreyArray, ellipse: Ellipse) -> Patch:
     part = grey[top:bottom, left:right].astype(np.float64)
     if min(part.shape) < 4:
         raise Rejection(Reason.EDGES_LOST, "the ring is outside the frame")
-    return Patch(ndimage.spline_filter(part, order=3, mode="mirror"), left, top)
+    return SplinePatch(ndimage.spline_filter(part, order=3, mode="mirror"), left, top)
 
 
 def steepest_ellipse(
-    patch: Patch, start: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
+    patch: SplinePatch, start: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
 ) -> Ellipse:
     """Return `start` made larger or smaller by up to two pixels to where the edge is steepest.
 
@@ -100,7 +100,7 @@ def steepest_ellipse(
 
 
 def edge_points(
-    patch: Patch, ellipse: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
+    patch: SplinePatch, ellipse: Ellipse, angles_rad: FloatArray, *, dark_inside: bool
 ) -> FloatArray:
     """Return the sub-pixel edge points (k, 2) [px] near points of an ellipse, k ≤ n.
 
@@ -126,7 +126,7 @@ def edge_points(
 
 
 def fit_edge(
-    patch: Patch,
+    patch: SplinePatch,
     camera: Camera,
     start: Ellipse,
     *,

@@ -90,7 +90,7 @@ def variance_in_pixels(variance: float, count: int) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EdgePairs:
+class EdgeIncidence:
     """Which of n pixels feel the edge of which of c circles.
 
     Attributes
@@ -109,13 +109,13 @@ class EdgePairs:
     background: FloatArray
 
 
-def pair_edges(
+def find_edge_incidence(
     points_m: FloatArray,
     metres_per_px: float,
     circles: Circles,
     blur: Blur,
     spread: FloatArray,
-) -> EdgePairs:
+) -> EdgeIncidence:
     """Find the pairs of pixels and circles whose edges are within reach of the blur.
 
     Parameters
@@ -138,7 +138,7 @@ def pair_edges(
     table[:, 2], table[:, 3] = circles.radii_m, circles.signs
     table[:, 4] = quadrature_for(circles.radii_m / sd_m, circles.radii_m / sharpest_m)
     slack_m = _SLACK_PX * metres_per_px
-    return EdgePairs(table, *_pair(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
+    return EdgeIncidence(table, *_pair(points_m, table, REACH_SIGMAS * sd_m, slack_m, spread))
 
 
 def reach_px(blur: Blur) -> float:

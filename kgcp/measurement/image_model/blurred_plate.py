@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.image_model.blur import EdgePairs
+from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.blurred_discs import render
 from kgcp.measurement.image_model.ray_plate import (
     PLATE_ROWS,
@@ -46,7 +46,7 @@ class WhiteShare:
 
 
 def white_share(
-    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence
 ) -> WhiteShare:
     """Return the white share of every pixel, with derivatives.
 
@@ -58,28 +58,28 @@ def white_share(
         As of a window.
     blur : (5,) array
         `Blur.vector`.
-    pairs : EdgePairs
+    incidence : EdgeIncidence
     """
-    views, on_plate = _rendered(pose, rays, blur, pairs, PLATE_ROWS)
+    views, on_plate = _rendered(pose, rays, blur, incidence, PLATE_ROWS)
     slopes = np.empty((SLOPE_ROWS, rays.shape[1]))
     carry_slopes(pose, views, on_plate, slopes)
     return WhiteShare(views[:2], on_plate[0], slopes)
 
 
 def white_level(
-    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence
 ) -> WhiteShare:
     """Return the white share of every pixel alone, at less than half the cost."""
-    views, on_plate = _rendered(pose, rays, blur, pairs, 1)
+    views, on_plate = _rendered(pose, rays, blur, incidence, 1)
     return WhiteShare(views[:2], on_plate[0], np.empty((0, rays.shape[1])))
 
 
 def _rendered(
-    pose: FloatArray, rays: FloatArray, blur: FloatArray, pairs: EdgePairs, rows: int
+    pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence, rows: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return views (15, n) and what is seen (rows, n)."""
     views, on_plate = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((rows, rays.shape[1]))
     meet_plate(pose, rays, views)
-    on_plate[0] = pairs.background
-    render(views, blur, pairs.circles, pairs.starts, pairs.members, on_plate)
+    on_plate[0] = incidence.background
+    render(views, blur, incidence.circles, incidence.starts, incidence.members, on_plate)
     return views, on_plate

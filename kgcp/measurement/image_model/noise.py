@@ -110,7 +110,7 @@ def _smeared_over(number: IndexArray, pixels: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class GreyNoise:
     """Noise of n pixels.
 
     Attributes
@@ -130,7 +130,7 @@ def estimate_noise(
     share: FloatArray,
     usable: BoolArray,
     count: float,
-) -> Noise:
+) -> GreyNoise:
     """Return the noise of every pixel from the residuals of a fit.
 
     Parameters
@@ -146,7 +146,7 @@ def estimate_noise(
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
     _estimate(residuals, share, usable, (_MIN_NOISE_COUNTS * count) ** 2, sd, plateau_sd)
-    return Noise(sd, plateau_sd)
+    return GreyNoise(sd, plateau_sd)
 
 
 @compiled

@@ -137,7 +137,7 @@ _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Imager:
+class PhotometricModel:
     """From white share to grey value, for the n pixels of one sample.
 
     Attributes

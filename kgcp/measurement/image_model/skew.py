@@ -12,14 +12,17 @@ import numpy as np
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.measurement.image_model.blur import EdgePairs
+from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.ray_plate import VIEW_ROWS, meet_plate
 
 SKEW_ROWS = 4
 
 
 def skew_rows(
-    pose: FloatArray, rays: FloatArray, covariance: tuple[float, float, float], pairs: EdgePairs
+    pose: FloatArray,
+    rays: FloatArray,
+    covariance: tuple[float, float, float],
+    incidence: EdgeIncidence,
 ) -> FloatArray:
     """Return the derivatives (4, n) of the white share by the third cumulants of the point spread.
 
@@ -31,7 +34,7 @@ def skew_rows(
         As of a window.
     covariance : (3,) tuple
         Of the blur: xx, yy, xy [px²].
-    pairs : EdgePairs
+    incidence : EdgeIncidence
 
     Returns
     -------
@@ -40,7 +43,7 @@ def skew_rows(
     """
     views, rows = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((SKEW_ROWS, rays.shape[1]))
     meet_plate(pose, rays, views)
-    _add_skew(views, *covariance, pairs.circles, pairs.starts, pairs.members, rows)
+    _add_skew(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
     return rows
 
 

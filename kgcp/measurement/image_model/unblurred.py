@@ -14,7 +14,7 @@ from kgcp.measurement.image_model.plate import EVEN, Circles, find_skips, plate_
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BarePlate:
+class UnblurredPlate:
     """The plate under n pixels.
 
     Attributes
@@ -39,7 +39,7 @@ class BarePlate:
     off_measured_m: FloatArray
 
 
-def look_at_plate(
+def unblurred_plate(
     circles: Circles,
     measured_count: int,
     pose: Pose,
@@ -48,7 +48,7 @@ def look_at_plate(
     small_m: float = 0.0,
     reach_m: float = math.inf,
     spread: FloatArray = EVEN,
-) -> BarePlate:
+) -> UnblurredPlate:
     """Find what is under every pixel of the plate as a pose puts it, without blur.
 
     Parameters
@@ -70,7 +70,7 @@ def look_at_plate(
     centres_m, radii_m, signs = circles.centres_m, circles.radii_m, circles.signs
     circle_table = np.vstack((centres_m, radii_m, signs))
     skips = find_skips(centres_m, radii_m)
-    return BarePlate(
+    return UnblurredPlate(
         points_m, *_look(points_m, circle_table, *skips, measured_count, small_m, reach_m, spread)
     )
 

@@ -16,7 +16,7 @@ from kgcp.measurement.search.code_signal import CodeMatch
 from kgcp.measurement.search.outlines import Seeds, find_outlines, find_seeds
 from kgcp.measurement.search.pyramid import build_pyramid
 from kgcp.measurement.search.sampling import sample_ellipses
-from kgcp.measurement.search.template_match import judge
+from kgcp.measurement.search.template_match import match_templates
 from kgcp.measurement.search.templates import ANGLES, CIRCLE, SAMPLED_RADII
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring
@@ -42,7 +42,7 @@ class Candidate:
     outline : Ellipse
         Of its outer circle [px].
     patch : (radii, angles) array
-        Grey values around it, for `kgcp.measurement.search.template_match.judge`.
+        Grey values around it, for `kgcp.measurement.search.template_match.match_templates`.
     """
 
     outline: Ellipse
@@ -128,13 +128,13 @@ def find_code(
     matches: list[CodeMatch] = []
     refused: list[Refusal] = []
     for candidate in candidates:
-        outline, verdict = candidate.outline, judge(candidate.patch, ring)
+        outline, template_match = candidate.outline, match_templates(candidate.patch, ring)
         try:
-            verdict.check(settings.min_score - _CIRCLE_LOSS)
+            template_match.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:
-            refused.append(Refusal(outline, verdict.score, rejection))
+            refused.append(Refusal(outline, template_match.score, rejection))
             continue
-        matches.append(verdict.code_match(ring, outline))
+        matches.append(template_match.code_match(ring, outline))
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)
 
 

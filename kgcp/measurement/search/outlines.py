@@ -30,7 +30,7 @@ _MAX_AXIS_RATIO = 2.0  # tilts to 60°
 _DIRECTIONS = np.stack((np.cos(RAYS_RAD), np.sin(RAYS_RAD)), axis=-1)
 
 
-def distinct(
+def non_max_suppression(
     centres: FloatArray, radii: FloatArray, clearness: FloatArray, near: float, alike: float
 ) -> IndexArray:
     """Return the indices of circles without those that are like a clearer one, clearest first.
@@ -118,7 +118,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
     peaks, ends = find_peaks(pyramid.reduced, pyramid.levels[first:])
     rings = check_peaks(pyramid, peaks, ends)
     centres, radii, contrasts = np.ascontiguousarray(rings[:, :2]), *rings[:, 2:].T.copy()
-    kept = distinct(centres, radii, contrasts, _NEAR_SEEDS, _ALIKE_SEEDS)
+    kept = non_max_suppression(centres, radii, contrasts, _NEAR_SEEDS, _ALIKE_SEEDS)
     return Seeds(centres, radii, contrasts).chosen(kept)
 
 
@@ -154,5 +154,7 @@ def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     ellipses[:, :2] += seeds.centres_px
     radii, centres = np.sqrt(ellipses[:, 2:4].prod(axis=1)), np.ascontiguousarray(ellipses[:, :2])
     return ellipses[
-        distinct(centres, radii, shares * seeds.contrasts, _NEAR_OUTLINES, _ALIKE_OUTLINES)
+        non_max_suppression(
+            centres, radii, shares * seeds.contrasts, _NEAR_OUTLINES, _ALIKE_OUTLINES
+        )
     ]

@@ -58,7 +58,7 @@ _EVERYWHERE = np.ones(ANGLES, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+class TemplateMatch:
     """How well one ring in the frame looks like a target's.
 
     Attributes
@@ -126,11 +126,11 @@ class Placement(NamedTuple):
     lag: int
 
 
-def judge_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> Verdict:
+def match_templates_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) -> TemplateMatch:
     """Compare a ring with its templates as a pose puts them; angles are the plate's."""
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
-    return judge(sample_grey(grey, points), ring)
+    return match_templates(sample_grey(grey, points), ring)
 
 
 def code_in_even_light(
@@ -151,11 +151,11 @@ def code_in_even_light(
 
 
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
-    """Sample a frame around an outline, for `judge`: (radii, angles)."""
+    """Sample a frame around an outline, for `match_templates`: (radii, angles)."""
     return np.asarray(sample_ellipses(grey, (outline,), SAMPLED_RADII, CIRCLE)[0])
 
 
-def judge(patch: FloatArray, ring: Ring) -> Verdict:
+def match_templates(patch: FloatArray, ring: Ring) -> TemplateMatch:
     """Compare a polar patch (radii, angles) of the frame with the ring's templates.
 
     In uneven light it is compared as it would be in even light; where a part of the ring is
@@ -163,23 +163,23 @@ def judge(patch: FloatArray, ring: Ring) -> Verdict:
     """
     templates = templates_of(ring)
     whole = best_placement(correlate(patch, templates))
-    verdict = _verdict(patch, ring, whole, None)
-    if verdict.is_clear:
-        return verdict
-    if verdict.score > _WORTH_EVENING:
+    template_match = _matched(patch, ring, whole, None)
+    if template_match.is_clear:
+        return template_match
+    if template_match.score > _WORTH_EVENING:
         even = evened_patch(patch, ring, whole.shift)
         if even is not None:
-            in_even_light = _verdict(even, ring, best_placement(correlate(even, templates)), None)
+            in_even_light = _matched(even, ring, best_placement(correlate(even, templates)), None)
             if in_even_light.is_clear:
                 return in_even_light
     visible = visible_angles(patch[whole.shift : whole.shift + len(TEMPLATE_RADII)], ring)
     if visible is None or not may_show_code(patch, visible, ring, whole.shift):
-        return verdict
+        return template_match
     scores = correlate(patch, templates, visible)
     part = best_placement(scores)
     if not _tells_heading(scores, part, visible, ring):
-        return verdict
-    return _verdict(patch, ring, part, visible)
+        return template_match
+    return _matched(patch, ring, part, visible)
 
 
 def best_placement(scores: SingleArray) -> Placement:
@@ -189,7 +189,9 @@ def best_placement(scores: SingleArray) -> Placement:
     return Placement(float(scores[template, shift, lag]), template, shift, lag)
 
 
-def _verdict(patch: FloatArray, ring: Ring, place: Placement, visible: BoolArray | None) -> Verdict:
+def _matched(
+    patch: FloatArray, ring: Ring, place: Placement, visible: BoolArray | None
+) -> TemplateMatch:
     templates = templates_of(ring)
     image = templates.images[place.template]
     first, last = code_rows(ring)
@@ -203,7 +205,7 @@ def _verdict(patch: FloatArray, ring: Ring, place: Placement, visible: BoolArray
         last,
         max(1, round(ring.dot_half_angle_deg * ANGLES / 360.0)),
     )
-    return Verdict(
+    return TemplateMatch(
         score=place.score,
         lag_deg=place.lag * 360.0 / ANGLES,
         black=black,

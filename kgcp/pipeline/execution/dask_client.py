@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from kgcp.errors import KgcpError
 from kgcp.io.tables.provenance import versions
-from kgcp.pipeline.execution.dask_worker import Terms, nothing, on_worker, release
-from kgcp.pipeline.execution.resilient_map import Loss, Lost, careful_map
-from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.dask_worker import JobContext, nothing, on_worker, release
+from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure, resilient_map
+from kgcp.pipeline.execution.signals import defer_interrupts
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -32,7 +32,7 @@ _WORKERS_S = 120.0  # without any worker, after which nobody waits any more
 _WATCH_S = 2.0  # between two looks whether there are workers
 
 
-class Cluster(Executor):
+class DaskCluster(Executor):
     """Calls made by the workers of a Dask scheduler; made by `connected`.
 
     Parameters
@@ -41,18 +41,18 @@ class Cluster(Executor):
         Of the scheduler, for messages.
     """
 
-    def __init__(self, name: str, client: Client, terms: Terms) -> None:
-        self._name, self._client, self._terms = name, client, terms
+    def __init__(self, name: str, client: Client, context: JobContext) -> None:
+        self._name, self._client, self._context = name, client, context
         self._waiting: set[Future[Any]] = set()
         self._is_over = threading.Event()
-        with stops_held():
+        with defer_interrupts():
             self._dask: Executor = client.get_executor(pure=False)
         threading.Thread(target=self._watch, daemon=True).start()
 
     @property
     def jobs(self) -> int:
         """Threads of the workers that are there now; at least one."""
-        with stops_held():
+        with defer_interrupts():
             threads: dict[str, int] = self._client.nthreads()
         return max(1, sum(threads.values()))
 
@@ -60,17 +60,17 @@ class Cluster(Executor):
         """Let a worker make a call; what Dask raises becomes what it means here."""
         future: Future[Any] = Future()
         self._waiting.add(future)
-        with stops_held():
-            inner = self._dask.submit(on_worker, self._terms, fn, *args, **kwargs)
+        with defer_interrupts():
+            inner = self._dask.submit(on_worker, self._context, fn, *args, **kwargs)
             inner.add_done_callback(partial(self._hand_over, future))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: ARG002, FBT001, FBT002 - the base class's signature
         """Drop what is under way, and end the processes that the workers keep for this run."""
         self._is_over.set()
-        with stops_held(), suppress(Exception):  # a cluster that is gone has none
+        with defer_interrupts(), suppress(Exception):  # a cluster that is gone has none
             self._dask.shutdown(wait=False)
-            self._client.run(release, self._terms.run, on_error="ignore")
+            self._client.run(release, self._context.run, on_error="ignore")
 
     def _hand_over(self, future: Future[Any], inner: Future[Any]) -> None:
         if inner.cancelled():
@@ -78,11 +78,11 @@ class Cluster(Executor):
             return
         error = inner.exception()
         if type(error).__name__ == "KilledWorker":  # of distributed: several workers in its hands
-            error = Lost(Loss.DIED)
+            error = Lost(TaskFailure.CRASHED)
         elif isinstance(error, ImportError):
             error = KgcpError(
                 f"{self._name}: a worker cannot do this work ({error}); install kgcp"
-                f" {self._terms.versions['kgcp']} on all of them"
+                f" {self._context.versions['kgcp']} on all of them"
             )
         self._settle(future, error, None if error is not None else inner.result())
 
@@ -117,7 +117,7 @@ class Cluster(Executor):
 
 
 @contextmanager
-def connected(scheduler: str, limit_s: float, folders: tuple[Path, ...]) -> Iterator[Cluster]:
+def connected(scheduler: str, limit_s: float, folders: tuple[Path, ...]) -> Iterator[DaskCluster]:
     """Have the workers of a Dask scheduler until the block ends.
 
     Parameters
@@ -138,10 +138,12 @@ def connected(scheduler: str, limit_s: float, folders: tuple[Path, ...]) -> Iter
     """
     with ExitStack() as stack:
         client = _connect(scheduler, stack)
-        cluster = Cluster(scheduler, client, Terms(uuid.uuid4().hex, limit_s, versions(), folders))
+        cluster = DaskCluster(
+            scheduler, client, JobContext(uuid.uuid4().hex, limit_s, versions(), folders)
+        )
         stack.callback(cluster.shutdown)
-        ((_, result),) = careful_map(nothing, (None,), cluster, 1)  # finds most that can be wrong
-        if isinstance(result, Loss):
+        ((_, result),) = resilient_map(nothing, (None,), cluster, 1)  # finds most that can be wrong
+        if isinstance(result, TaskFailure):
             raise KgcpError(
                 f"{scheduler}: a worker's process ends as soon as it is started; see the worker's"
                 " log, and give it memory"
@@ -167,7 +169,7 @@ def _connect(scheduler: str, stack: ExitStack) -> Client:
         )
     address: str | LocalCluster = scheduler
     try:
-        with stops_held():
+        with defer_interrupts():
             if local is not None:
                 address = LocalCluster(  # in this process, where nobody else can give it work
                     n_workers=int(local[1]),
@@ -188,5 +190,5 @@ def _connect(scheduler: str, stack: ExitStack) -> Client:
 
 
 def _close(each: Client | LocalCluster) -> None:
-    with stops_held():
+    with defer_interrupts():
         each.close()

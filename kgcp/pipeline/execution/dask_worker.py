@@ -23,7 +23,7 @@ _processes: dict[int, tuple[str, WorkerProcess]] = {}  # by thread: a run, and o
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class JobContext:
     """What a worker's calls go by.
 
     Attributes
@@ -48,7 +48,7 @@ def nothing(_: object) -> None:
     """Do nothing: to be called shows that the way there and back is open."""
 
 
-def on_worker(terms: Terms, function: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401 - those of any function
+def on_worker(context: JobContext, function: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401 - those of any function
     """Make a call in the process that belongs to this thread of a worker.
 
     Raises
@@ -56,26 +56,26 @@ def on_worker(terms: Terms, function: Callable[..., Any], *args: Any) -> Any:  #
     Lost
         If the process ends, or the call takes too long.
     KgcpError
-        If the worker is not as the terms want it, or cannot start a process.
+        If the worker has other versions, does not see a folder, or cannot start a process.
     Exception
         As the function does.
     """
-    _require_same_versions(terms)
-    for folder in terms.folders:
+    _require_same_versions(context)
+    for folder in context.folders:
         if not folder.is_dir():
             raise KgcpError(
                 f"{folder}: is not seen by the worker {_here()}; mount it there under the same name"
             )
-    return _process(terms).call(function, *args)
+    return _process(context).call(function, *args)
 
 
-def _require_same_versions(terms: Terms) -> None:
+def _require_same_versions(context: JobContext) -> None:
     here = _own_versions()
-    differing = [name for name, value in terms.versions.items() if here.get(name) != value]
+    differing = [name for name, value in context.versions.items() if here.get(name) != value]
     if differing:
         name = differing[0]
         raise KgcpError(
-            f"the worker {_here()}: has {name} {here.get(name)}, not {terms.versions[name]}, and"
+            f"the worker {_here()}: has {name} {here.get(name)}, not {context.versions[name]}, and"
             " might give other results; install the same versions everywhere"
         )
 
@@ -91,16 +91,16 @@ def _here() -> str:
     return str(get_worker().address)
 
 
-def _process(terms: Terms) -> WorkerProcess:
+def _process(context: JobContext) -> WorkerProcess:
     thread = threading.get_ident()
     run, process = _processes.get(thread, (None, None))
-    if process is None or run != terms.run:
+    if process is None or run != context.run:
         if process is not None:
             process.end()  # of a run that had no time to say that it ends
         # Dask's workers may have no children, lest these outlive them. Ours end with their parent.
         multiprocessing.current_process().daemon = False
-        process = WorkerProcess(terms.limit_s)
-        _processes[thread] = terms.run, process
+        process = WorkerProcess(context.limit_s)
+        _processes[thread] = context.run, process
     return process
 
 

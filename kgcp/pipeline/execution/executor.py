@@ -13,16 +13,21 @@ from typing import TypeVar
 
 from kgcp.io.images.remote import StoredFolder
 from kgcp.pipeline.execution.dask_client import connected
-from kgcp.pipeline.execution.local_processes import LocalPool
+from kgcp.pipeline.execution.local_processes import SupervisedProcessPool
 from kgcp.pipeline.execution.profiling import profiled
-from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map, usable_cores
+from kgcp.pipeline.execution.resilient_map import (
+    SerialExecutor,
+    TaskFailure,
+    resilient_map,
+    usable_cores,
+)
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Crew:
+class WorkerPool:
     """Workers, the same for all that a run does.
 
     Attributes
@@ -42,15 +47,15 @@ class Crew:
 
     def map(
         self, function: Callable[[_Item], _Result], items: Iterable[_Item]
-    ) -> Generator[tuple[_Item, _Result | Loss]]:
+    ) -> Generator[tuple[_Item, _Result | TaskFailure]]:
         """Yield items and results as they come."""
         if not self.callers:
-            yield from careful_map(function, items, self.executor, self.jobs)
+            yield from resilient_map(function, items, self.executor, self.jobs)
             return
         timed = partial(profiled, self.callers, function)
-        with closing(careful_map(timed, items, self.executor, self.jobs)) as results:
+        with closing(resilient_map(timed, items, self.executor, self.jobs)) as results:
             for item, result in results:
-                if isinstance(result, Loss):
+                if isinstance(result, TaskFailure):
                     yield item, result
                 else:
                     self.stages_s.update(result.stages_s)
@@ -58,13 +63,13 @@ class Crew:
 
 
 @contextmanager
-def hired(
+def open_pool(
     jobs: int | None,
     limit_s: float,
     scheduler: str | None,
     frames: Path | StoredFolder,
     callers: tuple[Callable[..., object], ...] = (),
-) -> Iterator[Crew]:
+) -> Iterator[WorkerPool]:
     """Have a crew until the block ends.
 
     Parameters
@@ -87,9 +92,9 @@ def hired(
     """
     if scheduler is None:
         jobs = usable_cores() if jobs is None else jobs
-        with LocalPool(jobs, limit_s) if jobs else Inline() as executor:
-            yield Crew(jobs, executor, callers, Counter())
+        with SupervisedProcessPool(jobs, limit_s) if jobs else SerialExecutor() as executor:
+            yield WorkerPool(jobs, executor, callers, Counter())
         return
     folders = (frames,) if isinstance(frames, Path) else ()
     with connected(scheduler, limit_s, folders) as cluster:
-        yield Crew(jobs or cluster.jobs, cluster, callers, Counter())
+        yield WorkerPool(jobs or cluster.jobs, cluster, callers, Counter())

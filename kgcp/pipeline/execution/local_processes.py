@@ -19,8 +19,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from kgcp.errors import KgcpError
-from kgcp.pipeline.execution.resilient_map import Loss, Lost
-from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure
+from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
 _SPAWN = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
@@ -74,9 +74,9 @@ class WorkerProcess:
             if connection.poll(limit_s):
                 result, error = connection.recv()
             else:
-                result, error = None, Lost(Loss.LATE)
+                result, error = None, Lost(TaskFailure.TIMED_OUT)
         except (EOFError, OSError):
-            result, error = None, Lost(Loss.DIED)
+            result, error = None, Lost(TaskFailure.CRASHED)
         if isinstance(error, Lost):
             self._kill()
         if error is not None:
@@ -89,7 +89,7 @@ class WorkerProcess:
             try:
                 with self._lock:
                     if self._is_over:
-                        raise Lost(Loss.DIED)
+                        raise Lost(TaskFailure.CRASHED)
                     use_one_thread_each()
                     self._process = _SPAWN.Process(target=_serve, args=(other,), daemon=True)
                     self._process.start()
@@ -155,7 +155,7 @@ def _portable(error: Exception) -> Exception:
     return error
 
 
-class LocalPool(ThreadPoolExecutor):
+class SupervisedProcessPool(ThreadPoolExecutor):
     """Threads, each of which lets a process of its own make its calls.
 
     Parameters
@@ -173,7 +173,8 @@ class LocalPool(ThreadPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
         """Let a process make a call, within the limit of time."""
-        with stops_held():  # threads and processes inherit that Ctrl-C is none of their business
+        # Threads and processes inherit that they leave Ctrl-C to this one.
+        with defer_interrupts():
             return super().submit(self._call, fn, *args, **kwargs)
 
     def _call(self, function: Callable[..., Any], /, *args: Any) -> Any:  # noqa: ANN401 - those of any function
@@ -185,7 +186,7 @@ class LocalPool(ThreadPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:  # noqa: FBT001, FBT002 - the base class's signature
         """End the processes, also in the midst of their work."""
-        with stops_held():
+        with defer_interrupts():
             super().shutdown(wait=False, cancel_futures=cancel_futures)
             for worker in self._workers:
                 worker.end()

@@ -10,7 +10,7 @@ from itertools import islice
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.signals import defer_interrupts
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -21,28 +21,28 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class Loss(Enum):
+class TaskFailure(Enum):
     """Why an item has no result."""
 
-    DIED = auto()  # the process that worked on it ended
-    LATE = auto()  # it took longer than it may
+    CRASHED = auto()  # the process that worked on it ended
+    TIMED_OUT = auto()  # it took longer than it may
 
 
 class Lost(Exception):  # noqa: N818 - the outcome of one item, of which the map makes a value
     """The process that made a call has ended, or was ended, without a result."""
 
-    def __init__(self, loss: Loss) -> None:
+    def __init__(self, loss: TaskFailure) -> None:
         super().__init__(loss)
         self.loss = loss
 
 
-class Inline(Executor):
+class SerialExecutor(Executor):
     """Works in this process, at once: its end is the end of all. Signals wait for a call's end."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
         """Return the result of a call as a future that is done."""
         future: Future[Any] = Future()
-        with stops_held():
+        with defer_interrupts():
             try:
                 future.set_result(fn(*args, **kwargs))
             except Exception as error:  # it belongs to whoever asks for the result
@@ -50,9 +50,9 @@ class Inline(Executor):
         return future
 
 
-def careful_map(
+def resilient_map(
     function: Callable[[Item], Result], items: Iterable[Item], executor: Executor, jobs: int
-) -> Generator[tuple[Item, Result | Loss]]:
+) -> Generator[tuple[Item, Result | TaskFailure]]:
     """Yield every item with `function(item)`, as they come; few are in memory at a time.
 
     An item that is lost is tried once more when all others are done: alone, since memory may have
@@ -80,7 +80,7 @@ def careful_map(
     done: SimpleQueue[Future[Result]] = SimpleQueue()
 
     def submit(item: Item) -> None:
-        with stops_held():
+        with defer_interrupts():
             future = executor.submit(function, item)
             pending[future] = item
             future.add_done_callback(done.put)

@@ -12,7 +12,7 @@ _STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
-def stops_held() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Hold SIGINT and SIGTERM back while they would break something; they come when the block ends.
 
     An exception that a signal's handler raises between two lines of an executor's code leaves a

@@ -70,7 +70,7 @@ class RangeRow:
 
 @dataclass(frozen=True, slots=True)
 class DetectionRate:
-    """Detections among the chances of one range, with Wilson's 95 % interval.
+    """Share of the frames that must show the target in which it was measured, for one range.
 
     Attributes
     ----------
@@ -173,9 +173,9 @@ class BiasNumbers:
         Of the errors over their reported standard deviations.
     sd_reference_m : float or None
         Median standard deviation of the reference distances.
-    astray : tuple of str
+    misplaced : tuple of str
         Frames in which something else was measured.
-    detected, chances : int
+    detected, expected_visible : int
         Over all distances.
     left_out : tuple of (str, int)
         Frames that could not be compared: why and how many.
@@ -198,9 +198,9 @@ class BiasNumbers:
     influences: tuple[Influence, ...]
     standardised: Spread | None
     sd_reference_m: float | None
-    astray: tuple[str, ...]
+    misplaced: tuple[str, ...]
     detected: int
-    chances: int
+    expected_visible: int
     left_out: tuple[tuple[str, int], ...]
     attitudes_agree: bool
 
@@ -251,7 +251,7 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         + np.nan_to_num(sd_reference) ** 2
     )
     total, halves, bins = _range_rows(data.distance_m, data.residual_m, sd_reference)
-    detected = [study.trusts(pair) for pair in study.chances]
+    detected = [study.trusts(pair) for pair in study.expected_visible]
     scaled = (data.residual_m / sd)[np.isfinite(sd)]
     stated = sd_reference[np.isfinite(sd_reference)]
     left_out = Counter(absence.value for absence in study.absences)
@@ -266,16 +266,20 @@ def bias_numbers(study: BiasStudy) -> BiasNumbers:
         total=total,
         halves=halves,
         bins=bins,
-        rates=rates_by_distance([pair.reference_distance_m for pair in study.chances], detected),
-        radius_rates=rates_by_radius([pair.expected_radius_px for pair in study.chances], detected),
+        rates=rates_by_distance(
+            [pair.reference_distance_m for pair in study.expected_visible], detected
+        ),
+        radius_rates=rates_by_radius(
+            [pair.expected_radius_px for pair in study.expected_visible], detected
+        ),
         regression=regression,
         edges=_edges(study, compared),
         influences=_influences(data, percent - explained),
         standardised=Spread.of(scaled) if scaled.size else None,
         sd_reference_m=float(np.median(stated)) if stated.size else None,
-        astray=tuple(pair.attempt.frame for pair in study.measured if not study.trusts(pair)),
+        misplaced=tuple(pair.attempt.frame for pair in study.measured if not study.trusts(pair)),
         detected=sum(detected),
-        chances=len(detected),
+        expected_visible=len(detected),
         left_out=tuple(left_out.most_common()),
         attitudes_agree=study.attitudes_agree,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.guided import Expectation, look_again
+from kgcp.measurement.guided import Prediction, look_again
 from kgcp.measurement.records import Measurement
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
@@ -67,11 +67,11 @@ def measure_again(
     It is looked for only where it is, whatever the size of the frame. Empty if it is not found
     there unchanged.
     """
-    expected = Expectation(centre_px, _SD_PX, radius_px, _SD_LOG_RADIUS, "the unchanged frame")
+    prediction = Prediction(centre_px, _SD_PX, radius_px, _SD_LOG_RADIUS, "the unchanged frame")
 
     def measured(gain: float) -> Measurement | None:
         changed = _reexposed_around(grey, gain, centre_px, radius_px)
-        return look_again(changed, camera, target, expected, settings, None, ())[0]
+        return look_again(changed, camera, target, prediction, settings, None, ())[0]
 
     before = measured(1.0)
     if before is None:

@@ -51,7 +51,7 @@ def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexp
             "one_edge_regression": _regression(edges.regression),
         },
         "detected": numbers.detected,
-        "frames_with_target": numbers.chances,
+        "frames_with_target": numbers.expected_visible,
         "rates_by_distance_m": [{**asdict(rate), "rate": rate.rate} for rate in numbers.rates],
         "rates_by_radius_px": [
             {**asdict(rate), "rate": rate.rate} for rate in numbers.radius_rates
@@ -63,7 +63,7 @@ def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexp
         "outliers": []
         if regression is None
         else [frames[row] for row in regression.outlier.nonzero()[0].tolist()],
-        "astray": list(numbers.astray),
+        "misplaced": list(numbers.misplaced),
         "left_out": dict(numbers.left_out),
         "attitudes_agree": numbers.attitudes_agree,
     }

@@ -208,20 +208,20 @@ def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
 def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
     regression = numbers.regression
     outliers = 0 if regression is None else int(regression.outlier.sum())
-    astray = len(numbers.astray)
-    if not outliers + astray:
+    misplaced = len(numbers.misplaced)
+    if not outliers + misplaced:
         return
-    share = (outliers + astray) / (numbers.total.percent.count + astray)
+    share = (outliers + misplaced) / (numbers.total.percent.count + misplaced)
     grade = Grade.GOOD
     if share > limits.unusable_lost_share:
         grade = Grade.UNUSABLE
     elif share > limits.lost_share:
         grade = Grade.LOOK
     parts = []
-    if astray:
+    if misplaced:
         parts.append(
-            f"{astray} {_plural('measurement', astray)} not where the target must be, left out of"
-            " the statistics"
+            f"{misplaced} {_plural('measurement', misplaced)} not where the target must be,"
+            " left out of the statistics"
         )
     if outliers:
         parts.append(
@@ -236,13 +236,13 @@ def _plural(word: str, count: int) -> str:
 
 
 def _detection(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
-    if not numbers.chances:
+    if not numbers.expected_visible:
         return
-    share = numbers.detected / numbers.chances
+    share = numbers.detected / numbers.expected_visible
     kind = "the target fully in view" if numbers.attitudes_agree else "a reference pose"
     yield Finding(
         Grade.GOOD if share >= limits.detection_rate else Grade.LOOK,
-        f"Detected in {numbers.detected} of {numbers.chances} frames with {kind}"
+        f"Detected in {numbers.detected} of {numbers.expected_visible} frames with {kind}"
         f" ({100.0 * share:.1f} %).",
         "rate",
     )

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.gcp import Kgcp
+from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints
 
 Factory = Callable[..., MapPoints]
@@ -35,8 +35,8 @@ COV_PX = np.array([[9.0, 2.0], [2.0, 4.0]]) * 1e-4
 PRIOR_COV = np.diag([0.3, 0.4, 0.1, 0.004, 0.005, 0.006]) ** 2 + 1e-6
 
 
-def kgcp(number: int, offset: tuple[float, float, float], px: tuple[float, float]) -> Kgcp:
-    return Kgcp(
+def kgcp(number: int, offset: tuple[float, float, float], px: tuple[float, float]) -> Gcp:
+    return Gcp(
         id=f"K{number:04d}",
         frame=f"a/IMG_{number}.JPG",
         target="A",
@@ -51,7 +51,7 @@ def kgcp(number: int, offset: tuple[float, float, float], px: tuple[float, float
     )
 
 
-def default_kgcps() -> tuple[Kgcp, ...]:
+def default_kgcps() -> tuple[Gcp, ...]:
     edge = kgcp(1, (0.0, 0.0, 0.0), (-0.5, 1200.5))
     other_edge = kgcp(2, (10.125, 5.5, 0.25), (1599.5, -0.5))
     inside = kgcp(3, (21.0000004, 11.0000003, 0.5000001), (812.3456789, 77.7654321))
@@ -74,10 +74,10 @@ def prior(frame: str, offset: tuple[float, float, float], rotvec: FloatArray) ->
 def make_points() -> Factory:
     def make(
         crs: str = "EPSG:25831",
-        kgcps: tuple[Kgcp, ...] | None = None,
+        gcps: tuple[Gcp, ...] | None = None,
         priors: tuple[CameraPrior, ...] = (),
     ) -> MapPoints:
-        return MapPoints(crs, default_kgcps() if kgcps is None else kgcps, CAMERA, priors)
+        return MapPoints(crs, default_kgcps() if gcps is None else gcps, CAMERA, priors)
 
     return make
 

@@ -106,9 +106,9 @@ def test_mmvii_has_points_and_marks_with_covariances(points: MapPoints) -> None:
     cov = np.zeros((3, 3))
     cov[np.triu_indices(3)] = upper
     cov = cov + cov.T - np.diag(np.diag(cov))
-    assert points.kgcps[0].cov_m2 is not None
+    assert points.gcps[0].cov_m2 is not None
     np.testing.assert_allclose(
-        np.linalg.eigvalsh(cov), np.linalg.eigvalsh(points.kgcps[0].cov_m2), rtol=1e-9
+        np.linalg.eigvalsh(cov), np.linalg.eigvalsh(points.gcps[0].cov_m2), rtol=1e-9
     )
     image = _mmvii_data(texts["mmvii/MesIm-IMG_1.JPG.xml"], "SetMesIm")
     assert _bare(image, "NameIm") == "IMG_1.JPG"
@@ -119,8 +119,8 @@ def test_mmvii_has_points_and_marks_with_covariances(points: MapPoints) -> None:
 
 def test_mmvii_covariances_turn_with_the_axes(points: MapPoints) -> None:
     """Grid north is 0.55° west of true north: the covariance turns by that, as a tensor."""
-    along_grid_north = replace(points.kgcps[0], cov_m2=np.diag([1e-4, 1.0, 1e-4]))
-    texts = mmvii.files(replace(points, kgcps=(along_grid_north,)))
+    along_grid_north = replace(points.gcps[0], cov_m2=np.diag([1e-4, 1.0, 1e-4]))
+    texts = mmvii.files(replace(points, gcps=(along_grid_north,)))
     xx, xy, _, yy, _, _ = _numbers(_mmvii_points(texts)["K0001"], "__Opt__Sigma2")
     turn_deg = np.degrees(0.5 * np.arctan2(2.0 * xy, yy - xx))  # of the long axis, towards east
     assert turn_deg == pytest.approx(-0.83 * np.sin(np.radians(41.4)), abs=0.01)
@@ -167,9 +167,9 @@ def test_local_distances_are_true_where_those_of_the_grid_are_not(points: MapPoi
     start = np.array([500000.0, 4583523.0, 0.0])
     ends = (start, start + np.array([80.0, 0.0, 0.0]))
     two = tuple(
-        replace(point, position_map=end) for point, end in zip(points.kgcps[:2], ends, strict=True)
+        replace(point, position_map=end) for point, end in zip(points.gcps[:2], ends, strict=True)
     )
-    entries = _mmvii_points(mmvii.files(replace(points, kgcps=two))).values()
+    entries = _mmvii_points(mmvii.files(replace(points, gcps=two))).values()
     first, second = (_numbers(entry, "Pt") for entry in entries)
     assert np.linalg.norm(second - first) == pytest.approx(80.0 / 0.9996, abs=1e-5)
 
@@ -180,13 +180,13 @@ def test_feet_become_metres(make_points: Factory) -> None:
     Between the standard parallels of EPSG:2263, 40° 40′ and 41° 2′, the cone's scale is below 1 by
     (11′)²/2 = 5e-6 at most; 100 m of height stretch lengths by 100 / 6.38e6.
     """
-    one = make_points().kgcps[0]
+    one = make_points().gcps[0]
     ends = ([984000.0, 200000.0, 100.0], [985000.0, 200000.0, 100.0], [984000.0, 200000.0, 110.0])
-    kgcps = tuple(
+    gcps = tuple(
         replace(one, id=f"K{number}", frame=f"{number}.jpg", position_map=np.array(end))
         for number, end in enumerate(ends)
     )
-    entries = _mmvii_points(mmvii.files(make_points("EPSG:2263", kgcps))).values()
+    entries = _mmvii_points(mmvii.files(make_points("EPSG:2263", gcps))).values()
     first, second, above = (_numbers(entry, "Pt") for entry in entries)
     expected = 1000.0 * 1200.0 / 3937.0 * (1.0 + 100.0 / 6.38e6)
     assert np.linalg.norm(second - first) == pytest.approx(expected, rel=6e-6)
@@ -195,13 +195,13 @@ def test_feet_become_metres(make_points: Factory) -> None:
 
 def test_names_that_break_the_lines_are_refused(points: MapPoints) -> None:
     for frame in ("IMG 1.JPG", "IMG*1.JPG", 'IMG"1.JPG'):
-        bad = replace(points, kgcps=(replace(points.kgcps[0], frame=frame),))
+        bad = replace(points, gcps=(replace(points.gcps[0], frame=frame),))
         with pytest.raises(KgcpError, match="in its name"):
             mmvii.files(bad)
 
 
 def test_points_without_deviations_are_refused(points: MapPoints) -> None:
-    bare = replace(points, kgcps=(replace(points.kgcps[0], cov_m2=None),))
+    bare = replace(points, gcps=(replace(points.gcps[0], cov_m2=None),))
     for module in (micmac, mmvii):
         with pytest.raises(KgcpError, match="K0001 has no standard deviations"):
             module.files(bare)
@@ -211,7 +211,7 @@ def test_measures_of_an_earlier_export_do_not_stay(points: MapPoints, tmp_path: 
     export(points, "mmvii", tmp_path)
     mine = tmp_path / "mmvii" / "notes.txt"
     mine.touch()
-    export(replace(points, kgcps=points.kgcps[1:2]), "mmvii", tmp_path)
+    export(replace(points, gcps=points.gcps[1:2]), "mmvii", tmp_path)
     assert [path.name for path in (tmp_path / "mmvii").glob("MesIm-*")] == ["MesIm-IMG_2.JPG.xml"]
     assert mine.exists()
 

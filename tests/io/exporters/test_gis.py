@@ -20,12 +20,12 @@ def test_gdal_reads_the_geopackage(points: MapPoints, tmp_path: Path) -> None:
     export(points, "geopackage", tmp_path)
     table = geopandas.read_file(tmp_path / "geopackage" / "kgcps.gpkg", engine="pyogrio")
     assert table.crs == CRS.from_epsg(25831)
-    assert list(table["id"]) == [point.id for point in points.kgcps]
-    expected = np.array([point.position_map for point in points.kgcps])
+    assert list(table["id"]) == [point.id for point in points.gcps]
+    expected = np.array([point.position_map for point in points.gcps])
     got = np.array([(place.x, place.y, place.z) for place in table.geometry])
     np.testing.assert_allclose(got, expected, atol=1e-6, rtol=0)
     np.testing.assert_allclose(table[["x", "y", "z"]].to_numpy(), expected, atol=1e-6, rtol=0)
-    pixels = np.array([point.centre_px for point in points.kgcps])
+    pixels = np.array([point.centre_px for point in points.gcps])
     np.testing.assert_allclose(table[["x_px", "y_px"]].to_numpy(), pixels, atol=1e-6)
     np.testing.assert_allclose(table[["sd_x", "sd_y", "sd_z"]].to_numpy()[0], [0.02, 0.03, 0.04])
     assert list(table["role"]).count("check") == 1
@@ -61,7 +61,7 @@ def test_geojson_is_in_wgs84_with_longitude_first(points: MapPoints) -> None:
     collection = json.loads(geojson.files(points)["geojson/kgcps.geojson"])
     assert collection["type"] == "FeatureCollection"
     to_grid = Transformer.from_crs("EPSG:4326", "EPSG:25831", always_xy=True)
-    for feature, point in zip(collection["features"], points.kgcps, strict=True):
+    for feature, point in zip(collection["features"], points.gcps, strict=True):
         longitude, latitude, height = feature["geometry"]["coordinates"]
         assert 2.0 < longitude < 3.0
         assert 41.0 < latitude < 42.0
@@ -77,4 +77,4 @@ def test_gdal_reads_the_geojson(points: MapPoints, tmp_path: Path) -> None:
     table = geopandas.read_file(tmp_path / "geojson" / "kgcps.geojson", engine="pyogrio")
     assert table.crs.to_2d() == CRS.from_epsg(4326)
     assert len(table) == 7
-    assert table.geometry[2].z == pytest.approx(points.kgcps[2].position_map[2], abs=1e-6)
+    assert table.geometry[2].z == pytest.approx(points.gcps[2].position_map[2], abs=1e-6)

@@ -38,7 +38,7 @@ def _xyz(row: dict[str, str]) -> list[float]:
 
 def test_metashape_markers_have_accuracies_and_roles(points: MapPoints) -> None:
     rows = _table(metashape.files(points)["metashape/markers.csv"])
-    expected = points.kgcps[:6]  # the gate once
+    expected = points.gcps[:6]  # the gate once
     assert [row["label"] for row in rows] == [
         *(point.id for point in expected[:5]),
         "north_gate",
@@ -80,7 +80,7 @@ def test_metashape_marks_begin_at_the_corner(points: MapPoints) -> None:
     reference = markers["2"].find("reference")
     assert reference is not None
     where = [float(str(reference.get(name))) for name in "xyz"]
-    np.testing.assert_allclose(where, points.kgcps[2].position_map, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(where, points.gcps[2].position_map, atol=1e-6, rtol=0)
 
 
 def test_metashape_cameras_have_angles_and_accuracies(points: MapPoints) -> None:
@@ -144,11 +144,11 @@ def test_the_script_adds_scale_bars_from_markers_to_cameras(
 
 
 def test_separators_in_file_names_are_refused(points: MapPoints) -> None:
-    bad = replace(points, kgcps=(replace(points.kgcps[0], frame="a/IMG,1.JPG"),))
+    bad = replace(points, gcps=(replace(points.gcps[0], frame="a/IMG,1.JPG"),))
     for module in (metashape, pix4d):
         with pytest.raises(KgcpError, match="in its name"):
             module.files(bad)
-    spaced = replace(points, kgcps=(replace(points.kgcps[0], frame="a/IMG 1.JPG"),), priors=())
+    spaced = replace(points, gcps=(replace(points.gcps[0], frame="a/IMG 1.JPG"),), priors=())
     assert "IMG 1.JPG" in metashape.files(spaced)["metashape/scale_bars.csv"]
     assert "IMG 1.JPG" in pix4d.files(spaced)["pix4d/marks.csv"]
 
@@ -179,7 +179,7 @@ def test_pix4d_and_opf_follow_the_axes_of_the_crs(
 ) -> None:
     """EPSG defines 4326 as latitude, longitude and 2180 as northing, easting."""
     points = replace(in_degrees, crs=crs)
-    x, y, z = points.kgcps[0].position_map
+    x, y, z = points.gcps[0].position_map
     (row,) = [line.split(",") for line in pix4d.files(points)["pix4d/gcps.csv"].splitlines()]
     assert [*map(float, row[1:4])] == pytest.approx([y, x, z], abs=tolerance)
     (gcp,) = json.loads(opf.files(points)["opf/input_control_points.json"])["gcps"]
@@ -201,7 +201,7 @@ def test_pyopf_reads_the_project(points: MapPoints, tmp_path: Path) -> None:
     images = {camera.id: camera.uri for camera in project.camera_list.cameras}
     gcps = {gcp.id: gcp for gcp in project.input_control_points.gcps}
     assert [*gcps] == ["K0001", "K0002", "K0003", "K0004", "K0005", "north gate"]
-    for point in points.kgcps:
+    for point in points.gcps:
         gcp = gcps[point.id]
         location = gcp.geolocation
         assert location.crs.definition == "EPSG:25831"
@@ -217,7 +217,7 @@ def test_pyopf_reads_the_project(points: MapPoints, tmp_path: Path) -> None:
 
 
 def test_opf_escapes_paths_and_says_what_feet_are(make_points: Factory) -> None:
-    point = make_points().kgcps[0]
+    point = make_points().gcps[0]
     spaced = replace(point, frame="a/IMG 1.JPG", position_map=np.array([987000.0, 2e5, 100.0]))
     texts = opf.files(make_points("EPSG:2263", (spaced,)))
     assert '"a/IMG%201.JPG"' in texts["opf/camera_list.json"]
@@ -271,7 +271,7 @@ def test_opensfm_shifts_datums(make_points: Factory) -> None:
     Their constant terms, in 10 000″; the formulae hold to 0.12″ and 0.08″. On CH1903+ itself the
     place is at 7° 26′ 22.50″, 46° 57′ 08.66″: 3.4″ and 4.8″ away.
     """
-    point = replace(make_points().kgcps[0], position_map=np.array([2600000.0, 1200000.0, 600.0]))
+    point = replace(make_points().gcps[0], position_map=np.array([2600000.0, 1200000.0, 600.0]))
     texts = opensfm.files(make_points("EPSG:2056", (point,)))
     (entry,) = json.loads(texts["opensfm/ground_control_points.json"])["points"]
     assert entry["position"]["longitude"] == pytest.approx(2.6779094 * 1e4 / 3600, abs=3e-5)

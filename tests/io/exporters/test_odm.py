@@ -15,7 +15,7 @@ Factory = Callable[..., MapPoints]
 
 
 def _moved(points: MapPoints, position: tuple[float, float, float]) -> MapPoints:
-    return replace(points, kgcps=(replace(points.kgcps[0], position_map=np.array(position)),))
+    return replace(points, gcps=(replace(points.gcps[0], position_map=np.array(position)),))
 
 
 def _lines(points: MapPoints) -> list[str]:
@@ -92,12 +92,12 @@ def test_odm_needs_a_code_or_a_proj_string(points: MapPoints) -> None:
 
 
 def test_odm_refuses_what_would_break_its_columns(points: MapPoints) -> None:
-    spaced = replace(points.kgcps[0], frame="a/IMG 1.JPG")
+    spaced = replace(points.gcps[0], frame="a/IMG 1.JPG")
     with pytest.raises(KgcpError, match="white space"):
-        odm.files(replace(points, kgcps=(spaced,)))
-    namesake = replace(points.kgcps[1], frame="b/IMG_1.JPG")
+        odm.files(replace(points, gcps=(spaced,)))
+    namesake = replace(points.gcps[1], frame="b/IMG_1.JPG")
     with pytest.raises(KgcpError, match="same file name"):
-        odm.files(replace(points, kgcps=(points.kgcps[0], namesake)))
+        odm.files(replace(points, gcps=(points.gcps[0], namesake)))
 
 
 def test_geo_has_positions_angles_and_accuracies(points: MapPoints) -> None:

@@ -18,8 +18,8 @@ def _cov(row: dict[str, str], names: list[str], pairs: dict[tuple[int, int], str
 
 def test_csv_has_every_observation_with_its_covariance(points: MapPoints) -> None:
     rows = [*csv.DictReader(plain_csv.files(points)["kgcps.csv"].splitlines())]
-    assert len(rows) == len(points.kgcps)
-    for row, point in zip(rows, points.kgcps, strict=True):
+    assert len(rows) == len(points.gcps)
+    for row, point in zip(rows, points.gcps, strict=True):
         assert (row["id"], row["frame"], row["crs"]) == (point.id, point.frame, "EPSG:25831")
         got = [float(row[name]) for name in ("x", "y", "z", "x_px", "y_px", "distance_m")]
         expected = [*point.position_map, *point.centre_px, point.distance_m]

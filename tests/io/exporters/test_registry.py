@@ -18,7 +18,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, rotation_from_opk
 from kgcp.georef.camera_priors import CameraPrior
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.exporters import camera_priors, geopackage, metashape, odm, opf, pix4d
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
@@ -40,7 +40,7 @@ def test_a_format_writes_the_files_it_declares(
     assert not [path for path in tmp_path.rglob("*") if path.suffix == ".part"]
     if name not in {"colmap", "camera-priors"}:
         always = [pattern for pattern in FORMATS[name].files if pattern[0] != "["]
-        plain = make_points(kgcps=points.controls)
+        plain = make_points(gcps=points.controls)
         left = {str(path.relative_to(tmp_path)) for path in export(plain, name, tmp_path)}
         assert all(any(fnmatch(path, pattern) for pattern in always) for path in left)
         files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
@@ -50,7 +50,7 @@ def test_a_format_writes_the_files_it_declares(
 @pytest.mark.parametrize("name", FORMATS)
 def test_no_points_are_an_error(make_points: Factory, tmp_path: Path, name: str) -> None:
     with pytest.raises(KgcpError, match="no points left"):
-        export(make_points(kgcps=()), name, tmp_path)
+        export(make_points(gcps=()), name, tmp_path)
     assert not [*tmp_path.iterdir()]
 
 
@@ -72,12 +72,12 @@ def test_the_page_has_every_format_and_default() -> None:
 
 def test_a_thousand_points_take_no_time(make_points: Factory, tmp_path: Path) -> None:
     """A coarse guard: CPU time, ten times what it should be."""
-    one = make_points().kgcps[0]
-    kgcps = tuple(
+    one = make_points().gcps[0]
+    gcps = tuple(
         replace(one, id=f"K{n:04d}", frame=f"{n}.JPG", position_map=one.position_map + 0.5 * n)
         for n in range(1000)
     )
-    points = make_points(kgcps=kgcps)
+    points = make_points(gcps=gcps)
     begin_s = time.process_time()
     for name in set(FORMATS) - {"colmap", "camera-priors"}:
         export(points, name, tmp_path)
@@ -87,11 +87,11 @@ def test_a_thousand_points_take_no_time(make_points: Factory, tmp_path: Path) ->
 def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> None:
     """Project by OpenCV what a reader of OPF and of camera_priors.csv gets: the same pixels."""
     template = make_points()
-    frame = MapFrame.at(template.crs, template.kgcps[0].position_map)
+    local_frame = LocalFrame.at(template.crs, template.gcps[0].position_map)
     camera_enu = np.array([12.0, -7.0, 76.0])
     opk = np.array([[3.0, -6.0, 41.0]])
     enu_from_camera = (
-        frame.grid_rotation(camera_enu) @ rotation_from_opk(opk)[0] @ CAMERA_FROM_PHOTO
+        local_frame.grid_rotation(camera_enu) @ rotation_from_opk(opk)[0] @ CAMERA_FROM_PHOTO
     )
     camera = template.camera
     matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
@@ -99,29 +99,31 @@ def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> N
     ground = np.array([[5.0, -9.0, 1.0], [-11.0, 3.0, -2.0], [30.0, 12.0, 0.5]])
     inside = (ground - camera_enu) @ enu_from_camera
     pixels = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-    kgcps = tuple(
+    gcps = tuple(
         replace(
-            template.kgcps[0],
+            template.gcps[0],
             id=f"K{number}",
             frame="one.jpg",
-            position_map=frame.map_from_enu(place[None])[0],
+            position_map=local_frame.map_from_enu(place[None])[0],
             centre_px=pixel,
             distance_m=float(np.linalg.norm(ray)),
         )
         for number, (place, pixel, ray) in enumerate(zip(ground, pixels, inside, strict=True))
     )
-    map_from_camera = frame.grid_rotation(camera_enu).T @ enu_from_camera
-    prior = CameraPrior("one.jpg", frame.map_from_enu(camera_enu[None])[0], map_from_camera, None)
-    points = make_points(kgcps=kgcps, priors=(prior,))
+    map_from_camera = local_frame.grid_rotation(camera_enu).T @ enu_from_camera
+    prior = CameraPrior(
+        "one.jpg", local_frame.map_from_enu(camera_enu[None])[0], map_from_camera, None
+    )
+    points = make_points(gcps=gcps, priors=(prior,))
 
     (row,) = csv.DictReader(
         camera_priors.files(points)["camera_priors/camera_priors.csv"].splitlines()
     )
-    centre = frame.enu_from_map(np.array([[float(row[name]) for name in "xyz"]]))[0]
+    centre = local_frame.enu_from_map(np.array([[float(row[name]) for name in "xyz"]]))[0]
     angles = np.array([[float(row[f"{name}_deg"]) for name in ("omega", "phi", "kappa")]])
-    attitude = frame.grid_rotation(centre) @ rotation_from_opk(angles)[0] @ CAMERA_FROM_PHOTO
+    attitude = local_frame.grid_rotation(centre) @ rotation_from_opk(angles)[0] @ CAMERA_FROM_PHOTO
     for gcp in json.loads(opf.files(points)["opf/input_control_points.json"])["gcps"]:
-        place = frame.enu_from_map(np.array([gcp["geolocation"]["coordinates"]]))
+        place = local_frame.enu_from_map(np.array([gcp["geolocation"]["coordinates"]]))
         ray = (place - centre) @ attitude
         got = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, distortion)[0][0, 0]
         (mark,) = gcp["marks"]
@@ -133,10 +135,10 @@ def test_packages_that_take_distances_are_told_what_these_hang_on(
     points: MapPoints, tmp_path: Path, name: str
 ) -> None:
     """1.23 cm of 79 m are 0.016 % of the distance; unknown, where flight.toml says nothing."""
-    silent = tuple(replace(point, sd_common_distance_m=None) for point in points.kgcps)
+    silent = tuple(replace(point, sd_common_distance_m=None) for point in points.gcps)
     for some, words in (
         (points, "the share is 0.016 % here"),
-        (replace(points, kgcps=silent), "flight.toml does not say"),
+        (replace(points, gcps=silent), "flight.toml does not say"),
     ):
         (how_to,) = [path for path in export(some, name, tmp_path) if path.name == "HOWTO.txt"]
         text = " ".join(how_to.read_text(encoding="utf-8").split())

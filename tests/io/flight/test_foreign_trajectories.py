@@ -12,7 +12,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.georef.target_positions import Place
+from kgcp.georef.target_positions import TargetPosition
 from kgcp.io.files.time_text import parse_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
@@ -48,12 +48,18 @@ def places(folder: Path, keys: str) -> tuple[FloatArray, FloatArray]:
     (folder / "frames").mkdir(exist_ok=True)
     shutil.copy(SAMPLE / "frames.csv", folder)
     shutil.copy(SAMPLE / "vehicle.csv", folder)
-    whereabouts = FlightData(read_flight(folder), ()).whereabouts
+    target_positions = FlightData(read_flight(folder), ()).target_positions
     times = list(read_times(SAMPLE / "frames.csv", []).values())
-    found = [p for p in whereabouts.places(["A"] * len(times), times) if isinstance(p, Place)]
+    found = [
+        p
+        for p in target_positions.positions(["A"] * len(times), times)
+        if isinstance(p, TargetPosition)
+    ]
     assert len(found) == len(times)
-    enu = np.array([place.position_m for place in found])
-    return whereabouts.frame.map_from_enu(enu), np.array([place.cov_m2 for place in found])
+    enu = np.array([position.position_m for position in found])
+    return target_positions.local_frame.map_from_enu(enu), np.array(
+        [position.cov_m2 for position in found]
+    )
 
 
 def test_sbet_with_its_accuracies(tmp_path: Path, vehicle: dict[str, FloatArray]) -> None:

@@ -9,13 +9,13 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.toml_table import TomlTable
-from kgcp.io.flight.vehicle_table import Vehicle, read_vehicle
-from kgcp.io.formats.trajectories.records import TrajectoryNotation, Wander
+from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 
 NEEDED = 'trajectory = "v.out"\nlever_arm_m = [1, 2, 3]\n'
 
 
-def read(folder: Path, lines: str) -> Vehicle | None:
+def read(folder: Path, lines: str) -> VehicleTable | None:
     values = tomllib.loads(f"[vehicle]\n{NEEDED}{lines}")
     return read_vehicle(TomlTable("flight.toml:", values, ("vehicle",)), folder)
 
@@ -24,7 +24,7 @@ def test_without_keys_the_file_speaks_for_itself(tmp_path: Path) -> None:
     vehicle = read(tmp_path, "")
     assert vehicle is not None
     assert vehicle.trajectory_file == tmp_path / "v.out"
-    assert vehicle.notation == TrajectoryNotation()
+    assert vehicle.options == TrajectoryFileOptions()
     assert read_vehicle(TomlTable("flight.toml:", {}, ("vehicle",)), tmp_path) is None
 
 
@@ -36,7 +36,7 @@ def test_every_key_arrives_in_its_record(tmp_path: Path, day: str) -> None:
         f'wander = "subtract"\nattitude = "course"\nsd_attitude_deg = [2, 1.5, 3]\ndate = {day}\n',
     )
     assert vehicle is not None
-    assert vehicle.notation == TrajectoryNotation(
+    assert vehicle.options == TrajectoryFileOptions(
         format="sbet",
         crs="EPSG:7912",
         time_system=TimeSystem.GPS,

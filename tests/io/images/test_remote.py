@@ -22,8 +22,8 @@ from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.images.remote import StoredFolder, at_hand, frames_below, parsed_url, stamps_of
-from kgcp.pipeline.detect import Nobody, RunOptions, detect_flight
-from kgcp.pipeline.workspace import workplace
+from kgcp.pipeline.detect import NoProgress, RunOptions, detect_flight
+from kgcp.pipeline.workspace import open_workspace
 
 FRAMES = 6
 KEYS = {
@@ -122,7 +122,7 @@ def test_points_are_made_of_stored_detections(
         assert content(bucket, f"flights/one/kgcp/{name}") == (out / name).read_bytes()
 
 
-class Stop(Nobody):
+class Stop(NoProgress):
     def progress(self, stage: str, done: int, total: int, found: int) -> None:  # noqa: ARG002 - the base class's signature
         if done == FRAMES // 2:
             raise KeyboardInterrupt
@@ -134,8 +134,10 @@ def test_what_an_interrupted_run_has_done_is_kept_on_this_machine(
 ) -> None:
     out = parsed_url(f"s3://flights/results/7{query}")
     options = RunOptions(jobs=0)
-    with pytest.raises(KeyboardInterrupt), workplace(flight, out) as place:
-        detect_flight(read_flight(place.flight), out=place.out, options=options, listener=Stop())
+    with pytest.raises(KeyboardInterrupt), open_workspace(flight, out) as workspace:
+        detect_flight(
+            read_flight(workspace.flight), out=workspace.out, options=options, listener=Stop()
+        )
     assert not [name for name in names_in(endpoint) if "parquet" in name]
     done = detect(str(flight), "--out", f"s3://flights/results/7{query}", "--jobs", "0", "--json")
     assert json.loads(done.stdout)["kept"] == FRAMES // 2

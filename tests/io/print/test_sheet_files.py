@@ -35,9 +35,9 @@ from kgcp.io.print.write import FORMATS, check_stems, file_stem, write_sheets
 from kgcp.measurement.records import Measurement, Miss
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
-from kgcp.targets.artwork import Plate, draw_target
+from kgcp.targets.artwork import MountingPlate, draw_target
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Artwork, Box, Disc, Layer, Sheet, Text, rectangle
+from kgcp.targets.shapes import Artwork, Box, FilledCircle, Layer, Sheet, Text, filled_rectangle
 from kgcp.targets.sheets import Paper, lay_out
 from kgcp.targets.validation import check_targets
 
@@ -122,7 +122,7 @@ def test_diameters_are_true_at_600_dpi(
 def test_painted_circles_have_their_radius_and_centre(place_mm: tuple[float, float]) -> None:
     """By area and centre of mass of the ink, whose edges are grey."""
     radius_mm = 45.0
-    disc = Artwork((Disc(Layer.INK, (0.0, 0.0), radius_mm),), Box(-45.0, -45.0, 45.0, 45.0))
+    disc = Artwork((FilledCircle(Layer.INK, (0.0, 0.0), radius_mm),), Box(-45.0, -45.0, 45.0, 45.0))
     sheet = Sheet("", 100.0, 100.0, disc, place_mm, Box(0.0, 0.0, 100.0, 100.0))
     ink = 1.0 - raster_of_png(sheet, DPI) / 255.0
     assert math.sqrt(ink.sum() / math.pi) / PX_PER_MM == pytest.approx(radius_mm, abs=2e-3)
@@ -256,7 +256,7 @@ def test_what_was_printed_is_found_with_its_code(number: int) -> None:
 
 
 def test_dxf_is_read_back_with_its_circles_in_millimetres() -> None:
-    artwork = draw_target(TARGET, Plate(180.0, hole_mm=6.0))
+    artwork = draw_target(TARGET, MountingPlate(180.0, hole_mm=6.0))
     drawing = ezdxf.read(io.StringIO(dxf_of(artwork).decode("utf-8")))
     assert not drawing.audit().has_errors
     assert drawing.units == ezdxf.units.MM
@@ -285,7 +285,7 @@ def test_svg_has_the_paper_s_size_and_needs_no_typeface() -> None:
 
 
 def test_pdf_has_a_page_for_each_tile_and_can_be_searched() -> None:
-    tiles = lay_out(draw_target(TARGET, Plate(400.0)), "Südtor 1", Paper.A4, is_tiled=True)
+    tiles = lay_out(draw_target(TARGET, MountingPlate(400.0)), "Südtor 1", Paper.A4, is_tiled=True)
     document = pypdfium2.PdfDocument(pdf_of(tiles, "Target Südtor 1"))
     assert len(document) == len(tiles) > 1
     assert sorted(document[0].get_size()) == pytest.approx([595.28, 841.89], abs=0.01)
@@ -297,7 +297,7 @@ def test_pdf_has_a_page_for_each_tile_and_can_be_searched() -> None:
 def test_tiles_overlap_by_their_bleed_and_show_nothing_beyond_it() -> None:
     """Two tiles of a black square: each paints it up to 3 mm beyond the common cut."""
     square = Artwork(
-        (rectangle(Layer.INK, Box(-140.0, -50.0, 140.0, 50.0)),), Box(-140, -50, 140, 50)
+        (filled_rectangle(Layer.INK, Box(-140.0, -50.0, 140.0, 50.0)),), Box(-140, -50, 140, 50)
     )
     sheets = lay_out(square, "x", Paper.A4, is_tiled=True)
     assert len(sheets) == 2
@@ -317,7 +317,7 @@ def test_png_carries_its_resolution(tmp_path: Path) -> None:
 
 
 def test_the_same_sheets_are_the_same_bytes(tmp_path: Path) -> None:
-    sheets = lay_out(draw_target(TARGET, Plate(200.0)), "A", Paper.A4, is_tiled=True)
+    sheets = lay_out(draw_target(TARGET, MountingPlate(200.0)), "A", Paper.A4, is_tiled=True)
     assert len(sheets) == 2
     first = write_sheets(sheets, "A", tmp_path / "1", FORMATS, 20)
     again = write_sheets(sheets, "A", tmp_path / "2", FORMATS, 20)

@@ -14,8 +14,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.covariance import propagate
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.adjustment.two_poses import fit_both_poses
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.records import Appearance, Measurement
@@ -23,7 +23,7 @@ from kgcp.targets.layout import Target
 
 PlacePlate = Callable[..., Pose]
 DrawFrame = Callable[..., GreyArray]
-FitPlate = Callable[[tuple[float, ...], float], Fit]
+FitPlate = Callable[[tuple[float, ...], float], TargetFit]
 CODE = (0.0, 43.0, 78.0, 180.0)
 
 
@@ -33,15 +33,15 @@ def fit_plate(
     camera: Camera,
     place_plate: PlacePlate,
     draw_frame: DrawFrame,
-    imaging_of: Callable[..., Imaging],
+    imaging_of: Callable[..., FitProblem],
 ) -> FitPlate:
     """The target fitted to a plate with dots in these directions, of this radius [px]."""
 
-    def fit(code_deg: tuple[float, ...], radius_px: float) -> Fit:
+    def fit(code_deg: tuple[float, ...], radius_px: float) -> TargetFit:
         pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
         shown = Target(replace(target.ring, code_deg=code_deg), target.replicas)
-        imaging = imaging_of(draw_frame((shown, pose)), camera, target, pose)
-        return fit_both_poses(imaging, pose, Blur(0.5, 0.5, 0.0)).best
+        problem = imaging_of(draw_frame((shown, pose)), camera, target, pose)
+        return fit_both_poses(problem, pose, Blur(0.5, 0.5, 0.0)).best
 
     return fit
 
@@ -86,7 +86,9 @@ def test_other_dots_are_another_code(
     ],
     ids=["outliers", "noise"],
 )
-def test_what_does_not_fit_is_refused(fit_plate: FitPlate, spoil: Callable[[Fit], Fit]) -> None:
+def test_what_does_not_fit_is_refused(
+    fit_plate: FitPlate, spoil: Callable[[TargetFit], TargetFit]
+) -> None:
     with pytest.raises(Rejection) as caught:
         check_fit(spoil(fit_plate(CODE, 12.0)))
     assert caught.value.reason is Reason.POOR_FIT

@@ -15,8 +15,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
-from kgcp.measurement.adjustment.problem import Imaging
-from kgcp.measurement.adjustment.solver import Fit
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.adjustment.two_poses import fit_both_poses
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.targets.layout import Target
@@ -71,14 +71,14 @@ def fit(
     camera: Camera,
     place_plate: PlacePlate,
     draw_frame: Callable[..., GreyArray],
-    imaging_of: Callable[..., Imaging],
-) -> Fit:
+    imaging_of: Callable[..., FitProblem],
+) -> TargetFit:
     pose = place_plate((205.4, 190.7), 25.0, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
     grey = draw_frame((target, pose))
     return fit_both_poses(imaging_of(grey, camera, target, pose), pose, Blur(0.5, 0.5, 0.0)).best
 
 
-def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: Fit) -> None:
+def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: TargetFit) -> None:
     covariance = pose_covariance(fit)
     plain = np.linalg.inv(normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns))[:6, :6]
     assert eigh(covariance.pose_cov, plain, eigvals_only=True).min() > 1.0 - 1e-6
@@ -86,9 +86,9 @@ def test_a_pose_is_never_better_known_than_its_pixels_allow(fit: Fit) -> None:
     assert 1.0 <= covariance.inflation < 3.0
 
 
-def test_residuals_that_run_along_the_edges_make_it_worse(fit: Fit) -> None:
+def test_residuals_that_run_along_the_edges_make_it_worse(fit: TargetFit) -> None:
     """The same residuals, constant over each of some stripes: fewer independent ones."""
-    x = fit.prediction.points_m[0] * fit.sample.imaging.outer_radius_px / 0.45
+    x = fit.prediction.points_m[0] * fit.sample.problem.outer_radius_px / 0.45
     stripe = (x // 5.0).astype(int) - int(x.min() // 5.0)
     sign = np.random.default_rng(1).choice((-1.0, 1.0), stripe.max() + 1)[stripe]
     score = sign * np.abs(fit.misfit.score)

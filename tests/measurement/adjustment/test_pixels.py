@@ -14,12 +14,12 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, choose_sample
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import predict
-from kgcp.measurement.image_model.blur import Blur, pair_edges
+from kgcp.measurement.image_model.blur import Blur, find_edge_incidence
 from kgcp.measurement.image_model.blurred_plate import white_level
-from kgcp.measurement.image_model.photometry import Imager, Light
+from kgcp.measurement.image_model.photometry import Light, PhotometricModel
 from kgcp.measurement.image_model.plate import EVEN, plate_points
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import Plate, PlateImage, image_plate
@@ -27,7 +27,7 @@ from kgcp.simulation.shapes import ConvexPolygon, regular_polygon
 from kgcp.targets.layout import Target
 
 PlacePlate = Callable[..., Pose]
-ImagingOf = Callable[..., Imaging]
+ImagingOf = Callable[..., FitProblem]
 PSF_PX = 0.7
 BLUR = Blur(PSF_PX**2 + 1.0 / 12.0, PSF_PX**2 + 1.0 / 12.0, 0.0)
 WHITE, BLACK = 0.8, 0.06
@@ -46,17 +46,17 @@ def photograph(
 
 
 def opacity_of(sample: Sample, image: PlateImage) -> FloatArray:
-    window = sample.imaging.window
+    window = sample.problem.window
     x, y = window.pixels(sample.index).astype(int)
     return np.asarray(image.opacity[y - image.window.row, x - image.window.column])
 
 
 def beyond_px(sample: Sample, pose: Pose) -> FloatArray:
     """How far the pixels are beyond the outer circle."""
-    imaging = sample.imaging
+    problem = sample.problem
     points = plate_points(pose, sample.rays)
-    beyond = np.hypot(*points) / imaging.outer_radius_m - 1.0
-    return np.asarray(beyond * imaging.outer_radius_px)
+    beyond = np.hypot(*points) / problem.outer_radius_m - 1.0
+    return np.asarray(beyond * problem.outer_radius_px)
 
 
 @pytest.mark.parametrize("ground", [0.05, 0.35])
@@ -75,9 +75,9 @@ def test_what_mixes_with_the_surroundings_is_left_out(
     pose = place_plate((205.4, 190.7), radius_px, tilt_deg=20.0, way_deg=200.0, turn_deg=31.0)
     outline = regular_polygon(corners, 0.45 * (1.0 + BORDER_PX / radius_px))
     grey, image = photograph(camera, target, pose, outline, ground)
-    imaging = imaging_of(grey, camera, target, pose)
-    sample = choose_sample(imaging, pose, BLUR, LIGHT)
-    everything = choose_sample(imaging, pose, BLUR, None)
+    problem = imaging_of(grey, camera, target, pose)
+    sample = select_pixels(problem, pose, BLUR, LIGHT)
+    everything = select_pixels(problem, pose, BLUR, None)
     mixed, unfiltered = (
         (WHITE - ground) * (1.0 - opacity_of(each, image)) for each in (sample, everything)
     )
@@ -104,9 +104,9 @@ def test_where_a_streak_carries_the_surroundings_to_the_ring_nothing_is_used(
     irradiance = np.full((camera.height, camera.width), 0.2)
     image.paste(irradiance)
     grey = Sensor().expose(irradiance, 1.0, np.random.default_rng(5))
-    imaging = imaging_of(grey, camera, target, pose)
+    problem = imaging_of(grey, camera, target, pose)
     blur = Blur(1.1**2 + 1.0 / 12.0, 1.1**2 + 1.0 / 12.0, 0.0, *streak)
-    sample, everything = (choose_sample(imaging, pose, blur, light) for light in (LIGHT, None))
+    sample, everything = (select_pixels(problem, pose, blur, light) for light in (LIGHT, None))
     mixed, unfiltered = (
         (WHITE - 0.2) * (1.0 - opacity_of(each, image)) for each in (sample, everything)
     )
@@ -121,8 +121,8 @@ def test_surroundings_as_bright_as_the_plate_are_no_loss(
 ) -> None:
     pose = place_plate((205.4, 190.7), 20.0, turn_deg=31.0)
     grey, _ = photograph(camera, target, pose, NARROW, WHITE)
-    imaging = imaging_of(grey, camera, target, pose)
-    found, everything = (choose_sample(imaging, pose, BLUR, light) for light in (LIGHT, None))
+    problem = imaging_of(grey, camera, target, pose)
+    found, everything = (select_pixels(problem, pose, BLUR, light) for light in (LIGHT, None))
     np.testing.assert_array_equal(found.index, everything.index)
 
 
@@ -132,13 +132,13 @@ def test_all_that_says_where_edges_are_is_used(
     """On a wide plate: all pixels within 1.5 σ of a circle, and levels beyond the ring."""
     pose = place_plate((205.4, 190.7), 40.0, tilt_deg=20.0, turn_deg=31.0)
     grey, _ = photograph(camera, target, pose, WIDE, 0.2)
-    imaging = imaging_of(grey, camera, target, pose)
-    sample = choose_sample(imaging, pose, BLUR, LIGHT)
-    window = imaging.window
+    problem = imaging_of(grey, camera, target, pose)
+    sample = select_pixels(problem, pose, BLUR, LIGHT)
+    window = problem.window
     everywhere = plate_points(pose, window.rays)
     near = np.zeros(everywhere.shape[1], bool)
-    px_per_m = imaging.outer_radius_px / imaging.outer_radius_m
-    for centre, radius in zip(imaging.circles.centres_m.T, imaging.circles.radii_m, strict=True):
+    px_per_m = problem.outer_radius_px / problem.outer_radius_m
+    for centre, radius in zip(problem.circles.centres_m.T, problem.circles.radii_m, strict=True):
         off_edge = np.hypot(*(everywhere - centre[:, None])) - radius
         near |= np.abs(off_edge) * px_per_m < 1.5 * BLUR.largest_sd_px
     assert set(np.flatnonzero(near)) <= set(sample.index)
@@ -151,9 +151,9 @@ def test_a_target_outside_its_window_has_lost_its_edges(
 ) -> None:
     pose, elsewhere = place_plate((205.4, 190.7), 20.0), place_plate((300.0, 250.0), 20.0)
     grey, _ = photograph(camera, target, pose, NARROW, 0.05)
-    imaging = imaging_of(grey, camera, target, pose)
+    problem = imaging_of(grey, camera, target, pose)
     with pytest.raises(Rejection) as caught:
-        choose_sample(imaging, elsewhere, BLUR, LIGHT)
+        select_pixels(problem, elsewhere, BLUR, LIGHT)
     assert caught.value.reason is Reason.EDGES_LOST
 
 
@@ -163,16 +163,16 @@ def test_sharpening_feels_the_far_tails_of_edges(
     """They take no part themselves. Against the whole window, exposed and sharpened by OpenCV."""
     pose = place_plate((205.4, 190.7), 12.0, tilt_deg=20.0, turn_deg=31.0)
     grey, _ = photograph(camera, target, pose, WIDE, WHITE)
-    imaging = replace(imaging_of(grey, camera, target, pose), sharpening_px=1.2)
+    problem = replace(imaging_of(grey, camera, target, pose), sharpening_px=1.2)
     light = Light(BLACK, WHITE, tone_1=1.0, tone_2=-0.3, sharpening=0.6)
-    sample = choose_sample(imaging, pose, BLUR, light)
+    sample = select_pixels(problem, pose, BLUR, light)
     seen = predict(sample, Parameters.of(pose, BLUR, light)).levels
 
-    window = imaging.window
+    window = problem.window
     points_m, px_m = plate_points(pose, window.rays), 0.45 / 12.0
-    pairs = pair_edges(points_m, 1.07 * px_m, imaging.circles, BLUR, EVEN)
-    share = white_level(pose.matrix, window.rays, BLUR.vector, pairs).value
-    plain = Imager(np.zeros((2, len(share))), imaging.response, None).levels(share, light)
+    incidence = find_edge_incidence(points_m, 1.07 * px_m, problem.circles, BLUR, EVEN)
+    share = white_level(pose.matrix, window.rays, BLUR.vector, incidence).value
+    plain = PhotometricModel(np.zeros((2, len(share))), problem.response, None).levels(share, light)
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
     kernel /= kernel.sum()
     smooth = cv2.sepFilter2D(plain.reshape(window.height, -1), cv2.CV_64F, kernel, kernel).ravel()

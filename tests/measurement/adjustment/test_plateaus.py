@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.plateaus import Plateaus, look_at_plateaus, step_across
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.light_field import ANGLE, OFFSET, PLATE
 from kgcp.targets.layout import Target
 
@@ -27,38 +27,40 @@ def look(
     camera: Camera,
     place_plate: Callable[..., Pose],
     draw_frame: Callable[..., GreyArray],
-    imaging_of: Callable[..., Imaging],
-) -> Callable[..., tuple[Imaging, Plateaus]]:
+    imaging_of: Callable[..., FitProblem],
+) -> Callable[..., tuple[FitProblem, Plateaus]]:
     def at(
         shown: Target, shade: Callable[[FloatArray], FloatArray] | None = None
-    ) -> tuple[Imaging, Plateaus]:
+    ) -> tuple[FitProblem, Plateaus]:
         pose = place_plate(CENTRE_PX, 60.0, tilt_deg=10.0)
         grey = draw_frame((shown, pose))
         if shade is not None:
             y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
             along = (x - CENTRE_PX[0]) * math.cos(WAY) + (y - CENTRE_PX[1]) * math.sin(WAY)
             grey = np.rint(grey * shade(along)).astype(np.uint8)
-        imaging = imaging_of(grey, camera, target, pose)
-        plateaus = look_at_plateaus(imaging, pose, 0.8)
+        problem = imaging_of(grey, camera, target, pose)
+        plateaus = look_at_plateaus(problem, pose, 0.8)
         assert plateaus is not None
-        return imaging, plateaus
+        return problem, plateaus
 
     return at
 
 
-def test_even_light_is_even(look: Callable[..., tuple[Imaging, Plateaus]], target: Target) -> None:
-    imaging, plateaus = look(target)
+def test_even_light_is_even(
+    look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
+) -> None:
+    problem, plateaus = look(target)
     assert not plateaus.is_uneven
     assert plateaus.typical == pytest.approx((0.08, 0.75), abs=0.006)
-    assert step_across(imaging, plateaus) is None
+    assert step_across(problem, plateaus) is None
 
 
 def test_a_shadow_s_edge_is_found_where_it_lies(
-    look: Callable[..., tuple[Imaging, Plateaus]], target: Target
+    look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:
-    imaging, plateaus = look(target, lambda along: np.where(along > OFF_PX, LEFT, 1.0))
+    problem, plateaus = look(target, lambda along: np.where(along > OFF_PX, LEFT, 1.0))
     assert plateaus.is_uneven
-    edge = step_across(imaging, plateaus)
+    edge = step_across(problem, plateaus)
     assert edge is not None
     assert edge[ANGLE] == pytest.approx(WAY, abs=math.radians(8.0))
     assert edge[OFFSET] == pytest.approx(OFF_PX, abs=4.0)
@@ -66,7 +68,7 @@ def test_a_shadow_s_edge_is_found_where_it_lies(
 
 
 def test_dots_of_another_code_are_not_light(
-    look: Callable[..., tuple[Imaging, Plateaus]], target: Target
+    look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:
     more = replace(target.ring, code_deg=(*target.ring.code_deg, 230.0))
     _, plateaus = look(Target(more, target.replicas))

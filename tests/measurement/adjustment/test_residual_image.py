@@ -11,7 +11,7 @@ import pytest
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment.residual_image import contours_px, residuals_of
+from kgcp.measurement.adjustment.residual_image import contours_px, residual_image_of
 from kgcp.targets.layout import Target
 
 CONTRAST = 0.75 - 0.08  # of the fixture's frames
@@ -31,7 +31,7 @@ def test_the_right_pose_leaves_noise(
     camera: Camera, target: Target, draw_frame: DrawFrame, pose: Pose, response: Response
 ) -> None:
     grey = draw_frame((target, pose), noise=NOISE)
-    left = residuals_of(grey, replace(camera, response=response), target, pose, None)
+    left = residual_image_of(grey, replace(camera, response=response), target, pose, None)
     seen = left.share[np.isfinite(left.share)]
     assert 0.5 < np.isfinite(left.share).mean() < 0.8, "an ellipse in its box"
     scatter = 1.4826 * np.median(np.abs(seen))
@@ -47,7 +47,7 @@ def test_a_pose_too_near_or_beside_shows_where(
     grey = draw_frame((target, pose), noise=NOISE)
     px_m = pose.distance_m / camera.mean_focal_px
     beside = Pose(pose.rotation, pose.translation_m - np.array([2.0 * px_m, 0.0, 0.0]))
-    left = residuals_of(grey, camera, target, beside, 0.8)
+    left = residual_image_of(grey, camera, target, beside, 0.8)
     x, y = np.rint(camera.project(beside.translation_m)).astype(int) - (left.x0, left.y0)
     row = left.share[y, :]
     edge = int(np.flatnonzero(np.isfinite(row)).max() - x)

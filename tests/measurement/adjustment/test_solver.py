@@ -15,8 +15,8 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, choose_sample
-from kgcp.measurement.adjustment.problem import Imaging
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import adjust
 from kgcp.measurement.adjustment.unknowns import _streak_of, unknowns_of
 from kgcp.measurement.image_model.blur import Blur
@@ -59,7 +59,7 @@ def test_a_streak_is_read_from_the_gaussian_that_fits_its_edges(
 @pytest.mark.parametrize(("growth_px", "rounds"), [(0.2, 1), (0.6, 2)])
 def test_pixels_are_chosen_anew_for_what_moves_in_the_image_alone(
     photograph: Callable[..., GreyArray],
-    imaging_of: Callable[..., Imaging],
+    imaging_of: Callable[..., FitProblem],
     monkeypatch: pytest.MonkeyPatch,
     growth_px: float,
     rounds: int,
@@ -68,16 +68,16 @@ def test_pixels_are_chosen_anew_for_what_moves_in_the_image_alone(
     radius_px, ray = 18.0, np.append(WIDE.undistort(np.array([52.3, 41.8])), 1.0)
     pose = Pose(np.eye(3), ray * 0.45 * WIDE.mean_focal_px / radius_px).tilted_across(0.2)
     grey = photograph(WIDE, pose, np.random.default_rng(3))
-    imaging = imaging_of(grey, WIDE, TARGET_PLATE.target, pose)
+    problem = imaging_of(grey, WIDE, TARGET_PLATE.target, pose)
     chosen: list[Sample] = []
 
     def choose(*asked: Any, **more: Any) -> Sample:  # noqa: ANN401 - whatever it is asked
-        chosen.append(choose_sample(*asked, **more))
+        chosen.append(select_pixels(*asked, **more))
         return chosen[-1]
 
-    monkeypatch.setattr("kgcp.measurement.adjustment.solver.choose_sample", choose)
+    monkeypatch.setattr("kgcp.measurement.adjustment.solver.select_pixels", choose)
     off = Pose(pose.rotation, (1.0 + growth_px / radius_px) * pose.translation_m)
     start = Parameters.of(off, Blur(0.5, 0.5, 0.0), Light(0.05, 0.75))
-    fit = adjust(imaging, start, unknowns_of(imaging, has_streak=False))
+    fit = adjust(problem, start, unknowns_of(problem, has_streak=False))
     assert fit.parameters.pose.distance_m == pytest.approx(pose.distance_m, rel=2e-3)
     assert len(chosen) == rounds

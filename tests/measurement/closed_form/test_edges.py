@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse, ellipse_from_conic
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.closed_form.edges import edge_points, fit_edge, patch_around
+from kgcp.measurement.closed_form.edges import edge_points, fit_edge, spline_patch_around
 from kgcp.measurement.search.code_signal import clear_of_dots
 from kgcp.targets.layout import Target
 
@@ -27,7 +27,7 @@ def test_edge_points_lie_on_a_blurred_edge() -> None:
     radius = np.hypot(columns - 130.3, rows - 118.8)
     frame = (40.0 + 150.0 / (1.0 + np.exp(-(radius - 90.25) / 0.6))).astype(np.float64)
     start = Ellipse(130.4, 118.75, 90.35, 90.2, 0.2)
-    patch = patch_around(frame, start)
+    patch = spline_patch_around(frame, start)
     points = edge_points(patch, start, AROUND, dark_inside=True)
     distance = np.hypot(points[:, 0] - 130.3, points[:, 1] - 118.8) - 90.25
     assert len(points) == 200
@@ -40,7 +40,7 @@ def test_edges_outside_the_frame_are_left_out() -> None:
     rows, columns = np.indices((120, 100))
     frame = np.where(np.hypot(columns - 90.0, rows - 60.0) < 30.0, 20.0, 200.0)
     start = Ellipse(90.0, 60.0, 30.0, 30.0, 0.0)
-    points = edge_points(patch_around(frame, start), start, AROUND, dark_inside=True)
+    points = edge_points(spline_patch_around(frame, start), start, AROUND, dark_inside=True)
     assert 80 < len(points) < 140
     assert points[:, 0].max() <= 99.0
 
@@ -74,7 +74,7 @@ def test_both_edges_are_measured(
     frame = draw_frame((target, pose), noise=0.003)
     x, y = camera.project(pose.translation_m)
     start = Ellipse(x + 0.4, y - 0.3, 1.04 * radius_px, 1.02 * radius_px, 0.0)
-    patch = patch_around(frame, start)
+    patch = spline_patch_around(frame, start)
     for diameter_m, scale, tolerance_px in ((0.9, 1.0, outer_px), (0.45, 0.5, inner_px)):
         fit = fit_edge(
             patch,
@@ -95,7 +95,7 @@ def test_a_plain_frame_has_no_edge(camera: Camera, target: Target) -> None:
     start = Ellipse(200.0, 150.0, 30.0, 30.0, 0.0)
     with pytest.raises(Rejection) as caught:
         fit_edge(
-            patch_around(frame, start),
+            spline_patch_around(frame, start),
             camera,
             start,
             ring=target.ring,

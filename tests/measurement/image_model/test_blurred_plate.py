@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.image_model.blur import Blur, EdgePairs, pair_edges
+from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_incidence
 from kgcp.measurement.image_model.blurred_plate import white_level, white_share
 from kgcp.measurement.image_model.plate import (
     EVEN,
@@ -51,9 +51,9 @@ def rays_of(pixels: FloatArray) -> FloatArray:
     return np.vstack((normalised.T, inverse.reshape(-1, 4).T))
 
 
-def pairs_of(pose: Pose, rays: FloatArray, blur: Blur) -> EdgePairs:
+def pairs_of(pose: Pose, rays: FloatArray, blur: Blur) -> EdgeIncidence:
     scale = largest_metres_per_px(pose, rays)
-    return pair_edges(plate_points(pose, rays), scale, CIRCLES, blur, EVEN)
+    return find_edge_incidence(plate_points(pose, rays), scale, CIRCLES, blur, EVEN)
 
 
 CIRCLES = circles_of(RINGS)
@@ -75,10 +75,10 @@ def moved(step: FloatArray) -> tuple[Pose, Blur]:
 @pytest.mark.parametrize("index", range(11))
 def test_jacobian_is_that_of_the_value(index: int) -> None:
     blur = moved(np.zeros(11))[1]
-    pairs = pairs_of(POSE, RAYS, blur)
-    share = white_share(POSE.matrix, RAYS, blur.vector, pairs)
+    incidence = pairs_of(POSE, RAYS, blur)
+    share = white_share(POSE.matrix, RAYS, blur.vector, incidence)
     assert np.allclose(
-        white_level(POSE.matrix, RAYS, blur.vector, pairs).value, share.value, atol=1e-12
+        white_level(POSE.matrix, RAYS, blur.vector, incidence).value, share.value, atol=1e-12
     )
     assert np.allclose(share.points_m, plate_points(POSE, RAYS), rtol=0.0, atol=1e-12)
     step = np.zeros(11)
@@ -86,7 +86,7 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
     levels = []
     for sign in (1.0, -1.0):
         pose, other = moved(sign * step)
-        levels.append(white_level(pose.matrix, RAYS, other.vector, pairs).value)
+        levels.append(white_level(pose.matrix, RAYS, other.vector, incidence).value)
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order; and all
     # leave out derivatives of what oblique blur adds
@@ -136,11 +136,11 @@ def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
     scale = largest_metres_per_px(pose, rays)
     middle = rays[:, rays.shape[1] // 2].copy()
     spread = blur_on_plate(pose, middle, blur.total_covariance, blur.largest_sd_px * scale)
-    pairs = pair_edges(plate_points(pose, rays), scale, CIRCLES, blur, spread)
-    closest = pairs.circles.copy()
+    incidence = find_edge_incidence(plate_points(pose, rays), scale, CIRCLES, blur, spread)
+    closest = incidence.circles.copy()
     closest[closest[:, 4] < Quadrature.EDGE, 4] = Quadrature.CHORDS_70
     chosen, exact = (
         white_level(pose.matrix, rays, blur.vector, each).value
-        for each in (pairs, replace(pairs, circles=closest))
+        for each in (incidence, replace(incidence, circles=closest))
     )
     assert np.abs(chosen - exact).max() < 4e-4

@@ -15,7 +15,13 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Imager, Light, Param, srgb_encoded
+from kgcp.measurement.image_model.photometry import (
+    PARAM_COUNT,
+    Light,
+    Param,
+    PhotometricModel,
+    srgb_encoded,
+)
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 
 WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
@@ -31,21 +37,21 @@ CASES = [
 ]
 
 
-def make_imager(response: Response, sharpening_px: float) -> Imager:
+def make_imager(response: Response, sharpening_px: float) -> PhotometricModel:
     """Two pixels of three are modelled; the others are ink or plate."""
     rng = np.random.default_rng(8)
     index = np.sort(rng.permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT * 2 // 3])
     offsets = np.stack((index % WIDTH / WIDTH - 0.5, index // WIDTH / HEIGHT - 0.5))
     if sharpening_px == 0.0:
-        return Imager(offsets, response, None)
+        return PhotometricModel(offsets, response, None)
     plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, sharpening_px)
-    return Imager(offsets, response, mask)
+    return PhotometricModel(offsets, response, mask)
 
 
-def make_share(imager: Imager) -> WhiteShare:
+def make_share(photometry: PhotometricModel) -> WhiteShare:
     rng = np.random.default_rng(9)
-    count = int(imager.offsets.shape[1])
+    count = int(photometry.offsets.shape[1])
     return WhiteShare(np.zeros((2, count)), rng.random(count), rng.normal(size=(11, count)))
 
 
@@ -53,10 +59,10 @@ def make_share(imager: Imager) -> WhiteShare:
 def test_levels_are_the_same_with_and_without_derivatives(
     response: Response, sharpening_px: float, light: Light
 ) -> None:
-    imager = make_imager(response, sharpening_px)
-    share = make_share(imager)
-    levels, jacobian = imager.linearised(share, light)
-    np.testing.assert_allclose(levels, imager.levels(share.value, light), atol=1e-14)
+    photometry = make_imager(response, sharpening_px)
+    share = make_share(photometry)
+    levels, jacobian = photometry.linearised(share, light)
+    np.testing.assert_allclose(levels, photometry.levels(share.value, light), atol=1e-14)
     assert jacobian.shape == (PARAM_COUNT, len(levels))
 
 
@@ -64,12 +70,12 @@ def test_levels_are_the_same_with_and_without_derivatives(
 def test_geometric_rows_of_the_jacobian_are_derivatives(
     response: Response, sharpening_px: float, light: Light
 ) -> None:
-    imager = make_imager(response, sharpening_px)
-    share = make_share(imager)
-    _, jacobian = imager.linearised(share, light)
+    photometry = make_imager(response, sharpening_px)
+    share = make_share(photometry)
+    _, jacobian = photometry.linearised(share, light)
     for row in range(11):
         high, low = (
-            imager.levels(share.value + sign * STEP * share.jacobian[row], light)
+            photometry.levels(share.value + sign * STEP * share.jacobian[row], light)
             for sign in (1.0, -1.0)
         )
         expected = (high - low) / (2.0 * STEP)
@@ -84,11 +90,11 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     light: Light,
     name: str,
 ) -> None:
-    imager = make_imager(response, sharpening_px)
-    share = make_share(imager)
-    _, jacobian = imager.linearised(share, light)
+    photometry = make_imager(response, sharpening_px)
+    share = make_share(photometry)
+    _, jacobian = photometry.linearised(share, light)
     # a gradient over a whole ring is flat over the mask: its rows leave sharpening out
-    seen = make_imager(response, 0.0) if name.startswith("slope") else imager
+    seen = make_imager(response, 0.0) if name.startswith("slope") else photometry
     high, low = (
         seen.levels(share.value, replace(light, **{name: getattr(light, name) + sign * STEP}))
         for sign in (1.0, -1.0)
@@ -108,22 +114,22 @@ def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> N
     plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
     even = np.zeros((2, len(index)))
     plain = np.where(plateau > 0.5, LIGHT.white, LIGHT.black)
-    plain[index] = Imager(even, Response.UNKNOWN, None).levels(share, LIGHT)
+    plain[index] = PhotometricModel(even, Response.UNKNOWN, None).levels(share, LIGHT)
     smooth = cv2.GaussianBlur(
         plain.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
     ).ravel()
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
-    sharp = Imager(even, Response.UNKNOWN, mask).levels(share, LIGHT)
+    sharp = PhotometricModel(even, Response.UNKNOWN, mask).levels(share, LIGHT)
     expected = (plain + LIGHT.sharpening * (plain - smooth))[index]
     np.testing.assert_allclose(sharp, expected, atol=1e-12)
 
 
 def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
-    imager = make_imager(Response.UNKNOWN, 0.0)
-    count = imager.offsets.shape[1]
+    photometry = make_imager(Response.UNKNOWN, 0.0)
+    count = photometry.offsets.shape[1]
     even = replace(LIGHT, slope_x=0.0, slope_y=0.0)
-    np.testing.assert_allclose(imager.levels(np.zeros(count), even), even.black)
-    np.testing.assert_allclose(imager.levels(np.ones(count), even), even.white)
+    np.testing.assert_allclose(photometry.levels(np.zeros(count), even), even.black)
+    np.testing.assert_allclose(photometry.levels(np.ones(count), even), even.white)
 
 
 @given(st.floats(0.0, 1.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.image_model.blur import EdgePairs
+from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.skew import skew_rows
 
 _SHIFT_PX, _SHARE = 1.0, 0.2  # a fifth of the light goes one pixel astray
@@ -38,13 +38,13 @@ def test_third_moments_displace_edges_as_two_gaussians_do() -> None:
     rays[0], rays[1], rays[2], rays[5] = x, y, 1.0, 1.0
     pose = np.hstack((np.eye(3), [[0.0], [0.0], [1.0]]))  # a metre is a pixel
     members = np.arange(len(x))
-    pairs = EdgePairs(
+    incidence = EdgeIncidence(
         np.array([[0.0, 0.0, radius, 1.0, 0.0]]),
         np.array([0, len(x)]),
         members,
         np.zeros(len(x)),
     )
-    rows = skew_rows(pose, rays, (_SD_PX**2 + variance, _SD_PX**2, 0.0), pairs)
+    rows = skew_rows(pose, rays, (_SD_PX**2 + variance, _SD_PX**2, 0.0), incidence)
     # what is odd in x is the skew's; all else is the spread's variance
     opposite = np.array([np.argmin((x + a) ** 2 + (y - b) ** 2) for a, b in zip(x, y, strict=True)])
     odd = 0.5 * (truth - truth[opposite])

@@ -19,7 +19,7 @@ from kgcp.measurement.search.code_signal import (
     reference_signals,
 )
 from kgcp.measurement.search.sampling import sample_grey
-from kgcp.measurement.search.template_match import judge
+from kgcp.measurement.search.template_match import match_templates
 from kgcp.measurement.search.templates import ANGLES_RAD, SAMPLED_RADII
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
@@ -112,9 +112,9 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
     assert match_code(signal, target.ring)[0][0] > 0.95
     assert find_dotted(frame, (outer,), target.rings) == {target.ring: (), target.replicas[0]: ()}
     patch = np.stack([outer.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
-    verdict = judge(sample_grey(frame, patch), target.ring)
+    template_match = match_templates(sample_grey(frame, patch), target.ring)
     with pytest.raises(Rejection):
-        verdict.check(DetectSettings().min_score)
+        template_match.check(DetectSettings().min_score)
 
 
 def test_a_code_in_view_is_held_against_its_known_heading(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import GreyArray
-from kgcp.measurement.search.outlines import distinct, find_outlines, find_seeds
+from kgcp.measurement.search.outlines import find_outlines, find_seeds, non_max_suppression
 from kgcp.measurement.search.pyramid import build_pyramid, factor_of
 
 SUPER = 8  # drawn so many times as large
@@ -90,5 +90,5 @@ def test_of_circles_that_are_alike_the_clearest_is_kept(seed: int) -> None:
         ratio = np.abs(np.log(radii[i] / radii[kept]))
         if not np.any((apart <= 0.5 * radii[kept]) & (ratio <= 0.3)):
             kept.append(int(i))
-    assert distinct(centres, radii, clearness, 0.5, 0.3).tolist() == kept
+    assert non_max_suppression(centres, radii, clearness, 0.5, 0.3).tolist() == kept
     assert len(kept) < 90

@@ -7,7 +7,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.search.correlation import bank_of, correlate
 from kgcp.measurement.search.template_match import (
     best_placement,
-    judge,
+    match_templates,
     may_show_code,
     visible_angles,
 )
@@ -108,10 +108,10 @@ def test_the_visible_part_of_a_ring_fits_as_well_as_all_of_it(target: Target, fi
     score, *place = best_placement(correlate(patch, templates, visible))
     assert score == pytest.approx(1.0, abs=0.01)
     assert place == [3, SHIFTS, 17]
-    verdict = judge(patch, ring)
-    assert verdict.visible is not None
-    assert verdict.lag_deg == pytest.approx(17 * 360.0 / ANGLES)
-    assert (verdict.black, verdict.white) == pytest.approx((20.0, 170.0), abs=1.0)
+    template_match = match_templates(patch, ring)
+    assert template_match.visible is not None
+    assert template_match.lag_deg == pytest.approx(17 * 360.0 / ANGLES)
+    assert (template_match.black, template_match.white) == pytest.approx((20.0, 170.0), abs=1.0)
 
 
 @pytest.mark.parametrize("turn", [0, 11, 50, 87])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.search.template_match import judge
+from kgcp.measurement.search.template_match import match_templates
 from kgcp.measurement.search.templates import ANGLES, ANGLES_RAD, SHIFTS, templates_of
 from kgcp.measurement.search.uneven_light import evened_patch
 from kgcp.targets.layout import Ring, Target
@@ -36,17 +36,17 @@ def test_a_ring_half_in_shade_is_clear(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
     even = evened_patch(patch, target.ring, SHIFTS)
     assert even is not None
-    verdict = judge(patch, target.ring)
-    assert verdict.is_clear
-    assert verdict.lag_deg == pytest.approx(TURN * 360.0 / ANGLES, abs=3.1)
+    template_match = match_templates(patch, target.ring)
+    assert template_match.is_clear
+    assert template_match.lag_deg == pytest.approx(TURN * 360.0 / ANGLES, abs=3.1)
 
 
 def test_a_highlight_beside_a_ring_is_made_even(target: Target) -> None:
     added = 90.0 * np.exp(-0.5 * ((ANGLES_RAD - 2.0) / 0.8) ** 2)
-    assert judge(patch_of(target.ring, np.ones(ANGLES), added), target.ring).is_clear
+    assert match_templates(patch_of(target.ring, np.ones(ANGLES), added), target.ring).is_clear
 
 
 @pytest.mark.parametrize("code_deg", [(0.0, 43.0, 78.0, 180.0, 260.0), (0.0, 43.0, 180.0)])
 def test_another_code_in_shade_is_another_code(target: Target, code_deg: tuple[float, ...]) -> None:
     shown = replace(target.ring, code_deg=code_deg)
-    assert not judge(patch_of(shown, half_in_shade()), target.ring).is_clear
+    assert not match_templates(patch_of(shown, half_in_shade()), target.ring).is_clear

@@ -25,10 +25,10 @@ from benchmarks.reliability.torture import make_flight
 from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
-from kgcp.pipeline.detect import Nobody, RunOptions, detect_flight
+from kgcp.pipeline.detect import NoProgress, RunOptions, detect_flight
 from kgcp.pipeline.execution.dask_client import connected
 from kgcp.pipeline.execution.dask_worker import _processes
-from kgcp.pipeline.execution.resilient_map import Loss, Lost, careful_map
+from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure, resilient_map
 
 FRAMES = 8
 ANY_PORT = "127.0.0.1:0"
@@ -60,13 +60,15 @@ def expected(flight: Path) -> bytes:
     return detect(flight, "here", RunOptions(jobs=0))
 
 
-def detect(flight: Path, out: str, options: RunOptions, listener: Nobody | None = None) -> bytes:
+def detect(
+    flight: Path, out: str, options: RunOptions, listener: NoProgress | None = None
+) -> bytes:
     folder = flight.parent / out
     detect_flight(read_flight(flight), out=folder, options=options, listener=listener)
     return (folder / "detections.parquet").read_bytes()
 
 
-class Killer(Nobody):
+class Killer(NoProgress):
     """Kills a worker of a cluster when so much is done."""
 
     def __init__(self, cluster: LocalCluster, done: int) -> None:
@@ -92,14 +94,14 @@ def test_what_kills_its_process_or_hangs_costs_no_worker_and_no_other() -> None:
     items = ["1 + 1", deadly, "2 + 2", slow, "3 + 3", "4 + 4"]
     with connected("local:2", 0.5, ()) as workers:
         assert workers.jobs == 2
-        results = dict(careful_map(eval, items, workers, 2))
+        results = dict(resilient_map(eval, items, workers, 2))
         assert workers.jobs == 2
         assert _processes
     assert not _processes, "no process is left of the run"
     assert results == {
         **{item: eval(item) for item in items if item[0].isdigit()},  # noqa: S307 - these are ours
-        deadly: Loss.DIED,
-        slow: Loss.LATE,
+        deadly: TaskFailure.CRASHED,
+        slow: TaskFailure.TIMED_OUT,
     }
 
 

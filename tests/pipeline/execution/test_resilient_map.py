@@ -17,8 +17,13 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError, SettingError
-from kgcp.pipeline.execution.local_processes import LocalPool
-from kgcp.pipeline.execution.resilient_map import Inline, Loss, careful_map, usable_cores
+from kgcp.pipeline.execution.local_processes import SupervisedProcessPool
+from kgcp.pipeline.execution.resilient_map import (
+    SerialExecutor,
+    TaskFailure,
+    resilient_map,
+    usable_cores,
+)
 
 DEADLY, UNLUCKY, SLOW = 3, 5, 7
 LIMIT_S = 1.5
@@ -59,13 +64,13 @@ def end_process(_: object) -> None:
 
 
 def pool(jobs: int, limit_s: float = LIMIT_S) -> Executor:
-    return LocalPool(jobs, limit_s) if jobs else Inline()
+    return SupervisedProcessPool(jobs, limit_s) if jobs else SerialExecutor()
 
 
 def test_what_kills_its_process_is_lost_and_nothing_else(tmp_path: Path) -> None:
     with pool(2) as executor:
-        results = dict(careful_map(partial(work, tmp_path), range(9), executor, 2))
-    lost = {DEADLY: Loss.DIED, SLOW: Loss.LATE}
+        results = dict(resilient_map(partial(work, tmp_path), range(9), executor, 2))
+    lost = {DEADLY: TaskFailure.CRASHED, SLOW: TaskFailure.TIMED_OUT}
     assert results == {item: lost.get(item, item * item) for item in range(9)}
     assert (tmp_path / "died").exists(), "died once, and was tried again"
 
@@ -82,7 +87,7 @@ def test_few_items_are_taken_before_their_time() -> None:
         taken = 0
         with (
             pool(jobs) as executor,
-            closing(careful_map(abs, numbers(), executor, jobs)) as results,
+            closing(resilient_map(abs, numbers(), executor, jobs)) as results,
         ):
             for done, _ in enumerate(islice(results, 30), start=1):
                 assert taken <= done + ahead
@@ -91,21 +96,21 @@ def test_few_items_are_taken_before_their_time() -> None:
 def test_what_an_item_raises_arrives() -> None:
     for jobs in (0, 1):
         with pool(jobs) as executor, pytest.raises(LookupError, match="4"):
-            list(careful_map(fail, (4,), executor, jobs))
+            list(resilient_map(fail, (4,), executor, jobs))
     with (
         pool(1) as executor,
         pytest.raises(RuntimeError, match="SettingError: fx: is 0; give more"),
     ):
-        list(careful_map(fail_oddly, (4,), executor, 1))
+        list(resilient_map(fail_oddly, (4,), executor, 1))
 
 
 def test_one_pool_serves_several_maps(tmp_path: Path) -> None:
     with pool(1) as executor:
-        (first,) = careful_map(partial(pid_and, tmp_path), (1,), executor, 1)
-        (second,) = careful_map(pid_and, (2,), executor, 1)
+        (first,) = resilient_map(partial(pid_and, tmp_path), (1,), executor, 1)
+        (second,) = resilient_map(pid_and, (2,), executor, 1)
         with pytest.raises(LookupError):
-            list(careful_map(fail, (4,), executor, 1))
-        (third,) = careful_map(pid_and, (2,), executor, 1)
+            list(resilient_map(fail, (4,), executor, 1))
+        (third,) = resilient_map(pid_and, (2,), executor, 1)
     assert first[1] == (second[1][0], (tmp_path, 1))  # type: ignore[index] # nothing was lost
     assert second == third
 
@@ -119,7 +124,7 @@ def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
         steps.append(f"{item} ended")
 
     with pytest.raises(KeyboardInterrupt):
-        list(careful_map(stop, (1, 2), Inline(), 0))
+        list(resilient_map(stop, (1, 2), SerialExecutor(), 0))
     assert steps == ["1 ended"]
 
 
@@ -127,7 +132,7 @@ def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("kgcp.pipeline.execution.local_processes._serve", end_process)
     text = "end as soon as they are started; free memory"
     with pool(1) as executor, pytest.raises(KgcpError, match=text) as caught:
-        list(careful_map(abs, (1, 2), executor, 1))
+        list(resilient_map(abs, (1, 2), executor, 1))
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
@@ -141,7 +146,7 @@ def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), pool(1, 300.0) as executor:
-        list(careful_map(partial(wait_forever, tmp_path), stop(), executor, 1))
+        list(resilient_map(partial(wait_forever, tmp_path), stop(), executor, 1))
     assert time.monotonic() - start_s < 60.0
     wait_until_gone(workers_in(tmp_path))
 
@@ -170,11 +175,11 @@ def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
         "from functools import partial; from pathlib import Path; import sys\n"
         "sys.path.insert(0, sys.argv[2])\n"
         "from test_resilient_map import pool, wait_forever\n"
-        "from kgcp.pipeline.execution.resilient_map import careful_map\n"
+        "from kgcp.pipeline.execution.resilient_map import resilient_map\n"
         "if __name__ == '__main__':\n"
         "    work = partial(wait_forever, Path(sys.argv[1]))\n"
         "    with pool(2, 300.0) as executor:\n"
-        "        list(careful_map(work, (1, 2), executor, 2))\n"
+        "        list(resilient_map(work, (1, 2), executor, 2))\n"
     )
     script, marks = tmp_path / "parent.py", tmp_path / "marks"
     marks.mkdir()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from kgcp.pipeline.execution.signals import stops_held
+from kgcp.pipeline.execution.signals import defer_interrupts
 
 
 class CameError(Exception):
@@ -28,9 +28,9 @@ def raising() -> Iterator[None]:
 
 
 def hold(number: signal.Signals, steps: list[str]) -> None:
-    with stops_held():
+    with defer_interrupts():
         signal.raise_signal(number)
-        with stops_held():
+        with defer_interrupts():
             signal.raise_signal(number)
         steps.append("inside")
     steps.append("behind")
@@ -59,7 +59,7 @@ def test_an_ignored_signal_stays_ignored() -> None:
 
 def test_other_threads_hear_no_signals_anyway() -> None:
     def block() -> None:
-        with stops_held():
+        with defer_interrupts():
             steps.append("inside")
 
     steps: list[str] = []

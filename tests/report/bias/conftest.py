@@ -54,7 +54,7 @@ def compare() -> Compare:
 
 @pytest.fixture(scope="session")
 def study() -> Study:
-    """Put comparisons together, all of them chances of detection."""
+    """Put comparisons together, all of frames that show the target."""
 
     def made(
         *compared: Comparison, attitudes_agree: bool = True, method: Method = Method.MODEL

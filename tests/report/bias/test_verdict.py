@@ -75,7 +75,7 @@ def test_numbers_are_those_of_the_study(compare: Compare, study: Study) -> None:
         (37, 1),
         (74, 1),
     ]
-    assert numbers.astray == ("f_65.00.jpg",)
+    assert numbers.misplaced == ("f_65.00.jpg",)
     assert numbers.left_out == (("no_reference_pose", 1),)
     assert numbers.sd_reference_m == pytest.approx(0.02)
     assert numbers.regression is None

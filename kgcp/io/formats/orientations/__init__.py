@@ -14,7 +14,7 @@ from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations import colmap, csv, metashape, odm, opensfm, opf, pix4d
 from kgcp.io.formats.orientations.georeference import on_the_map
 from kgcp.io.formats.orientations.names import frames_of
-from kgcp.io.formats.orientations.records import PoseNotation, SourcePoses
+from kgcp.io.formats.orientations.records import OrientationFileOptions, SourcePoses
 from kgcp.io.formats.registry import Registry
 
 FORMATS: Registry[Callable[[ForeignFile], SourcePoses]] = Registry(
@@ -34,7 +34,7 @@ FORMATS: Registry[Callable[[ForeignFile], SourcePoses]] = Registry(
 
 def read_reference_poses(
     path: Path,
-    notation: PoseNotation | None = None,
+    options: OrientationFileOptions | None = None,
     *,
     crs: str | None = None,
     frames: Sequence[str] = (),
@@ -43,7 +43,7 @@ def read_reference_poses(
 
     Parameters
     ----------
-    notation : PoseNotation or None
+    options : OrientationFileOptions or None
         What flight.toml says about the file; None: nothing.
     crs : str or None
         The flight's, in which the poses are returned; it may be None where the file's coordinates
@@ -57,10 +57,10 @@ def read_reference_poses(
         Naming the file, the element in it and the remedy: if it is missing, of no known format,
         incomplete, not georeferenced, or in a CRS from which no way leads to the flight's.
     """
-    notation = notation or PoseNotation()
+    options = options or OrientationFileOptions()
     file = ForeignFile(path, "[reference] poses")
-    source = FORMATS.reader(file, notation.form)(file)
+    source = FORMATS.reader(file, options.form)(file)
     if not source.names:
         raise file.error("holds no pose", "export the aligned frames")
     names = source.names if source.has_our_names else frames_of(file, source.names, frames)
-    return on_the_map(file, source, names, notation, crs)
+    return on_the_map(file, source, names, options, crs)

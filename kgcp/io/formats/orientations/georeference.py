@@ -11,10 +11,10 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
 from kgcp.georef.crs import FARTHEST, FLIGHT_TOML, geographic_of, parse_crs
-from kgcp.georef.local_frame import MapChange, MapFrame
+from kgcp.georef.local_frame import CrsTransform, LocalFrame
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations.records import (
-    PoseNotation,
+    OrientationFileOptions,
     SourcePoses,
     from_geocentric,
     from_level,
@@ -28,7 +28,7 @@ def on_the_map(
     file: ForeignFile,
     source: SourcePoses,
     frames: tuple[str, ...],
-    notation: PoseNotation,
+    options: OrientationFileOptions,
     crs: str | None,
 ) -> ReferencePoses:
     """Return poses in the flight's CRS, attitudes relative to its grid.
@@ -45,10 +45,10 @@ def on_the_map(
         its own, no exact way leads from there to the flight's CRS, or a pose lies far from
         the Earth's surface.
     """
-    placed = _placed(file, _shifted(file, source, notation), notation.crs)
+    placed = _placed(file, _shifted(file, source, options), options.crs)
     if placed.crs is not None and not _is_same(placed.crs, crs):
-        where = f"{file.path}: crs" if notation.crs is None else REFERENCE_CRS
-        placed = _moved(file, placed, MapFrame.at(placed.crs, placed.position[0], where), crs)
+        where = f"{file.path}: crs" if options.crs is None else REFERENCE_CRS
+        placed = _moved(file, placed, LocalFrame.at(placed.crs, placed.position[0], where), crs)
     high = np.flatnonzero(np.abs(placed.position[:, 2]) > FARTHEST)
     if high.size:
         raise file.error_at(
@@ -65,17 +65,19 @@ def on_the_map(
     )
 
 
-def _shifted(file: ForeignFile, source: SourcePoses, notation: PoseNotation) -> SourcePoses:
-    if notation.offset_file is None:
+def _shifted(
+    file: ForeignFile, source: SourcePoses, options: OrientationFileOptions
+) -> SourcePoses:
+    if options.offset_file is None:
         return source
     if source.crs is not None:
         raise file.error("is georeferenced already", "delete [reference] offset")
-    if notation.crs is None and (source.level or source.unreferenced):
+    if options.crs is None and (source.level or source.unreferenced):
         raise file.error(
             "is not in map coordinates, to which an offset could lead",
             "give [reference] crs as well",
         )
-    return replace(source, position=source.position + read_offset(notation.offset_file))
+    return replace(source, position=source.position + read_offset(options.offset_file))
 
 
 def read_offset(path: Path) -> FloatArray:
@@ -138,21 +140,23 @@ def _is_same(crs: str, flight_crs: str | None) -> bool:
     )
 
 
-def _moved(file: ForeignFile, source: SourcePoses, here: MapFrame, crs: str | None) -> SourcePoses:
+def _moved(
+    file: ForeignFile, source: SourcePoses, here: LocalFrame, crs: str | None
+) -> SourcePoses:
     """Bring poses from their map, that of `here`, to the flight's."""
     if crs is None:
         raise file.error(
             "has coordinates of its own CRS, but flight.toml has none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )
-    change = MapChange.to(crs, here, source.position[0], FLIGHT_TOML)
-    turn = np.array([change.axes(point) for point in source.position])
+    transform = CrsTransform.to(crs, here, source.position[0], FLIGHT_TOML)
+    turn = np.array([transform.axes(point) for point in source.position])
     sd = source.sd_position_m
     if sd is not None:  # the axes turn; what correlates then is left out
         sd = np.sqrt(np.einsum("nij,nj->ni", turn**2, sd**2))
     return replace(
         source,
-        position=change.positions(source.position),
+        position=transform.positions(source.position),
         frame_from_photo=turn @ source.frame_from_photo,
         sd_position_m=sd,
     )

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kgcp.georef.crs import WGS84_3D
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
 from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
@@ -60,13 +60,13 @@ def poses(file: ForeignFile) -> SourcePoses:
     )
 
 
-def _unreferenced(file: ForeignFile, level: MapFrame | None) -> str | None:
+def _unreferenced(file: ForeignFile, level: LocalFrame | None) -> str | None:
     if file.path.name != _TOPOCENTRIC and (file.path.parent / _TOPOCENTRIC).is_file():
         return f"may hold OpenDroneMap's UTM coordinates: {_TOPOCENTRIC} beside it does not"
     return f"has no reference_lla, nor has {_REFERENCE} beside it" if level is None else None
 
 
-def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> MapFrame | None:
+def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> LocalFrame | None:
     """Return the frame over the reference; None without one."""
     references = [part.child("reference_lla") for part in parts if part.values.get("reference_lla")]
     beside = file.path.parent / _REFERENCE
@@ -78,7 +78,7 @@ def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> MapFrame | None:
         raise file.error(
             "holds reconstructions of different reference_lla", "keep those of one of them"
         )
-    return MapFrame.at(WGS84_3D, np.array(origins.pop())) if origins else None
+    return LocalFrame.at(WGS84_3D, np.array(origins.pop())) if origins else None
 
 
 def _lla(reference: JsonObject) -> tuple[float, float, float]:

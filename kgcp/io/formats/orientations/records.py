@@ -10,14 +10,14 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO
-from kgcp.georef.local_frame import MapFrame
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.files.sniff import ForeignFile
 
 _MAX_DISTORTION = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class PoseNotation:
+class OrientationFileOptions:
     """The keys of [reference] about its file.
 
     Attributes
@@ -51,7 +51,7 @@ class SourcePoses:
         file's frame: of a map its x, y and z at the projection centre.
     crs : str or None
         Of the positions, x first; None: the file does not say it.
-    level : MapFrame or None
+    level : LocalFrame or None
         Where the file's frame is east, north, up in metres over a point that it names.
     unreferenced : str or None
         Why the coordinates belong to no map unless flight.toml names one; None: they are in the
@@ -68,7 +68,7 @@ class SourcePoses:
     position: FloatArray
     frame_from_photo: FloatArray
     crs: str | None = None
-    level: MapFrame | None = None
+    level: LocalFrame | None = None
     unreferenced: str | None = None
     sd_position_m: FloatArray | None = None
     sd_angle_deg: FloatArray | None = None
@@ -110,13 +110,13 @@ def from_geocentric(
     geodetic : str
         Three-dimensional geographic CRS of the same datum.
     """
-    earth = MapFrame.at(geodetic, np.zeros(3))
+    earth = LocalFrame.at(geodetic, np.zeros(3))
     enu = (ecef_m - earth.origin_ecef_m) @ earth.ecef_from_enu
     return from_level(names, enu, earth.ecef_from_enu.T @ ecef_from_photo, earth)
 
 
 def from_level(
-    names: tuple[str, ...], enu_m: FloatArray, enu_from_photo: FloatArray, frame: MapFrame
+    names: tuple[str, ...], enu_m: FloatArray, enu_from_photo: FloatArray, local_frame: LocalFrame
 ) -> SourcePoses:
     """Bring poses in the ENU axes of one point into a geographic CRS and their own local axes.
 
@@ -124,9 +124,9 @@ def from_level(
     ----------
     enu_m : (n, 3) array
         Projection centres in the ENU frame [m].
-    frame : MapFrame
+    local_frame : LocalFrame
         Of a geographic CRS.
     """
-    here_from_enu = np.swapaxes(frame.level_rotations(enu_m), 1, 2)
-    position = frame.map_from_enu(enu_m)
-    return SourcePoses(names, position, here_from_enu @ enu_from_photo, crs=frame.crs)
+    here_from_enu = np.swapaxes(local_frame.level_rotations(enu_m), 1, 2)
+    position = local_frame.map_from_enu(enu_m)
+    return SourcePoses(names, position, here_from_enu @ enu_from_photo, crs=local_frame.crs)

@@ -1,4 +1,4 @@
-"""Readers of the target carrier's trajectory."""
+"""Readers of the vehicle's trajectory."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution
 from kgcp.io.formats.trajectories import csv, rtklib, sbet, tum
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions
 
-FORMATS: Registry[Callable[[ForeignFile, TrajectoryNotation, str], Epochs]] = Registry(
+FORMATS: Registry[Callable[[ForeignFile, TrajectoryFileOptions, str], Epochs]] = Registry(
     "a trajectory",
     "give one of them, and its name as [vehicle] format in flight.toml to see what is wrong",
     {
@@ -29,11 +29,11 @@ FORMATS: Registry[Callable[[ForeignFile, TrajectoryNotation, str], Epochs]] = Re
         "tum": (tum.matches, tum.read),
     },
 )
-_CONTRACT = TrajectoryNotation()
+_CONTRACT = TrajectoryFileOptions()
 
 
 def read_trajectory(
-    path: Path, flight_crs: str, notation: TrajectoryNotation = _CONTRACT
+    path: Path, flight_crs: str, options: TrajectoryFileOptions = _CONTRACT
 ) -> Trajectory:
     """Read the vehicle's trajectory, in one of the `FORMATS` of docs/conventions.md.
 
@@ -51,15 +51,15 @@ def read_trajectory(
     file = ForeignFile(path, "[vehicle] trajectory")
     if not file.head.strip():
         raise file.error("is empty", "give a trajectory")
-    form = notation.format or FORMATS.recognised(file)
-    _refuse_foreign_keys(form, notation)
-    epochs = FORMATS.reader(file, form)(file, notation, flight_crs)
+    form = options.format or FORMATS.recognised(file)
+    _refuse_foreign_keys(form, options)
+    epochs = FORMATS.reader(file, form)(file, options, flight_crs)
     if epochs.crs != flight_crs:
         epochs = _on_map(path, epochs, flight_crs)
     attitude_deg, sd_attitude_deg = epochs.attitude_deg, epochs.sd_attitude_deg
-    if notation.course_sd_deg is not None:
+    if options.course_sd_deg is not None:
         attitude_deg = attitude_from_course(str(path), epochs.time_s, epochs.position, flight_crs)
-        sd_attitude_deg = np.tile(notation.course_sd_deg, (len(epochs.time_s), 1))
+        sd_attitude_deg = np.tile(options.course_sd_deg, (len(epochs.time_s), 1))
     if attitude_deg is None:
         raise KgcpError(
             f"{path}: has no attitude, which turns the lever arm; give a trajectory with attitude,"
@@ -76,12 +76,12 @@ def read_trajectory(
     )
 
 
-def _refuse_foreign_keys(form: str, notation: TrajectoryNotation) -> None:
+def _refuse_foreign_keys(form: str, options: TrajectoryFileOptions) -> None:
     given = {
-        "accuracies": notation.accuracies_file is not None and form != "sbet",
-        "wander": notation.wander is not None and form != "sbet",
-        "date": notation.first_day is not None and form == "rtklib",
-        "time_system": notation.time_system is not None and form == "rtklib",
+        "accuracies": options.accuracies_file is not None and form != "sbet",
+        "wander": options.wander is not None and form != "sbet",
+        "date": options.first_day is not None and form == "rtklib",
+        "time_system": options.time_system is not None and form == "rtklib",
     }
     for key, is_foreign in given.items():
         if is_foreign:

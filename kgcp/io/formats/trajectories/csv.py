@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kgcp.io.files.csv_columns import read_csv_columns
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
 from kgcp.io.formats.trajectories.times import times_from_texts
 
 _POSITION = ("x", "y", "z")
@@ -18,7 +18,7 @@ def matches(file: ForeignFile) -> bool:
     return "," in file.first_line
 
 
-def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
+def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> Epochs:
     """Read a trajectory from a CSV file by docs/conventions.md.
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
@@ -29,7 +29,7 @@ def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Ep
     KgcpError
         Naming the line: missing columns, values that are not finite, times that do not ascend.
     """
-    with_attitude = notation.course_sd_deg is None
+    with_attitude = options.course_sd_deg is None
     columns = read_csv_columns(
         file.path,
         ("time",),
@@ -38,11 +38,11 @@ def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Ep
         file.toml_key,
     )
     times = columns.texts["time"]
-    time_s = times_from_texts(file.path, columns.lines, times, notation)
+    time_s = times_from_texts(file.path, columns.lines, times, options)
     check_times(file.path, time_s, lambda row: f"line {columns.lines[row]} ({times[row]})")
     return Epochs(
         time_s=time_s,
-        crs=notation.crs or flight_crs,
+        crs=options.crs or flight_crs,
         position=columns.block(_POSITION),
         attitude_deg=columns.block(_ATTITUDE) if with_attitude else None,
         sd_position_m=columns.deviations(_SD_POSITION),

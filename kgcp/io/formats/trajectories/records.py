@@ -24,7 +24,7 @@ class Wander(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectoryNotation:
+class TrajectoryFileOptions:
     """The keys of [vehicle] about its trajectory's file.
 
     Attributes

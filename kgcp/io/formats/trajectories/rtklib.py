@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import WGS84_3D
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.rtklib_pos import Solution, read_solution
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
 
 GEOCENTRIC = "EPSG:4978"
 _AS_HEIGHTS = "write the solution as latitude, longitude and height (out-solformat = llh)"
@@ -23,7 +23,7 @@ _GEODETIC = (("longitude", "latitude", "height"), ("sde", "sdn", "sdu"), ("sdne"
 _ECEF = (("x-ecef", "y-ecef", "z-ecef"), ("sdx", "sdy", "sdz"), ("sdxy", "sdyz", "sdzx"))
 
 
-def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> Epochs:
+def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) -> Epochs:
     """Read a solution file; it has no attitude.
 
     Raises
@@ -44,14 +44,14 @@ def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> E
     lacking = [name for name in position if name not in solution.columns]
     if lacking:
         raise file.error(f"its header lacks {', '.join(lacking)}", _AS_HEIGHTS)
-    if notation.crs is None and not geocentric:
+    if options.crs is None and not geocentric:
         _check_heights(solution)
     cov = None
     if set(deviations) | set(roots) <= solution.columns.keys():
         cov = _covariances(_block(solution, deviations), _block(solution, roots))
     return Epochs(
         time_s=solution.time_s,
-        crs=notation.crs or (GEOCENTRIC if geocentric else WGS84_3D),
+        crs=options.crs or (GEOCENTRIC if geocentric else WGS84_3D),
         position=_block(solution, position),
         attitude_deg=None,
         sd_position_m=None if cov is None else np.sqrt(np.diagonal(cov, axis1=1, axis2=2)),

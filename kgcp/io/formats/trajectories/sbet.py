@@ -18,7 +18,7 @@ from kgcp.georef.crs import WGS84_3D
 from kgcp.io.files.gps_time import unwrap_week
 from kgcp.io.files.safe_read import LARGEST, read_bytes
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, Wander, check_times
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, Wander, check_times
 from kgcp.io.formats.trajectories.times import times_from_week
 
 _RECORD = 17  # time, latitude, longitude, height, 3 velocities, roll, pitch, heading, wander, …
@@ -44,7 +44,7 @@ def matches(file: ForeignFile) -> bool:
     return bool(sound and on_earth)
 
 
-def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> Epochs:
+def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) -> Epochs:
     """Read records of 17 little-endian doubles: seconds of the week, radians, metres.
 
     Deviations are those of the smrmsg file that flight.toml names, if it does.
@@ -59,16 +59,16 @@ def read(file: ForeignFile, notation: TrajectoryNotation, _flight_crs: str) -> E
     records = _read_records(path, _RECORD, file.toml_key)
     _check_values(path, records)
     seconds = records[:, 0]
-    time_s = times_from_week(path, seconds, notation)
+    time_s = times_from_week(path, seconds, options)
     check_times(path, time_s, lambda row: f"record {row + 1}")
     sd_position_m, sd_attitude_deg = None, None
-    if notation.accuracies_file is not None:
-        sd_position_m, sd_attitude_deg = _read_accuracies(notation.accuracies_file, seconds)
+    if options.accuracies_file is not None:
+        sd_position_m, sd_attitude_deg = _read_accuracies(options.accuracies_file, seconds)
     return Epochs(
         time_s=time_s,
-        crs=notation.crs or WGS84_3D,
+        crs=options.crs or WGS84_3D,
         position=np.column_stack((np.degrees(records[:, [2, 1]]), records[:, 3])),
-        attitude_deg=_attitude_deg(path, records, notation.wander),
+        attitude_deg=_attitude_deg(path, records, options.wander),
         sd_position_m=sd_position_m,
         sd_attitude_deg=sd_attitude_deg,
     )

@@ -12,11 +12,11 @@ from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem, clock_from_date, unix_from_clock, weekday
 from kgcp.io.files.time_text import NUMBER, parse_time
-from kgcp.io.formats.trajectories.records import TrajectoryNotation
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions
 
 
 def times_from_texts(
-    path: Path, lines: Sequence[int], texts: Sequence[str], notation: TrajectoryNotation
+    path: Path, lines: Sequence[int], texts: Sequence[str], options: TrajectoryFileOptions
 ) -> FloatArray:
     """Return the Unix times (n,) of texts by docs/conventions.md, "Trajectories and times".
 
@@ -25,18 +25,18 @@ def times_from_texts(
     KgcpError
         Naming the line: no time, no zone, or a zone that contradicts `time_system`.
     """
-    if notation.first_day is not None:
-        return times_from_week(path, _numbers(path, lines, texts), notation)
+    if options.first_day is not None:
+        return times_from_week(path, _numbers(path, lines, texts), options)
     clock_s = np.array(
         [
-            _clock_time(text, notation.time_system, f"{path}, line {line}")
+            _clock_time(text, options.time_system, f"{path}, line {line}")
             for line, text in zip(lines, texts, strict=True)
         ]
     )
-    return unix_from_clock(clock_s, notation.time_system or TimeSystem.UTC)
+    return unix_from_clock(clock_s, options.time_system or TimeSystem.UTC)
 
 
-def times_from_week(path: Path, seconds: FloatArray, notation: TrajectoryNotation) -> FloatArray:
+def times_from_week(path: Path, seconds: FloatArray, options: TrajectoryFileOptions) -> FloatArray:
     """Return the Unix times of seconds (n,) of the week that flight.toml gives.
 
     Raises
@@ -44,7 +44,7 @@ def times_from_week(path: Path, seconds: FloatArray, notation: TrajectoryNotatio
     KgcpError
         If flight.toml does not give day and time system, or the day is not that of the first epoch.
     """
-    day, system = notation.first_day, notation.time_system
+    day, system = options.first_day, options.time_system
     if day is None or system is None:
         lacking = [key for key, value in (("date", day), ("time_system", system)) if value is None]
         raise KgcpError(

@@ -13,7 +13,7 @@ from kgcp.georef.local_frame import level_axes_ecef, map_axes_ecef
 from kgcp.georef.trajectory import ENU_FROM_NED
 from kgcp.io.files.safe_read import is_sound, read_lines
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, check_times
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
 from kgcp.io.formats.trajectories.times import times_from_texts
 
 _CELLS = 8
@@ -25,7 +25,7 @@ def matches(file: ForeignFile) -> bool:
     return len(file.first_line.split()) == _CELLS
 
 
-def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Epochs:
+def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> Epochs:
     """Read poses R(map ← body), t in the map, of a body with x forward, y right, z down.
 
     Raises
@@ -36,9 +36,9 @@ def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Ep
     """
     path = file.path
     lines, texts, numbers = _read_rows(file)
-    time_s = times_from_texts(path, lines, texts, notation)
+    time_s = times_from_texts(path, lines, texts, options)
     check_times(path, time_s, lambda row: f"line {lines[row]}")
-    crs = notation.crs or flight_crs
+    crs = options.crs or flight_crs
     position = numbers[:, :3]
     norms = np.linalg.norm(numbers[:, 3:], axis=1)
     wrong = np.flatnonzero(np.abs(norms - 1.0) > _MAX_NORM_ERROR)
@@ -48,7 +48,7 @@ def read(file: ForeignFile, notation: TrajectoryNotation, flight_crs: str) -> Ep
             " write timestamp tx ty tz qx qy qz qw with a unit quaternion"
         )
     attitude_deg = None
-    if notation.course_sd_deg is None:
+    if options.course_sd_deg is None:
         attitude_deg = _attitude_deg(crs, position, numbers[:, 3:])
         _refuse_roof(path, attitude_deg)
     return Epochs(time_s, crs, position, attitude_deg)

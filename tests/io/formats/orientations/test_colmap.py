@@ -13,14 +13,14 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
 Check = Callable[[ReferencePoses, FloatArray, FloatArray], None]
 Invert = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
-UTM = PoseNotation(crs="EPSG:32631")
+UTM = OrientationFileOptions(crs="EPSG:32631")
 OFFSET = np.array([299_000.0, 4_585_000.0, 0.0])
 
 
@@ -48,7 +48,7 @@ def test_colmap_s_own_files_in_map_coordinates(
     offset = tmp_path / "offset.xyz"
     offset.write_text("299000.000 4585000.000 0.000\n")
     poses = read_reference_poses(
-        path, PoseNotation(crs="EPSG:32631", offset_file=offset), crs="EPSG:32631"
+        path, OrientationFileOptions(crs="EPSG:32631", offset_file=offset), crs="EPSG:32631"
     )
     assert poses.frames == NAMES
     assert (poses.sd_position_m, poses.sd_angle_deg) == (None, None)
@@ -60,7 +60,7 @@ def test_colmap_in_geocentric_coordinates(
 ) -> None:
     rotation, shift = world_to_camera(truth["ecef"], truth["ecef_from_photo"])
     path = colmap_folder(tmp_path, rotation, shift)
-    poses = read_reference_poses(path, PoseNotation(crs="EPSG:4978"), crs="EPSG:32631")
+    poses = read_reference_poses(path, OrientationFileOptions(crs="EPSG:4978"), crs="EPSG:32631")
     check(poses, truth["utm"], truth["utm_from_photo"])
 
 
@@ -132,23 +132,23 @@ def test_images_of_a_rig_have_poses_of_their_own(tmp_path: Path) -> None:
         ("1 1 0 0 0 1 2 e 1 a.JPG\n\n", UTM, "line 1: holds '1 1 0 0 0 1 2 e' instead of 8"),
         (
             "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
-            PoseNotation(crs="EPSG:4326"),
+            OrientationFileOptions(crs="EPSG:4326"),
             r"\[reference\] crs 'EPSG:4326' counts degrees, but the poses are in a Cartesian",
         ),
         (
             "1 1 0 0 0 1 2 3 1 a.JPG\n\n",
-            PoseNotation(crs="EPSG:0"),
+            OrientationFileOptions(crs="EPSG:0"),
             r"flight.toml: \[reference\] crs 'EPSG:0' cannot be used",
         ),
         (
             "1 1 0 0 0 -4001 -2 -4900001 1 a.JPG\n\n",  # a grid's coordinates, cut by their offset
-            PoseNotation(crs="EPSG:4978"),
+            OrientationFileOptions(crs="EPSG:4978"),
             r"pose of 'a.JPG': has a height of -\d{7}; correct \[reference\] crs",
         ),
     ],
 )
 def test_a_colmap_model_without_a_map_is_refused(
-    tmp_path: Path, text: str, notation: PoseNotation | None, words: str
+    tmp_path: Path, text: str, notation: OrientationFileOptions | None, words: str
 ) -> None:
     path = tmp_path / "images.txt"
     path.write_text(text)

@@ -14,7 +14,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -72,7 +72,7 @@ def test_metashape_s_world_is_geocentric_whatever_the_chunk_s_crs(
     assert poses.frames == tuple(f"b/{name}" for name in NAMES)  # labels lack the extension
     check(poses, truth["utm"], truth["utm_from_photo"])
     with pytest.raises(KgcpError, match=r"names its CRS already; delete \[reference\]"):
-        read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")
+        read_reference_poses(path, OrientationFileOptions(crs="EPSG:32631"), crs="EPSG:32631")
 
 
 def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
@@ -82,7 +82,7 @@ def test_metashape_s_local_coordinates_are_of_the_crs_that_is_stated(
     path.write_text(metashape_document(truth, LOCAL, in_component=False))
     with pytest.raises(KgcpError, match="is in local coordinates; align it to a map"):
         read_reference_poses(path, crs="EPSG:32631")
-    stated = PoseNotation(crs="EPSG:4978")
+    stated = OrientationFileOptions(crs="EPSG:4978")
     poses = read_reference_poses(path, stated, crs="EPSG:32631")
     check(poses, truth["utm"], truth["utm_from_photo"])
     path.write_text(metashape_document(truth, GEOGRAPHIC, in_component=True, with_world=False))
@@ -118,4 +118,4 @@ def test_a_mirrored_camera_is_refused(tmp_path: Path) -> None:
         "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"
     )
     with pytest.raises(KgcpError, match="camera 'a': has a matrix that is not a rotation"):
-        read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")
+        read_reference_poses(path, OrientationFileOptions(crs="EPSG:32631"), crs="EPSG:32631")

@@ -16,7 +16,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -24,7 +24,7 @@ Check = Callable[[ReferencePoses, FloatArray, FloatArray], None]
 Invert = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 Part = dict[str, Any]
 
-UTM = PoseNotation(crs="EPSG:32631")
+UTM = OrientationFileOptions(crs="EPSG:32631")
 OFFSET = np.array([299_000.0, 4_585_000.0, 0.0])
 
 
@@ -101,9 +101,9 @@ def test_opendronemap_s_overwritten_file_is_utm_less_an_offset(
     check(read_reference_poses(original, crs="EPSG:32631"), truth["utm"], truth["utm_from_photo"])
     offset = tmp_path / "coords.txt"
     offset.write_text("WGS84 UTM 31N\n299000.0 4585000.0\n12.5 7.5 512.25\n")
-    notation = PoseNotation("opensfm", "EPSG:32631", offset)
+    options = OrientationFileOptions("opensfm", "EPSG:32631", offset)
     check(
-        read_reference_poses(path, notation, crs="EPSG:32631"),
+        read_reference_poses(path, options, crs="EPSG:32631"),
         truth["utm"],
         truth["utm_from_photo"],
     )

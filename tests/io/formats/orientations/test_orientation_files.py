@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.formats.orientations import FORMATS, read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 
 SAMPLES: dict[str, Any] = {
     "csv": "frame,x,y,z,omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0\n",
@@ -65,8 +65,8 @@ def test_the_content_tells_the_format_whatever_the_name(tmp_path: Path, form: st
         kind = {"format": f"application/opf-{name.replace('_', '-')}+json"}
         (tmp_path / f"{name}.json").write_text(json.dumps({**part, **kind}))
     stated = "EPSG:32631" if form in {"colmap", "metashape", "opensfm"} else None
-    named = read_reference_poses(path, PoseNotation(form, stated), crs="EPSG:32631")
-    found = read_reference_poses(path, PoseNotation(None, stated), crs="EPSG:32631")
+    named = read_reference_poses(path, OrientationFileOptions(form, stated), crs="EPSG:32631")
+    found = read_reference_poses(path, OrientationFileOptions(None, stated), crs="EPSG:32631")
     assert found.frames == named.frames == ("a.jpg",)
     np.testing.assert_array_equal(found.position_map, named.position_map)
 
@@ -124,12 +124,12 @@ def test_deviations_turn_with_the_axes(tmp_path: Path) -> None:
         "frame,x,y,z,omega_deg,phi_deg,kappa_deg,sd_x,sd_y,sd_z,sd_angle_deg\n"
         "a.jpg,29,-26,1500,0,0,0,0.01,0.02,0.03,0.1\n"
     )
-    notation = PoseNotation(crs="EPSG:4148")
-    poses = read_reference_poses(path, notation, crs="EPSG:2053")
+    options = OrientationFileOptions(crs="EPSG:4148")
+    poses = read_reference_poses(path, options, crs="EPSG:2053")
     assert poses.sd_position_m is not None
     np.testing.assert_allclose(poses.sd_position_m, [[0.01, 0.02, 0.03]], atol=1e-9)
     np.testing.assert_allclose(np.abs(poses.opk_deg), [[0, 0, 180]], atol=1e-6)
-    turned = read_reference_poses(path, notation, crs="EPSG:4148")
+    turned = read_reference_poses(path, options, crs="EPSG:4148")
     np.testing.assert_allclose(turned.opk_deg, [[0, 0, 0]])
     assert turned.sd_angle_deg is not None
 
@@ -155,7 +155,7 @@ def test_a_format_that_is_named_wrongly_is_a_line_about_the_file(
     path = tmp_path / "poses"
     path.write_text(content)
     with pytest.raises(KgcpError) as caught:
-        read_reference_poses(path, PoseNotation(form), crs="EPSG:32631")
+        read_reference_poses(path, OrientationFileOptions(form), crs="EPSG:32631")
     assert str(caught.value).startswith(f"{path}")
     assert "\n" not in str(caught.value)
 

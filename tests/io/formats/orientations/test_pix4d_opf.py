@@ -19,7 +19,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation, rotation_from_opk
 from kgcp.io.formats.orientations import read_reference_poses
-from kgcp.io.formats.orientations.records import PoseNotation
+from kgcp.io.formats.orientations.records import OrientationFileOptions
 
 NAMES = tuple(f"DJI_{index:04d}.JPG" for index in range(7))
 Truth = Mapping[str, FloatArray]
@@ -43,7 +43,7 @@ def test_pix4d_angles_are_those_of_the_conventions(
 ) -> None:
     path = pix4d_file(tmp_path, truth["utm"], truth["utm_from_photo"])
     check(read_reference_poses(path), truth["utm"], truth["utm_from_photo"])
-    moved = read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:4326")
+    moved = read_reference_poses(path, OrientationFileOptions(crs="EPSG:32631"), crs="EPSG:4326")
     np.testing.assert_allclose(moved.position_map, truth["geodetic"], rtol=0, atol=1e-8)
     np.testing.assert_allclose(
         rotation_from_opk(moved.opk_deg), truth["enu_from_photo"], rtol=0, atol=1e-9
@@ -57,11 +57,11 @@ def test_pix4d_s_local_coordinates_need_their_offset(
     path = pix4d_file(tmp_path, truth["utm"] - shift, truth["utm_from_photo"])
     offset = tmp_path / "offset.xyz"
     offset.write_text("299000.000 4585000.000 400.000\n")
-    poses = read_reference_poses(path, PoseNotation(offset_file=offset))
+    poses = read_reference_poses(path, OrientationFileOptions(offset_file=offset))
     check(poses, truth["utm"], truth["utm_from_photo"])
     offset.write_text("none\n")
     with pytest.raises(KgcpError, match=r"offset\.xyz: has no line of two or three numbers; give"):
-        read_reference_poses(path, PoseNotation(offset_file=offset))
+        read_reference_poses(path, OrientationFileOptions(offset_file=offset))
 
 
 def test_a_published_pose_of_pix4d(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_opf_says_what_it_lacks(tmp_path: Path, truth: Truth) -> None:
     )
     with pytest.raises(KgcpError, match=r"is in a scene without a map; align it to a map and give"):
         read_reference_poses(path, crs="EPSG:32631")
-    stated = read_reference_poses(path, PoseNotation(crs="EPSG:32631"), crs="EPSG:32631")
+    stated = read_reference_poses(path, OrientationFileOptions(crs="EPSG:32631"), crs="EPSG:32631")
     np.testing.assert_allclose(stated.position_map, truth["utm"], rtol=0, atol=1e-9)
     (tmp_path / "camera_list.json").unlink()
     with pytest.raises(KgcpError, match=r"needs .*camera_list\.json, which does not exist; name"):

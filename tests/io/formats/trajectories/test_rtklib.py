@@ -16,9 +16,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories import read_trajectory, rtklib
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions
 
-COURSE = TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0))
+COURSE = TrajectoryFileOptions(course_sd_deg=(2.0, 2.0, 3.0))
 KIND = "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp)\n"
 PROGRAM = (
     "% program   : RTKLIB ver.2.4.3 b34\n% obs start : 2015/06/01 00:00:00.0 GPST (week1847)\n"
@@ -46,8 +46,8 @@ CELLS = tuple(
 FIRST_S = datetime(2015, 6, 1, tzinfo=UTC).timestamp() - 16.0  # 16 s until the end of June 2015
 
 
-def read_rtklib(path: Path, notation: TrajectoryNotation) -> Epochs:
-    return rtklib.read(ForeignFile(path, "[vehicle] trajectory"), notation, "EPSG:4979")
+def read_rtklib(path: Path, options: TrajectoryFileOptions) -> Epochs:
+    return rtklib.read(ForeignFile(path, "[vehicle] trajectory"), options, "EPSG:4979")
 
 
 def write(folder: Path, rows: tuple[str, ...], names: str = NAMES, clock: str = "GPST") -> Path:
@@ -268,13 +268,13 @@ def test_heights_of_an_unknown_geoid_and_other_datums_are_refused(
         KgcpError, match=f"as {kind}, .*out-height = ellipsoidal.*\\[vehicle\\] crs"
     ):
         read_rtklib(path, COURSE)
-    named = TrajectoryNotation(crs="EPSG:4301", course_sd_deg=(1.0, 1.0, 1.0))
+    named = TrajectoryFileOptions(crs="EPSG:4301", course_sd_deg=(1.0, 1.0, 1.0))
     assert read_rtklib(path, named).crs == "EPSG:4301"
 
 
 def test_without_attitude_nothing_is_guessed(tmp_path: Path) -> None:
     path = write(tmp_path, calendar_rows())
     with pytest.raises(KgcpError, match=r'no attitude.*attitude = "course" and sd_attitude_deg'):
-        read_trajectory(path, "EPSG:25834", TrajectoryNotation(format="rtklib"))
+        read_trajectory(path, "EPSG:25834", TrajectoryFileOptions(format="rtklib"))
     with pytest.raises(KgcpError, match=r"\[vehicle\] time_system: has no meaning .* rtklib"):
-        read_trajectory(path, "EPSG:25834", TrajectoryNotation(time_system=TimeSystem.GPS))
+        read_trajectory(path, "EPSG:25834", TrajectoryFileOptions(time_system=TimeSystem.GPS))

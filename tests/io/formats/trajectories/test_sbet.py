@@ -15,14 +15,14 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories import read_trajectory, sbet
-from kgcp.io.formats.trajectories.records import Epochs, TrajectoryNotation, Wander
+from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, Wander
 
-SATURDAY = TrajectoryNotation(time_system=TimeSystem.GPS, first_day=date(2026, 5, 9))
+SATURDAY = TrajectoryFileOptions(time_system=TimeSystem.GPS, first_day=date(2026, 5, 9))
 SUNDAY_S = datetime(2026, 5, 10, tzinfo=UTC).timestamp()
 
 
-def read_sbet(path: Path, notation: TrajectoryNotation) -> Epochs:
-    return sbet.read(ForeignFile(path, "[vehicle] trajectory"), notation, "EPSG:4979")
+def read_sbet(path: Path, options: TrajectoryFileOptions) -> Epochs:
+    return sbet.read(ForeignFile(path, "[vehicle] trajectory"), options, "EPSG:4979")
 
 
 def record(
@@ -60,25 +60,25 @@ def test_a_literal_sample_over_saturday_midnight(tmp_path: Path) -> None:
 
 def test_utc_needs_no_leap_seconds(tmp_path: Path) -> None:
     path = write(tmp_path, record(604799.5), record(604800.0), record(604800.5))
-    notation = TrajectoryNotation(time_system=TimeSystem.UTC, first_day=date(2026, 5, 9))
-    times = read_sbet(path, notation).time_s
+    options = TrajectoryFileOptions(time_system=TimeSystem.UTC, first_day=date(2026, 5, 9))
+    times = read_sbet(path, options).time_s
     assert_allclose(times, SUNDAY_S + np.array([-0.5, 0.0, 0.5]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("notation", "words"),
     [
-        (TrajectoryNotation(), ("give date and time_system under [vehicle]", '"gps" or "utc"')),
-        (TrajectoryNotation(time_system=TimeSystem.GPS), ("give date under [vehicle]",)),
-        (TrajectoryNotation(first_day=date(2026, 5, 9)), ("give time_system under [vehicle]",)),
+        (TrajectoryFileOptions(), ("give date and time_system under [vehicle]", '"gps" or "utc"')),
+        (TrajectoryFileOptions(time_system=TimeSystem.GPS), ("give date under [vehicle]",)),
+        (TrajectoryFileOptions(first_day=date(2026, 5, 9)), ("give time_system under [vehicle]",)),
         (
-            TrajectoryNotation(time_system=TimeSystem.GPS, first_day=date(2026, 5, 10)),
+            TrajectoryFileOptions(time_system=TimeSystem.GPS, first_day=date(2026, 5, 10)),
             ("on a Saturday", "2026-05-10 is a Sunday", "[vehicle] date"),
         ),
     ],
 )
 def test_what_the_format_lacks_has_to_be_said(
-    tmp_path: Path, notation: TrajectoryNotation, words: tuple[str, ...]
+    tmp_path: Path, notation: TrajectoryFileOptions, words: tuple[str, ...]
 ) -> None:
     path = write(tmp_path, record(604799.5), record(0.0))
     with pytest.raises(KgcpError) as caught:
@@ -99,16 +99,16 @@ def test_what_the_wander_angle_means_has_to_be_said(
     path = write(tmp_path, *rows)
     with pytest.raises(KgcpError, match=r"wander angles up to 22\.9183 deg.*\"subtract\""):
         read_sbet(path, SATURDAY)
-    notation = TrajectoryNotation(
+    options = TrajectoryFileOptions(
         time_system=TimeSystem.GPS, first_day=date(2026, 5, 9), wander=wander
     )
-    epochs = read_sbet(path, notation)
+    epochs = read_sbet(path, options)
     assert epochs.attitude_deg is not None
     assert_allclose(epochs.attitude_deg[:, 2], np.degrees(heading), rtol=1e-12)
 
 
-def _with_accuracies(path: Path) -> TrajectoryNotation:
-    return TrajectoryNotation(
+def _with_accuracies(path: Path) -> TrajectoryFileOptions:
+    return TrajectoryFileOptions(
         time_system=TimeSystem.GPS, first_day=date(2026, 5, 9), accuracies_file=path
     )
 
@@ -183,9 +183,9 @@ def test_other_files_of_as_many_bytes_are_not_taken_for_it(tmp_path: Path) -> No
 def test_keys_of_sbet_are_refused_elsewhere(tmp_path: Path) -> None:
     path = tmp_path / "v.csv"
     path.write_text("time,x,y,z\n")
-    notation = TrajectoryNotation(format="csv", wander=Wander.ADD)
+    options = TrajectoryFileOptions(format="csv", wander=Wander.ADD)
     with pytest.raises(KgcpError, match=r"\[vehicle\] wander: has no meaning .* format csv"):
-        read_trajectory(path, "EPSG:25831", notation)
+        read_trajectory(path, "EPSG:25831", options)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
@@ -212,8 +212,8 @@ def test_a_written_trajectory_reads_back(
     path = write(tmp_path, records.astype("<f8").tobytes())
     sunday = date(2026, 5, 3)
     day = date.fromordinal(sunday.toordinal() + int(start // 86400.0))
-    notation = TrajectoryNotation(time_system=TimeSystem.GPS, first_day=day, format="sbet")
-    trajectory = read_trajectory(path, "EPSG:4979", notation)
+    options = TrajectoryFileOptions(time_system=TimeSystem.GPS, first_day=day, format="sbet")
+    trajectory = read_trajectory(path, "EPSG:4979", options)
     week_s = datetime(2026, 5, 3, tzinfo=UTC).timestamp() - 18.0
     assert_allclose(trajectory.time_s, week_s + seconds, rtol=0, atol=1e-6)
     assert_allclose(trajectory.position_map[:, 0], longitude, rtol=0, atol=1e-12)

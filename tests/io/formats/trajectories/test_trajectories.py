@@ -15,7 +15,7 @@ from kgcp.georef.trajectory import Trajectory
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.trajectories import FORMATS, read_trajectory
-from kgcp.io.formats.trajectories.records import TrajectoryNotation
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions
 
 _CRS = "EPSG:25832"
 _HEADER = "time,x,y,z,roll_deg,pitch_deg,heading_deg"
@@ -102,8 +102,8 @@ def test_binary_rubbish_is_an_error_not_a_traceback(tmp_path: Path) -> None:
         read_trajectory(path, _CRS)
 
 
-def _notation(system: TimeSystem | None = None, day: date | None = None) -> TrajectoryNotation:
-    return TrajectoryNotation(time_system=system, first_day=day)
+def _notation(system: TimeSystem | None = None, day: date | None = None) -> TrajectoryFileOptions:
+    return TrajectoryFileOptions(time_system=system, first_day=day)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def _notation(system: TimeSystem | None = None, day: date | None = None) -> Traj
     ],
 )
 def test_times_are_of_the_clock_that_flight_toml_names(
-    tmp_path: Path, text: str, notation: TrajectoryNotation, unix_s: float
+    tmp_path: Path, text: str, notation: TrajectoryFileOptions, unix_s: float
 ) -> None:
     later = "2026-05-04T09:30:06+00:00" if "+" in text else text[:-3].replace("05", "06") + ".00"
     path = _write(tmp_path, _HEADER, f"{text},1,2,3,4,5,6", f"{later},1,2,3,4,5,6")
@@ -140,7 +140,7 @@ def test_times_are_of_the_clock_that_flight_toml_names(
     ],
 )
 def test_times_that_contradict_their_clock_are_refused(
-    tmp_path: Path, text: str, notation: TrajectoryNotation, words: str
+    tmp_path: Path, text: str, notation: TrajectoryFileOptions, words: str
 ) -> None:
     path = _write(tmp_path, _HEADER, f"{text},1,2,3,4,5,6", f"{text},1,2,3,4,5,6")
     with pytest.raises(KgcpError, match=rf"vehicle\.csv.*{words}") as caught:
@@ -153,7 +153,7 @@ def test_a_csv_in_degrees_comes_to_the_flight_s_grid(tmp_path: Path) -> None:
     # to 45 degrees on GRS 80 is 4 984 944.378 m.
     rows = [f"{second},9,45,100,1,2,3,0.01,0.02,0.03" for second in (0, 1)]
     path = _write(tmp_path, f"{_HEADER},sd_x,sd_y,sd_z", *rows)
-    trajectory = read_trajectory(path, _CRS, TrajectoryNotation(crs="EPSG:4258"))
+    trajectory = read_trajectory(path, _CRS, TrajectoryFileOptions(crs="EPSG:4258"))
     expected = [500000.0, 0.9996 * 4984944.378, 100.0]
     np.testing.assert_allclose(trajectory.position_map[0], expected, rtol=0, atol=1e-3)
     np.testing.assert_allclose(trajectory.attitude_deg[0], [1, 2, 3])
@@ -168,7 +168,7 @@ def test_feet_of_the_grid_are_not_those_of_heights(tmp_path: Path) -> None:
     foot_m = 1200.0 / 3937.0
     rows = [f"{second},{2e6 / foot_m},{5e5 / foot_m},100,1,2,3" for second in (0, 1)]
     path = _write(tmp_path, _HEADER, *rows)
-    trajectory = read_trajectory(path, "EPSG:4269", TrajectoryNotation(crs="EPSG:2229"))
+    trajectory = read_trajectory(path, "EPSG:4269", TrajectoryFileOptions(crs="EPSG:2229"))
     expected = [-118.0, 33.5, 100.0]
     np.testing.assert_allclose(trajectory.position_map[0], expected, rtol=0, atol=1e-8)
 
@@ -177,7 +177,7 @@ def test_a_csv_may_be_earth_centred(tmp_path: Path) -> None:
     # On the equator at Greenwich, 100 m above the ellipsoid: X is up, Y east and Z north.
     rows = [f"{second},6378237,{9 * second},0,1,2,3,0.03,0.01,0.02" for second in (0, 1)]
     path = _write(tmp_path, f"{_HEADER},sd_x,sd_y,sd_z", *rows)
-    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryNotation(crs="EPSG:4978"))
+    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryFileOptions(crs="EPSG:4978"))
     np.testing.assert_allclose(trajectory.position_map[0], [0.0, 0.0, 100.0], atol=1e-6)
     np.testing.assert_allclose(trajectory.position_map[1, 0], np.degrees(9.0 / 6378237), rtol=1e-9)
     assert trajectory.sd_position_m is not None
@@ -189,17 +189,17 @@ def test_a_crs_of_no_datum_has_no_exact_way(tmp_path: Path) -> None:
     path = _write(tmp_path, _HEADER, "0,5e5,5e6,100,1,2,3", "1,5e5,5e6,100,1,2,3")
     local = "+proj=utm +zone=32 +ellps=GRS80 +type=crs"
     with pytest.raises(KgcpError, match="is not known exactly; give a CRS of the flight's datum"):
-        read_trajectory(path, _CRS, TrajectoryNotation(crs=local))
+        read_trajectory(path, _CRS, TrajectoryFileOptions(crs=local))
 
 
 def test_a_grid_that_is_not_installed_is_named(tmp_path: Path) -> None:
     rows = [f"{second},-1.5,52,100,1,2,3" for second in (0, 1)]
     path = _write(tmp_path, _HEADER, *rows)
     with pytest.raises(KgcpError, match=r"vehicle.csv: the way .*EPSG:27700.* needs the grid") as e:
-        read_trajectory(path, "EPSG:27700", TrajectoryNotation(crs="EPSG:4258"))
+        read_trajectory(path, "EPSG:27700", TrajectoryFileOptions(crs="EPSG:4258"))
     assert "\n" not in str(e.value)
     with pytest.raises(KgcpError, match=r"\[vehicle\] crs 'EPSG:0' cannot be used"):
-        read_trajectory(path, _CRS, TrajectoryNotation(crs="EPSG:0"))
+        read_trajectory(path, _CRS, TrajectoryFileOptions(crs="EPSG:0"))
 
 
 def test_heights_above_a_geoid_need_its_grid(tmp_path: Path) -> None:
@@ -208,17 +208,19 @@ def test_heights_above_a_geoid_need_its_grid(tmp_path: Path) -> None:
         pytest.skip("the grid of EGM96 is installed")
     path = _write(tmp_path, _HEADER, "0,2.17,41.4,100,1,2,3", "1,2.17,41.4,100,1,2,3")
     with pytest.raises(KgcpError, match="needs the grid us_nga_egm96"):
-        read_trajectory(path, "EPSG:4326+5773", TrajectoryNotation(crs="EPSG:4979"))
+        read_trajectory(path, "EPSG:4326+5773", TrajectoryFileOptions(crs="EPSG:4979"))
 
 
 def test_a_point_out_of_this_world_is_named(tmp_path: Path) -> None:
     rows = ("0,9,45,100,1,2,3", "1,9,450,100,1,2,3")
     with pytest.raises(KgcpError, match=r"vehicle.csv: the point \(9, 450, 100\) of epoch 2"):
-        read_trajectory(_write(tmp_path, _HEADER, *rows), _CRS, TrajectoryNotation(crs="EPSG:4258"))
+        read_trajectory(
+            _write(tmp_path, _HEADER, *rows), _CRS, TrajectoryFileOptions(crs="EPSG:4258")
+        )
     # easting and northing taken for Earth-centred coordinates lie a thousand kilometres deep
     grid = _write(tmp_path, _HEADER, "0,689586,5336250,547,1,2,3", "1,689587,5336250,547,1,2,3")
     with pytest.raises(KgcpError, match=r"epoch 1 has no place .* which is 'EPSG:4978' now"):
-        read_trajectory(grid, _CRS, TrajectoryNotation(crs="EPSG:4978"))
+        read_trajectory(grid, _CRS, TrajectoryFileOptions(crs="EPSG:4978"))
 
 
 @pytest.mark.parametrize(
@@ -251,47 +253,47 @@ def test_the_format_may_be_named_instead(tmp_path: Path) -> None:
         ("sbet", "12 bytes, not a multiple of 136"),
     ):
         with pytest.raises(KgcpError, match=words):
-            read_trajectory(path, _CRS, TrajectoryNotation(format=kind))
+            read_trajectory(path, _CRS, TrajectoryFileOptions(format=kind))
         with pytest.raises(KgcpError, match=r"does not exist; .*\[vehicle\] trajectory"):
-            read_trajectory(tmp_path / "gone", _CRS, TrajectoryNotation(format=kind))
+            read_trajectory(tmp_path / "gone", _CRS, TrajectoryFileOptions(format=kind))
 
 
 # Two epochs on the meridian of zone 32, 0.5 s and 1e-5 degrees apart, heading north.
-_SAME_PLACES: dict[str, tuple[bytes, TrajectoryNotation]] = {
+_SAME_PLACES: dict[str, tuple[bytes, TrajectoryFileOptions]] = {
     "csv": (
         f"{_HEADER}\n1777887000,9,45,100,0,0,0\n1777887000.5,9,45.00001,100,0,0,0\n".encode(),
-        TrajectoryNotation(crs="EPSG:4979"),
+        TrajectoryFileOptions(crs="EPSG:4979"),
     ),
     "sbet": (
         b"".join(
             struct.pack("<17d", second, np.radians(lat), np.radians(9.0), 100.0, *[0.0] * 13)
             for second, lat in ((120618.0, 45.0), (120618.5, 45.00001))
         ),
-        TrajectoryNotation(time_system=TimeSystem.GPS, first_day=date(2026, 5, 4)),
+        TrajectoryFileOptions(time_system=TimeSystem.GPS, first_day=date(2026, 5, 4)),
     ),
     "rtklib": (
         (
             b"% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  GPST latitude(deg) longitude(deg)"
             b" height(m) Q\n2417 120618.0 45.0 9.0 100.0 1\n2417 120618.5 45.00001 9.0 100.0 1\n"
         ),
-        TrajectoryNotation(course_sd_deg=(2.0, 2.0, 3.0)),
+        TrajectoryFileOptions(course_sd_deg=(2.0, 2.0, 3.0)),
     ),
     "tum": (
         "".join(
             f"{time} 9 {lat} 100 {np.sqrt(0.5)} {np.sqrt(0.5)} 0 0\n"
             for time, lat in ((1777887000.0, 45.0), (1777887000.5, 45.00001))
         ).encode(),
-        TrajectoryNotation(crs="EPSG:4979"),
+        TrajectoryFileOptions(crs="EPSG:4979"),
     ),
 }
 
 
 @pytest.mark.parametrize("kind", FORMATS.names)
 def test_all_formats_say_the_same_recognised_or_named(tmp_path: Path, kind: str) -> None:
-    content, notation = _SAME_PLACES[kind]
+    content, options = _SAME_PLACES[kind]
     path = tmp_path / "vehicle"
     path.write_bytes(content)
-    for stated in (notation, replace(notation, format=kind)):
+    for stated in (options, replace(options, format=kind)):
         trajectory = read_trajectory(path, _CRS, stated)
         np.testing.assert_allclose(trajectory.time_s, 1777887000.0 + np.array([0.0, 0.5]))
         arc_m = 0.9996 * 4984944.378  # to 45 degrees, on the zone's meridian
@@ -301,7 +303,7 @@ def test_all_formats_say_the_same_recognised_or_named(tmp_path: Path, kind: str)
         np.testing.assert_allclose(trajectory.attitude_deg, 0.0, atol=1e-6)
 
 
-_COURSE = TrajectoryNotation(course_sd_deg=(2.0, 1.5, 3.0))
+_COURSE = TrajectoryFileOptions(course_sd_deg=(2.0, 1.5, 3.0))
 
 
 def _drive(tmp_path: Path, time_s: FloatArray, east: FloatArray, north: FloatArray) -> Trajectory:

@@ -15,7 +15,7 @@ from kgcp.errors import KgcpError
 from kgcp.georef.trajectory import body_to_ned
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.formats.trajectories import read_trajectory
-from kgcp.io.formats.trajectories.records import TrajectoryNotation
+from kgcp.io.formats.trajectories.records import TrajectoryFileOptions
 
 CRS = "EPSG:25831"
 ORIGIN = (430606.1, 4583523.0, 120.0)  # 2.17 E, 41.4 N: grid north 0.55 degrees west of true north
@@ -66,7 +66,7 @@ def test_quaternions_may_be_against_the_earth_s_axes(tmp_path: Path) -> None:
     quaternion = " ".join(f"{value:.15f}" for value in body.as_quat())
     path = tmp_path / "vehicle.txt"
     path.write_text(f"0 6378237 0 0 {quaternion}\n1 6378237 9 0 {quaternion}\n")
-    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryNotation(crs="EPSG:4978"))
+    trajectory = read_trajectory(path, "EPSG:4979", TrajectoryFileOptions(crs="EPSG:4978"))
     assert_allclose(trajectory.position_map[0], [0.0, 0.0, 100.0], atol=1e-6)
     assert_allclose(trajectory.attitude_deg[0], [0.0, 0.0, 90.0], atol=1e-9)
 
@@ -129,13 +129,13 @@ def test_a_robot_s_axes_are_refused_with_the_way_out(tmp_path: Path) -> None:
 def test_other_clocks_and_the_course(tmp_path: Path) -> None:
     positions = [(ORIGIN[0] + 5.0 * k, ORIGIN[1], ORIGIN[2]) for k in range(4)]
     rows = [row(f"{123400 + k}.5", NORTH, position) for k, position in enumerate(positions)]
-    notation = TrajectoryNotation(
+    options = TrajectoryFileOptions(
         format="tum",
         time_system=TimeSystem.GPS,
         first_day=date(2026, 5, 4),
         course_sd_deg=(2.0, 2.0, 3.0),
     )
-    trajectory = read_trajectory(write(tmp_path, *rows), CRS, notation)
+    trajectory = read_trajectory(write(tmp_path, *rows), CRS, options)
     monday_s = 1777887000.0 - 9.5 * 3600.0
     assert trajectory.time_s[0] == pytest.approx(monday_s - 86400.0 + 123400.5 - 18.0)
     assert_allclose(trajectory.attitude_deg[:, 2], 90.0 + CONVERGENCE_DEG, atol=1e-3)
