@@ -63,6 +63,9 @@ class Camera:
         How grey values follow light.
     readout_s : float
         Rolling shutter: time from the first to the last row [s]; 0 is a global shutter.
+    motion_sd_deg_s : float
+        With a rolling shutter, how fast the scene turns about each of the camera's axes where that
+        is not known: standard deviation [deg/s].
     time_reference : TimeReference
         What the frames' times are of, before they are brought to mid-exposure.
     """
@@ -83,6 +86,7 @@ class Camera:
     k6: float = 0.0
     response: Response = Response.UNKNOWN
     readout_s: float = 0.0
+    motion_sd_deg_s: float = 5.0
     time_reference: TimeReference = TimeReference.MIDDLE
 
     @classmethod
@@ -94,6 +98,7 @@ class Camera:
         *,
         response: Response = Response.UNKNOWN,
         readout_s: float = 0.0,
+        motion_sd_deg_s: float = 5.0,
     ) -> Self:
         """Return the camera that `cv2.calibrateCamera` found.
 
@@ -106,7 +111,7 @@ class Camera:
             (thin prism, tilted sensor) must be zero.
         size : tuple of int
             Width and height of the frames [px], as OpenCV's `imageSize`.
-        response, readout_s
+        response, readout_s, motion_sd_deg_s
             As the fields of these names.
 
         Raises
@@ -160,6 +165,7 @@ class Camera:
             k6=k6,
             response=response,
             readout_s=readout_s,
+            motion_sd_deg_s=motion_sd_deg_s,
         )
 
     def __post_init__(self) -> None:
@@ -178,6 +184,7 @@ class Camera:
             if not math.isfinite(getattr(self, key)):
                 raise SettingError(key, "is not a finite number", "give a number or leave it out")
         require_range("readout_s", self.readout_s, 0.0, 10.0, unit="s")
+        require_range("motion_sd_deg_s", self.motion_sd_deg_s, 0.0, 1000.0, unit="deg/s")
 
     def binned(self, count: int) -> Camera:
         """Return the camera whose pixels are squares of `count` by `count` of this one's."""

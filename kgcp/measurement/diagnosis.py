@@ -66,7 +66,7 @@ def _plain_cause(
     if outline.b < min_radius_px:
         return Reason.TOO_SMALL, f"{outline.b:.1f} px of {min_radius_px:g} px across"
     patch = polar_patch(grey, outline)
-    template_match = match_templates(patch, ring)
+    template_match = match_templates(patch, ring, outline.a)
     unseen = _share_unseen(patch)
     if unseen > _UNSEEN:
         return Reason.HIDDEN, f"{unseen:.0%} of its edge not seen"

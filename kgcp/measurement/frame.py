@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.closed_form.chain import measure_ring
 from kgcp.measurement.closed_form.circles import paper_outlines
 from kgcp.measurement.diagnosis import explain
-from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Considered, Measurement, Miss, Outcome
 from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
 from kgcp.measurement.search.code_signal import CodeMatch, fixed_lag_score, points_of_code
@@ -61,7 +62,7 @@ def examine(
     camera: Camera,
     targets: tuple[Target, ...],
     settings: DetectSettings,
-    prior: NormalPrior | None = None,
+    priors: Mapping[str, PlatePrior] = MappingProxyType({}),
     measured: Sequence[Measurement] = (),
 ) -> Examination:
     """Look for every target in a frame and measure what is found.
@@ -72,8 +73,8 @@ def examine(
         Raw frame, uint8 or uint16, of the camera's size.
     targets : tuple of Target
         All that may be seen.
-    prior : NormalPrior, optional
-        Of the normal of the plate on the vehicle: of all targets without a position of their own.
+    priors : mapping of str to PlatePrior, optional
+        What is known of targets before, by name.
     measured : sequence of Measurement
         Targets of this frame that are already measured.
     """
@@ -82,7 +83,7 @@ def examine(
     candidates = find_dotted(grey, search(grey, settings), rings)
     trials = [
         _try_target(
-            grey, camera, candidates, target, settings, prior if target.position_m is None else None
+            grey, camera, candidates, target, settings, priors.get(target.name, PlatePrior())
         )
         for target in targets
     ]
@@ -126,7 +127,7 @@ def _try_target(
     candidates: dict[Ring, tuple[Candidate, ...]],
     target: Target,
     settings: DetectSettings,
-    prior: NormalPrior | None,
+    prior: PlatePrior,
 ) -> _Trial:
     """Measure all plates of one target; its replicas serve where the main ring cannot."""
     plates: list[Measurement] = []
@@ -168,7 +169,7 @@ def measure_match(
     target: Target,
     match: CodeMatch,
     settings: DetectSettings,
-    prior: NormalPrior | None,
+    prior: PlatePrior,
 ) -> Measurement:
     """Measure a matched ring by the method of the settings, and make sure that it is the target.
 

@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.frame import measure_match
-from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Considered, Measurement
 from kgcp.measurement.search.candidates import find_rings_at
 from kgcp.measurement.search.code_signal import CodeMatch
@@ -96,7 +96,7 @@ def look_again(
     target: Target,
     prediction: Prediction,
     settings: DetectSettings,
-    prior: NormalPrior | None,
+    prior: PlatePrior,
     rivals: Sequence[Measurement],
 ) -> tuple[Measurement | None, tuple[Considered, ...]]:
     """Look for one target where it must be, however faint its ring is.
@@ -143,7 +143,7 @@ def _candidates(grey: GreyArray, target: Target, prediction: Prediction) -> Iter
         matches = [
             template_match.code_match(ring, outline)
             for outline in _outlines(grey, prediction, scale)
-            for template_match in (match_templates(polar_patch(grey, outline), ring),)
+            for template_match in (match_templates(polar_patch(grey, outline), ring, outline.a),)
             if template_match.score > _WORTH_A_TRY
         ]
         matches.sort(key=lambda match: -match.score)

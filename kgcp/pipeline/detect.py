@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import versions, write_run_record
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.normal_prior import NormalPrior, normal_priors
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.pipeline.guidance import predict_missing, with_predictions
 from kgcp.pipeline.overlay import draw_overlay
@@ -128,7 +128,11 @@ def detect_flight(
         if flight.times_file is not None:
             times = read_times(flight.times_file, frames, flight.times_format)
         data = FlightData(flight, frames)
-        inputs = _frame_inputs(flight, data, frames, times)
+        priors = priors_of_frames(flight, data, frames, times)
+        inputs = [
+            FrameInput(frame, times.get(frame), known)
+            for frame, known in zip(frames, priors, strict=True)
+        ]
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     job = DetectionJob(
         frames_folder,
@@ -171,7 +175,10 @@ def detect_flight(
         summary = builder.summary(
             table=table,
             kept=run.kept,
-            frames_without_attitude=sum(frame_input.prior is None for frame_input in inputs)
+            frames_without_attitude=sum(
+                all(prior.normal is None for prior in frame_input.priors.values())
+                for frame_input in inputs
+            )
             if is_level
             else 0,
             not_drawn=not_drawn,
@@ -201,24 +208,6 @@ def _stages_s(stopwatch: Stopwatch, journal: Journal, pool: WorkerPool) -> dict[
         "journal, within these": journal.seconds,
         **{f"workers: {stage}": seconds for stage, seconds in workers},
     }
-
-
-def _frame_inputs(
-    flight: Flight, data: FlightData, frames: Sequence[str], times: Mapping[str, float]
-) -> list[FrameInput]:
-    """Return what is known of each frame before it is read."""
-    priors: Sequence[NormalPrior | None] = [None] * len(frames)
-    if flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None:
-        priors = normal_priors(
-            frames,
-            data.reference_poses if data.has_reference else None,
-            level_sd_deg=flight.vehicle.settings.level_sd_deg,
-            plumb_sd_deg=flight.plumb_sd_deg,
-        )
-    return [
-        FrameInput(frame, times.get(frame), prior)
-        for frame, prior in zip(frames, priors, strict=True)
-    ]
 
 
 def _making(job: DetectionJob) -> dict[str, str]:

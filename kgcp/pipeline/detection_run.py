@@ -204,7 +204,7 @@ class DetectionRun:
 
 def _key(frame_input: FrameInput, file: tuple[int, int] | None) -> str:
     name = fingerprint(frame_input.frame)[:16]
-    return f"first-{name}-{fingerprint(file, frame_input.time_s, frame_input.prior)[:16]}"
+    return f"first-{name}-{fingerprint(file, frame_input.time_s, frame_input.priors)[:16]}"
 
 
 def _name_of(key: str) -> str:

@@ -16,7 +16,7 @@ from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Prediction, look_again
-from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import (
     Considered,
     ExposureSettings,
@@ -63,13 +63,13 @@ class FrameInput:
         Path relative to the frames folder.
     time_s : float or None
         From the times file, of the camera's `time_reference`, Unix UTC [s]; None: EXIF decides.
-    prior : NormalPrior or None
-        Of the normal of the plate on the vehicle; None: nothing is known of it.
+    priors : mapping of str to PlatePrior
+        What is known of its targets, by their names.
     """
 
     frame: str
     time_s: float | None
-    prior: NormalPrior | None
+    priors: Mapping[str, PlatePrior]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         with at_hand(job.frames_folder, frame_input.frame) as path:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
-        examination = examine(grey, job.camera, job.targets, job.settings, frame_input.prior)
+        examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
         outcomes = tuple(_with_common_uncertainty(job, one) for one in examination.outcomes)
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
@@ -136,8 +136,12 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
     for target in job.targets:
         if target.name in guided_input.predictions:
             seen, more = look_again(
-                *(grey, job.camera, target, guided_input.predictions[target.name], job.settings),
-                guided_input.input.prior if target.position_m is None else None,
+                grey,
+                job.camera,
+                target,
+                guided_input.predictions[target.name],
+                job.settings,
+                guided_input.input.priors.get(target.name, PlatePrior()),
                 tuple(found.values()),
             )
             considered += more
@@ -181,7 +185,7 @@ def _merged(
     missed = tuple(target for target in job.targets if target.name not in found)
     if first.keys() & found.keys():  # rings on those plates explain no other's miss any more
         others = tuple(found.values())
-        again = examine(grey, job.camera, missed, job.settings, guided_input.input.prior, others)
+        again = examine(grey, job.camera, missed, job.settings, guided_input.input.priors, others)
         first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
     instead: dict[str, Outcome] = {}
     for target in missed:

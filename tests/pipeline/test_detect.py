@@ -99,11 +99,12 @@ def normals(quaternions: FloatArray) -> FloatArray:
     )
 
 
-def test_a_level_plate_and_reference_attitudes_find_the_right_side(
-    flight: Path, tmp_path: Path
+@pytest.mark.parametrize("edits", [(), (LEVEL,)])
+def test_attitudes_of_vehicle_and_camera_find_the_right_side(
+    flight: Path, tmp_path: Path, edits: tuple[tuple[str, str], ...]
 ) -> None:
-    detect(flight, tmp_path / "plain")
-    summary = detect(flight, tmp_path / "level", LEVEL)
+    detect(flight, tmp_path / "plain", ('poses = "reference.csv"', 'poses = "later.csv"'))
+    summary = detect(flight, tmp_path / "level", *edits)
     plain, level = measured(tmp_path / "plain"), measured(tmp_path / "level")
     assert summary.frames_without_attitude == 0
     assert len(plain) == len(level) >= FRAMES - 1

@@ -31,7 +31,7 @@ CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
 A = Target(replace(TARGET_PLATE.target.ring, sd_outer_diameter_m=1e-3))
 B = Target(Ring("B", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 60.0, 150.0, 240.0)))
 POSE = Pose(np.eye(3), np.array([0.5, -0.4, 30.0]))
-FRAME_INPUT = FrameInput("a.png", 12.0, None)
+FRAME_INPUT = FrameInput("a.png", 12.0, {})
 STRICT = DetectSettings(min_score=1.0)  # more than any ring in a frame has
 PREDICTION = Prediction(CAMERA.project(POSE.translation_m), 1.0, 13.5, 0.03, "a test")
 

@@ -21,7 +21,7 @@ _TARGET = Target(Ring("A", 0.9, 0.45, 0.642857143, 0.128571429, (0.0, 43.0, 78.0
 def _time_s(folder: Path, reference: str, name: str = "f.jpg") -> float | None:
     camera = replace(_CAMERA, time_reference=TimeReference(reference))
     job = DetectionJob(folder, camera, None, (_TARGET,), DetectSettings())
-    return examine_frame(job, FrameInput(name, 1000.0, None)).time_s
+    return examine_frame(job, FrameInput(name, 1000.0, {})).time_s
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
 CAMERA_KEYS = (
     *("file", "format", "camera", "width", "height", *CALIBRATION_PARAMETERS),
     *(*DEVIATION_KEYS, "cov_of", "cov", "plumb_sd_deg"),
-    *("response", "readout_s", "time_reference"),
+    *("response", "readout_s", "motion_sd_deg_s", "time_reference"),
 )
 
 
@@ -39,6 +39,7 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
             camera,
             response=response or Response.UNKNOWN,
             readout_s=table.number("readout_s", 0.0),
+            motion_sd_deg_s=table.number("motion_sd_deg_s", camera.motion_sd_deg_s),
             time_reference=moment or TimeReference.MIDDLE,
         )
 

@@ -19,12 +19,14 @@ from scipy.special import ndtri
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import plateau_levels, share_at
+from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.records import Uncertainty
 
 _ARC_PX = 6.0
@@ -95,7 +97,23 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     if fit.parameters.has_skew:
         across_m = _skew_displacement_px(fit) * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
+    shutter = fit.sample.problem.shutter
+    if shutter is not None:
+        by_rotation = _by_rotation(fit, shutter) * shutter.rotation.sd_rad_s
+        turned = inverse[:6] @ (scaled * misfit.weight) @ (by_rotation / fit.sd).T
+        pose_cov += turned @ turned.T
     return PoseCovariance(pose_cov, max(1.0, mean))
+
+
+def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
+    """Return the derivatives (3, n) of grey values by the scene's rotation during the readout.
+
+    A target's pose turns about the camera: its centre t by Ω × t, its axes by Ω, as much longer as
+    a row is exposed later.
+    """
+    by_translation, by_turn = fit.jacobian[:3], fit.jacobian[3:6]
+    turned = cross_matrix(fit.parameters.matrix[:, 3]) @ by_translation
+    return np.asarray((turned + by_turn) * shutter.delay_s[fit.sample.index])
 
 
 def _skew_displacement_px(fit: TargetFit) -> float:

@@ -5,6 +5,7 @@ The plain model comes first, and where its residuals ask for nothing its result 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 
@@ -29,8 +30,8 @@ from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_pos
 from kgcp.measurement.adjustment.unknowns import unknowns_of
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param
+from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
-_SMALLEST_UNEVEN_PX = 12.5  # radius: smaller rings hardly show ink and plate beside their edges
 _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
 
@@ -44,7 +45,7 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
         As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; and `POOR_FIT` where levels that
         vary explain nothing either.
     """
-    is_small = problem.outer_radius_px < _SMALLEST_UNEVEN_PX
+    is_small = problem.outer_radius_px < SMALLEST_UNEVEN_PX
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
@@ -74,10 +75,14 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
         )
         gaussian = replace(gaussian, field=best.parameters.field)
         spreads.append((gaussian, unknowns_of(problem, has_streak=False)))
-    skewed = [
-        _fit_skewed(problem, parameters, other.parameters.pose, with_skew(unknowns))
-        for parameters, unknowns in spreads
-    ]
+    skewed = []
+    for parameters, unknowns in spreads:
+        with contextlib.suppress(Rejection):  # then the plain model is the better one
+            skewed.append(
+                _fit_skewed(problem, parameters, other.parameters.pose, with_skew(unknowns))
+            )
+    if not skewed:
+        return poses
     return replace(min(skewed, key=lambda both: loss_per_pixel(both.best)), even=poses.even)
 
 

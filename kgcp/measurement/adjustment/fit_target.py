@@ -29,14 +29,16 @@ from kgcp.measurement.adjustment.two_poses import (
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.noise import find_censoring
 from kgcp.measurement.image_model.plate import circles_of
+from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
-from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
 from kgcp.measurement.records import Alternative, InitialPose, Measurement
 from kgcp.targets.layout import Target
 
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
+_NOTHING_KNOWN = PlatePrior()
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 
 
@@ -45,7 +47,7 @@ def measure_by_model(
     camera: Camera,
     target: Target,
     start: InitialPose,
-    prior: NormalPrior | None = None,
+    prior: PlatePrior = _NOTHING_KNOWN,
     visible: BoolArray | None = None,
 ) -> Measurement:
     """Measure a target that the search has found.
@@ -58,9 +60,9 @@ def measure_by_model(
     target : Target
         Its layout.
     start : InitialPose
-    prior : NormalPrior, optional
-        Of the plate's normal. It only helps to choose between the two poses, whose values remain
-        those of the image.
+    prior : PlatePrior, optional
+        Its normal only helps to choose between the two poses, whose values remain those of the
+        image.
     visible : (m,) array of bool, optional
         Where the target is seen, in equal steps about its normal from its +x axis on.
 
@@ -70,15 +72,16 @@ def measure_by_model(
         `CUT`, `EDGES_LOST`, `NO_CONTRAST`, `POOR_FIT` or `OTHER_CODE`.
     """
     pose = _without_edge_shift(start)
-    problem = replace(fit_problem_of(grey, camera, target, pose), visible=visible)
+    problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
+    problem = replace(problem, visible=visible)
     poses = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
-    if prior is not None:
-        poses = choose_by_prior(problem, poses, prior)
+    if prior.normal is not None:
+        poses = choose_by_prior(problem, poses, prior.normal)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
     if poses.even is not None:
         check_code(poses.even, target.ring)
-    observation = _observation(camera, target, start, poses, prior)
+    observation = _observation(camera, target, start, poses, prior.normal)
     check_precision(observation)
     return observation
 
@@ -92,8 +95,17 @@ def _without_edge_shift(start: InitialPose) -> Pose:
     return Pose(start.pose.rotation, shrink * start.pose.translation_m)
 
 
-def fit_problem_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) -> FitProblem:
-    """Collect what the adjustment starts from: the main ring, or a replica where that is cut."""
+def fit_problem_of(
+    grey: GreyArray,
+    camera: Camera,
+    target: Target,
+    pose: Pose,
+    rotation: SceneRotation | None = None,
+) -> FitProblem:
+    """Collect what the adjustment starts from: the main ring, or a replica where that is cut.
+
+    `rotation` is that of the scene during the readout; None: `SceneRotation.unknown`.
+    """
     count = 0
     for ring in target.rings:
         radius_m = 0.5 * ring.outer_diameter_m
@@ -111,17 +123,26 @@ def fit_problem_of(grey: GreyArray, camera: Camera, target: Target, pose: Pose) 
             cut = rejection
             continue
         is_plain = binning > 1 or camera.response is Response.LINEAR
+        centre_px = seen.project(pose.translation_m[None])[0]
+        shutter = None
+        if camera.readout_s:
+            rows = window.pixels(np.arange(len(window.levels)))[1]
+            shutter = RollingShutter.of(
+                seen, rows, centre_px[1], rotation or SceneRotation.unknown(camera)
+            )
+            window = replace(window, rays=shutter.rays_at_one_moment(window.rays))
         return FitProblem(
             window=window,
             circles=circles_of(target.rings),
             measured_count=count,
             outer_radius_m=radius_m,
             outer_radius_px=size_px,
-            centre_px=seen.project(pose.translation_m[None])[0],
+            centre_px=centre_px,
             focal_px=seen.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
             response=apparent_response(camera.response, window),
             sharpening_px=0.0 if is_plain else _SHARPENING_PX,
+            shutter=shutter,
         )
     raise cut
 

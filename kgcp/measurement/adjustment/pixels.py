@@ -28,7 +28,7 @@ from kgcp.measurement.image_model.blur import (
 from kgcp.measurement.image_model.blurred_plate import white_level
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import (
-    PARAM_COUNT,
+    PLAIN_COUNT,
     Light,
     PhotometricModel,
     plateau_levels,
@@ -115,7 +115,7 @@ def select_pixels(
     is_thinned = most is not None and len(index) > most
     if most is not None and is_thinned:
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
-    if len(index) < 4 * PARAM_COUNT:
+    if len(index) < 4 * PLAIN_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
     return _sample(seen, pose, light, index, is_thinned=is_thinned)
 

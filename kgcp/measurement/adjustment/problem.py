@@ -10,6 +10,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.plate import Circles
+from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import Window
 
 _CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
@@ -38,6 +39,8 @@ class FitProblem:
     response : Response
     sharpening_px : float
         σ of the unsharp mask to be modelled [px]; 0: none.
+    shutter : RollingShutter or None
+        What is known of the rotation is taken out of the window's rays; None: a global shutter.
     visible : (m,) array of bool, or None
         Where the target is seen, in equal steps about its normal from its +x axis on; None:
         everywhere, as far as the search knows.
@@ -53,6 +56,7 @@ class FitProblem:
     censoring: Censoring
     response: Response
     sharpening_px: float
+    shutter: RollingShutter | None = None
     visible: BoolArray | None = None
 
     @property

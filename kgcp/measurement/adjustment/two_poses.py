@@ -22,7 +22,7 @@ from kgcp.measurement.adjustment.solver import TargetFit, adjust, approach, mini
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak, unknowns_of
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import misfit
-from kgcp.measurement.normal_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior
 
 _START_SLACK_PX = 1.5
 _HALF_SHARPENED, _NARROWED = 0.25, 1.12  # strength, and blur as a share of what seems to be
@@ -143,8 +143,7 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
     if prior is None:
         return of_image
     rotation_cov = covariance.pose_cov[3:, 3:]
-    worse, better = (prior.chi2(fit.parameters.pose, rotation_cov) for fit in (other, best))
-    return of_image + worse - better
+    return of_image + prior.preference(best.parameters.pose, other.parameters.pose, rotation_cov)
 
 
 def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:

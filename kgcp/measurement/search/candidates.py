@@ -128,7 +128,8 @@ def find_code(
     matches: list[CodeMatch] = []
     refused: list[Refusal] = []
     for candidate in candidates:
-        outline, template_match = candidate.outline, match_templates(candidate.patch, ring)
+        outline = candidate.outline
+        template_match = match_templates(candidate.patch, ring, outline.a)
         try:
             template_match.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:

@@ -29,7 +29,7 @@ from kgcp.measurement.search.templates import (
     edge_rows,
     templates_of,
 )
-from kgcp.measurement.search.uneven_light import evened_patch
+from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX, evened_patch
 from kgcp.targets.layout import Ring
 
 # Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
@@ -130,7 +130,7 @@ def match_templates_at(grey: GreyArray, camera: Camera, pose: Pose, ring: Ring) 
     """Compare a ring with its templates as a pose puts them; angles are the plate's."""
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
-    return match_templates(sample_grey(grey, points), ring)
+    return match_templates(sample_grey(grey, points), ring, _radius_px(camera, pose, ring))
 
 
 def code_in_even_light(
@@ -138,8 +138,10 @@ def code_in_even_light(
 ) -> FloatArray | None:
     """Return what a pose shows along the code circle (360,), as it would be in even light.
 
-    None where the light is even, or where a part is not a ring.
+    None where the light is even, where a part is not a ring, and of a small ring.
     """
+    if _radius_px(camera, pose, ring) < SMALLEST_UNEVEN_PX:
+        return None
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
     even = evened_patch(sample_grey(grey, points), ring, SHIFTS)
@@ -150,23 +152,27 @@ def code_in_even_light(
     return np.asarray(np.interp(np.arange(360.0), sampled_deg, even[row], period=360.0))
 
 
+def _radius_px(camera: Camera, pose: Pose, ring: Ring) -> float:
+    return 0.5 * ring.outer_diameter_m * camera.mean_focal_px / pose.distance_m
+
+
 def polar_patch(grey: GreyArray, outline: Ellipse) -> FloatArray:
     """Sample a frame around an outline, for `match_templates`: (radii, angles)."""
     return np.asarray(sample_ellipses(grey, (outline,), SAMPLED_RADII, CIRCLE)[0])
 
 
-def match_templates(patch: FloatArray, ring: Ring) -> TemplateMatch:
+def match_templates(patch: FloatArray, ring: Ring, radius_px: float) -> TemplateMatch:
     """Compare a polar patch (radii, angles) of the frame with the ring's templates.
 
-    In uneven light it is compared as it would be in even light; where a part of the ring is
-    hidden, the rest of it is compared.
+    In uneven light a ring of some size is compared as it would be in even light; where a part of
+    the ring is hidden, the rest of it is compared.
     """
     templates = templates_of(ring)
     whole = best_placement(correlate(patch, templates))
     template_match = _matched(patch, ring, whole, None)
     if template_match.is_clear:
         return template_match
-    if template_match.score > _WORTH_EVENING:
+    if template_match.score > _WORTH_EVENING and radius_px >= SMALLEST_UNEVEN_PX:
         even = evened_patch(patch, ring, whole.shift)
         if even is not None:
             in_even_light = _matched(even, ring, best_placement(correlate(even, templates)), None)

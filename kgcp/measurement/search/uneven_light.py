@@ -8,6 +8,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.search.templates import ANGLES, edge_rows
 from kgcp.targets.layout import Ring
 
+SMALLEST_UNEVEN_PX = 12.5
+"""Radius below which rings hardly show ink and plate beside their edges: their light is even."""
 _INK_RANK = 0.35  # of grey values near an angle: dots that blur spreads are brighter than ink
 _HALF_INK, _HALF_PLATE = 10, 5  # samples to either side: more than a dot, less than a shadow
 _SMOOTHED = 3.0  # samples

@@ -9,6 +9,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.measurement.guided import Prediction, look_again
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Measurement
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
@@ -71,7 +72,7 @@ def measure_again(
 
     def measured(gain: float) -> Measurement | None:
         changed = _reexposed_around(grey, gain, centre_px, radius_px)
-        return look_again(changed, camera, target, prediction, settings, None, ())[0]
+        return look_again(changed, camera, target, prediction, settings, PlatePrior(), ())[0]
 
     before = measured(1.0)
     if before is None:

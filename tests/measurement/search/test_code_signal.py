@@ -112,7 +112,7 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
     assert match_code(signal, target.ring)[0][0] > 0.95
     assert find_dotted(frame, (outer,), target.rings) == {target.ring: (), target.replicas[0]: ()}
     patch = np.stack([outer.points(ANGLES_RAD, radius) for radius in SAMPLED_RADII])
-    template_match = match_templates(sample_grey(frame, patch), target.ring)
+    template_match = match_templates(sample_grey(frame, patch), target.ring, 40.0)
     with pytest.raises(Rejection):
         template_match.check(DetectSettings().min_score)
 

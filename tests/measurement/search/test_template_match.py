@@ -108,7 +108,7 @@ def test_the_visible_part_of_a_ring_fits_as_well_as_all_of_it(target: Target, fi
     score, *place = best_placement(correlate(patch, templates, visible))
     assert score == pytest.approx(1.0, abs=0.01)
     assert place == [3, SHIFTS, 17]
-    template_match = match_templates(patch, ring)
+    template_match = match_templates(patch, ring, 40.0)
     assert template_match.visible is not None
     assert template_match.lag_deg == pytest.approx(17 * 360.0 / ANGLES)
     assert (template_match.black, template_match.white) == pytest.approx((20.0, 170.0), abs=1.0)

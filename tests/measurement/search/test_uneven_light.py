@@ -36,17 +36,25 @@ def test_a_ring_half_in_shade_is_clear(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
     even = evened_patch(patch, target.ring, SHIFTS)
     assert even is not None
-    template_match = match_templates(patch, target.ring)
+    template_match = match_templates(patch, target.ring, 40.0)
     assert template_match.is_clear
     assert template_match.lag_deg == pytest.approx(TURN * 360.0 / ANGLES, abs=3.1)
 
 
 def test_a_highlight_beside_a_ring_is_made_even(target: Target) -> None:
     added = 90.0 * np.exp(-0.5 * ((ANGLES_RAD - 2.0) / 0.8) ** 2)
-    assert match_templates(patch_of(target.ring, np.ones(ANGLES), added), target.ring).is_clear
+    assert match_templates(
+        patch_of(target.ring, np.ones(ANGLES), added), target.ring, 40.0
+    ).is_clear
 
 
 @pytest.mark.parametrize("code_deg", [(0.0, 43.0, 78.0, 180.0, 260.0), (0.0, 43.0, 180.0)])
 def test_another_code_in_shade_is_another_code(target: Target, code_deg: tuple[float, ...]) -> None:
     shown = replace(target.ring, code_deg=code_deg)
-    assert not match_templates(patch_of(shown, half_in_shade()), target.ring).is_clear
+    assert not match_templates(patch_of(shown, half_in_shade()), target.ring, 40.0).is_clear
+
+
+def test_small_rings_are_taken_to_be_in_even_light(target: Target) -> None:
+    patch = patch_of(target.ring, half_in_shade())
+    assert match_templates(patch, target.ring, 13.0).is_clear
+    assert not match_templates(patch, target.ring, 12.0).is_clear

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from kgcp.geometry.arrays import GreyArray
-from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, ReferencePoses, rotation_from_opk
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.frame import examine
-from kgcp.measurement.normal_prior import NormalPrior, normal_priors
+from kgcp.measurement.plate_prior import NormalPrior, PlatePrior
 from kgcp.measurement.records import Alternative, Measurement
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
@@ -48,7 +47,8 @@ def photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
 def measure(
     grey: GreyArray, prior: NormalPrior | None, target: Target = TARGET_PLATE.target
 ) -> Measurement:
-    (outcome,) = examine(grey, CAMERA, (target,), DetectSettings(), prior).outcomes
+    priors = {target.name: PlatePrior(prior)}
+    (outcome,) = examine(grey, CAMERA, (target,), DetectSettings(), priors).outcomes
     assert isinstance(outcome, Measurement)
     return outcome
 
@@ -126,13 +126,6 @@ def test_a_vague_prior_says_nothing() -> None:
     assert other_pose(after).ambiguity == pytest.approx(other_pose(before).ambiguity, abs=1e-3)
 
 
-def test_a_target_that_stands_still_is_not_taken_for_level() -> None:
-    _, grey, before = frame(0)
-    turning = NormalPrior(other_pose(before).pose.normal, SD_DEG)
-    static = Target(TARGET_PLATE.target.ring, TARGET_PLATE.target.replicas, (0.0, 0.0, 0.0))
-    assert np.array_equal(measure(grey, turning, static).pose.rotation, before.pose.rotation)
-
-
 def test_chi2_counts_prior_and_measurement() -> None:
     pose = Pose(Rotation.from_euler("x", 3.0, degrees=True).as_matrix(), 10.0 * DOWN)
     exact = np.zeros((3, 3))
@@ -143,22 +136,3 @@ def test_chi2_counts_prior_and_measurement() -> None:
     upright = Pose(np.eye(3), 10.0 * DOWN)
     assert NormalPrior(pose.normal, 1.5).chi2(upright, about_z) == pytest.approx(4.0)
     assert NormalPrior(pose.normal, 1.5).chi2(pose, noisy) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_attitudes_come_from_poses_and_else_from_the_plumb() -> None:
-    opk_deg = np.array([[4.0, -7.0, 130.0], [-20.0, 10.0, 3.0]])
-    poses = ReferencePoses(("a", "b"), np.zeros((2, 3)), opk_deg, None, np.array([0.5, 1.2]))
-    a, c, b = normal_priors(["a", "c", "b"], poses, level_sd_deg=0.9, plumb_sd_deg=4.0)
-    assert a is not None
-    assert b is not None
-    assert c is not None
-    assert b.sd_deg == pytest.approx(1.5)
-    assert c.sd_deg == pytest.approx(4.1)
-    assert np.array_equal(c.direction_camera, DOWN)
-    camera_from_map = CAMERA_FROM_PHOTO @ rotation_from_opk(opk_deg[0]).T
-    assert np.allclose(a.direction_camera, camera_from_map @ -DOWN)
-    assert normal_priors(["c"], poses, level_sd_deg=0.9, plumb_sd_deg=None) == [None]
-    unsure = ReferencePoses(("a",), np.zeros((1, 3)), opk_deg[:1], None, None)
-    (exact,) = normal_priors(["a"], unsure, level_sd_deg=0.9, plumb_sd_deg=None)
-    assert exact is not None
-    assert exact.sd_deg == 0.9

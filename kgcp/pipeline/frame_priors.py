@@ -1,0 +1,126 @@
+"""What a flight's data say about each frame before it is looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
+from kgcp.georef.scene_rotation import rotations_between_frames
+from kgcp.georef.target_positions import TargetPosition, Vehicle
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight
+from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
+from kgcp.targets.layout import Target
+
+Priors = Mapping[str, PlatePrior]
+
+
+def priors_of_frames(
+    flight: Flight, data: FlightData, frames: Sequence[str], times: Mapping[str, float]
+) -> list[Priors]:
+    """Return for each frame what is known of its targets, by their names.
+
+    Detecting needs neither reference poses nor a trajectory: where the files cannot be used,
+    nothing is known. Commands that need them say what is wrong with them.
+
+    Raises
+    ------
+    KgcpError
+        If flight.toml says that the plate is level and the reference poses cannot be read.
+    """
+    time_s = [times.get(frame) for frame in frames]
+    moving = [target for target in flight.targets if target.position_m is None]
+    normals = _normals(flight, data, frames, time_s, moving)
+    by_target = {target.name: normals for target in moving}
+    rotations = {
+        target.name: _rotations(flight, data, frames, time_s, target) for target in flight.targets
+    }
+    unknown: list[NormalPrior | None] = [None] * len(frames)
+    priors: list[Priors] = []
+    for row in range(len(frames)):
+        known = {
+            target.name: PlatePrior(
+                by_target.get(target.name, unknown)[row], rotations[target.name].get(row)
+            )
+            for target in flight.targets
+        }
+        priors.append({name: prior for name, prior in known.items() if prior != PlatePrior()})
+    return priors
+
+
+def _normals(
+    flight: Flight,
+    data: FlightData,
+    frames: Sequence[str],
+    time_s: Sequence[float | None],
+    moving: Sequence[Target],
+) -> list[NormalPrior | None]:
+    vehicle: Vehicle | None = None
+    level_sd_deg = None if flight.vehicle is None else flight.vehicle.settings.level_sd_deg
+    if not moving or flight.vehicle is None:
+        return [None] * len(frames)
+    try:
+        poses = data.reference_poses if data.has_reference else None
+        if poses is not None and data.has_position_of(moving[0]):
+            vehicle = data.target_positions.vehicle
+    except KgcpError:
+        if level_sd_deg is not None and data.has_reference:
+            raise
+        return [None] * len(frames)
+    attitudes = CameraAttitudes(poses, flight.plumb_sd_deg)
+    return normal_priors(frames, time_s, attitudes, vehicle, level_sd_deg)
+
+
+def _rotations(
+    flight: Flight,
+    data: FlightData,
+    frames: Sequence[str],
+    time_s: Sequence[float | None],
+    target: Target,
+) -> dict[int, SceneRotation]:
+    """Return by row how the scene about a target turns while the frame is read."""
+    camera = flight.camera
+    if not camera.readout_s or not data.has_reference or not data.has_position_of(target):
+        return {}
+    try:
+        poses, target_positions = data.reference_poses, data.target_positions
+        posed = {frame: row for row, frame in enumerate(poses.frames)}
+        timed = [
+            (time, row)
+            for row, (frame, time) in enumerate(zip(frames, time_s, strict=True))
+            if time is not None and frame in posed
+        ]
+        timed = sorted(dict(sorted(timed)).items())  # of frames of one time, one
+        positions = target_positions.positions(
+            [target.name] * len(timed), [time for time, _ in timed]
+        )
+    except KgcpError:
+        return {}
+    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+    placed = [
+        (time, row, position)
+        for (time, row), position in zip(timed, positions, strict=True)
+        if isinstance(position, TargetPosition)
+    ]
+    if not placed:
+        return {}
+    at = [posed[frames[row]] for _, row, _ in placed]
+    camera_from_enu = np.swapaxes(orientations.enu_from_camera[at], 1, 2)
+    sight_m = np.array([position.position_m for *_, position in placed]) - orientations.centre_m[at]
+    enu_from_body = np.array(
+        [
+            np.eye(3) if position.vehicle_state is None else position.vehicle_state.frame_from_body
+            for *_, position in placed
+        ]
+    )
+    rotations = rotations_between_frames(
+        np.array([time for time, *_ in placed]),
+        np.einsum("nij,nj->ni", camera_from_enu, sight_m),
+        camera_from_enu @ enu_from_body,
+        SceneRotation.unknown(camera),
+    )
+    return {row: rotation for (_, row, _), rotation in zip(placed, rotations, strict=True)}

@@ -1,0 +1,61 @@
+"""The rotation of the scene about the camera, from the frames before and after."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.scene_rotation import combine, rotations_between_frames
+from kgcp.measurement.plate_prior import SceneRotation
+
+A_PRIORI = SceneRotation((0.0, 0.0, 0.0), math.radians(5.0))
+TIME_S = np.array([0.0, 0.5, 1.1, 1.5, 2.0, 2.6, 3.0, 3.5, 4.1, 4.5])
+
+
+def turning(velocity_rad_s: FloatArray, wobble_rad: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """A target that turns about the camera, with an attitude of the camera that wobbles."""
+    rng = np.random.default_rng(2)
+    turns = Rotation.from_rotvec(TIME_S[:, None] * velocity_rad_s)
+    turns = Rotation.from_rotvec(wobble_rad * rng.standard_normal((len(TIME_S), 3))) * turns
+    return turns.apply([1.0, -2.0, 20.0]), turns.as_matrix()
+
+
+def test_an_even_rotation_is_found() -> None:
+    velocity = np.array([0.06, -0.03, 0.02])
+    rotations = rotations_between_frames(TIME_S, *turning(velocity), A_PRIORI)
+    for rotation in rotations[1:-1]:
+        assert np.allclose(rotation.velocity_rad_s, velocity, rtol=0.05, atol=3e-4)
+        assert math.degrees(rotation.sd_rad_s) == pytest.approx(1.0, rel=0.05)
+    assert rotations[0] == rotations[-1] == A_PRIORI
+
+
+def test_frames_that_foretell_nothing_leave_what_was_known() -> None:
+    rotations = rotations_between_frames(TIME_S, *turning(np.zeros(3), wobble_rad=0.5), A_PRIORI)
+    for rotation in rotations[1:-1]:
+        assert np.linalg.norm(rotation.velocity_rad_s) < A_PRIORI.sd_rad_s
+        assert 0.9 * A_PRIORI.sd_rad_s < rotation.sd_rad_s <= A_PRIORI.sd_rad_s
+
+
+def test_deviations_are_those_of_a_restless_camera() -> None:
+    """Velocities of a camera that wobbles are off by what the frames around say."""
+    wobble_rad = 0.01
+    rotations = rotations_between_frames(TIME_S, *turning(np.zeros(3), wobble_rad), A_PRIORI)
+    off = [np.array(rotation.velocity_rad_s) / rotation.sd_rad_s for rotation in rotations[1:-1]]
+    assert 0.3 < math.sqrt(np.mean(np.square(off))) < 1.3
+
+
+def test_few_frames_tell_nothing() -> None:
+    sight, attitude = turning(np.array([0.1, 0.0, 0.0]))
+    few = slice(0, 6)
+    rotations = rotations_between_frames(TIME_S[few], sight[few], attitude[few], A_PRIORI)
+    assert rotations == [A_PRIORI] * 6
+
+
+def test_two_sources_are_weighted() -> None:
+    rotation = combine(np.array([0.1, 0.0, -0.2]), A_PRIORI.sd_rad_s, A_PRIORI)
+    assert rotation.velocity_rad_s == pytest.approx((0.05, 0.0, -0.1))
+    assert rotation.sd_rad_s == pytest.approx(A_PRIORI.sd_rad_s / math.sqrt(2.0))

@@ -1,0 +1,63 @@
+"""What trajectory and reference poses say about a frame before it is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.io.formats.frame_times import read_times
+from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
+from kgcp.pipeline.frame_priors import priors_of_frames
+
+SAMPLE = Path(__file__).parents[2] / "sample_flight"
+
+
+def priors(flight: Flight) -> dict[str, dict[str, PlatePrior]]:
+    frames = sorted(path.name for path in flight.frames_folder.iterdir())
+    assert flight.times_file is not None
+    times = read_times(flight.times_file, frames, flight.times_format)
+    known = priors_of_frames(flight, FlightData(flight, frames), frames, times)
+    return {frame: dict(each) for frame, each in zip(frames, known, strict=True)}
+
+
+def test_attitudes_tell_where_normals_point() -> None:
+    known = priors(read_flight(SAMPLE))
+    normals = [prior.normal for each in known.values() for prior in each.values()]
+    assert len(normals) == len(known)
+    assert all(isinstance(normal, NormalPrior) for normal in normals)
+    directions = np.array([normal.direction_camera for normal in normals if normal is not None])
+    assert (directions[:, 2] > np.cos(np.radians(30.0))).all()
+    assert all(prior.rotation is None for each in known.values() for prior in each.values())
+
+
+def test_a_target_that_stands_still_is_not_taken_for_the_vehicle_s() -> None:
+    flight = read_flight(SAMPLE)
+    static = tuple(replace(target, position_m=(0.0, 0.0, 0.0)) for target in flight.targets)
+    assert not any(priors(replace(flight, targets=static)).values())
+
+
+def test_files_that_cannot_be_read_tell_nothing(tmp_path: Path) -> None:
+    flight = read_flight(SAMPLE)
+    assert flight.reference is not None
+    bad = tmp_path / "reference.csv"
+    bad.write_text("not,a,table\n", encoding="utf-8")
+    assert not any(priors(replace(flight, reference=replace(flight.reference, file=bad))).values())
+    assert not any(priors(replace(flight, reference=None)).values())
+
+
+@pytest.mark.parametrize("sd_deg_s", [5.0, 40.0])
+def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: float) -> None:
+    flight = read_flight(SAMPLE)
+    camera = replace(flight.camera, readout_s=0.02, motion_sd_deg_s=sd_deg_s)
+    known = priors(replace(flight, camera=camera))
+    rotations = [prior.rotation for each in known.values() for prior in each.values()]
+    assert SceneRotation.unknown(camera) in rotations  # the first frame has none before it
+    sds = np.degrees([rotation.sd_rad_s for rotation in rotations if rotation is not None])
+    assert len(sds) == len(known)
+    assert (sds <= sd_deg_s).all()
+    assert (sds < sd_deg_s).sum() > len(known) // 2
