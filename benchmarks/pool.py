@@ -28,7 +28,6 @@ def ordered_map(
     ----------
     function : callable
         Importable, not a closure.
-    items : sequence
     jobs : int
         Processes; 1 works in this one.
     start : callable

@@ -52,10 +52,8 @@ def adjust(block: Block, kgcps: KgcpSet, way: Way, sd_calibration: FloatArray | 
 
     Parameters
     ----------
-    block : Block
     kgcps : KgcpSet
         Used where the way says so.
-    way : Way
     sd_calibration : (5,) array or None
         Deviations of `FREE_PARAMETERS` in a calibration that is an observation besides, with its
         errors drawn anew; None: nothing is known.

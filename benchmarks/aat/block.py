@@ -70,8 +70,6 @@ class Block:
 
     Attributes
     ----------
-    settings : BlockSettings
-    seed : int
     camera, believed : Camera
         True, and the calibration from before the flight, which the measurement of targets uses.
     views : tuple of CameraState
@@ -82,8 +80,6 @@ class Block:
         Their covariance.
     gcps_enu_m : (g, 3) array
         Surveyed places of the classic GCPs [m].
-    sights : Sights
-    ride : Ride
     """
 
     settings: BlockSettings

@@ -25,7 +25,7 @@ from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
+from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 from kgcp.targets.layout import Ring, Target
 
 _WINDOW_PX = np.array([480, 640])  # of the frame, about the target: all that is rendered
@@ -149,7 +149,7 @@ def render_window(block: Block, ground: Ground, index: int) -> tuple[GreyArray, 
     plate = replace(TARGET_PLATE, target=nominal_target(0.0, ride.plate_scale))
     plane = view.pose_of(_DOWN, np.array([0.0, 0.0, ride.road_m[index]]))
     optics = Optics(float(rng.uniform(0.55, 0.75)), _STREAK_PX)
-    scene = Scene(plane, PlatePose(plate, pose), ())
+    scene = SimulatedScene(plane, PlatePose(plate, pose), ())
     window = window_of(block.camera, first_px)
     irradiance = render_irradiance(window, ground, scene, optics, rng)
     return _SENSOR.expose(irradiance, float(rng.uniform(0.7, 1.0)), rng), first_px

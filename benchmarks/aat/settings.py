@@ -34,7 +34,6 @@ class BlockSettings:
 
     Attributes
     ----------
-    frames : int
     interval_s, speed_m_s : float
         Of the frames [s]; of the vehicle and the UAV [m/s].
     bend_radius_m : float

@@ -34,7 +34,6 @@ class Trial:
         Of the check points, east, north, up [m].
     cov_m2 : (3 c, 3 c) array
         As the adjustment predicts it.
-    focal_error_px, sd_focal_px : float
     """
 
     error_m: FloatArray
@@ -76,7 +75,6 @@ class Row:
         How well so many blocks know it.
     whole_scatter : float
         The same of all errors of a block together, by their joint covariance.
-    focal_rms_px, focal_predicted_px : float
     benefit : float
         Median over the blocks of GNSS only's height RMS over this one's.
     """

@@ -73,8 +73,6 @@ class Circumstances:
 
     Attributes
     ----------
-    name : str
-    jobs : int
     environment : mapping of str
         Besides that of this process.
     has_cluster : bool

@@ -51,8 +51,6 @@ class Alarm:
 
     Attributes
     ----------
-    photo : str
-    variant : int
     accepted : tuple of str
         Measurements, all of them wrong.
     reasons : tuple of str

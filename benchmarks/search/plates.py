@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.simulation.plate import Plate
-from kgcp.simulation.shapes import Disc, Shape, rectangle, regular_polygon
+from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.regions import DiscRegion, Region, rectangle, regular_polygon
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.validation import check_targets, codes_coincide
 
@@ -31,7 +31,7 @@ check_targets(TARGETS)
 
 
 @dataclass(frozen=True, slots=True)
-class PaintedPlate(Plate):
+class PaintedPlate(PrintedPlate):
     """A plate that is no coded target; `target` says only how large it is.
 
     Attributes
@@ -40,23 +40,23 @@ class PaintedPlate(Plate):
         What is painted on the plate, in this order; ink or not.
     """
 
-    layers: tuple[tuple[Shape, bool], ...] = ()
+    layers: tuple[tuple[Region, bool], ...] = ()
 
-    def print_layers(self) -> Iterator[tuple[Shape, float]]:
+    def print_layers(self) -> Iterator[tuple[Region, float]]:
         """Yield shapes and radiances, in painting order."""
         for shape, ink in self.layers:
             yield shape, self.black if ink else self.white
 
 
-def plate_of(target: Target, rng: np.random.Generator) -> Plate:
+def plate_of(target: Target, rng: np.random.Generator) -> PrintedPlate:
     """Return a target on some plate: corners, margin, ink and paint differ."""
     radius_m = 0.5 * target.ring.outer_diameter_m
     outline = regular_polygon(int(rng.choice((4, 8, 24))), radius_m * rng.uniform(1.28, 1.42))
     white, black = rng.uniform(0.75, 0.9), rng.uniform(0.03, 0.09)
-    return Plate(target, outline, float(white), float(black))
+    return PrintedPlate(target, outline, float(white), float(black))
 
 
-def _recoded(code_deg: tuple[float, ...], rng: np.random.Generator) -> Plate:
+def _recoded(code_deg: tuple[float, ...], rng: np.random.Generator) -> PrintedPlate:
     return plate_of(_target("decoy", code_deg), rng)
 
 
@@ -71,11 +71,11 @@ def _random_code(count: int, rng: np.random.Generator) -> tuple[float, ...]:
             return decoy.ring.code_deg
 
 
-def _other_code(rng: np.random.Generator) -> Plate:
+def _other_code(rng: np.random.Generator) -> PrintedPlate:
     return _recoded(_random_code(int(rng.integers(1, _MOST_DOTS + 1)), rng), rng)
 
 
-def _extra_dot(rng: np.random.Generator) -> Plate:
+def _extra_dot(rng: np.random.Generator) -> PrintedPlate:
     free = [a for a in range(360) if _gap_deg(float(a), _CODE_A) >= _MIN_GAP_DEG]
     return _recoded((*_CODE_A, float(rng.choice(free))), rng)
 
@@ -84,24 +84,24 @@ def _gap_deg(angle: float, others: tuple[float, ...]) -> float:
     return float(np.abs((np.subtract(others, angle) + 180.0) % 360.0 - 180.0).min())
 
 
-def _missing_dot(rng: np.random.Generator) -> Plate:
+def _missing_dot(rng: np.random.Generator) -> PrintedPlate:
     gone = int(rng.integers(len(_CODE_A)))
     return _recoded(_CODE_A[:gone] + _CODE_A[gone + 1 :], rng)
 
 
-def _mirrored(rng: np.random.Generator) -> Plate:
+def _mirrored(rng: np.random.Generator) -> PrintedPlate:
     return _recoded(tuple(-angle % 360.0 for angle in _CODE_A), rng)
 
 
-def _moved_dot(rng: np.random.Generator) -> Plate:
+def _moved_dot(rng: np.random.Generator) -> PrintedPlate:
     return _with_moved_dot(_MOVED_DEG, rng)
 
 
-def _hardly_moved_dot(rng: np.random.Generator) -> Plate:
+def _hardly_moved_dot(rng: np.random.Generator) -> PrintedPlate:
     return _with_moved_dot(_MOVED_LITTLE_DEG, rng)
 
 
-def _with_moved_dot(step_deg: float, rng: np.random.Generator) -> Plate:
+def _with_moved_dot(step_deg: float, rng: np.random.Generator) -> PrintedPlate:
     while True:
         moved = int(rng.integers(len(_CODE_A)))
         others = _CODE_A[:moved] + _CODE_A[moved + 1 :]
@@ -110,55 +110,59 @@ def _with_moved_dot(step_deg: float, rng: np.random.Generator) -> Plate:
             return _recoded((*others, float(angle)), rng)
 
 
-def _same_replica(rng: np.random.Generator) -> Plate:
+def _same_replica(rng: np.random.Generator) -> PrintedPlate:
     """Print another main ring around the replica that belongs to A."""
     return plate_of(_target("decoy", _random_code(4, rng), _REPLICA_A), rng)
 
 
-def _plain_ring(rng: np.random.Generator) -> Plate:
+def _plain_ring(rng: np.random.Generator) -> PrintedPlate:
     inner = rng.uniform(0.3, 0.7)
-    return _painted(rng, (Disc((0.0, 0.0), 0.45), True), (Disc((0.0, 0.0), 0.45 * inner), False))
+    return _painted(
+        rng, (DiscRegion((0.0, 0.0), 0.45), True), (DiscRegion((0.0, 0.0), 0.45 * inner), False)
+    )
 
 
-def _painted(rng: np.random.Generator, *layers: tuple[Shape, bool]) -> Plate:
+def _painted(rng: np.random.Generator, *layers: tuple[Region, bool]) -> PrintedPlate:
     plate = plate_of(TARGET_A, rng)
     return PaintedPlate(plate.target, plate.outline, plate.white, plate.black, layers)
 
 
-def _bull_s_eye(rng: np.random.Generator) -> Plate:
+def _bull_s_eye(rng: np.random.Generator) -> PrintedPlate:
     radii = np.cumsum(rng.dirichlet(np.ones(5)) + 0.1)[::-1]
     radii *= 0.45 / radii[0]
     return _painted(
-        rng, *((Disc((0.0, 0.0), float(r)), index % 2 == 0) for index, r in enumerate(radii))
+        rng, *((DiscRegion((0.0, 0.0), float(r)), index % 2 == 0) for index, r in enumerate(radii))
     )
 
 
-def _negative(rng: np.random.Generator) -> Plate:
+def _negative(rng: np.random.Generator) -> PrintedPlate:
     """Print A in white on black, with a black rim outside."""
     ring = TARGET_A.ring
     dots = [
-        (Disc((float(x), float(y)), 0.5 * ring.dot_diameter_m), True)
+        (DiscRegion((float(x), float(y)), 0.5 * ring.dot_diameter_m), True)
         for x, y in ring.dot_centres_m()
     ]
     return _painted(
         rng,
-        (Disc((0.0, 0.0), 0.6), True),
-        (Disc((0.0, 0.0), 0.45), False),
-        (Disc((0.0, 0.0), 0.225), True),
+        (DiscRegion((0.0, 0.0), 0.6), True),
+        (DiscRegion((0.0, 0.0), 0.45), False),
+        (DiscRegion((0.0, 0.0), 0.225), True),
         *dots,
     )
 
 
-def _spokes(rng: np.random.Generator) -> Plate:
+def _spokes(rng: np.random.Generator) -> PrintedPlate:
     """Print a ring that is crossed by bars: a wheel, or a circular bar code."""
     bars = [
         (rectangle((0.0, 0.0), 0.9, rng.uniform(0.03, 0.12), direction), False)
         for direction in rng.uniform(0.0, 180.0, int(rng.integers(1, 4)))
     ]
-    return _painted(rng, (Disc((0.0, 0.0), 0.45), True), *bars, (Disc((0.0, 0.0), 0.225), False))
+    return _painted(
+        rng, (DiscRegion((0.0, 0.0), 0.45), True), *bars, (DiscRegion((0.0, 0.0), 0.225), False)
+    )
 
 
-def _other_proportions(rng: np.random.Generator) -> Plate:
+def _other_proportions(rng: np.random.Generator) -> PrintedPlate:
     """Print A's code on a ring of other proportions."""
     inner = float(rng.choice((0.25, 0.68)))
     middle = 0.5 * (1.0 + inner)
@@ -167,7 +171,7 @@ def _other_proportions(rng: np.random.Generator) -> Plate:
     return plate_of(Target(ring), rng)
 
 
-DECOYS: dict[str, Callable[[np.random.Generator], Plate]] = {
+DECOYS: dict[str, Callable[[np.random.Generator], PrintedPlate]] = {
     "other code": _other_code,
     "extra dot": _extra_dot,
     "missing dot": _missing_dot,

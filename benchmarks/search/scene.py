@@ -16,10 +16,10 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
-from kgcp.simulation.patch import Patch, PixelWindow, outline_box
-from kgcp.simulation.plate import Plate, PlateImage
-from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
-from kgcp.simulation.shapes import ConvexPolygon, Disc
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
+from kgcp.simulation.plate import PlateImage, PrintedPlate
+from kgcp.simulation.regions import ConvexPolygon, DiscRegion
+from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 
 _ROAD_RADIUS_M = 180.0
 _AROUND_M = (100.0, 260.0)  # where on the ground the plates are, from the road's centre
@@ -59,16 +59,15 @@ class Obstacle:
 
     Attributes
     ----------
-    shape : Disc or ConvexPolygon
+    shape : DiscRegion or ConvexPolygon
         On the plate [m].
     pose : Pose
         Of the plate.
     radiance : float or None
         None: textured like ground.
-    opacity : float
     """
 
-    shape: Disc | ConvexPolygon
+    shape: DiscRegion | ConvexPolygon
     pose: Pose
     radiance: float | None
     opacity: float = 1.0
@@ -88,23 +87,17 @@ class Shot:
 
     Attributes
     ----------
-    camera : Camera
-    look : Look
-    scene : Scene
     wanted : tuple of PlatePose
         Plates that should be found.
     decoys : tuple of (kind, PlatePose)
         Plates that should not.
-    obstacles : tuple of Obstacle
-    optics : Optics
     gain : float
         Exposure relative to the one at which radiance 1 fills the well.
-    veil : Veil
     """
 
     camera: Camera
     look: Look
-    scene: Scene
+    scene: SimulatedScene
     wanted: tuple[PlatePose, ...]
     decoys: tuple[tuple[str, PlatePose], ...]
     obstacles: tuple[Obstacle, ...]
@@ -145,7 +138,7 @@ def halved(camera: Camera) -> Camera:
 
 def place(
     camera: Camera,
-    plate: Plate,
+    plate: PrintedPlate,
     pixel: FloatArray,
     ring_px: float,
     tilt: tuple[float, float],
@@ -176,7 +169,7 @@ def pixel_inside(camera: Camera, ring_px: float, rng: np.random.Generator) -> Fl
 
 def place_apart(
     camera: Camera,
-    plates: Sequence[Plate],
+    plates: Sequence[PrintedPlate],
     ring_px: tuple[float, float],
     tilt: tuple[float, float],
     rng: np.random.Generator,
@@ -200,7 +193,9 @@ def place_apart(
     return tuple(placed)
 
 
-def scene_around(main: PlatePose, others: Sequence[PlatePose], rng: np.random.Generator) -> Scene:
+def scene_around(
+    main: PlatePose, others: Sequence[PlatePose], rng: np.random.Generator
+) -> SimulatedScene:
     """Lay ground below a plate, half the time with a vehicle between the two."""
     driven = main.pose.distance_m > _NEAREST_VEHICLE_M and bool(rng.random() < 0.5)
     turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True).as_matrix()
@@ -210,7 +205,11 @@ def scene_around(main: PlatePose, others: Sequence[PlatePose], rng: np.random.Ge
         [radius_m * math.cos(way), radius_m * math.sin(way), -(_ROOF_M if driven else _STAND_M)]
     )
     ground = Pose(rotation, main.pose.translation_m - rotation @ below)
-    return Scene(ground, main, tuple(others)) if driven else Scene(ground, None, (*others, main))
+    return (
+        SimulatedScene(ground, main, tuple(others))
+        if driven
+        else SimulatedScene(ground, None, (*others, main))
+    )
 
 
 @lru_cache(maxsize=2)
@@ -244,7 +243,7 @@ def _cover(irradiance: FloatArray, shot: Shot, obstacle: Obstacle, ground: Groun
     if not window.meets(shot.camera):
         return
     window = window.near(shot.camera, margin)
-    patch = Patch.of(shot.camera, obstacle.pose, window, _OVERSAMPLING)
+    patch = PlaneRaster.of(shot.camera, obstacle.pose, window, _OVERSAMPLING)
     opacity = np.zeros_like(patch.x_m)
     patch.paint(opacity, obstacle.shape, obstacle.opacity)
     if obstacle.radiance is None:

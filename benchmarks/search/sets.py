@@ -24,8 +24,8 @@ from benchmarks.search.scene import (
 )
 from kgcp.geometry.camera import Camera
 from kgcp.simulation.imaging import Optics
+from kgcp.simulation.regions import ConvexPolygon, DiscRegion, polygon, regular_polygon
 from kgcp.simulation.scene import PlatePose
-from kgcp.simulation.shapes import ConvexPolygon, Disc, polygon, regular_polygon
 from kgcp.targets.layout import Target
 
 _UPRIGHT, _LEANING, _OBLIQUE = (0.0, 12.0), (0.0, 25.0), (30.0, 45.0)
@@ -45,7 +45,6 @@ class FrameSet:
 
     Attributes
     ----------
-    name : str
     plan : callable
         Random numbers → one frame.
     goal : float or None
@@ -122,14 +121,16 @@ def _hidden(rng: Rng) -> Shot:
     return _shot(camera, look, [seen], rng, obstacles=[obstacle])
 
 
-def _quarter(rng: Rng) -> ConvexPolygon | Disc:
+def _quarter(rng: Rng) -> ConvexPolygon | DiscRegion:
     """Return what hides up to a quarter of the main ring's outer circle, on any side."""
     radius_m = 0.5 * TARGET_A.ring.outer_diameter_m
     half, way = math.radians(rng.uniform(36.0, 45.0)), rng.uniform(0.0, 2.0 * math.pi)
     kind = rng.integers(3)
     if kind == 0:  # a blob on the rim
         centre = radius_m * np.array([math.cos(way), math.sin(way)])
-        return Disc((float(centre[0]), float(centre[1])), 2.0 * radius_m * math.sin(0.5 * half))
+        return DiscRegion(
+            (float(centre[0]), float(centre[1])), 2.0 * radius_m * math.sin(0.5 * half)
+        )
     near = 0.45 if kind == 1 else math.cos(half)  # a wedge from inside the disc; a straight edge
     far, slope = rng.uniform(1.1, 2.5), math.tan(half)
     corners = [(near, -near * slope), (far, -far * slope), (far, far * slope), (near, near * slope)]

@@ -27,7 +27,6 @@ class FrameVerdict:
 
     Attributes
     ----------
-    index : int
     wanted, found : int
         Plates that should be found, and that were, well enough.
     decoys : int

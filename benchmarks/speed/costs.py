@@ -35,7 +35,6 @@ class FrameCost:
 
     Attributes
     ----------
-    pixels : int
     decode_s, search_s, measure_s : float
         Of decoding the file; of the search for rings alone; of search and measurement.
     found : int
@@ -57,7 +56,6 @@ class Costs:
     ----------
     name, targets : str
         Where they are from, and whether a target was measured in them.
-    frames : tuple of FrameCost
     """
 
     name: str

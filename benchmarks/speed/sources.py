@@ -28,7 +28,6 @@ class Source:
 
     Attributes
     ----------
-    name : str
     flight : Flight
         Its frames folder, camera and targets.
     frames : tuple of str

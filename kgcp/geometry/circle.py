@@ -171,7 +171,7 @@ def circle_planes(conic: FloatArray) -> tuple[CirclePlane, CirclePlane]:
     Raises
     ------
     Rejection
-        IMPOSSIBLE_GEOMETRY if the conic is no cone over an ellipse in front of the camera.
+        IMPOSSIBLE_GEOMETRY if the conic is not the image of a circle in front of the camera.
     """
     values, axes = np.linalg.eigh(oriented(conic))
     low, middle, high = values.tolist()

@@ -36,7 +36,7 @@ def fit_ellipses(
     ellipses : (n, 5) array
         Filled in: centre, semi-major and semi-minor axis, direction of the major one [rad].
     shares : (n,) array
-        Filled in: of the edges that count; 0 where there is no ellipse, or too long a one.
+        Filled in: share of edges that count; 0 if no ellipse fits or its axes differ too much.
     """
     powers = np.empty(5)
     moments = np.empty((5, 5))
@@ -62,7 +62,7 @@ def fit_ellipses(
 
 @compiled
 def _fit(moments: FloatArray, ellipse: FloatArray) -> bool:
-    """Fit an ellipse to points of which the sums of xᵖ yᑫ are given; False where there is none."""
+    """Fit an ellipse to points given by their sums of xᵖ yᑫ; False if no ellipse fits."""
     linear, inverse = np.empty((3, 3)), np.empty((3, 3))
     mixed, reduce, matrix = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     _fill(moments, linear, mixed)
@@ -111,7 +111,7 @@ def _fill(moments: FloatArray, linear: FloatArray, mixed: FloatArray) -> None:
 def _vector_of_largest(matrix: FloatArray, vector: FloatArray) -> None:
     """Fill in an eigenvector (3,) of the largest of three real eigenvalues: in closed form.
 
-    Of the constrained scatter matrix just one eigenvalue is not negative, that of the ellipse.
+    The constrained scatter matrix has one non-negative eigenvalue: that of the ellipse.
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     minors = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]

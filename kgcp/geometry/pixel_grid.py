@@ -42,7 +42,6 @@ def normalised_grid(
 
     Parameters
     ----------
-    camera : Camera
     x_px : (m,) array
         Columns of the grid [px], ascending.
     y_px : (n,) array

@@ -131,7 +131,7 @@ class Pose:
 def rotation_about(vector: FloatArray) -> FloatArray:
     """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad], by Rodrigues' formula.
 
-    Adjustments take so many small turns that the overhead of a general library shows.
+    Adjustments take many small turns: the overhead of a general library would show.
     """
     x, y, z = vector[0], vector[1], vector[2]
     square = x * x + y * y + z * z

@@ -7,7 +7,7 @@ attitude of the camera; from the plate's place it is then one vector to the proj
     X(camera)       = X(plate) − R(map ← camera) t
 
 R(body ← plate) is the mount of docs/conventions.md. A small error of the plate's normal moves the
-camera by the whole distance times that angle: these are priors, and their covariances say how weak.
+camera by the whole distance times that angle: these are priors, as weak as their covariances.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _BODY_FROM_LEVEL_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPrior:
-    """Exterior orientation of one frame, as the plate and its vehicle tell it.
+    """Exterior orientation of one frame, derived from the plate and its vehicle.
 
     Attributes
     ----------
@@ -104,12 +104,11 @@ def camera_priors(
 ) -> tuple[CameraPrior, ...]:
     """Orient the camera in every frame where the plate on the vehicle tells its attitude.
 
-    Left out are static targets, whose attitude nobody knows, measurements without a pose, and
+    Left out are static targets, whose attitude is unknown, measurements without a pose, and
     those whose two poses cannot be told apart: the wrong one moves the camera by metres.
 
     Parameters
     ----------
-    gcps : sequence of Gcp
     sightings : sequence of Sighting
         Of which the KGCPs were made.
     target_positions : TargetPositions
@@ -120,13 +119,13 @@ def camera_priors(
     vehicle = target_positions.vehicle
     if vehicle is None:
         return ()
-    seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
+    sighting_of = {(each.frame, each.target): each for each in sightings if each.instance == 0}
     chosen = [
-        (point, seen[point.frame, point.target], point.time_s)
+        (point, sighting_of[point.frame, point.target], point.time_s)
         for point in gcps
         if point.time_s is not None
         and point.target not in target_positions.static
-        and _is_told_apart(seen[point.frame, point.target])
+        and _is_told_apart(sighting_of[point.frame, point.target])
     ]
     if not chosen:
         return ()

@@ -9,7 +9,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.local_frame import LocalFrame, level_axes_ecef
 
 _HALF_BASE_S = 0.25  # one step of a fast logger is all noise
-_MIN_SPEED_M_S = 0.5  # slower, the noise of positions has a say in the course
+_MIN_SPEED_M_S = 0.5  # slower, the noise of positions turns the course
 
 
 def attitude_from_course(
@@ -39,7 +39,7 @@ def attitude_from_course(
     moves = np.hypot(east, north) > _MIN_SPEED_M_S * (end - start)
     if not moves.any():
         raise KgcpError(
-            f"{file}: the vehicle never moves, so that its course tells no heading;"
+            f"{file}: the vehicle never moves, so its course gives no heading;"
             " give a trajectory with attitude"
         )
     last_move = np.maximum.accumulate(np.where(moves, np.arange(len(moves)), -1))

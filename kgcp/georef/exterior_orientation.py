@@ -64,8 +64,8 @@ def visible_pixels(camera: Camera, points_camera: FloatArray) -> FloatArray:
     pixels = np.full((len(points_camera), 2), np.nan)
     ahead = points_camera[:, 2] > 0.0
     normalised = points_camera[ahead, :2] / points_camera[ahead, 2:]
-    seen = camera.distort(normalised)
-    error = np.linalg.norm(camera.undistort(seen) - normalised, axis=1)
-    seen[~(error < _FOLD_TOLERANCE)] = np.nan
-    pixels[ahead] = seen
+    distorted = camera.distort(normalised)
+    error = np.linalg.norm(camera.undistort(distorted) - normalised, axis=1)
+    distorted[~(error < _FOLD_TOLERANCE)] = np.nan
+    pixels[ahead] = distorted
     return pixels

@@ -145,11 +145,11 @@ class LocalFrame:
         Raises
         ------
         KgcpError
-            If the map's axes are left-handed, or there are none at a point.
+            If the map's axes are left-handed, or undefined at a point.
         """
         jacobian = self.map_axes_enu(enu)
         lengths = np.linalg.norm(jacobian, axis=-1, keepdims=True)
-        if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # deep inside the Earth, say
+        if not np.all((lengths > 0.0) & np.isfinite(lengths)):  # for example deep inside the Earth
             raise KgcpError(
                 f"{self._where} {self.crs!r} has no directions at a point of its file;"
                 " give the CRS of the coordinates"
@@ -303,7 +303,7 @@ class CrsTransform:
         except ProjError as error:
             text = " ".join(str(error).split())
             raise KgcpError(
-                f"{self._where}: {self.source.crs!r} does not lead to the CRS asked for here"
+                f"{self._where}: {self.source.crs!r} does not lead to that CRS"
                 f" ({text}); give one that covers the flight"
             ) from error
         return moved
@@ -311,13 +311,13 @@ class CrsTransform:
     def axes(self, xyz: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the source map's axes to the other's at (..., 3).
 
-        Both maps are compared with east, north and up of the same place: what datums differ
-        from each other in direction is some 1e-5, which no standard deviation feels.
+        Both maps are compared with east, north and up of the same place: the directions of
+        datums differ by some 1e-5, which does not matter for standard deviations.
         """
         points = np.reshape(np.asarray(xyz, dtype=np.float64), (-1, 3))
-        here = _level_from_grid(self.source, points)
-        there = _level_from_grid(self.target, self.positions(points))
-        turned: FloatArray = np.swapaxes(there, 1, 2) @ here
+        from_source = _level_from_grid(self.source, points)
+        from_target = _level_from_grid(self.target, self.positions(points))
+        turned: FloatArray = np.swapaxes(from_target, 1, 2) @ from_source
         return turned.reshape(*np.shape(xyz), 3)
 
 

@@ -59,7 +59,6 @@ def predict_position(track: Track, by_reference: FloatArray | None) -> list[Pred
 
     Parameters
     ----------
-    track : Track
     by_reference : (n, 3) array or None
         States by `reference_states`.
 

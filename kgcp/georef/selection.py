@@ -53,13 +53,10 @@ def select(
 
     Parameters
     ----------
-    gcps : sequence of Gcp
     sightings : sequence of Sighting
         In which they were seen.
     local_frame : LocalFrame
         Of the points' positions.
-    camera : Camera
-    wanted : Selection
     """
     good, faulty = pass_gates(flag_jumps(gcps, sightings, local_frame), wanted)
     spaced, close = thin(good, local_frame, camera, wanted.min_spacing_m)
@@ -93,13 +90,14 @@ def flag_jumps(
     ups = local_frame.enu_from_map(np.array([gcps[index].position_map for index in order]))[:, 2]
     sights = [seen[gcps[index].frame, gcps[index].target] for index in order]
     series = {
-        Flag.DISTANCE: np.array([(one.distance_m, one.sd_distance_m or 0.0) for one in sights]),
+        Flag.DISTANCE: np.array([(each.distance_m, each.sd_distance_m or 0.0) for each in sights]),
         Flag.HEIGHT: np.array([_height(*pair) for pair in zip(sights, ups, strict=True)]),
     }
     flagged = list(gcps)
     for flag, values in series.items():
-        known = np.flatnonzero(np.isfinite(values).all(axis=1))
-        for place in known[find_jumps(times[known], *values[known].T)]:
+        finite = np.flatnonzero(np.isfinite(values).all(axis=1))
+        value, sd = values[finite].T
+        for place in finite[find_jumps(times[finite], value, sd)]:
             if flagged[order[place]].flag is None:
                 flagged[order[place]] = replace(flagged[order[place]], flag=flag)
     return tuple(flagged)

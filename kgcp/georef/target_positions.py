@@ -69,7 +69,6 @@ class Vehicle:
         Its trajectory in the ENU frame of `local_frame`.
     settings : VehicleSettings
         Lever arm, time offset and their standard deviations.
-    local_frame : LocalFrame
     """
 
     motion: Motion

@@ -83,7 +83,6 @@ class FlightBias:
 
     Attributes
     ----------
-    flight : Flight
     settings : DetectSettings
         That the distances were measured with.
     study : BiasStudy

@@ -32,7 +32,6 @@ class Card:
     ----------
     frame, target, status, reason : str
         As in the table; or the status `DROPPED`.
-    instance : int
     headline, text : str
         The main value, and the others.
     distance_m, sd_percent, radius_px, residual_percent : float or None

@@ -42,7 +42,6 @@ class Points:
 
     Attributes
     ----------
-    axes : Axes
     rows : (m,) array of int
         Which measurements, by their place in time.
     x, y : (m,) array
@@ -61,7 +60,6 @@ class Picture:
 
     Attributes
     ----------
-    png : bytes
     rows : (m,) array of int
         Measurements that are drawn; one may be in several panels.
     places : (m, 2) array of int

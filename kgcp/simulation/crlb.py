@@ -19,9 +19,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.patch import Patch, PixelWindow, outline_box
-from kgcp.simulation.plate import Plate
-from kgcp.simulation.shapes import Disc
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
+from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.regions import DiscRegion
 
 _STEP_PX = 0.02  # of the central differences, as the largest movement of an edge
 _OPAQUE = 0.999  # share of the plate in a pixel from which the plate's outline does not matter
@@ -53,13 +53,10 @@ class Shot:
 
     Attributes
     ----------
-    camera : Camera
-    plate : Plate
+    plate : PrintedPlate
         With the radiances of plate and ink.
     pose : Pose
         Target → camera.
-    optics : Optics
-    sensor : Sensor
     gain : float
         Exposure relative to the one at which radiance 1 fills the well.
     has_unknown_streak : bool
@@ -69,7 +66,7 @@ class Shot:
     """
 
     camera: Camera
-    plate: Plate
+    plate: PrintedPlate
     pose: Pose
     optics: Optics
     sensor: Sensor
@@ -91,7 +88,7 @@ def bound_of(shot: Shot) -> Bound:
     weight = np.sqrt(_information(view, share))
     nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view, white, share)])
     pose = weight[:, None] * _pose_derivatives(view)
-    return _in_words(shot.camera, shot.pose, pose_bound(pose, nuisances))
+    return _propagated(shot.camera, shot.pose, pose_bound(pose, nuisances))
 
 
 def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
@@ -121,7 +118,7 @@ class _View:
 
     def white(self, pose: Pose) -> FloatArray:
         """Return the share of white in the sub-pixels, on a plate without end."""
-        patch = Patch.of(self.shot.camera, pose, self.window, self._oversampling)
+        patch = PlaneRaster.of(self.shot.camera, pose, self.window, self._oversampling)
         white = np.ones_like(patch.x_m)
         for shape, radiance in replace(self.shot.plate, black=0.0, white=1.0).print_layers():
             patch.paint(white, shape, radiance)
@@ -139,7 +136,7 @@ class _View:
     def opaque(self) -> npt.NDArray[np.bool_]:
         """Return where (height, width) a pixel of the frame sees nothing but the plate."""
         shot, window = self.shot, self.window
-        patch = Patch.of(shot.camera, shot.pose, window, self._oversampling)
+        patch = PlaneRaster.of(shot.camera, shot.pose, window, self._oversampling)
         plate = np.zeros_like(patch.x_m)
         patch.paint(plate, shot.plate.outline, 1.0)
         columns = window.column + np.arange(window.width)
@@ -157,7 +154,7 @@ class _View:
 
 def _ring_window(shot: Shot) -> PixelWindow:
     """Return the window with everything that the edges of the main ring send light to."""
-    edge = Disc((0.0, 0.0), 0.5 * shot.plate.target.ring.outer_diameter_m)
+    edge = DiscRegion((0.0, 0.0), 0.5 * shot.plate.target.ring.outer_diameter_m)
     corner, size = outline_box(shot.camera, shot.pose, edge)
     margin = shot.optics.reach_px
     column, row = np.floor(corner).astype(int) - margin
@@ -242,7 +239,7 @@ def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[Fl
         yield bend * (2.0 * share - 1.0)
 
 
-def _in_words(camera: Camera, pose: Pose, covariance: FloatArray) -> Bound:
+def _propagated(camera: Camera, pose: Pose, covariance: FloatArray) -> Bound:
     """Propagate the covariance of the pose to distance, centre and normal."""
     x, y, z = pose.translation_m
     ray = pose.translation_m / pose.distance_m

@@ -27,11 +27,11 @@ from kgcp.simulation.path import (
     drive,
     hover,
 )
-from kgcp.simulation.plate import Plate
+from kgcp.simulation.plate import PrintedPlate
 from kgcp.simulation.presets import SimulationSettings
+from kgcp.simulation.regions import regular_polygon
 from kgcp.simulation.rolling_shutter import RowMotion
-from kgcp.simulation.scene import PlatePose, Scene, render_irradiance
-from kgcp.simulation.shapes import regular_polygon
+from kgcp.simulation.scene import PlatePose, SimulatedScene, render_irradiance
 from kgcp.targets.layout import Ring, Target
 
 CRS = "EPSG:25832"
@@ -48,10 +48,10 @@ def _target(name: str, code_deg: tuple[float, ...], replica_deg: tuple[float, ..
     return Target(ring, (ring.scaled(f"{name}-inner", 0.2, replica_deg),))
 
 
-TARGET_PLATE = Plate(
+TARGET_PLATE = PrintedPlate(
     _target("A", (0, 43, 78, 180), (10, 80, 150, 250, 290)), regular_polygon(4, 0.61)
 )
-DECOY_PLATE = Plate(
+DECOY_PLATE = PrintedPlate(
     _target("decoy", (0, 60, 150, 270), (0, 50, 120, 200, 300)), regular_polygon(8, 0.58)
 )
 
@@ -62,7 +62,6 @@ class FramePlan:
 
     Attributes
     ----------
-    index : int
     time_s : float
         Mid-exposure of the row of the target's centre, Unix UTC, without error [s].
     camera : CameraState
@@ -75,8 +74,6 @@ class FramePlan:
         Whether the whole ring is in the frame; otherwise nothing of the plate is.
     decoys : tuple of Pose
         Decoy plates that are wholly in the frame.
-    optics : Optics
-    gain : float
     """
 
     index: int
@@ -96,9 +93,6 @@ class FlightPlan:
 
     Attributes
     ----------
-    settings : SimulationSettings
-    seed : int
-    frames : tuple of FramePlan
     target_map : (n, 3) array
         Target centres in the flight's CRS.
     recorded_times_s : (n,) array
@@ -162,15 +156,13 @@ def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
 
     Parameters
     ----------
-    plan : FlightPlan
     ground : Ground
         That of `grow_ground`.
-    index : int
     """
     settings, frame = plan.settings, plan.frames[index]
     rng = _stream(plan.seed, "pixels", index)
     field = _light_field(plan, frame)
-    scene = Scene(
+    scene = SimulatedScene(
         frame.camera.ground,
         PlatePose(TARGET_PLATE, frame.target, field),
         tuple(PlatePose(DECOY_PLATE, pose, field) for pose in frame.decoys),

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.fft
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.simulation.patch import Patch
+from kgcp.simulation.plane_raster import PlaneRaster
 
 _TILE = 1024  # texels per side of the periodic noise
 _SPECTRUM_EXPONENT = 1.2  # amplitude ~ 1/frequency^e: between pink noise and natural images
@@ -64,7 +64,7 @@ class Ground:
             pyramid.append(pyramid[-1].reshape(size, 2, size, 2).mean(axis=(1, 3)))
         return cls(tuple(pyramid), road_radius_m)
 
-    def radiance(self, patch: Patch) -> FloatArray:
+    def radiance(self, patch: PlaneRaster) -> FloatArray:
         """Return what the ground plane sends to each sub-pixel of a patch, without clutter."""
         x, y = patch.x_m[::_STEP, ::_STEP], patch.y_m[::_STEP, ::_STEP]
         gsd_m = float(np.hypot(x[0, -1] - x[0, 0], y[0, -1] - y[0, 0])) / patch.x_m.shape[1]
@@ -89,7 +89,9 @@ class Ground:
         v = (-layer.sin * scale) * x + (layer.cos * scale) * y
         return _bilinear(tile, u, v)
 
-    def _pave(self, light: FloatArray, patch: Patch, asphalt: FloatArray, gsd_m: float) -> None:
+    def _pave(
+        self, light: FloatArray, patch: PlaneRaster, asphalt: FloatArray, gsd_m: float
+    ) -> None:
         """Lay the road over the ground, with edge lines and a dashed middle line, in place."""
         offset = np.sqrt(patch.x_m * patch.x_m + patch.y_m * patch.y_m) - self.road_radius_m
         on_road = np.nonzero(np.abs(offset) < _ROAD_HALF_WIDTH_M)

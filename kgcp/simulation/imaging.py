@@ -18,7 +18,7 @@ from enum import StrEnum
 
 import numpy as np
 import scipy.fft
-from scipy.ndimage import convolve, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.settings import require_range
@@ -165,7 +165,6 @@ class Sensor:
         Electrons at which a pixel clips.
     read_noise_e : float
         Standard deviation of the read noise [e⁻].
-    tone : ToneCurve
     sharpening : float
         Amount of the unsharp mask; 0: none.
     sharpening_px : float
@@ -183,23 +182,6 @@ class Sensor:
         require_range("read_noise_e", self.read_noise_e, 0.0, 1e4, unit="e⁻")
         require_range("sharpening", self.sharpening, 0.0, 10.0)
         require_range("sharpening_px", self.sharpening_px, 0.1, 10.0, unit="px")
-
-    def expected(self, irradiance: FloatArray, gain: float) -> FloatArray:
-        """Return grey values 0…255 of an exposure without noise, not rounded."""
-        return self.develop(np.minimum(gain * irradiance, 1.0))
-
-    def variance(self, irradiance: FloatArray, gain: float) -> FloatArray:
-        """Return the noise variance of the grey values, to first order.
-
-        Shot and read noise through the slope of the tone curve, spread by the squared kernel of
-        the unsharp mask (whose correlation between neighbours is not expressed), plus 1/12 for
-        rounding. Clipped pixels have the variance of rounding alone.
-        """
-        exposure = gain * irradiance
-        electrons = self.full_well_e * exposure + self.read_noise_e**2
-        light = electrons / self.full_well_e**2 * self.tone.slope(np.clip(exposure, 0.0, 1.0)) ** 2
-        light[(exposure <= 0.0) | (exposure >= 1.0)] = 0.0
-        return _WHITE_LEVEL**2 * self._sharpened_variance(light) + 1.0 / 12.0
 
     def expose(self, irradiance: FloatArray, gain: float, rng: np.random.Generator) -> GreyArray:
         """Return a frame of grey values (uint8) with noise."""
@@ -219,13 +201,3 @@ class Sensor:
             grey = grey + self.sharpening * (grey - gaussian_filter(grey, self.sharpening_px))
             grey = np.clip(grey, 0.0, 1.0)
         return grey * _WHITE_LEVEL
-
-    def _sharpened_variance(self, variance: FloatArray) -> FloatArray:
-        if not self.sharpening:
-            return variance
-        impulse = np.zeros((2 * math.ceil(4.0 * self.sharpening_px) + 1,) * 2)
-        impulse[impulse.shape[0] // 2, impulse.shape[1] // 2] = 1.0
-        smooth = gaussian_filter(impulse, self.sharpening_px)
-        kernel = impulse + self.sharpening * (impulse - smooth)
-        spread: FloatArray = convolve(variance, kernel * kernel)
-        return spread

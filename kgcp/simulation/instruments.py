@@ -28,13 +28,10 @@ def record_trajectory(
 
     Parameters
     ----------
-    settings : SimulationSettings
-    local_frame : LocalFrame
     start_s : float
         Unix time of the first sample [s].
     duration_s : float
         From the first sample to the last [s].
-    rng : numpy Generator
     """
     elapsed_s = np.arange(0.0, duration_s + _TRAJECTORY_INTERVAL_S, _TRAJECTORY_INTERVAL_S)
     states = drive(elapsed_s)
@@ -71,13 +68,10 @@ def adjust_reference(
 
     Parameters
     ----------
-    settings : SimulationSettings
-    local_frame : LocalFrame
     frames : tuple of str
         Names of the frames.
     cameras : tuple of CameraState
         Their true exterior orientations.
-    rng : numpy Generator
     """
     position_enu_m = np.array([camera.position_enu_m for camera in cameras])
     grid_from_camera = np.array(

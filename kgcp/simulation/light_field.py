@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, mini
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
-from kgcp.simulation.patch import Patch
+from kgcp.simulation.plane_raster import PlaneRaster
 
 _REACH_M = 0.9  # of the plate's corners from its centre
 _EDGE_REACH_M = 0.45  # shadow edges pass the centre within this: they meet the ring
@@ -136,10 +136,6 @@ class LightField:
     ----------
     light_left : float
         Share of the light where every ray of the sun is hidden.
-    shades : tuple of Shade
-    stains : tuple of Stain
-    cloud : Cloud or None
-    highlight : Highlight or None
     """
 
     light_left: float = 1.0
@@ -166,12 +162,12 @@ class LightField:
             None if glare is None else _draw_highlight(glare, gain, rng),
         )
 
-    def shine_on(self, patch: Patch, painted: FloatArray, opacity: FloatArray) -> FloatArray:
+    def shine_on(self, patch: PlaneRaster, painted: FloatArray, opacity: FloatArray) -> FloatArray:
         """Return the radiance of sub-pixels that send out `painted` under uniform light.
 
         Parameters
         ----------
-        patch : Patch
+        patch : PlaneRaster
             Of the plate.
         painted : array
             Mean radiance of the sub-pixels.
@@ -184,7 +180,7 @@ class LightField:
             light += opacity * self.highlight.added(patch.x_m, patch.y_m)
         return light
 
-    def share(self, patch: Patch) -> FloatArray:
+    def share(self, patch: PlaneRaster) -> FloatArray:
         """Return how much light the sub-pixels of a patch send back, against a clean lit print.
 
         Means over the sub-pixels: where shade or a stain begins, they are integrated.

@@ -25,8 +25,8 @@ from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.settings import require_range
 from kgcp.simulation.crlb import Shot, bound_of
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.plate import Plate
-from kgcp.simulation.shapes import regular_polygon
+from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.regions import regular_polygon
 from kgcp.targets.layout import Ring, Target
 
 TILT_DEG = 6.0
@@ -51,7 +51,6 @@ SURE_PX = 9.0
 LARGEST_SHARE = 0.46
 """Largest radius that was tried, of the image's shorter side."""
 _RADII_PX = (6.0, 9.0, 20.0, 45.0)  # where the bound is computed
-_Z95 = 1.959964
 _SPAN = 50.0
 _ROUND = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 _WAYS_DEG = (35.0, 125.0)  # of tilt and streak: small rings feel where their dots are
@@ -67,7 +66,6 @@ class Conditions:
     ----------
     blur_px : float
         Motion of the image during the exposure, at most [px].
-    exposure_s : float
     psf_px : float
         σ of the point spread of lens and sensor [px].
     accuracy_percent : float
@@ -162,8 +160,7 @@ def _at(logarithm: PchipInterpolator, radius_px: float) -> float:
 def usual_heights(camera: Camera, target: Target) -> tuple[float, ...]:
     """Return round heights from which some ring of a target can be measured [m].
 
-    They span a factor of fifty at most: a replica may be measured from hands' distance, where
-    nobody flies.
+    They span a factor of fifty at most: a replica can be measured from nearer than any flight.
     """
     px_m = [0.5 * ring.outer_diameter_m * camera.mean_focal_px for ring in target.rings]
     farthest = max(px_m) / FOUND[0][0]
@@ -245,11 +242,11 @@ def chance_to_find(radius_px: float) -> tuple[float, float, float]:
     if not bands:
         return 0.0, 0.0, 0.0
     found, shown = bands[-1]
-    share, spread = found / shown, _Z95**2 / shown
-    middle = share + 0.5 * spread
-    half = math.sqrt(share * (1.0 - share) * spread + 0.25 * spread**2)
-    low, high = (middle - half) / (1.0 + spread), (middle + half) / (1.0 + spread)
-    return share, low, 1.0 if found == shown else high  # which rounding would make less
+    # Loaded here because it takes long, and only plans need it.
+    from scipy.stats import binomtest
+
+    interval = binomtest(found, shown).proportion_ci(0.95, method="wilson")
+    return found / shown, float(interval.low), float(interval.high)
 
 
 def _of_unit_size(ring: Ring) -> Ring:
@@ -267,7 +264,7 @@ def _accuracy(camera: Camera, ring: Ring, blur_px: float, psf_px: float) -> _Acc
     """Compute the bound at some radii, for plates tilted in several ways, times the scatter."""
     # In the middle of the image there is no distortion; small images must not cut the ring.
     spacious = Camera(1000, 1000, camera.fx, camera.fy, 499.5, 499.5, response=camera.response)
-    plate = Plate(Target(ring), regular_polygon(4, 0.7 * ring.outer_diameter_m))
+    plate = PrintedPlate(Target(ring), regular_polygon(4, 0.7 * ring.outer_diameter_m))
     by_distance, by_centre = SCATTER[camera.response is Response.LINEAR]
     variances = np.zeros((2, len(_RADII_PX)))
     for column, radius_px in enumerate(_RADII_PX):

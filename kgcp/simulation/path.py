@@ -118,15 +118,12 @@ def hover(
 
     Parameters
     ----------
-    settings : SimulationSettings
     target_enu_m : (3,) array
         Target centre [m].
     distance_m : float
         Of the camera from it [m].
     plate_reach_m : float
         Radius that must be inside the frame, or outside if the target is not `present` [m].
-    rng : numpy Generator
-    present : bool
     """
     tilt_deg, azimuth, kappa = (
         rng.uniform(*settings.tilt_deg),

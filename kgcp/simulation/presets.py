@@ -38,8 +38,6 @@ class SimulationSettings:
     ----------
     name : str
         Name of the flight.
-    camera : Camera
-    sensor : Sensor
     frames : int
         Number of frames.
     distance_m : tuple of float
@@ -52,9 +50,7 @@ class SimulationSettings:
         σ of the point spread, uniform [px].
     streak_px : tuple of float
         Length of the motion streak, uniform, in any direction [px].
-    shadow : Shadow or None
-    dirt : Dirt or None
-    glare : Glare or None
+    shadow, dirt, glare : Shadow, Dirt, Glare or None
         Light on the plates that is not the same everywhere; None: none of the kind.
     lens : Aberration or None
         None: the point spread is a round Gaussian.

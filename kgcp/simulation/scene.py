@@ -13,9 +13,9 @@ from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import LightField
-from kgcp.simulation.patch import Patch, PixelWindow, outline_box
-from kgcp.simulation.plate import Plate, image_plate, plate_window
-from kgcp.simulation.shapes import Annulus, ConvexPolygon, Disc, Shape, polygon, rectangle
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
+from kgcp.simulation.plate import PrintedPlate, image_plate, plate_window
+from kgcp.simulation.regions import Annulus, ConvexPolygon, DiscRegion, Region, polygon, rectangle
 
 _CLUTTER_PIECES = 70
 # On the roof, in plate axes: x to the vehicle's right, y to its rear.
@@ -30,13 +30,13 @@ _SHADOW_SHIFT_M = (0.9, -0.7)
 class PlatePose:
     """A plate in front of the camera; `pose` is plate → camera, `field` the light on it."""
 
-    plate: Plate
+    plate: PrintedPlate
     pose: Pose
     field: LightField | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SimulatedScene:
     """Everything that one frame may see.
 
     Attributes
@@ -55,31 +55,31 @@ class Scene:
 
 
 def render_irradiance(
-    camera: Camera, ground: Ground, scene: Scene, optics: Optics, rng: np.random.Generator
+    camera: Camera, ground: Ground, scene: SimulatedScene, optics: Optics, rng: np.random.Generator
 ) -> FloatArray:
     """Return the irradiance (height, width) of a frame: ground, clutter, vehicle and plates.
 
     Everything but the plates is painted at one ray per pixel (with exact coverage at edges) and
     then spread; the plates are painted on fine sub-pixels and lie over it.
     """
-    patch = Patch.of(camera, scene.ground, PixelWindow(0, 0, camera.width, camera.height))
+    patch = PlaneRaster.of(camera, scene.ground, PixelWindow(0, 0, camera.width, camera.height))
     light = ground.radiance(patch)
     _scatter_clutter(patch, light, rng)
     if scene.carrier is not None:
         _park_vehicle(patch, light, scene.ground, scene.carrier.pose)
     irradiance = optics.spread(light, 1)
     carried = () if scene.carrier is None else (scene.carrier,)
-    for seen in (*scene.others, *carried):
-        window = plate_window(camera, seen.plate, seen.pose, optics)
+    for placed in (*scene.others, *carried):
+        window = plate_window(camera, placed.plate, placed.pose, optics)
         if window.meets(camera):
             if window.exceeds(camera):
                 window = window.near(camera, optics.reach_px)
-            image = image_plate(camera, seen.plate, seen.pose, optics, window, seen.field)
+            image = image_plate(camera, placed.plate, placed.pose, optics, window, placed.field)
             image.paste(irradiance)
     return irradiance
 
 
-def _scatter_clutter(patch: Patch, light: FloatArray, rng: np.random.Generator) -> None:
+def _scatter_clutter(patch: PlaneRaster, light: FloatArray, rng: np.random.Generator) -> None:
     """Paint circles, rings, manholes, blocks and lines of all sizes over the ground, in place."""
     rows, columns = light.shape
     view_m = math.hypot(
@@ -97,7 +97,7 @@ def _scatter_clutter(patch: Patch, light: FloatArray, rng: np.random.Generator) 
 
 def _piece(
     rng: np.random.Generator, centre: tuple[float, float], size_m: float
-) -> list[tuple[Shape, float]]:
+) -> list[tuple[Region, float]]:
     """Return the shapes of one piece of clutter, with their radiances, in painting order."""
     dark, bright = float(rng.uniform(0.02, 0.15)), float(rng.uniform(0.3, 0.9))
     value = dark if rng.random() < 0.5 else bright
@@ -105,21 +105,21 @@ def _piece(
     inner = float(rng.uniform(0.35, 0.75))
     kind = rng.integers(5)
     if kind == 0:
-        return [(Disc(centre, 0.5 * size_m), value)]
+        return [(DiscRegion(centre, 0.5 * size_m), value)]
     if kind == 1:
         return [(Annulus(centre, 0.5 * size_m, 0.12 * size_m), value)]
     if kind == 2:  # a manhole or a wheel: concentric like the target, without a code
         return [
-            (Disc(centre, 0.5 * size_m), dark),
-            (Disc(centre, 0.5 * inner * size_m), bright),
-            (Disc(centre, 0.15 * inner * size_m), dark),
+            (DiscRegion(centre, 0.5 * size_m), dark),
+            (DiscRegion(centre, 0.5 * inner * size_m), bright),
+            (DiscRegion(centre, 0.15 * inner * size_m), dark),
         ]
     if kind == 3:
         return [(rectangle(centre, size_m, inner * size_m, direction), value)]
     return [(rectangle(centre, 8.0 * size_m, 0.08 * size_m, direction), value)]
 
 
-def _park_vehicle(patch: Patch, light: FloatArray, ground: Pose, pose: Pose) -> None:
+def _park_vehicle(patch: PlaneRaster, light: FloatArray, ground: Pose, pose: Pose) -> None:
     """Paint the vehicle's shadow, body and windscreen under its plate, in place."""
     roof = Pose(pose.rotation, pose.translation_m + _BODY_BELOW_PLATE_M * pose.normal)
     corners = roof.transform(np.array(_BODY.vertices_m)) - ground.translation_m
@@ -130,7 +130,7 @@ def _park_vehicle(patch: Patch, light: FloatArray, ground: Pose, pose: Pose) -> 
 
 
 def _paint_plane(
-    frame: Patch, light: FloatArray, pose: Pose, shape: ConvexPolygon, value: float
+    frame: PlaneRaster, light: FloatArray, pose: Pose, shape: ConvexPolygon, value: float
 ) -> None:
     """Paint a shape of another plane into a frame's light, in place."""
     corner, size = outline_box(frame.camera, pose, shape)
@@ -141,4 +141,4 @@ def _paint_plane(
     width, height = (int(extent) for extent in last - first)
     window = PixelWindow(int(first[0]), int(first[1]), width, height)
     piece = light[window.row : window.row + height, window.column : window.column + width]
-    Patch.of(frame.camera, pose, window).paint(piece, shape, value)
+    PlaneRaster.of(frame.camera, pose, window).paint(piece, shape, value)

@@ -20,7 +20,7 @@ from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.light_field import LightField
-from kgcp.simulation.plate import Plate, image_plate
+from kgcp.simulation.plate import PrintedPlate, image_plate
 from kgcp.targets.layout import Ring, Target
 
 SUBPIXELS = 4
@@ -155,7 +155,7 @@ def photograph() -> Callable[..., GreyArray]:
         pose: Pose,
         rng: np.random.Generator,
         *,
-        plate: Plate = TARGET_PLATE,
+        plate: PrintedPlate = TARGET_PLATE,
         sensor: Sensor = Sensor(),  # noqa: B008 - frozen
         gain: float = 0.9,
         shade: Callable[[FloatArray, FloatArray], FloatArray] | None = None,

@@ -23,8 +23,8 @@ from kgcp.measurement.search.candidates import find_code, find_dotted, find_ring
 from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
-from kgcp.simulation.plate import Plate
-from kgcp.simulation.shapes import Disc, Shape, rectangle
+from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.regions import DiscRegion, Region, rectangle
 
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
@@ -38,17 +38,17 @@ NO_CODE_THERE_DEG = (130.0, 225.0, 300.0)
 
 
 @dataclass(frozen=True)
-class HiddenPlate(Plate):
+class HiddenPlate(PrintedPlate):
     """The target with something on it."""
 
-    layers: tuple[tuple[Shape, float], ...] = ()
+    layers: tuple[tuple[Region, float], ...] = ()
 
-    def print_layers(self) -> Iterator[tuple[Shape, float]]:
-        yield from Plate.print_layers(self)
+    def print_layers(self) -> Iterator[tuple[Region, float]]:
+        yield from PrintedPlate.print_layers(self)
         yield from self.layers
 
 
-def with_layers(*layers: tuple[Shape, float]) -> HiddenPlate:
+def with_layers(*layers: tuple[Region, float]) -> HiddenPlate:
     return HiddenPlate(TARGET_PLATE.target, TARGET_PLATE.outline, layers=layers)
 
 
@@ -75,7 +75,9 @@ class Outcome:
 
 @pytest.fixture(scope="module")
 def measure(photograph: Photograph, start_near: StartNear) -> Callable[..., list[Outcome]]:
-    def over_frames(plate: Plate, shadow: tuple[float, float] | None = None) -> list[Outcome]:
+    def over_frames(
+        plate: PrintedPlate, shadow: tuple[float, float] | None = None
+    ) -> list[Outcome]:
         outcomes = []
         for seed in range(FRAMES):
             rng = np.random.default_rng(100 + seed)
@@ -124,8 +126,10 @@ def is_measured(outcomes: list[Outcome]) -> bool:
 
 
 def test_dirt_spots_cost_little(measure: Callable[..., list[Outcome]]) -> None:
-    spots = [(Disc(on_circle(0.42, angle), 0.025), 0.1) for angle in (17.0, 63.0, 229.0, 286.0)]
-    drops = [(Disc(on_circle(0.18, angle), 0.04), 0.15) for angle in (17.0, 126.0, 229.0)]
+    spots = [
+        (DiscRegion(on_circle(0.42, angle), 0.025), 0.1) for angle in (17.0, 63.0, 229.0, 286.0)
+    ]
+    drops = [(DiscRegion(on_circle(0.18, angle), 0.04), 0.15) for angle in (17.0, 126.0, 229.0)]
     outcomes = measure(with_layers(*spots, *drops))
     assert is_measured(outcomes)
     check(outcomes, sigmas=5.0, percent=0.1)
@@ -188,7 +192,7 @@ def test_a_target_with_a_hidden_quarter_is_found_and_measured(
     rng = np.random.default_rng(7)
     pose = some_pose(rng)
     quarter_m = 0.9 * math.sin(math.radians(21.0))
-    plate = with_layers((Disc(on_circle(0.45, angle_deg), quarter_m), radiance))
+    plate = with_layers((DiscRegion(on_circle(0.45, angle_deg), quarter_m), radiance))
     grey = photograph(LENS, pose, rng, plate=plate)
     (seen,) = measure_frame(grey, LENS, (TARGET_PLATE.target,), DetectSettings())
     assert isinstance(seen, Measurement)
@@ -202,7 +206,9 @@ def test_a_replica_leads_to_its_ring_of_which_a_quarter_is_hidden(photograph: Ph
     rng = np.random.default_rng(8)
     far, target = some_pose(rng), TARGET_PLATE.target
     pose = Pose(far.rotation, RADIUS_PX / 60.0 * far.translation_m)
-    plate = with_layers((Disc(on_circle(0.45, 130.0), 0.9 * math.sin(math.radians(21.0))), 0.85))
+    plate = with_layers(
+        (DiscRegion(on_circle(0.45, 130.0), 0.9 * math.sin(math.radians(21.0))), 0.85)
+    )
     grey = photograph(LENS, pose, rng, plate=plate)
     settings, replica = DetectSettings(), target.rings[1]
     candidates = find_dotted(grey, find_rings(grey, settings), [replica])

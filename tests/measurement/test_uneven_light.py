@@ -23,7 +23,7 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade
 from kgcp.simulation.light_settings import Dirt
-from kgcp.simulation.plate import Plate
+from kgcp.simulation.plate import PrintedPlate
 from kgcp.simulation.point_spread import Aberration
 from kgcp.targets.layout import Target
 
@@ -124,7 +124,7 @@ def test_uneven_light_is_measured_the_same_every_time(
     assert first.tobytes() == second.tobytes()
 
 
-def other_code(code_deg: tuple[float, ...]) -> Plate:
+def other_code(code_deg: tuple[float, ...]) -> PrintedPlate:
     target = TARGET_PLATE.target
     return replace(
         TARGET_PLATE, target=Target(replace(target.ring, code_deg=code_deg), target.replicas)

@@ -18,9 +18,9 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade, Stain
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
-from kgcp.simulation.patch import Patch, PixelWindow
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.simulation.plate import image_plate
-from kgcp.simulation.shapes import ConvexPolygon, rectangle
+from kgcp.simulation.regions import ConvexPolygon, rectangle
 
 CAMERA = Camera(
     width=900, height=700, fx=1210.0, fy=1206.0, cx=441.2, cy=361.7, k1=-0.09, k2=0.06
@@ -62,7 +62,7 @@ def test_full_shade_leaves_the_share_that_was_asked_for() -> None:
 def test_a_shadow_edge_takes_the_light_of_the_area_behind_it(
     direction_deg: float, penumbra_m: float
 ) -> None:
-    patch = Patch.of(FLAT, FACING, WINDOW, 4)
+    patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4)
     light = LightField(0.3, (half_plane(direction_deg, 0.0137, penumbra_m),)).share(patch)
     # Penumbras are symmetric: in every row, light is lost as beyond a sharp edge.
     angle = math.radians(direction_deg)
@@ -95,7 +95,7 @@ def test_narrow_stripes_never_reach_full_shade() -> None:
 
 def supersampled(field: LightField, edge: ConvexPolygon, factor: int) -> FloatArray:
     """Mean light of sub-pixels by brute force: a plate half black, on a `factor`² finer grid."""
-    patch = Patch.of(FLAT, FACING, WINDOW, 4 * factor)
+    patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4 * factor)
     painted = np.ones_like(patch.x_m)
     patch.paint(painted, edge, 0.1)
     light = painted * field.share(patch)
@@ -108,7 +108,7 @@ def supersampled(field: LightField, edge: ConvexPolygon, factor: int) -> FloatAr
 def test_edges_of_the_print_are_shared_by_area_in_a_penumbra(direction_deg: float) -> None:
     ink = rectangle((0.5021, 0.0013), 1.0, 2.0, 33.0)
     field = LightField(0.45, (half_plane(33.0 + direction_deg, -0.003, 0.02),))
-    patch = Patch.of(FLAT, FACING, WINDOW, 4)
+    patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4)
     painted = np.ones_like(patch.x_m)
     patch.paint(painted, ink, 0.1)
     light = field.shine_on(patch, painted, np.ones_like(painted))
@@ -137,7 +137,7 @@ def test_dirt_has_the_declared_deviation_and_correlation() -> None:
 
 
 def test_stains_take_the_light_of_their_area() -> None:
-    patch = Patch.of(FLAT, FACING, WINDOW, 8)
+    patch = PlaneRaster.of(FLAT, FACING, WINDOW, 8)
     for radius_m in (0.02, 0.05):
         light = LightField(stains=(Stain((0.0131, -0.0072), radius_m, 0.8),)).share(patch)
         lost = (1.0 - light).sum() * (PIXEL_M / 8.0) ** 2

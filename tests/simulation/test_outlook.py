@@ -28,7 +28,7 @@ from kgcp.simulation.outlook import (
     look_ahead,
     usual_heights,
 )
-from kgcp.simulation.patch import Patch, PixelWindow
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.targets.layout import Target
 
 CAMERA = Camera(130, 120, 1000.0, 1002.0, 66.3, 58.2, k1=-0.05, response=Response.LINEAR)
@@ -52,7 +52,7 @@ def measured(height_m: float, rng: np.random.Generator) -> tuple[Measurement, Po
     x, y = rng.uniform(-2.0, 2.0, 2) / CAMERA.fx
     pose = Pose(rotation.as_matrix(), height_m * np.array([x, y, 1.0]) / math.hypot(x, y, 1.0))
     streak = CONDITIONS.blur_px * math.cos(motion), CONDITIONS.blur_px * math.sin(motion)
-    patch = Patch.of(CAMERA, pose, PixelWindow(0, 0, CAMERA.width, CAMERA.height), _FINE)
+    patch = PlaneRaster.of(CAMERA, pose, PixelWindow(0, 0, CAMERA.width, CAMERA.height), _FINE)
     light = np.full_like(patch.x_m, TARGET_PLATE.white)
     for shape, radiance in TARGET_PLATE.print_layers():
         patch.paint(light, shape, radiance)

@@ -10,19 +10,19 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.flight import TARGET_PLATE, plan_flight
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.patch import Patch, PixelWindow
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.simulation.plate import image_plate
 from kgcp.simulation.presets import preset
+from kgcp.simulation.regions import DiscRegion, Region, rectangle
 from kgcp.simulation.rolling_shutter import ImageMotion, RowMotion
-from kgcp.simulation.shapes import Disc, Shape, rectangle
 
 CAMERA = Camera(width=640, height=480, fx=1000.0, fy=1000.0, cx=320.3, cy=240.7)
 WINDOW = PixelWindow(280, 200, 80, 90)
 FACING = Pose(np.eye(3), np.array([0.0, 0.0, 1000.0]))  # one metre is one pixel
 
 
-def scene(shape: Shape, oversampling: int) -> FloatArray:
-    patch = Patch.of(CAMERA, FACING, WINDOW, oversampling)
+def scene(shape: Region, oversampling: int) -> FloatArray:
+    patch = PlaneRaster.of(CAMERA, FACING, WINDOW, oversampling)
     image = np.zeros_like(patch.x_m)
     patch.paint(image, shape, 1.0)
     return image
@@ -30,7 +30,7 @@ def scene(shape: Shape, oversampling: int) -> FloatArray:
 
 @pytest.mark.parametrize("oversampling", [1, 4, 5])
 def test_without_motion_it_is_a_global_shutter(oversampling: int) -> None:
-    image = scene(Disc((1.7, -4.2), 13.0), oversampling)
+    image = scene(DiscRegion((1.7, -4.2), 13.0), oversampling)
     still = RowMotion((0.0, 0.0), 100.0, 480)
     rolled = Optics(0.7, (0.4, 1.0), motion=still).spread(image, oversampling, WINDOW.row)
     assert_allclose(rolled, Optics(0.7, (0.4, 1.0)).spread(image, oversampling), atol=1e-12)

@@ -124,8 +124,6 @@ def find_edge_incidence(
         Where the pixels' rays meet the plate.
     metres_per_px : float
         Largest length on the plate that a pixel spans.
-    circles : Circles
-    blur : Blur
     spread : (3,) array
         By `blur_on_plate`.
     """

@@ -58,7 +58,6 @@ def white_share(
         As of a window.
     blur : (5,) array
         `Blur.vector`.
-    incidence : EdgeIncidence
     """
     views, on_plate = _rendered(pose, rays, blur, incidence, PLATE_ROWS)
     slopes = np.empty((SLOPE_ROWS, rays.shape[1]))

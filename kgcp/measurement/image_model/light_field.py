@@ -104,7 +104,6 @@ class LightField:
 
     Attributes
     ----------
-    knots : Knots
     values : (2, k) array
         Of ink and plate at all knots.
     precision : (2, k) array

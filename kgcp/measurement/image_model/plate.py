@@ -112,7 +112,6 @@ def blur_on_plate(
 
     Parameters
     ----------
-    pose : Pose
     ray : (6,) array
         Of a pixel on the plate, as in `Window`.
     covariance : (3,) tuple

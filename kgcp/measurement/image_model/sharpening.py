@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray, IndexArray, SingleArray
 
 _LAYERS = 16  # room for all rows that are sharpened: a full vector of the processor
 _TAPS = 7  # of the mask: 2.5 σ to either side, if σ is 1.2 px
 
-SingleArray = npt.NDArray[np.float32]
 NumberArray = npt.NDArray[np.int32]
 
 
@@ -82,7 +81,6 @@ class Mask:
             The first two are the derivatives by what ink and plate are.
         others : (2,) tuple
             By how much the other pixels change with them.
-        strength : float
         """
         count, kernel = jacobian.shape[1], self.kernel.astype(np.float32)
         layers = np.zeros((count + 1, _LAYERS), dtype=np.float32)
@@ -109,7 +107,6 @@ def unsharp_mask(
         The modelled pixels in the flattened window.
     share : (rows · columns,) array
         Where all other pixels are between ink, 0, and plate, 1.
-    sigma_px : float
     """
     along_rows, along_columns = _gather(index, *shape)
     steps = np.arange(_TAPS) - _TAPS // 2

@@ -34,7 +34,6 @@ def skew_rows(
         As of a window.
     covariance : (3,) tuple
         Of the blur: xx, yy, xy [px²].
-    incidence : EdgeIncidence
 
     Returns
     -------

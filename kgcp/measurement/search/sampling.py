@@ -33,7 +33,6 @@ def sample_ellipses(
     Parameters
     ----------
     grey : (height, width) array
-    outlines : sequence of n Ellipse
     factors : (m,) array
     circle : (k, 2) array
         Points of the unit circle, of which `Ellipse.points` makes those of the ellipse.

@@ -27,7 +27,6 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
     ----------
     patch : (rows + 2 shifts, angles) array
         Sampled at `SAMPLED_RADII`.
-    ring : Ring
     shift : int
         Of the template that fits best.
 

@@ -60,7 +60,6 @@ class Finding:
     ----------
     grade : Grade
         What it makes of the flight; `GOOD` where it only informs.
-    text : str
     section : str
         Where the page shows it: the id of a section.
     """

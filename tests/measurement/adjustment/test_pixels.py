@@ -22,8 +22,8 @@ from kgcp.measurement.image_model.blurred_plate import white_level
 from kgcp.measurement.image_model.photometry import Light, PhotometricModel
 from kgcp.measurement.image_model.plate import EVEN, plate_points
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.plate import Plate, PlateImage, image_plate
-from kgcp.simulation.shapes import ConvexPolygon, regular_polygon
+from kgcp.simulation.plate import PlateImage, PrintedPlate, image_plate
+from kgcp.simulation.regions import ConvexPolygon, regular_polygon
 from kgcp.targets.layout import Target
 
 PlacePlate = Callable[..., Pose]
@@ -39,7 +39,7 @@ BORDER_PX = 2.4
 def photograph(
     camera: Camera, target: Target, pose: Pose, outline: ConvexPolygon, ground: float
 ) -> tuple[GreyArray, PlateImage]:
-    image = image_plate(camera, Plate(target, outline, WHITE, BLACK), pose, Optics(PSF_PX))
+    image = image_plate(camera, PrintedPlate(target, outline, WHITE, BLACK), pose, Optics(PSF_PX))
     irradiance = np.full((camera.height, camera.width), ground)
     image.paste(irradiance)
     return Sensor().expose(irradiance, 1.0, np.random.default_rng(5)), image
@@ -99,7 +99,10 @@ def test_where_a_streak_carries_the_surroundings_to_the_ring_nothing_is_used(
     streak = (5.6, 2.0)
     pose = place_plate((205.4, 190.7), 13.0, turn_deg=turn_deg)
     image = image_plate(
-        camera, Plate(target, regular_polygon(4, 0.58), WHITE, BLACK), pose, Optics(1.1, streak)
+        camera,
+        PrintedPlate(target, regular_polygon(4, 0.58), WHITE, BLACK),
+        pose,
+        Optics(1.1, streak),
     )
     irradiance = np.full((camera.height, camera.width), 0.2)
     image.paste(irradiance)

@@ -10,8 +10,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pixel_grid import normalised_grid
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.patch import Patch, PixelWindow, outline_box
-from kgcp.simulation.shapes import Disc, Shape, rectangle, regular_polygon
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
+from kgcp.simulation.regions import DiscRegion, Region, rectangle, regular_polygon
 
 PLAIN = Camera(width=640, height=480, fx=1000.0, fy=1000.0, cx=320.3, cy=240.7)
 LENS = Camera(
@@ -26,8 +26,8 @@ def facing(x_px: float, y_px: float) -> Pose:
     return Pose(np.eye(3), np.array([x_px - PLAIN.cx, y_px - PLAIN.cy, 1000.0]))
 
 
-def render(shape: Shape, pose: Pose, oversampling: int, camera: Camera = PLAIN) -> FloatArray:
-    patch = Patch.of(camera, pose, WINDOW, oversampling)
+def render(shape: Region, pose: Pose, oversampling: int, camera: Camera = PLAIN) -> FloatArray:
+    patch = PlaneRaster.of(camera, pose, WINDOW, oversampling)
     image = np.zeros_like(patch.x_m)
     patch.paint(image, shape, 1.0)
     return image
@@ -54,7 +54,7 @@ def test_grid_is_undistorted_like_single_pixels() -> None:
 def test_discs_keep_area_and_centre(radius: float, oversampling: int) -> None:
     rng = np.random.default_rng(5)
     for x_px, y_px in rng.uniform(319.0, 321.0, (8, 2)) - (0.0, 80.0):
-        image = render(Disc((0.0, 0.0), radius), facing(x_px, y_px), oversampling)
+        image = render(DiscRegion((0.0, 0.0), radius), facing(x_px, y_px), oversampling)
         irradiance = Optics(0.6, (1.7, -0.9)).spread(image, oversampling)
         area, x, y = moments(irradiance, WINDOW)
         assert abs(np.sqrt(area / np.pi) - radius) < 0.0005
@@ -78,13 +78,13 @@ def test_oblique_discs_through_a_lens_agree_with_opencv() -> None:
         cross = x * np.roll(y, -1) - np.roll(x, -1) * y
         area = 0.5 * cross.sum()
         centroid = [((a + np.roll(a, -1)) * cross).sum() / (6.0 * area) for a in (x, y)]
-        corner, size = outline_box(LENS, pose, Disc((0.0, 0.0), 0.4))
+        corner, size = outline_box(LENS, pose, DiscRegion((0.0, 0.0), 0.4))
         column, row = np.floor(corner).astype(int) - 4
         width, height = np.ceil(size).astype(int) + 9
         window = PixelWindow(int(column), int(row), int(width), int(height))
-        patch = Patch.of(LENS, pose, window, 4)
+        patch = PlaneRaster.of(LENS, pose, window, 4)
         image = np.zeros_like(patch.x_m)
-        patch.paint(image, Disc((0.0, 0.0), 0.4), 1.0)
+        patch.paint(image, DiscRegion((0.0, 0.0), 0.4), 1.0)
         rendered = moments(Optics(0.7).spread(image, 4), window)
         assert_allclose(rendered[0], abs(area), rtol=1e-5)
         assert_allclose(rendered[1:], centroid, atol=2e-4)
@@ -109,7 +109,7 @@ def test_straight_edges_have_the_exact_profile() -> None:
 
 def test_half_level_of_blurred_discs_lies_inside_by_half_of_sigma_squared_over_radius() -> None:
     radius, psf = 9.0, 0.8
-    image = Optics(psf).spread(render(Disc((0.0, 0.0), radius), facing(320.4, 239.8), 8), 8)
+    image = Optics(psf).spread(render(DiscRegion((0.0, 0.0), radius), facing(320.4, 239.8), 8), 8)
     y, x = np.mgrid[200:280, 280:360]
     distance = np.hypot(x - 320.4, y - 239.8)
     near = np.abs(distance - radius) < 0.5
@@ -120,7 +120,7 @@ def test_half_level_of_blurred_discs_lies_inside_by_half_of_sigma_squared_over_r
 
 def test_blurred_dots_follow_the_noncentral_chi_square_law() -> None:
     radius, psf = 1.5, 1.1
-    image = Optics(psf).spread(render(Disc((0.0, 0.0), radius), facing(320.4, 239.8), 8), 8)
+    image = Optics(psf).spread(render(DiscRegion((0.0, 0.0), radius), facing(320.4, 239.8), 8), 8)
     y, x = np.mgrid[200:280, 280:360]
     variance = psf**2 + 1.0 / 12.0
     distance2 = (x - 320.4) ** 2 + (y - 239.8) ** 2
@@ -129,7 +129,7 @@ def test_blurred_dots_follow_the_noncentral_chi_square_law() -> None:
 
 
 def test_streaks_widen_along_their_direction_only() -> None:
-    image = render(Disc((0.0, 0.0), 3.0), facing(320.0, 240.0), 8)
+    image = render(DiscRegion((0.0, 0.0), 3.0), facing(320.0, 240.0), 8)
     y, x = np.mgrid[200.0:280.0, 280.0:360.0]
 
     def spread(optics: Optics) -> FloatArray:
@@ -151,4 +151,4 @@ def test_polygons_keep_their_area() -> None:
 
 
 def test_shapes_outside_the_window_paint_nothing() -> None:
-    assert not render(Disc((0.0, 0.0), 5.0), facing(100.0, 100.0), 3).any()
+    assert not render(DiscRegion((0.0, 0.0), 5.0), facing(100.0, 100.0), 3).any()

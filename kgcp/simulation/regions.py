@@ -16,7 +16,7 @@ _POINTS_PER_EDGE = 8
 _TINY_M = 1e-12  # keeps the centre of a circle, which has no outward direction, from 0/0
 
 
-class Shape(Protocol):
+class Region(Protocol):
     """A region of a plane."""
 
     @property
@@ -38,7 +38,7 @@ class Shape(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Disc:
+class DiscRegion:
     """A filled circle."""
 
     centre_m: tuple[float, float]

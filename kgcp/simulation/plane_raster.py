@@ -10,7 +10,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pixel_grid import normalised_grid
 from kgcp.geometry.pose import Pose
-from kgcp.simulation.shapes import Shape
+from kgcp.simulation.regions import Region
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +47,13 @@ class PixelWindow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Patch:
+class PlaneRaster:
     """The plane coordinates of every sub-pixel of a window.
 
     Attributes
     ----------
-    camera : Camera
     pose : Pose
         Plane → camera; the plane is z = 0.
-    window : PixelWindow
     oversampling : int
         Sub-pixels per pixel and axis.
     x_m, y_m : (height · oversampling, width · oversampling) arrays
@@ -70,7 +68,9 @@ class Patch:
     y_m: FloatArray
 
     @classmethod
-    def of(cls, camera: Camera, pose: Pose, window: PixelWindow, oversampling: int = 1) -> Patch:
+    def of(
+        cls, camera: Camera, pose: Pose, window: PixelWindow, oversampling: int = 1
+    ) -> PlaneRaster:
         """Cast rays through the distorted camera onto the plane of `pose`."""
         columns = _sub_pixels(window.column, window.width, oversampling)
         rows = _sub_pixels(window.row, window.height, oversampling)
@@ -82,7 +82,7 @@ class Patch:
         y_m = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * scale
         return cls(camera, pose, window, oversampling, x_m, y_m)
 
-    def paint(self, image: FloatArray, shape: Shape, value: float, opacity: float = 1.0) -> None:
+    def paint(self, image: FloatArray, shape: Region, value: float, opacity: float = 1.0) -> None:
         """Paint a shape over `image`, in place, each sub-pixel by the share that it covers."""
         place = self._slices(shape)
         if place is None:
@@ -90,7 +90,7 @@ class Patch:
         piece = image[place]
         piece += opacity * self._coverage(shape, place) * (value - piece)
 
-    def _slices(self, shape: Shape) -> tuple[slice, slice] | None:
+    def _slices(self, shape: Region) -> tuple[slice, slice] | None:
         """Return the sub-pixels that may see the shape; None where it is outside the window."""
         corner, size = outline_box(self.camera, self.pose, shape)
         origin = np.array([self.window.column, self.window.row]) - 0.5
@@ -102,7 +102,7 @@ class Patch:
             return None
         return slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
 
-    def _coverage(self, shape: Shape, place: tuple[slice, slice]) -> FloatArray:
+    def _coverage(self, shape: Region, place: tuple[slice, slice]) -> FloatArray:
         """Share of each sub-pixel that lies inside the shape.
 
         Exact for straight edges: with the projections a, b of the sub-pixel's sides on the edge
@@ -172,7 +172,7 @@ def _share_inside(distance: FloatArray, a: FloatArray, b: FloatArray) -> FloatAr
     return share
 
 
-def outline_box(camera: Camera, pose: Pose, shape: Shape) -> tuple[FloatArray, FloatArray]:
+def outline_box(camera: Camera, pose: Pose, shape: Region) -> tuple[FloatArray, FloatArray]:
     """Return corner and size (2,) of a box that holds the shape's image [px]."""
     pixels = camera.project(pose.transform(shape.hull()))
     return pixels.min(axis=0), np.ptp(pixels, axis=0)
