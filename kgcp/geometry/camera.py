@@ -106,7 +106,7 @@ class Camera:
         ----------
         camera_matrix : (3, 3) array
             Principal distances and principal point [px]; without skew.
-        distortion : array of 4, 5 or 8 numbers, in any shape
+        distortion : array of 0, 4, 5 or 8 numbers, in any shape
             k1, k2, p1, p2, k3, k4, k5, k6. The further numbers of OpenCV's models of 12 and 14
             (thin prism, tilted sensor) must be zero.
         size : tuple of int
@@ -133,7 +133,7 @@ class Camera:
                 "calibrate without skew, as cv2.calibrateCamera does",
             )
         numbers = np.asarray(distortion, dtype=np.float64).ravel()
-        if len(numbers) not in {4, 5, 8, 12, 14}:
+        if len(numbers) not in {0, 4, 5, 8, 12, 14}:
             raise SettingError(
                 "distortion",
                 f"has {len(numbers)} numbers",
@@ -147,22 +147,8 @@ class Camera:
             )
         k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(numbers[:8], (0, max(0, 8 - len(numbers)))).tolist()
         (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-        width, height = size
-        return cls(
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            k1=k1,
-            k2=k2,
-            p1=p1,
-            p2=p2,
-            k3=k3,
-            k4=k4,
-            k5=k5,
-            k6=k6,
+        return replace(
+            cls(*size, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6),
             response=response,
             readout_s=readout_s,
             motion_sd_deg_s=motion_sd_deg_s,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovaria
 from kgcp.geometry.camera import Camera, Response, TimeReference
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
-from kgcp.io.formats.calibrations.entry import camera_of
 from kgcp.settings import require_range
 
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
@@ -49,11 +49,11 @@ def _inline_camera(table: TomlTable) -> Camera:
         if key in table:
             raise table.error(key, "needs a file", "give file as well, or delete it")
     width, height = table.integer("width"), table.integer("height")
-    values = {
+    values: dict[str, Any] = {
         key: table.number(key, None if key in _NEEDED else 0.0) for key in CALIBRATION_PARAMETERS
     }
     with table.located():
-        return camera_of(width, height, values)
+        return Camera(width, height, **values)
 
 
 def _file_camera(table: TomlTable, folder: Path) -> Camera:

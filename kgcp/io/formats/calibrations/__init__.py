@@ -1,7 +1,8 @@
 """Camera calibrations as other programs write them, one module per format.
 
 A module offers `matches(file)`, whether a file's content is of its format, and `entries(file)`,
-the cameras in it, and has one line in `FORMATS`.
+the cameras in it, and has one line in `FORMATS`. `entries` raises `KgcpError`, which names the
+line or element, for a file that is not as its format says.
 """
 
 from __future__ import annotations

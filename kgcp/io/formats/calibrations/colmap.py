@@ -7,10 +7,11 @@ the coefficients of its radial and OPENCV models are OpenCV's.
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.calibrations.entry import CORNER_TO_CENTRE_PX, Entry, camera_of, unsupported
+from kgcp.io.formats.calibrations.entry import CORNER_TO_CENTRE_PX, Entry, unsupported
 
 # Models → their parameters in COLMAP's order; f is both fx and fy.
 _MODELS = {
@@ -31,13 +32,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras, named by their CAMERA_ID.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line that describes no camera.
-    """
+    """Return the cameras, named by their CAMERA_ID."""
     return tuple(_entry(file, line, row) for line, row in file.rows)
 
 
@@ -53,11 +48,11 @@ def _entry(file: ForeignFile, line: int, row: str) -> Entry:
             raise unsupported(file, f"the model {model}", f"line {line}")
         keys = _MODELS[model]
         numbers = file.numbers(" ".join(params), len(keys), f"line {line}")
-        values = dict(zip(keys, numbers, strict=True))
+        values: dict[str, Any] = dict(zip(keys, numbers, strict=True))
         if "f" in values:
             values["fx"] = values["fy"] = values.pop("f")
         values["cx"] += CORNER_TO_CENTRE_PX
         values["cy"] += CORNER_TO_CENTRE_PX
-        return camera_of(width, height, values)
+        return Camera(width, height, **values)
 
     return Entry(name, (int(width), int(height)), convert)

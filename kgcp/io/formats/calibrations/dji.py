@@ -26,13 +26,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the one camera.
-
-    Raises
-    ------
-    KgcpError
-        If there are not nine numbers, or the image is dewarped already.
-    """
+    """Return the one camera."""
     found = _TAG.search(file.text) or _BARE.fullmatch(file.text.strip())
     if found is None:
         raise file.error("has no DewarpData", "name an image as the camera wrote it")

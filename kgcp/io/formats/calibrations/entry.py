@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from kgcp.errors import KgcpError
@@ -35,26 +35,6 @@ class Entry:
     size: tuple[int, int] | None
     convert: Callable[[int, int], Camera]
     is_relative: bool = False
-
-
-def camera_of(width: int, height: int, values: Mapping[str, float]) -> Camera:
-    """Return the `Camera` of its parameters by name; distortion that is not named is 0."""
-    return Camera(
-        width=width,
-        height=height,
-        fx=values["fx"],
-        fy=values["fy"],
-        cx=values["cx"],
-        cy=values["cy"],
-        k1=values.get("k1", 0.0),
-        k2=values.get("k2", 0.0),
-        p1=values.get("p1", 0.0),
-        p2=values.get("p2", 0.0),
-        k3=values.get("k3", 0.0),
-        k4=values.get("k4", 0.0),
-        k5=values.get("k5", 0.0),
-        k6=values.get("k6", 0.0),
-    )
 
 
 def unsupported(file: ForeignFile, term: str, where: str = "") -> KgcpError:

@@ -35,13 +35,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras: of a cameras XML the adjusted ones, named by label, or id if need be.
-
-    Raises
-    ------
-    KgcpError
-        If the file is not XML.
-    """
+    """Return the cameras: of a cameras XML the adjusted ones, named by label, or id if need be."""
     if file.root is None:
         raise file.error("is not XML", "export it from Metashape again")
     if file.root.tag == "calibration":

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from numpy.typing import ArrayLike
+
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.safe_read import is_sound
 from kgcp.io.files.safe_yaml import load_yaml
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.calibrations.entry import Entry, refuse_terms, unsupported
+from kgcp.io.formats.calibrations.entry import Entry, unsupported
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -29,10 +31,6 @@ _HEIGHT_KEYS = ("imageheight", "height")
 _MOST_NUMBERS = 100  # in a matrix
 _PROBLEM, _REMEDY = "is not an OpenCV FileStorage of a camera", "write it again with OpenCV"
 
-# Numbers of coefficients that OpenCV writes for its models; beyond 8 they must be zero.
-_COUNTS = (0, 4, 5, 8, 12, 14)
-_REST = ("thin-prism s1", "thin-prism s2", "thin-prism s3", "thin-prism s4", "tilt x", "tilt y")
-
 
 def matches(file: ForeignFile) -> bool:
     """Whether the content is a FileStorage."""
@@ -40,13 +38,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the one camera of the file.
-
-    Raises
-    ------
-    KgcpError
-        If it cannot be read, or has no camera matrix.
-    """
+    """Return the one camera of the file."""
     nodes = {str(key).lower().replace("_", ""): value for key, value in _nodes(file).items()}
     try:
         is_fisheye = _number(nodes, ("fisheyemodel",))
@@ -60,8 +52,14 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     if matrix is None:
         raise file.error("has no camera_matrix", "add it or write the values to [camera]")
     size = (int(width), int(height)) if width and height else None
-    flat = [] if coefficients is None else [value for row in coefficients for value in row]
-    return (matrix_entry(file, "", size, matrix, flat),)
+    return (opencv_entry("", size, matrix, coefficients or []),)
+
+
+def opencv_entry(
+    name: str, size: tuple[int, int] | None, matrix: ArrayLike, coefficients: ArrayLike
+) -> Entry:
+    """Return the camera of OpenCV's camera matrix (3, 3) and its distortion coefficients."""
+    return Entry(name, size, lambda *size: Camera.from_opencv(matrix, coefficients, size))
 
 
 def _nodes(file: ForeignFile) -> Mapping[object, object]:
@@ -86,40 +84,6 @@ def _nodes(file: ForeignFile) -> Mapping[object, object]:
 def _element(element: Element) -> object:
     cells = {child.tag: child.text or "" for child in element}
     return {**cells, "data": cells.get("data", "").split()} if cells else element.text
-
-
-def matrix_entry(
-    file: ForeignFile,
-    name: str,
-    size: tuple[int, int] | None,
-    matrix: Sequence[Sequence[float]],
-    coefficients: Sequence[float],
-) -> Entry:
-    """Return the camera of OpenCV's camera matrix (3, 3) and coefficients k1 k2 p1 p2 k3 ….
-
-    Raises
-    ------
-    KgcpError
-        If it is not a pinhole camera with Brown-Conrady distortion.
-    """
-    if [len(row) for row in matrix] != [3, 3, 3]:
-        raise file.error("the camera matrix is not 3 x 3", "calibrate again")
-    (fx, skew, cx), (zero, fy, cy), last = matrix
-    if [zero, *last] != [0.0, 0.0, 0.0, 1.0]:
-        raise file.error("the camera matrix is not that of a pinhole camera", "calibrate again")
-    if skew:
-        raise unsupported(file, f"a skew of {skew:g}")
-    if len(coefficients) not in _COUNTS:
-        raise unsupported(file, f"{len(coefficients)} distortion coefficients")
-    rest = coefficients[8:]
-    refuse_terms(file, "", _REST[: len(rest)], rest)
-    padding = [0.0] * (8 - len(coefficients))
-    k1, k2, p1, p2, k3, k4, k5, k6 = [*coefficients[:8], *padding]
-
-    def convert(width: int, height: int) -> Camera:
-        return Camera(width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6)
-
-    return Entry(name, size, convert)
 
 
 def _matrix(nodes: Mapping[str, object], names: Sequence[str]) -> list[list[float]] | None:

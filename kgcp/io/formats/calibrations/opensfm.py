@@ -8,11 +8,12 @@ k1, k2, k3, p1, p2 are OpenCV's. A reconstruction.json holds such cameras, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile, JsonObject
-from kgcp.io.formats.calibrations.entry import Entry, camera_of, unsupported
+from kgcp.io.formats.calibrations.entry import Entry, unsupported
 
 # Models → the distortion terms that they have.
 _TERMS = {
@@ -34,13 +35,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras, named by their keys.
-
-    Raises
-    ------
-    KgcpError
-        If the file is not such JSON.
-    """
+    """Return the cameras, named by their keys."""
     if isinstance(file.document, list):
         parts = [JsonObject.of(file, f"[{i}]", v) for i, v in enumerate(file.document)]
         groups = [part.child("cameras") for part in parts]
@@ -48,7 +43,7 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         groups = [JsonObject.of(file, "", file.document)]
     found = {key: group.child(key) for group in groups for key in group.values}
     return tuple(
-        Entry(name, _size(camera), _Normalised(camera).convert, is_relative=True)
+        Entry(name, _size(camera), partial(_camera, camera), is_relative=True)
         for name, camera in found.items()
     )
 
@@ -62,32 +57,21 @@ def _size(camera: JsonObject) -> tuple[int, int] | None:
     return (int(width), int(height)) if width and height else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Normalised:
-    """One camera, in units of the longer side of whatever frame it is for."""
+def _camera(camera: JsonObject, width: int, height: int) -> Camera:
+    """Scale a camera, whose unit is the longer side of whatever frame it is for."""
+    model = camera.text("projection_type")
+    if model not in _TERMS:
+        raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)
+    longer = max(width, height)
+    terms: dict[str, Any] = {term: camera.number(term, 0.0) for term in _TERMS[model]}
+    fx, fy, cx, cy = (longer * length for length in _matrix(camera, model))
+    x, y = cx + 0.5 * (width - 1), cy + 0.5 * (height - 1)
+    return Camera(width, height, fx, fy, x, y, **terms)
 
-    camera: JsonObject
 
-    def convert(self, width: int, height: int) -> Camera:
-        camera = self.camera
-        model = camera.text("projection_type")
-        if model not in _TERMS:
-            raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)
-        longer = max(width, height)
-        terms = {term: camera.number(term, 0.0) for term in _TERMS[model]}
-        x, y, cx, cy = self._matrix(model)
-        matrix = {
-            "fx": longer * x,
-            "fy": longer * y,
-            "cx": longer * cx + 0.5 * (width - 1),
-            "cy": longer * cy + 0.5 * (height - 1),
-        }
-        return camera_of(width, height, {**matrix, **terms})
-
-    def _matrix(self, model: str) -> tuple[float, float, float, float]:
-        camera = self.camera
-        if model == "perspective":
-            return camera.number("focal"), camera.number("focal"), 0.0, 0.0
-        focal_x = camera.number("focal_x")
-        focal_y = camera.number("focal_y", focal_x)  # files of ODM may lack it: one focal length
-        return focal_x, focal_y, camera.number("c_x"), camera.number("c_y")
+def _matrix(camera: JsonObject, model: str) -> tuple[float, float, float, float]:
+    if model == "perspective":
+        return camera.number("focal"), camera.number("focal"), 0.0, 0.0
+    focal_x = camera.number("focal_x")
+    focal_y = camera.number("focal_y", focal_x)  # files of ODM may lack it: one focal length
+    return focal_x, focal_y, camera.number("c_x"), camera.number("c_y")

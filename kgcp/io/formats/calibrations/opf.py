@@ -6,7 +6,7 @@ tangential T1 T2 are OpenCV's k1 k2 k3 and p1 p2 (so Pix4D's own opf2colmap take
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile, JsonObject
@@ -21,16 +21,10 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the sensors, named by their ids; only input cameras know the size of their images.
-
-    Raises
-    ------
-    KgcpError
-        If the file is not such JSON.
-    """
+    """Return the sensors, named by their ids; only input cameras know the size of their images."""
     sensors = JsonObject.of(file, "", file.document).children("sensors")
     return tuple(
-        Entry(sensor.text("id"), _size(sensor), _Sensor(sensor).convert) for sensor in sensors
+        Entry(sensor.text("id"), _size(sensor), partial(_camera, sensor)) for sensor in sensors
     )
 
 
@@ -41,32 +35,14 @@ def _size(sensor: JsonObject) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sensor:
-    """One sensor."""
-
-    sensor: JsonObject
-
-    def convert(self, width: int, height: int) -> Camera:
-        """Return it as `Camera`."""
-        internals = self.sensor.child("internals")
-        model = internals.text("type")
-        if model != "perspective":
-            raise unsupported(internals.file, f"the type {model!r}", internals.where)
-        focal = internals.number("focal_length_px")
-        cx, cy = internals.vector("principal_point_px", 2)
-        k1, k2, k3 = internals.vector("radial_distortion", 3)
-        p1, p2 = internals.vector("tangential_distortion", 2)
-        return Camera(
-            width,
-            height,
-            focal,
-            focal,
-            cx + CORNER_TO_CENTRE_PX,
-            cy + CORNER_TO_CENTRE_PX,
-            k1=k1,
-            k2=k2,
-            p1=p1,
-            p2=p2,
-            k3=k3,
-        )
+def _camera(sensor: JsonObject, width: int, height: int) -> Camera:
+    internals = sensor.child("internals")
+    model = internals.text("type")
+    if model != "perspective":
+        raise unsupported(internals.file, f"the type {model!r}", internals.where)
+    focal = internals.number("focal_length_px")
+    cx, cy = internals.vector("principal_point_px", 2)
+    k1, k2, k3 = internals.vector("radial_distortion", 3)
+    p1, p2 = internals.vector("tangential_distortion", 2)
+    x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
+    return Camera(width, height, focal, focal, x, y, k1, k2, p1, p2, k3)

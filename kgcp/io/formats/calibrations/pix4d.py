@@ -32,13 +32,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the cameras: of the text one per set of parameters, named by its first image.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line or the block that is not as it should be.
-    """
+    """Return the cameras: of the text one per set of parameters, named by its first image."""
     if _CAM_HEAD.match(file.text):
         blocks = _CAM_HEAD.split(file.text)[1:]
         return tuple(
@@ -107,4 +101,4 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
 def _camera(parameters: _Parameters, width: int, height: int) -> Camera:
     fx, fy, cx, cy, k1, k2, k3, p1, p2 = parameters
     x, y = cx + CORNER_TO_CENTRE_PX, cy + CORNER_TO_CENTRE_PX
-    return Camera(width, height, fx, fy, x, y, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+    return Camera(width, height, fx, fy, x, y, k1, k2, p1, p2, k3)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import reprlib
 
+import numpy as np
+
 from kgcp.io.files.safe_yaml import load_yaml
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.calibrations.entry import Entry, unsupported
-from kgcp.io.formats.calibrations.opencv import matrix_entry
+from kgcp.io.formats.calibrations.opencv import opencv_entry
 
 _MODELS = ("plumb_bob", "rational_polynomial")
 
@@ -20,31 +22,17 @@ def matches(file: ForeignFile) -> bool:
 
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
-    """Return the one camera of the file.
-
-    Raises
-    ------
-    KgcpError
-        If it is not a camera_info, or its model is not one of `Camera`.
-    """
+    """Return the one camera of the file."""
     try:
         info = load_yaml(file.text)
         if not isinstance(info, dict):
             raise TypeError("no mapping")
         model, name = info.get("distortion_model", "plumb_bob"), info.get("camera_name", "")
         size = (int(info["image_width"]), int(info["image_height"]))
-        flat = [float(value) for value in info["camera_matrix"]["data"]]
+        matrix = np.reshape([float(value) for value in info["camera_matrix"]["data"]], (3, 3))
         coefficients = [float(value) for value in info["distortion_coefficients"]["data"]]
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise file.error(f"is not a camera_info of ROS ({error})", "write it again") from error
     if model not in _MODELS:
         raise unsupported(file, f"the distortion model {reprlib.repr(model)}")
-    return (
-        matrix_entry(
-            file,
-            name if isinstance(name, str) else "",
-            size,
-            [flat[0:3], flat[3:6], flat[6:]],
-            coefficients,
-        ),
-    )
+    return (opencv_entry(name if isinstance(name, str) else "", size, matrix, coefficients),)

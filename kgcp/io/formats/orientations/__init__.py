@@ -1,7 +1,8 @@
 """Readers of the camera's reference poses, one module per format.
 
 A module offers `matches(file)`, whether a file's content is of its format, and `poses(file)`, what
-stands in it, and has one line in `FORMATS`.
+stands in it, and has one line in `FORMATS`. `poses` raises `KgcpError`, which names the line or
+element, for a file that is not as its format says.
 """
 
 from __future__ import annotations

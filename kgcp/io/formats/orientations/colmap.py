@@ -28,13 +28,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses, in COLMAP's world.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line that describes no image.
-    """
+    """Return the poses, in COLMAP's world."""
     names, centres, rotations, places = [], [], [], []
     for line, row in _image_rows(file):
         where = f"line {line}"

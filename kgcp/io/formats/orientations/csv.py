@@ -23,11 +23,6 @@ def poses(file: ForeignFile) -> SourcePoses:
 
     Columns frame, x, y, z, omega_deg, phi_deg, kappa_deg and, optionally, sd_x, sd_y, sd_z and
     sd_angle_deg, in any order.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line: missing columns, values that are not finite, a frame twice.
     """
     columns = read_csv_columns(
         file.path,

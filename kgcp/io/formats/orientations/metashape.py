@@ -39,13 +39,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses of the aligned cameras.
-
-    Raises
-    ------
-    KgcpError
-        If the file is not such XML, has several chunks, or numbers are missing.
-    """
+    """Return the poses of the aligned cameras."""
     chunks = [] if file.root is None else file.root.findall("chunk")
     if len(chunks) != 1:
         raise file.error(f"holds {len(chunks)} chunks instead of one", "export one chunk")

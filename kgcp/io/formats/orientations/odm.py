@@ -30,13 +30,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses, in the UTM zone that the file is in.
-
-    Raises
-    ------
-    KgcpError
-        Naming the feature that lacks something; or if the translations fit no UTM zone.
-    """
+    """Return the poses, in the UTM zone that the file is in."""
     features = JsonObject.of(file, "", file.document).children("features")
     properties = [feature.child("properties") for feature in features]
     centre = vectors(properties, "translation")

@@ -36,14 +36,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses of all reconstructions.
-
-    Raises
-    ------
-    KgcpError
-        Naming the shot: no rotation or translation of three numbers; or reconstructions that do
-        not share their reference.
-    """
+    """Return the poses of all reconstructions."""
     document = file.document if isinstance(file.document, list) else [file.document]
     parts = [JsonObject.of(file, f"[{index}]", part) for index, part in enumerate(document)]
     groups = [part.child("shots") for part in parts]

@@ -36,13 +36,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses, in the base CRS of the scene.
-
-    Raises
-    ------
-    KgcpError
-        If a file of the project is missing or lacks something, or its CRS is unusable.
-    """
+    """Return the poses, in the base CRS of the scene."""
     calibrated = JsonObject.of(*_part(file, _CAMERAS))
     cameras = calibrated.children("cameras")
     names = _names(JsonObject.of(*_part(file, _LIST)))

@@ -24,13 +24,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def poses(file: ForeignFile) -> SourcePoses:
-    """Return the poses, in the flight's CRS.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line without six numbers.
-    """
+    """Return the poses, in the flight's CRS."""
     rows = [(line, row) for line, row in file.rows if _HEAD.match(row) is None]
     parts = [(line, row.rsplit(maxsplit=6)) for line, row in rows]
     numbers = np.array(

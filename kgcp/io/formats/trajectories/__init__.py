@@ -1,4 +1,9 @@
-"""Readers of the vehicle's trajectory."""
+"""Readers of the vehicle's trajectory, one module per format.
+
+A module offers `matches(file)`, whether a file's content is of its format, and `read(file, options,
+flight_crs)`, its epochs, and has one line in `FORMATS`. `read` raises `KgcpError`, which names line
+or record, for a file that is not as its format says or for which flight.toml lacks a key.
+"""
 
 from __future__ import annotations
 

@@ -23,11 +23,6 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> 
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
     in any order. The attitude may be absent where it is not wanted.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line: missing columns, values that are not finite, times that do not ascend.
     """
     with_attitude = options.course_sd_deg is None
     columns = read_csv_columns(

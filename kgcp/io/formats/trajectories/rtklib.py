@@ -24,14 +24,7 @@ _ECEF = (("x-ecef", "y-ecef", "z-ecef"), ("sdx", "sdy", "sdz"), ("sdxy", "sdyz",
 
 
 def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) -> Epochs:
-    """Read a solution file; it has no attitude.
-
-    Raises
-    ------
-    KgcpError
-        As `kgcp.io.formats.rtklib_pos.read_solution`, and for vectors from a base, heights above a
-        geoid or a datum that the file does not define.
-    """
+    """Read a solution file; it has no attitude."""
     solution = read_solution(file)
     check_times(file.path, solution.time_s, lambda row: f"line {solution.lines[row]}")
     if "e-baseline" in solution.columns:

@@ -48,12 +48,6 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) ->
     """Read records of 17 little-endian doubles: seconds of the week, radians, metres.
 
     Deviations are those of the smrmsg file that flight.toml names, if it does.
-
-    Raises
-    ------
-    KgcpError
-        If the file is cut or holds impossible values, flight.toml lacks the day or the time
-        system, or does not say what the wander angle means where it is not zero.
     """
     path = file.path
     records = _read_records(path, _RECORD, file.toml_key)

@@ -26,14 +26,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> Epochs:
-    """Read poses R(map ← body), t in the map, of a body with x forward, y right, z down.
-
-    Raises
-    ------
-    KgcpError
-        Naming the line: not eight numbers, no unit quaternion, times that do not ascend; or if
-        the vehicle drives on its roof, as it does where body axes are x forward, y left, z up.
-    """
+    """Read poses R(map ← body), t in the map, of a body with x forward, y right, z down."""
     path = file.path
     lines, texts, numbers = _read_rows(file)
     time_s = times_from_texts(path, lines, texts, options)

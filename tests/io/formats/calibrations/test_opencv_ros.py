@@ -120,9 +120,9 @@ def test_the_size_may_stand_beside_a_silent_file_and_must_agree(tmp_path: Path) 
         (ROS.replace("plumb_bob", "equidistant"), "distortion model 'equidistant'"),
         (ROS.replace("2300.5, 0,", "2300.5, 2,"), "a skew of 2"),
         (ROS.replace("2300.5, 0,", "-2300.5, 0,"), "fx: -2300.5 px is out of range"),
-        (ROS.replace("0, 0, 1]\ndist", "0, 0, 2]\ndist"), "not that of a pinhole camera"),
-        (ROS.replace(", 594.75, 0, 0, 1]", "]"), "is not 3 x 3"),
-        (ROS.replace(", 0.011]", ", 0.011, 1]"), "6 distortion coefficients"),
+        (ROS.replace("0, 0, 1]\ndist", "0, 0, 2]\ndist"), "is not of the form fx 0 cx"),
+        (ROS.replace(", 594.75, 0, 0, 1]", "]"), "is not a camera_info of ROS"),
+        (ROS.replace(", 0.011]", ", 0.011, 1]"), "distortion: has 6 numbers"),
         (ROS.replace("0.011]", ".nan]"), "k3: is not a finite number"),
         (ROS.replace("image_width: 1600\n", ""), "is not a camera_info of ROS \\('image_width'\\)"),
     ],
@@ -138,7 +138,7 @@ def test_other_files_and_models_are_refused(tmp_path: Path, content: str, words:
 
 def test_thin_prism_terms_are_refused(tmp_path: Path) -> None:
     path = opencv_file(tmp_path / "camera.yml", [*RATIONAL, 0.0, 0.001, 0.0, 0.0])
-    with pytest.raises(KgcpError, match=r"has thin-prism s2 = 0\.001, which kgcp does not support"):
+    with pytest.raises(KgcpError, match="has terms of a thin prism"):
         read_calibration(path, SILENT)
 
 
