@@ -104,6 +104,7 @@ class FlightBias:
         rows = [bias_row(pair, self.study.method) for pair in self.study.measured]
         return pd.DataFrame(rows, columns=names)
 
+    @single_threaded()
     def write_report(
         self,
         folder: Path | str | None = None,
@@ -127,8 +128,44 @@ class FlightBias:
         KgcpError
             If no measurement can be compared, or a file cannot be written.
         """
-        folder = results_folder(self.flight.folder) if folder is None else Path(folder)
-        return write_report(self.study, self.flight, self.settings, folder, reexpose, stored_frames)
+        study, flight = self.study, self.flight
+        folder = results_folder(flight.folder) if folder is None else Path(folder)
+        if not study.trusted:
+            raise KgcpError(
+                f"none of {len(study.measured)} measurements lies where a reference pose and the"
+                " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
+            )
+        table = folder / "bias.parquet"
+        rows = (bias_row(pair, study.method) for pair in study.measured)
+        write_table(table, BIAS_COLUMNS, rows, provenance(flight))
+        content = self._content(stored_frames or flight.frames_folder, reexpose)
+        files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
+        text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
+        files["bias_summary.json"] = f"{text}\n".encode()
+        files["bias_report.html"] = render_page(content).encode()
+        for name, data in files.items():
+            write_bytes(folder / name, data)
+        for name in set(FIGURE_FILES.values()) - files.keys():
+            (folder / name).unlink(missing_ok=True)  # of an earlier run: not of these numbers
+        paths = (table, *(folder / name for name in files))
+        return Report(content.summary, content.verdict, paths)
+
+    def _content(self, frames: Path | StoredFolder, reexpose: int) -> Content:
+        numbers = bias_numbers(self.study)
+        shown = [*evenly(numbers.data.distance_m, SPREAD), *numbers.worst]
+        again = evenly(numbers.data.distance_m, reexpose)
+        closeups, reexposed = _look(numbers, self.flight, frames, self.settings, shown, again)
+        verdict = assess(numbers, reexposed)
+        return Content(
+            name=self.flight.name,
+            numbers=numbers,
+            verdict=verdict,
+            pictures=_pictures(numbers, self.flight, reexposed),
+            rows=[bias_row(pair, self.study.method) for pair in numbers.compared],
+            closeups=closeups,
+            reexposed=reexposed,
+            summary=summary_of(numbers, verdict, reexposed),
+        )
 
 
 @single_threaded()
@@ -158,79 +195,6 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         settings.method,
     )
     return FlightBias(flight, settings, study)
-
-
-@single_threaded()
-def write_report(
-    study: BiasStudy,
-    flight: Flight,
-    settings: DetectSettings,
-    folder: Path,
-    reexpose: int,
-    stored_frames: StoredFolder | None = None,
-) -> Report:
-    """Write bias.parquet, bias_summary.json, the figures and bias_report.html into a folder.
-
-    Parameters
-    ----------
-    flight : Flight
-        Its frames, where they are, give the close-ups.
-    settings : DetectSettings
-        Of the detections, to measure frames again.
-    reexpose : int
-        How many frames to measure again, with darker and brighter grey values.
-    stored_frames : StoredFolder, optional
-        Where the frames are, if not in the flight's folder.
-
-    Raises
-    ------
-    KgcpError
-        If no measurement can be compared, or a file cannot be written.
-    """
-    if not study.trusted:
-        raise KgcpError(
-            f"none of {len(study.measured)} measurements lies where a reference pose and the"
-            " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
-        )
-    table = folder / "bias.parquet"
-    rows = (bias_row(pair, study.method) for pair in study.measured)
-    write_table(table, BIAS_COLUMNS, rows, provenance(flight))
-    frames = stored_frames or flight.frames_folder
-    content = _content(study, flight, settings, frames, reexpose)
-    files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
-    text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
-    files["bias_summary.json"] = f"{text}\n".encode()
-    files["bias_report.html"] = render_page(content).encode()
-    for name, data in files.items():
-        write_bytes(folder / name, data)
-    for name in set(FIGURE_FILES.values()) - files.keys():
-        (folder / name).unlink(missing_ok=True)  # of an earlier run: not of these numbers
-    paths = (table, *(folder / name for name in files))
-    return Report(content.summary, content.verdict, paths)
-
-
-def _content(
-    study: BiasStudy,
-    flight: Flight,
-    settings: DetectSettings,
-    frames: Path | StoredFolder,
-    reexpose: int,
-) -> Content:
-    numbers = bias_numbers(study)
-    shown = [*evenly(numbers.data.distance_m, SPREAD), *numbers.worst]
-    again = evenly(numbers.data.distance_m, reexpose)
-    closeups, reexposed = _look(numbers, flight, frames, settings, shown, again)
-    verdict = assess(numbers, reexposed)
-    return Content(
-        name=flight.name,
-        numbers=numbers,
-        verdict=verdict,
-        pictures=_pictures(numbers, flight, reexposed),
-        rows=[bias_row(pair, study.method) for pair in numbers.compared],
-        closeups=closeups,
-        reexposed=reexposed,
-        summary=summary_of(numbers, verdict, reexposed),
-    )
 
 
 def _look(

@@ -44,14 +44,8 @@ class Ring:
     sd_outer_diameter_m: float = 0.0
 
     def __post_init__(self) -> None:
-        require_range(
-            "outer_diameter_m", self.outer_diameter_m, 0.0, 100.0, unit="m", open_low=True
-        )
-        require_range(
-            "inner_diameter_m", self.inner_diameter_m, 0.0, 100.0, unit="m", open_low=True
-        )
-        require_range("code_diameter_m", self.code_diameter_m, 0.0, 100.0, unit="m", open_low=True)
-        require_range("dot_diameter_m", self.dot_diameter_m, 0.0, 100.0, unit="m", open_low=True)
+        for key in ("outer_diameter_m", "inner_diameter_m", "code_diameter_m", "dot_diameter_m"):
+            require_range(key, getattr(self, key), 0.0, 100.0, unit="m", open_low=True)
         require_range("sd_outer_diameter_m", self.sd_outer_diameter_m, 0.0, 1.0, unit="m")
         if self.inner_diameter_m >= self.outer_diameter_m:
             raise SettingError(

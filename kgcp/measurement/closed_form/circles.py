@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,19 +21,6 @@ _SAME_CIRCLE_PX = 0.7
 _TWIN_RADIUS_PX = 1.1
 
 
-@dataclass(frozen=True, slots=True)
-class ConcentricCircles:
-    """Concentric circles, as preliminary ellipses in the raw frame.
-
-    Attributes
-    ----------
-    ellipses : tuple of Ellipse
-        Largest first: the first is the cluster's representative [px].
-    """
-
-    ellipses: tuple[Ellipse, ...]
-
-
 def paper_outlines(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
     """Return what the paper's search takes for rings: §2.1 and §2.2 in turn.
 
@@ -42,7 +28,7 @@ def paper_outlines(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, 
     outline can be concentric and larger, so that here every member is tested.
     """
     clusters = concentric_clusters(near_circular(find_contours(grey, settings), settings))
-    return tuple(ellipse for cluster in clusters for ellipse in cluster.ellipses)
+    return tuple(ellipse for cluster in clusters for ellipse in cluster)
 
 
 def near_circular(contours: Contours, settings: DetectSettings) -> tuple[Ellipse, ...]:
@@ -99,8 +85,8 @@ def _preliminary_ellipse(points: FloatArray) -> Ellipse | None:
     return ellipse if ellipse.a <= _MAX_AXIS_RATIO * ellipse.b else None
 
 
-def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[ConcentricCircles, ...]:
-    """Group ellipses with a common centre, largest representative first.
+def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[tuple[Ellipse, ...], ...]:
+    """Group ellipses with a common centre, the largest of each group first.
 
     Both contours along one edge are one circle: of ellipses that agree within a pixel's fraction
     the larger is kept.
@@ -117,7 +103,7 @@ def concentric_clusters(ellipses: tuple[Ellipse, ...]) -> tuple[ConcentricCircle
             continue
         members = free & (np.linalg.norm(centres - centres[first], axis=1) <= reach)
         free &= ~members
-        clusters.append(ConcentricCircles(_distinct([ordered[i] for i in np.flatnonzero(members)])))
+        clusters.append(_distinct([ordered[i] for i in np.flatnonzero(members)]))
     return tuple(clusters)
 
 

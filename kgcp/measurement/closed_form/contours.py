@@ -84,7 +84,10 @@ def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatAr
     """Return the corners (k, 2) of the convex hulls that pass the circle test [px]."""
     if len(contours) == 0:
         return []
-    hulls = (_hull(contours.contour(int(i))) for i in np.flatnonzero(_goes_round(contours)))
+    hulls = [
+        cv2.convexHull(contours.contour(int(i)).astype(np.float32))[:, 0].astype(np.float64)
+        for i in np.flatnonzero(_goes_round(contours))
+    ]
     return [hull for hull in hulls if _is_circular(hull, settings)]
 
 
@@ -100,17 +103,10 @@ def _goes_round(contours: Contours) -> BoolArray:
     sectors = np.floor((np.arctan2(unit[:, 1], unit[:, 0]) / np.pi + 1.0) * (0.5 * _SECTORS))
     sector_bits = np.left_shift(1, sectors.astype(np.intp) % _SECTORS)
     sector_bits[(radii < _RIM[0]) | (radii > _RIM[1])] = 0
-    occupied = _count_bits(np.bitwise_or.reduceat(sector_bits, starts))
+    masks = np.bitwise_or.reduceat(sector_bits, starts)
+    occupied = (masks[:, None] >> np.arange(_SECTORS) & 1).sum(axis=1)
     round_box = half.max(axis=1) < _MAX_BOX_RATIO * half.min(axis=1)
     return np.asarray(round_box & (occupied >= _MIN_SECTORS))
-
-
-def _count_bits(masks: IndexArray) -> IndexArray:
-    return np.asarray((masks[:, None] >> np.arange(_SECTORS) & 1).sum(axis=1))
-
-
-def _hull(points: FloatArray) -> FloatArray:
-    return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
 
 
 def _is_circular(hull: FloatArray, settings: DetectSettings) -> bool:

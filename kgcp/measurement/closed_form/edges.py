@@ -43,14 +43,11 @@ class EdgeFit:
         Through them, in the raw frame [px].
     conic : (3, 3) array
         Through them in normalised coordinates, free of distortion.
-    rms_px : float
-        Of the points' distances from `ellipse` [px].
     """
 
     points_px: FloatArray
     ellipse: Ellipse
     conic: FloatArray
-    rms_px: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +159,7 @@ def fit_edge(
     rms = float(np.sqrt(np.mean(sampson_distance(conic, points) ** 2)))
     if rms > max(_MAX_RMS_PX, _MAX_RMS_SHARE * ellipse.a):
         raise Rejection(Reason.POOR_ELLIPSE, f"edge points scatter by {rms:.2f} px")
-    return EdgeFit(points, ellipse, fit_ellipse(camera.undistort(points)), rms)
+    return EdgeFit(points, ellipse, fit_ellipse(camera.undistort(points)))
 
 
 def _robust_fit(points: FloatArray) -> tuple[FloatArray, FloatArray]:

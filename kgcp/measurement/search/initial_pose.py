@@ -6,7 +6,6 @@ docs/method.md, "The start", describes it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -74,13 +73,11 @@ def initial_pose(grey: GreyArray, camera: Camera, target: Target, match: CodeMat
     # At a tilt of 0 the image does not change with it, to first order: an adjustment that starts
     # there stays there. So the start is tilted by what the outline cannot tell from 0.
     pose = pose.tilted(math.acos(max(0.0, 1.0 - _AXIS_ERROR_PX / match.outer.mean_radius)))
-    outer, inner = (
-        _profile(grey, match, diameter_m)
-        for diameter_m in (ring.outer_diameter_m, ring.inner_diameter_m)
-    )
+    outer_px, outer_slope = _edge_of_profile(grey, match, ring.outer_diameter_m)
+    inner_px, _ = _edge_of_profile(grey, match, ring.inner_diameter_m)
     contrast = match.white - match.black
-    slope = max(outer.slope_per_px, FAINTEST_SLOPE)
-    shift_px = (inner.radius_px - ring.inner_ratio * outer.radius_px) / (1.0 + ring.inner_ratio)
+    slope = max(outer_slope, FAINTEST_SLOPE)
+    shift_px = (inner_px - ring.inner_ratio * outer_px) / (1.0 + ring.inner_ratio)
     return InitialPose(
         ring=ring.name,
         score=float(scores[best]),
@@ -124,23 +121,13 @@ def _measure_spokes(
     return x, y, unit
 
 
-@dataclass(frozen=True, slots=True)
-class _Profile:
-    """One of a ring's edges, from the mean grey values along its radii.
+def _edge_of_profile(
+    grey: GreyArray, match: CodeMatch, edge_diameter_m: float
+) -> tuple[float, float]:
+    """Return where the mean grey values along the radii change most at an edge, and by how much.
 
-    Attributes
-    ----------
-    radius_px : float
-        Where they change most.
-    slope_per_px : float
-        By how much there, in grey values.
+    The first is a radius [px], the second in grey values per pixel.
     """
-
-    radius_px: float
-    slope_per_px: float
-
-
-def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Profile:
     ring, outline = match.ring, match.outer
     share = edge_diameter_m / ring.outer_diameter_m
     reach_px = min(_REACH_PX, 0.5 * (1.0 - ring.inner_ratio) * outline.mean_radius)
@@ -151,7 +138,7 @@ def _profile(grey: GreyArray, match: CodeMatch, edge_diameter_m: float) -> _Prof
     values = sample_ellipses(grey, (outline,), factors, _EDGE[clear])[0]
     sign = 1.0 if edge_diameter_m > ring.inner_diameter_m else -1.0
     steepest, rise = _steepest(values, sign)
-    return _Profile(float(radii_px[steepest]), rise / _STEP_PX)
+    return float(radii_px[steepest]), rise / _STEP_PX
 
 
 @compiled

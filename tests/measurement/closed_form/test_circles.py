@@ -31,7 +31,7 @@ def test_a_ring_becomes_one_cluster_of_two_circles_largest_first() -> None:
     outer, inner = Ellipse(140.0, 95.0, 40.0, 36.0, 0.4), Ellipse(140.2, 95.1, 20.0, 18.0, 0.4)
     circles = near_circular(find_contours(drawn(outer, inner), SETTINGS), SETTINGS)
     (cluster,) = concentric_clusters(circles)
-    found_outer, found_inner = cluster.ellipses
+    found_outer, found_inner = cluster
     for found, true in ((found_outer, outer), (found_inner, inner)):
         np.testing.assert_allclose(
             [found.x, found.y, found.a, found.b], [true.x, true.y, true.a, true.b], atol=1.0

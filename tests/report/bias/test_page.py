@@ -19,7 +19,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.gcps import BIAS_COLUMNS
-from kgcp.pipeline.bias_report import FIGURE_FILES, write_report
+from kgcp.pipeline.bias_report import FIGURE_FILES, FlightBias
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.settings import DetectSettings
 
@@ -97,7 +97,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, study: Study) -> Made:
         for index, (_, row) in enumerate(truth.iterrows())
     ]
     settings = DetectSettings()
-    write_report(study(*compared), read_flight(SAMPLE), settings, folder, 3)
+    FlightBias(read_flight(SAMPLE), settings, study(*compared)).write_report(folder, reexpose=3)
     return Made(folder, [])
 
 
@@ -215,9 +215,8 @@ def test_names_of_files_are_text_in_the_page(made: Made) -> None:
 
 
 def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_path: Path) -> None:
-    report = write_report(
-        study(compare(30.0, 0.1)), read_flight(SAMPLE), DetectSettings(), tmp_path, 5
-    )
+    bias = FlightBias(read_flight(SAMPLE), DetectSettings(), study(compare(30.0, 0.1)))
+    report = bias.write_report(tmp_path, reexpose=5)
     text = (tmp_path / "bias_report.html").read_text(encoding="utf-8")
     assert "One frame says nothing about bias." in text
     assert "The frames are not where" in text or "the frames are not where" in text
@@ -235,7 +234,8 @@ def test_without_times_deviations_or_poses_there_is_a_page_too(
         assert one.attempt.sighting is not None
         bare = replace(one.attempt.sighting, time_s=None, pose=None)
         compared.append(replace(one, attempt=replace(one.attempt, time_s=None, sighting=bare)))
-    write_report(study(*compared), read_flight(SAMPLE), DetectSettings(), tmp_path, 0)
+    bias = FlightBias(read_flight(SAMPLE), DetectSettings(), study(*compared))
+    bias.write_report(tmp_path, reexpose=0)
     summary = json.loads((tmp_path / "bias_summary.json").read_text(encoding="utf-8"))
     assert summary["standardised"] is None
     assert summary["edges"] is None
