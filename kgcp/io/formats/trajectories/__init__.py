@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.errors import KgcpError
-from kgcp.georef.course import attitude_from_course
 from kgcp.georef.crs import convert_positions
 from kgcp.georef.local_frame import map_axes_ecef, turn_covariances
-from kgcp.georef.trajectory import Trajectory
+from kgcp.georef.trajectory import Trajectory, attitude_from_course
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution
