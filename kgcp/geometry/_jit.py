@@ -21,7 +21,7 @@ def compiled(function: _Function) -> _Function:
 
 
 def summed(function: _Function) -> _Function:
-    """Do as `compiled`; sums are taken in whatever order lets vector units take several terms."""
+    """Do as `compiled`; sums may be reordered so that vector units take several terms."""
     made = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
     return cast("_Function", made)
 

@@ -49,7 +49,7 @@ def kim_centre(outer: FloatArray, inner: FloatArray) -> FloatArray:
     """Return the projected centre (2,) of two concentric circles, given their conics (3, 3).
 
     After Kim et al. (2005), as §4 of the paper uses it: for the repeated eigenvalue λ of
-    Q_i Q_o⁻¹ each row of Q_o⁻¹ - λ Q_i⁻¹ is the centre. Of measured ellipses the repeated
+    Q_i Q_o⁻¹ each row of Q_o⁻¹ - λ Q_i⁻¹ is the centre. For measured ellipses the repeated
     eigenvalue becomes two, with three rows each: six candidates. They are reconciled here: with
     the mean of the two eigenvalues, Q_o⁻¹ - λ Q_i⁻¹ is the centre times its transpose, of rank
     one but for noise. Its dominant eigenvector, taken where the outer ellipse is the unit circle,

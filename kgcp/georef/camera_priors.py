@@ -1,4 +1,4 @@
-"""Exterior orientation of the camera from a moving plate: the vehicle tells how the plate lies.
+"""Exterior orientation of the camera from a moving plate, whose attitude the vehicle gives.
 
 The pose of the plate in the camera and the attitude of the vehicle that carries it give the
 attitude of the camera; from the plate's place it is then one vector to the projection centre:
@@ -130,12 +130,13 @@ def camera_priors(
     if not chosen:
         return ()
     times = np.array([time_s for _, _, time_s in chosen])
-    return _oriented([(point, one) for point, one, _ in chosen], times, vehicle, local_frame)
+    pairs = [(point, sighting) for point, sighting, _ in chosen]
+    return _oriented(pairs, times, vehicle, local_frame)
 
 
-def _is_told_apart(seen: Sighting) -> bool:
-    is_clear = seen.ambiguity is None or seen.ambiguity >= MIN_AMBIGUITY
-    return seen.pose is not None and is_clear
+def _is_told_apart(sighting: Sighting) -> bool:
+    is_clear = sighting.ambiguity is None or sighting.ambiguity >= MIN_AMBIGUITY
+    return sighting.pose is not None and is_clear
 
 
 def _oriented(
@@ -151,7 +152,7 @@ def _oriented(
     # East, north and up are those of the plate, whatever datum the points' CRS has.
     level_from_body = np.swapaxes(level, -1, -2) @ states.frame_from_body
     enu_from_body = local_frame.level_rotations(plate) @ level_from_body
-    poses = [seen.pose for _, seen in pairs if seen.pose is not None]
+    poses = [sighting.pose for _, sighting in pairs if sighting.pose is not None]
     plate_from_camera = np.swapaxes(np.array([pose.rotation for pose in poses]), -1, -2)
     mount = body_from_plate(vehicle.settings.mount_deg)
     enu_from_camera = enu_from_body @ mount @ plate_from_camera
@@ -162,9 +163,9 @@ def _oriented(
     positions = local_frame.map_from_enu(camera)
     sds = states.sd_attitude_deg
     priors = []
-    for i, (point, seen) in enumerate(pairs):
+    for i, (point, sighting) in enumerate(pairs):
         cov = None
-        cov_pose = _whole_pose_cov(seen)
+        cov_pose = _whole_pose_cov(sighting)
         if point.cov_m2 is not None and cov_pose is not None and sds is not None:
             cov_plate = to_enu[i] @ point.cov_m2 @ to_enu[i].T
             attitude = _Attitude(enu_from_body[i], sds[i], vehicle.settings)
@@ -175,11 +176,11 @@ def _oriented(
     return tuple(priors)
 
 
-def _whole_pose_cov(seen: Sighting) -> FloatArray | None:
+def _whole_pose_cov(sighting: Sighting) -> FloatArray | None:
     """Return the pose's covariance with the errors that all frames share; None: not known."""
-    if seen.pose_cov is None or seen.common_pose_cov is None:
-        return seen.pose_cov
-    whole: FloatArray = seen.pose_cov + seen.common_pose_cov
+    if sighting.pose_cov is None or sighting.common_pose_cov is None:
+        return sighting.pose_cov
+    whole: FloatArray = sighting.pose_cov + sighting.common_pose_cov
     return whole
 
 

@@ -80,7 +80,7 @@ class Flag(StrEnum):
 
 
 class SkipReason(StrEnum):
-    """Why a sighting that could be placed is no KGCP."""
+    """Why a sighting with a position does not become a KGCP."""
 
     SECOND_PLATE = "second_plate"
     DISTANCE_JUMP = Flag.DISTANCE.value
@@ -135,19 +135,19 @@ def build_gcps(
         As `TargetPositions.positions`.
     """
     first = [sighting for sighting in sightings if sighting.instance == 0]
-    times = [seen.row_time_s(camera) for seen in first]
-    positions = target_positions.positions([seen.target for seen in first], times)
+    times = [sighting.row_time_s(camera) for sighting in first]
+    positions = target_positions.positions([sighting.target for sighting in first], times)
     skipped = [
-        SkippedSighting(seen.frame, seen.target, SkipReason.SECOND_PLATE)
-        for seen in sightings
-        if seen.instance > 0
+        SkippedSighting(sighting.frame, sighting.target, SkipReason.SECOND_PLATE)
+        for sighting in sightings
+        if sighting.instance > 0
     ]
     placed = []
-    for seen, time_s, position in zip(first, times, positions, strict=True):
+    for sighting, time_s, position in zip(first, times, positions, strict=True):
         if isinstance(position, TargetPosition):
-            placed.append((seen, time_s, position))
+            placed.append((sighting, time_s, position))
         else:
-            skipped.append(SkippedSighting(seen.frame, seen.target, position))
+            skipped.append(SkippedSighting(sighting.frame, sighting.target, position))
     return _on_the_map(placed, target_positions), tuple(skipped)
 
 
@@ -161,36 +161,38 @@ def _on_the_map(
     positions = np.array([place.position_m for _, _, place in placed])
     on_map, axes = local_frame.map_from_enu(positions), local_frame.grid_rotation(positions)
     return tuple(
-        _gcp(*one, position, turn, target_positions)
-        for one, position, turn in zip(placed, on_map, axes, strict=True)
+        _gcp(sighting, time_s, position, position_map, turn, target_positions)
+        for (sighting, time_s, position), position_map, turn in zip(
+            placed, on_map, axes, strict=True
+        )
     )
 
 
 def _gcp(
-    seen: Sighting,
+    sighting: Sighting,
     time_s: float | None,
     position: TargetPosition,
     position_map: FloatArray,
     axes: FloatArray,
     target_positions: TargetPositions,
 ) -> Gcp:
-    moves = seen.target not in target_positions.static
+    moves = sighting.target not in target_positions.static
     offset_s = target_positions.vehicle.settings.time_offset_s if target_positions.vehicle else 0.0
     return Gcp(
-        id=f"K{seen.number:04d}" if moves else seen.target,
-        frame=seen.frame,
-        target=seen.target,
+        id=f"K{sighting.number:04d}" if moves else sighting.target,
+        frame=sighting.frame,
+        target=sighting.target,
         time_s=None if time_s is None else time_s + offset_s,
         position_map=position_map,
         cov_m2=None if position.cov_m2 is None else axes.T @ position.cov_m2 @ axes,
         common_m=None if position.common_m is None else axes.T @ position.common_m,
-        centre_px=seen.centre_px,
-        centre_cov_px2=seen.centre_cov_px2,
-        distance_m=seen.distance_m,
-        sd_distance_m=seen.sd_distance_m,
-        sd_common_distance_m=seen.sd_common_distance_m,
-        score=seen.score,
-        ambiguity=seen.ambiguity,
+        centre_px=sighting.centre_px,
+        centre_cov_px2=sighting.centre_cov_px2,
+        distance_m=sighting.distance_m,
+        sd_distance_m=sighting.sd_distance_m,
+        sd_common_distance_m=sighting.sd_common_distance_m,
+        score=sighting.score,
+        ambiguity=sighting.ambiguity,
     )
 
 
@@ -204,8 +206,8 @@ def transform_gcps(gcps: Sequence[Gcp], transform: CrsTransform) -> tuple[Gcp, .
     """
     if not gcps:
         return ()
-    here = np.array([point.position_map for point in gcps])
-    return tuple(map(_moved, gcps, transform.positions(here), transform.axes(here)))
+    positions = np.array([point.position_map for point in gcps])
+    return tuple(map(_moved, gcps, transform.positions(positions), transform.axes(positions)))
 
 
 def _moved(point: Gcp, position_map: FloatArray, axes: FloatArray) -> Gcp:

@@ -20,10 +20,11 @@ def find_jumps(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> BoolArr
     """Return which of n values do not continue the parabola through their neighbours.
 
     A value is compared with the least-squares parabola through up to four neighbours on either
-    side, itself left out. Five deviations are too many. A deviation holds those of the values and,
-    twofold, the flight's unrest: by how much the scatter about parabolas is larger, of all values
-    or of these neighbours. The worst of a neighbourhood is taken out, then the others are looked
-    at again without it; two wrong values in one neighbourhood can hide each other.
+    side, itself left out. It jumps if it is off by more than five standard deviations. These
+    combine the deviations of the values with twice the flight's unrest, the excess of the scatter
+    about parabolas, of all values or of these neighbours. The worst of a neighbourhood is taken
+    out, and the others are compared again; two wrong values in one neighbourhood can hide each
+    other.
 
     Parameters
     ----------

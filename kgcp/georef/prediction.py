@@ -1,7 +1,7 @@
 """Where a target must be in frames in which it was not found.
 
-Two sources tell: the frames before and after, and reference poses with the target's place. Either
-is believed as far as it has proved itself on the frames in which the target was found.
+There are two sources: the frames before and after, and reference poses with the target's place.
+Either is trusted as far as it agrees with the frames in which the target was found.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Measurement
 from kgcp.targets.layout import Target
 
-_MIN_FOUND = 4  # frames that a reference must have proved itself on
+_MIN_FOUND = 4  # frames that the reference is compared with, at least
 _MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
 _MEDIAN_OF_1D = 0.6745  # of the absolute value
-_FLOOR_PX, _FLOOR_LOG = 0.5, 0.02  # what no prediction is better than
+_FLOOR_PX, _FLOOR_LOG = 0.5, 0.02  # least standard deviations of a prediction
 _TRIPLES = 8  # of neighbours, nearest in time, that tell how the target moves
 _MIN_TRIPLES = 3
 
@@ -72,8 +72,8 @@ def predict_position(track: Track, by_reference: FloatArray | None) -> list[Pred
         sources.append(predict_by_reference(track, by_reference))
     return [
         min(
-            (one for one in options if one is not None and not found),
-            key=lambda one: one.sd_px,
+            (option for option in options if option is not None and not found),
+            key=lambda option: option.sd_px,
             default=None,
         )
         for found, options in zip(track.is_found, zip(*sources, strict=True), strict=True)
@@ -110,12 +110,12 @@ def predict_between(track: Track) -> list[Prediction | None]:
     a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
     triples of found frames, of which each predicts its middle one.
     """
-    nothing: list[Prediction | None] = [None] * len(track.time_s)
+    predictions: list[Prediction | None] = [None] * len(track.time_s)
     found = np.flatnonzero(track.is_found & np.isfinite(track.time_s))
     found = found[np.unique(track.time_s[found], return_index=True)[1]]
     time, state = track.time_s[found], track.state[found]
     if len(time) < _MIN_TRIPLES + 2:
-        return nothing
+        return predictions
     middle, lever = _between(time[1:-1], time[:-2], time[2:], state[:-2], state[2:])
     acceleration2 = ((state[1:-1] - middle) / lever[:, None]) ** 2
     for index in np.flatnonzero(~track.is_found & np.isfinite(track.time_s)):
@@ -123,20 +123,20 @@ def predict_between(track: Track) -> list[Prediction | None]:
         after = int(np.searchsorted(time, now))
         if not 0 < after < len(time) or now == time[after]:
             continue
-        ends = slice(after - 1, after), slice(after, after + 1)
-        here, arm = _between(
-            track.time_s[index, None], *(time[i] for i in ends), *(state[i] for i in ends)
+        before, later = slice(after - 1, after), slice(after, after + 1)
+        state_now, arm = _between(
+            track.time_s[index, None], time[before], time[later], state[before], state[later]
         )
         near = np.argsort(np.abs(time[1:-1] - now), kind="stable")[:_TRIPLES]
         sd = arm[0] * np.sqrt(acceleration2[near].mean(axis=0))
-        nothing[index] = Prediction(
-            here[0, :2],
+        predictions[index] = Prediction(
+            state_now[0, :2],
             float(np.hypot(np.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)), _FLOOR_PX)),
-            float(np.exp(here[0, 2])),
+            float(np.exp(state_now[0, 2])),
             float(np.hypot(sd[2], _FLOOR_LOG)),
             "its neighbours",
         )
-    return nothing
+    return predictions
 
 
 def _between(

@@ -18,7 +18,7 @@ from kgcp.georef.sighting import Sighting
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What points must be to be handed over; None: whatever.
+    """Limits for the points that are handed over; None: no limit.
 
     Attributes
     ----------
@@ -81,17 +81,17 @@ def flag_jumps(
     local_frame : LocalFrame
         Of the points' positions.
     """
-    seen = {(one.frame, one.target): one for one in sightings if one.instance == 0}
+    sighting_of = {(each.frame, each.target): each for each in sightings if each.instance == 0}
     moving = [index for index, point in enumerate(gcps) if _moves(point)]
     order = sorted(moving, key=lambda index: gcps[index].time_s or 0.0)
     if not order:
         return tuple(gcps)
     times = np.array([gcps[index].time_s for index in order], dtype=np.float64)
     ups = local_frame.enu_from_map(np.array([gcps[index].position_map for index in order]))[:, 2]
-    sights = [seen[gcps[index].frame, gcps[index].target] for index in order]
+    sights = [sighting_of[gcps[index].frame, gcps[index].target] for index in order]
     series = {
         Flag.DISTANCE: np.array([(each.distance_m, each.sd_distance_m or 0.0) for each in sights]),
-        Flag.HEIGHT: np.array([_height(*pair) for pair in zip(sights, ups, strict=True)]),
+        Flag.HEIGHT: np.array([_height(each, up) for each, up in zip(sights, ups, strict=True)]),
     }
     flagged = list(gcps)
     for flag, values in series.items():
@@ -103,16 +103,17 @@ def flag_jumps(
     return tuple(flagged)
 
 
-def _height(seen: Sighting, up_m: float) -> tuple[float, float]:
+def _height(sighting: Sighting, up_m: float) -> tuple[float, float]:
     """Return the camera's height and its standard deviation [m]; NaN without a pose.
 
     h = n·t with the plate's normal n = R e_z: dh = n·dt + (n × t)·dδ for a left rotation δ.
     """
-    if seen.pose is None or seen.pose_cov is None:
+    pose, cov = sighting.pose, sighting.pose_cov
+    if pose is None or cov is None:
         return np.nan, np.nan
-    normal, sight = seen.pose.normal, seen.pose.translation_m
+    normal, sight = pose.normal, pose.translation_m
     effect = np.concatenate((normal, np.cross(normal, sight)))
-    return up_m + float(normal @ sight), float(np.sqrt(effect @ seen.pose_cov @ effect))
+    return up_m + float(normal @ sight), float(np.sqrt(effect @ cov @ effect))
 
 
 def pass_gates(

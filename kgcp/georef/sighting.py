@@ -1,4 +1,4 @@
-"""What the chain from sightings to ground needs of one measured target."""
+"""One measured target, as far as its place on the ground needs it."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What may move the edges: the columns of these names in the detections; None is null."""
+    """What may displace edges, named as the columns of the detections; None is null."""
 
     radius_px: float | None
     blur_px: float | None

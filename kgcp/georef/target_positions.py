@@ -240,7 +240,7 @@ class TargetPositions:
 def _moving_positions(
     vehicle: Vehicle, time_s: Sequence[float]
 ) -> list[TargetPosition | NoPosition]:
-    """Return the target's positions on the vehicle at frame times, or why there is none."""
+    """Return the target's positions on the vehicle at frame times, or why it is unknown."""
     times = np.array(time_s)
     coverage = vehicle.coverage(times)
     inside = np.array([kind is Coverage.INSIDE for kind in coverage])

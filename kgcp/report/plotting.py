@@ -1,4 +1,4 @@
-"""Matplotlib, as it is and not as the current folder has it."""
+"""Import of matplotlib without the settings of the current folder."""
 
 from __future__ import annotations
 

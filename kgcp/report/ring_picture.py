@@ -26,7 +26,7 @@ _LEAST_REACH_PX = 6.0
 _QUALITY = 80
 _MAGNIFIED = 2.0  # from here on pixels are shown as squares
 _PARTS = 4  # bits of a pixel that lines are drawn to
-# Told apart whatever one's colour vision, on ink and on plate; in OpenCV's order blue, green, red.
+# Distinct to all kinds of colour vision, on ink and on plate; in OpenCV's order blue, green, red.
 _FITTED, _DROPPED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
 _DARKER, _BRIGHTER = np.array([178.0, 114.0, 0.0]), np.array([0.0, 94.0, 213.0])
 _NOTHING = (226, 226, 226)
@@ -74,7 +74,7 @@ class _Cut:
 
     @classmethod
     def around(cls, view: RingView, reach: float) -> Self:
-        """Cut so many radii to each side of the centre."""
+        """Cut a square that reaches some radii to each side of the centre."""
         reach_px = math.ceil(max(reach * view.radius_px, _LEAST_REACH_PX))
         x, y = np.rint(view.centre_px).astype(int).tolist()
         return cls(x - reach_px, y - reach_px, 2 * reach_px + 1)

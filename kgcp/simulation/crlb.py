@@ -49,7 +49,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """What there is to see of one plate, and by what.
+    """One view of a plate: how it lies, and what takes the picture.
 
     Attributes
     ----------
@@ -163,10 +163,10 @@ def _ring_window(shot: Shot) -> PixelWindow:
 
 
 def _information(view: _View, share: FloatArray) -> FloatArray:
-    """Return what each pixel (n,) tells about its irradiance: 1 / variance, for one that is seen.
+    """Return the information (n,) of each pixel about its irradiance: 1 / variance if it is seen.
 
-    A pixel that may clip tells less, by the information of a censored normal variable; one that
-    is far above, nothing. Sharpening follows the noise and cannot add information: it is left
+    A pixel that may clip has less, that of a censored normal variable; one far above the limit
+    has none. Sharpening follows the noise and cannot add information: it is left
     out, as JPEG is.
     """
     gain, sensor = view.shot.gain, view.shot.sensor
@@ -174,8 +174,8 @@ def _information(view: _View, share: FloatArray) -> FloatArray:
     slope = _WHITE_LEVEL * sensor.tone.slope(exposure)
     electrons = sensor.full_well_e * exposure + sensor.read_noise_e**2
     variance = electrons / sensor.full_well_e**2 + 1.0 / 12.0 / slope**2
-    seen = censored_information((1.0 - exposure) / np.sqrt(variance))
-    information: FloatArray = view.opaque().ravel() * seen * gain**2 / variance
+    unclipped = censored_information((1.0 - exposure) / np.sqrt(variance))
+    information: FloatArray = view.opaque().ravel() * unclipped * gain**2 / variance
     return information
 
 

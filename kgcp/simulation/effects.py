@@ -1,7 +1,7 @@
-"""Each effect of real light by one figure: how much of it a simulated flight has.
+"""One number for each effect of real light: how strong it is in a simulated flight.
 
-A flight without the effect has the neutral figure: a share of 1 of the light is left, the ratio of
-the astigmatism is 1, everything else is 0.
+Without the effect it is neutral: 1 for the share of the light that is left and for the ratio of the
+astigmatism, 0 for all others.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """How much of each effect there is.
+    """How strong each effect is.
 
     Attributes
     ----------
     shadow : float
-        Share of the light that is left behind a shadow edge; 1: there is no edge.
+        Share of the light that is left behind a shadow edge; 1: no edge.
     stripes : int
         Number of stripe-shaped shadows.
     dirt : float

@@ -1,4 +1,4 @@
-"""What a camera will make of a target from some height: found or not, and how accurately.
+"""What to expect of a target from some height: whether it is found, and how accurately.
 
 The image model is the simulator's: a tilted plate in the middle of the image, well exposed, with
 the full well and read noise of `Sensor`. Its Cramér-Rao bound times the scatter that kgcp has over
@@ -30,7 +30,7 @@ from kgcp.simulation.regions import regular_polygon
 from kgcp.targets.layout import Ring, Target
 
 TILT_DEG = 6.0
-"""Of the plate against the viewing ray; more hardly matters, frontal views are better."""
+"""Tilt of the plate against the viewing ray: more hardly matters, frontal views are better."""
 GAIN = 0.85
 """Exposure relative to the one at which a perfect white clips."""
 SCATTER = {True: (1.0, 1.1), False: (1.4, 1.2)}

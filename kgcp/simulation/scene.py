@@ -1,4 +1,4 @@
-"""What lies about: clutter on the ground, the vehicle under its plate, the plates themselves."""
+"""The content of a frame: clutter on the ground, the vehicle under its plate, the plates."""
 
 from __future__ import annotations
 

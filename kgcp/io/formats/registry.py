@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from kgcp.io.files.sniff import ForeignFile
 
 Read = TypeVar("Read")
-"""Of a function that reads a file of some format."""
+"""Type of the function that reads a file of some format."""
 
 _OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsheet or archive"}
 
@@ -55,7 +55,7 @@ class Registry(Generic[Read]):
         Raises
         ------
         KgcpError
-            If it is of none of these.
+            If it has none of these formats.
         """
         for name, (matches, _) in self.formats.items():
             if matches(file):

@@ -44,7 +44,7 @@ class Blur:
         return bool(self.streak_x or self.streak_y)
 
     def scaled(self, factor: float) -> Blur:
-        """Return a blur that is so many times as wide."""
+        """Return the blur with all lengths times a factor."""
         square = factor * factor
         streak = (factor * self.streak_x, factor * self.streak_y)
         cube = square * factor

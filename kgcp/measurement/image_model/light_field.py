@@ -1,4 +1,4 @@
-"""Light that is not the same everywhere: how the levels of ink and plate vary over a window.
+"""Uneven light: how the levels of ink and plate vary over a window.
 
 The levels have a smooth part, splines on two grids of knots, and may have straight edges of
 shadows. Both add to the levels of ink and of plate, before tone curve and sharpening as those do.
@@ -100,7 +100,7 @@ def _weigh(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightField:
-    """What the levels of ink and plate have more than on average, over a window.
+    """How the levels of ink and plate differ from their means over a window.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class LightField:
         return float(0.5 * np.sum(self.precision * self.values**2)) + edge_penalty(self.edges)
 
     def added(self, pixels: FloatArray) -> FloatArray:
-        """Return what the levels of ink and plate (2, n) have more at pixels (2, n)."""
+        """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
         return added_by_knots(*self.knots.weights(pixels), self.values) + self.of_edges(pixels)
 
     def of_edges(self, pixels: FloatArray) -> FloatArray:

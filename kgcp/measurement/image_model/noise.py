@@ -25,8 +25,8 @@ _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
 _PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
-_MOST_SMEARED = 6  # grey values below the top in which more pixels than in the next ones …
-_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # … are so many of those at the top; how far that is felt
+_MOST_SMEARED = 6  # grey values below the top in which smeared pixels are looked for
+_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # least excess there, of the pixels at the top; reach of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class Censoring:
 def find_censoring(levels: FloatArray, count: float) -> Censoring:
     """Find where a window is clipped: at the ends of the range, or where values pile up.
 
-    Compression smears what is clipped over some grey values below; they say no more than it does.
+    Compression smears clipped pixels over some grey values below, which say no more than they do.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
 
 @compiled
 def _numbers_at_ends(levels: FloatArray, count: float) -> IndexArray:
-    """Return how many pixels (2, 13) are so many grey values from the top, and from the bottom."""
+    """Count pixels (2, 13) by their distance in grey values from the top and from the bottom."""
     number = np.zeros((2, 2 * _MOST_SMEARED + 1), np.intp)
     for level in levels:
         from_top, from_bottom = (1.0 - level) / count, level / count
@@ -91,7 +91,7 @@ def _numbers_at_ends(levels: FloatArray, count: float) -> IndexArray:
 
 
 def _smeared_over(number: IndexArray, pixels: int) -> int:
-    """Return over how many grey values what is clipped is smeared; 0 if it is not.
+    """Return over how many grey values clipped pixels are smeared; 0 if they are not.
 
     Parameters
     ----------
@@ -195,9 +195,9 @@ def _plateau_variances(
     ink, white = _trimmed_variance(dark[:of_dark]), _trimmed_variance(bright[:of_bright])
     if not math.isnan(ink + white):
         return ink, white
-    for one in (ink, white, _trimmed_variance(both[:of_both])):
-        if not math.isnan(one):
-            return one, one
+    for variance in (ink, white, _trimmed_variance(both[:of_both])):
+        if not math.isnan(variance):
+            return variance, variance
     return floor, floor
 
 
@@ -206,12 +206,12 @@ def median_at_edges(
     values: FloatArray, share: FloatArray, ink: float, plate: float, otherwise: float
 ) -> float:
     """Return the median of values (n,) where the white share (n,) is between two limits."""
-    there, count = np.empty(len(values)), 0
+    at_edges, count = np.empty(len(values)), 0
     for i in range(len(values)):
         if ink < share[i] < plate:
-            there[count] = values[i]
+            at_edges[count] = values[i]
             count += 1
-    return float(np.median(there[:count])) if count else otherwise
+    return float(np.median(at_edges[:count])) if count else otherwise
 
 
 @compiled

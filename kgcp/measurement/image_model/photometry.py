@@ -159,7 +159,7 @@ class PhotometricModel:
     ) -> FloatArray:
         """Return the modelled grey values (n,) before clipping.
 
-        `added` (2, n) is what ink and plate have more light at every pixel, of their contrast.
+        `added` (2, n) is the additional light on ink and plate at every pixel, of their contrast.
         """
         value = np.empty(len(share))
         _expose(share, self.offsets, light.values, self._added(added), value)
@@ -276,10 +276,10 @@ def _share_at(level: float, light: tuple[float, ...]) -> float:
     for k in range(1, _SHARE_STEPS + 1):
         t = k / _SHARE_STEPS
         tone, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
-        there = black + (white - black) * tone
-        if there > level:
-            return (k - 1 + (level - highest) / (there - highest)) / _SHARE_STEPS
-        highest = max(highest, there)
+        grey = black + (white - black) * tone
+        if grey > level:
+            return (k - 1 + (level - highest) / (grey - highest)) / _SHARE_STEPS
+        highest = max(highest, grey)
     return 1.0
 
 

@@ -148,7 +148,7 @@ def clear_of_dots(
 ) -> BoolArray:
     """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
 
-    On a small ring with many dots none may be: then the places farthest from dots are taken.
+    On a small ring with many dots no angle may be clear: then those farthest from dots are taken.
     """
     dots_rad = np.radians(np.add(ring.code_deg, lag_deg))
     gap_m = np.empty(len(angles_rad))

@@ -56,7 +56,7 @@ class Bank:
 
 
 def bank_of(images: FloatArray, row_weights: FloatArray, frequencies: int) -> Bank:
-    """Prepare templates (t, rows, angles) whose rows weigh so much (rows,).
+    """Prepare templates (t, rows, angles), given the weights of their rows (rows,).
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ RAYS = 40  # a ring of 6 px radius has about as many pixels along its edge
 _RADII = np.arange(0.5, 1.71, 0.04)  # of samples: seeds are good to a fifth, tilts go to 45°
 _STEP = 2  # samples either side that a slope is taken over: as wide as the blur of small rings
 _EVERY = 2  # ray is looked at first: most seeds are not rings, which half of the rays shows
-# Of the weighting of residuals, pass by pass: wide at first, so that a seed that is off by a
+# Widths of the residuals' weights, pass by pass: wide at first, so that a seed that is off by a
 # quarter of its radius still finds the curve; then as narrow as edges scatter.
 _WIDTHS_AT_FIRST = np.array((0.25, 0.12, 0.07))
 _WIDTHS = np.array((0.07, 0.05))

@@ -31,7 +31,7 @@ _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
 _MIN_CONTRAST = 5  # grey values: less is noise
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
 _LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
-_SAME_WHITE = 0.8  # core and surround may differ by so much, of the contrast
+_SAME_WHITE = 0.8  # largest difference of core and surround, of the contrast
 # Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
 # value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
 # a third may be dark, hidden or beyond the plate, and only bright ranks tell.

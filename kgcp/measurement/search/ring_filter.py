@@ -1,6 +1,6 @@
 """Where box filters answer to a ring: the first test of every pixel, which must be cheap.
 
-A small ring is a bright core in a dark disc in a bright surround. Of the means over 3 x 3, 5 x 5
+A small ring is a bright core in a dark disc in a bright surround. From the means over 3 x 3, 5 x 5
 and 7 x 7 pixels (the last weighted less towards its corners, as the mean of nine 5 x 5 means) the
 score is
 
@@ -95,7 +95,7 @@ def _limit(level: IndexArray) -> int:
 def _keep_best(peaks: FloatArray, limit: int) -> int:
     """Move the `limit` peaks with the largest shares to the front; return their number.
 
-    Of those that share the least of these shares the first are kept.
+    If several peaks have the smallest share that is kept, the first of them stay.
     """
     least = np.partition(peaks[:, 3].copy(), len(peaks) - limit)[len(peaks) - limit]
     count, alike = 0, limit - np.sum(peaks[:, 3] > least)

@@ -28,7 +28,7 @@ def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray
 def sample_ellipses(
     grey: GreyArray, outlines: Sequence[Ellipse], factors: FloatArray, circle: FloatArray
 ) -> FloatArray:
-    """Sample a frame on ellipses that are so many times as large as outlines, as `sample_grey`.
+    """Sample a frame on outlines enlarged by some factors, as `sample_grey`.
 
     Parameters
     ----------

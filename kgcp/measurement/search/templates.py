@@ -33,7 +33,7 @@ LOOKS = (
 )
 ANGLES = 120
 FREQUENCIES = 24  # a dot is wider than a wave of the highest; the others change scores by 5e-3
-SHIFTS = 4  # the edge that is seen may be up to so many steps off the true one, either way
+SHIFTS = 4  # steps that the visible edge may be off the true one, either way
 _ROWS = 20
 _LOG_STEP = 0.06
 _OUTERMOST = 1.15  # of the outer radius: the plate's margin is hardly wider

@@ -1,4 +1,4 @@
-"""Rings in light that is not the same all around: grey values as they were in even light."""
+"""Rings in uneven light: their grey values as they would be in even light."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEAST_CONTRAST = 0.2  # of the typical one: what is fainter is something else
 
 
 def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None:
-    """Return a polar patch as it were if ink and plate had the same levels at all angles.
+    """Return a polar patch as it would be if ink and plate had the same levels at all angles.
 
     They are read on either side of both edges, smoothed around the ring, and between the edges
     taken to change evenly: so much smoother than a code's dots that they cannot make one.
@@ -33,7 +33,7 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
     Returns
     -------
     (rows + 2 shifts, angles) array, or None
-        None where the levels are even, or where a part is no ring.
+        None if the levels are even, or if a part does not look like a ring.
     """
     plate, outside, disc, inside = (row + shift for row in edge_rows(ring))
     white_out, white_in = (_around(patch[r], 0.5, _HALF_PLATE) for r in (plate, disc))

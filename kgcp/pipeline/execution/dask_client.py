@@ -1,7 +1,7 @@
 """A Dask cluster as workers: the frames of one flight, looked at by many machines.
 
-Dask carries frames' names out and results home, and sends elsewhere what a machine that is gone had
-in its hands. `kgcp.pipeline.execution.dask_worker` is what happens there.
+Dask sends frames' names out and results back, and gives the work of a machine that is gone to
+others. `kgcp.pipeline.execution.dask_worker` is the part that runs there.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _LOCAL = re.compile(r"local:([1-9]\d{0,2})")
 _CONNECT_S = 5.0  # for the scheduler to answer
-_WORKERS_S = 120.0  # without any worker, after which nobody waits any more
+_WORKERS_S = 120.0  # without any worker, after which the run fails
 _WATCH_S = 2.0  # between two looks whether there are workers
 
 
@@ -77,7 +77,7 @@ class DaskCluster(Executor):
             self._settle(future, self._gone("has dropped the work"))
             return
         error = inner.exception()
-        if type(error).__name__ == "KilledWorker":  # of distributed: several workers in its hands
+        if type(error).__name__ == "KilledWorker":  # of distributed: several workers died of it
             error = Lost(TaskFailure.CRASHED)
         elif isinstance(error, ImportError):
             error = KgcpError(
@@ -98,7 +98,7 @@ class DaskCluster(Executor):
                 future.set_exception(error)
 
     def _watch(self) -> None:
-        """Give up what is waited for without end, since there is no worker to do it."""
+        """Fail the calls that wait if there has been no worker for a long time."""
         alone_s = 0.0
         while not self._is_over.wait(_WATCH_S):
             try:
@@ -118,7 +118,7 @@ class DaskCluster(Executor):
 
 @contextmanager
 def connected(scheduler: str, limit_s: float, folders: tuple[Path, ...]) -> Iterator[DaskCluster]:
-    """Have the workers of a Dask scheduler until the block ends.
+    """Provide the workers of a Dask scheduler until the block ends.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def _connect(scheduler: str, stack: ExitStack) -> Client:
     try:
         with defer_interrupts():
             if local is not None:
-                address = LocalCluster(  # in this process, where nobody else can give it work
+                address = LocalCluster(  # in this process, where others cannot submit work
                     n_workers=int(local[1]),
                     threads_per_worker=1,
                     processes=False,

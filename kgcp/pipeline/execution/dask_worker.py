@@ -64,19 +64,20 @@ def on_worker(context: JobContext, function: Callable[..., Any], *args: Any) -> 
     for folder in context.folders:
         if not folder.is_dir():
             raise KgcpError(
-                f"{folder}: is not seen by the worker {_here()}; mount it there under the same name"
+                f"{folder}: is not seen by the worker {_address()}; mount it there under the same"
+                " name"
             )
     return _process(context).call(function, *args)
 
 
 def _require_same_versions(context: JobContext) -> None:
-    here = _own_versions()
-    differing = [name for name, value in context.versions.items() if here.get(name) != value]
+    own = _own_versions()
+    differing = [name for name, value in context.versions.items() if own.get(name) != value]
     if differing:
         name = differing[0]
         raise KgcpError(
-            f"the worker {_here()}: has {name} {here.get(name)}, not {context.versions[name]}, and"
-            " might give other results; install the same versions everywhere"
+            f"the worker {_address()}: has {name} {own.get(name)}, not {context.versions[name]},"
+            " and might give other results; install the same versions everywhere"
         )
 
 
@@ -85,7 +86,7 @@ def _own_versions() -> Mapping[str, str]:
     return versions()
 
 
-def _here() -> str:
+def _address() -> str:
     from distributed import get_worker
 
     return str(get_worker().address)
@@ -97,7 +98,7 @@ def _process(context: JobContext) -> WorkerProcess:
     if process is None or run != context.run:
         if process is not None:
             process.end()  # of a run that had no time to say that it ends
-        # Dask's workers may have no children, lest these outlive them. Ours end with their parent.
+        # Dask's workers may have no children, which might outlive them. Ours end with their parent.
         multiprocessing.current_process().daemon = False
         process = WorkerProcess(context.limit_s)
         _processes[thread] = context.run, process

@@ -70,14 +70,14 @@ def open_pool(
     frames: Path | StoredFolder,
     callers: tuple[Callable[..., object], ...] = (),
 ) -> Iterator[WorkerPool]:
-    """Have a crew until the block ends.
+    """Provide workers until the block ends.
 
     Parameters
     ----------
     jobs : int or None
         0: this process; None: the usable cores, or all threads that the scheduler has.
     limit_s : float
-        Time for one look at one frame [s]; no limit in this process.
+        Time for one call [s]; no limit in this process.
     scheduler : str or None
         As `kgcp.pipeline.execution.dask_client.connected` takes it; None: this machine works alone.
     frames : Path or StoredFolder
@@ -88,7 +88,7 @@ def open_pool(
     Raises
     ------
     KgcpError
-        If the scheduler is of no use.
+        If the scheduler cannot be used.
     """
     if scheduler is None:
         jobs = usable_cores() if jobs is None else jobs

@@ -6,9 +6,9 @@ line says by what all results were made. A line is appended when its result is t
 whatever ends the run leaves at most one broken line, which counts as not done.
 
 Records are written as text without the loss of a bit. Not by pickling: a journal lies in a folder
-that may come from anybody, and a pickle may run code. Nor as a database: SQLite is no shorter once
-it must not trust the file (schemas with triggers, trees without end, rollback journals that name
-files to delete), and knows no checksums.
+that may come from anywhere, and a pickle may run code. Nor in a database: SQLite takes no less code
+once it must not trust the file (schemas with triggers, endless trees, rollback journals that name
+files to delete), and has no checksums.
 """
 
 from __future__ import annotations
@@ -126,9 +126,9 @@ class Journal:
     path : Path
         The file; it and its folder are made if need be. What was made otherwise is deleted.
     making : mapping of str
-        By what results are made: name, in words, to value.
+        What results are made with: name, for messages, to value.
     is_new : bool
-        Whether to delete whatever is there.
+        Whether to discard what is there.
 
     Attributes
     ----------

@@ -45,7 +45,7 @@ class SerialExecutor(Executor):
         with defer_interrupts():
             try:
                 future.set_result(fn(*args, **kwargs))
-            except Exception as error:  # it belongs to whoever asks for the result
+            except Exception as error:  # for the caller that asks for the result
                 future.set_exception(error)
         return future
 

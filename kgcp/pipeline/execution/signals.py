@@ -18,7 +18,7 @@ def defer_interrupts() -> Iterator[None]:
     An exception that a signal's handler raises between two lines of an executor's code leaves a
     lock behind, for which another thread then waits for ever; raised while a compiled function
     makes Python's objects of its result, it ends as a `SystemError`. Processes started in the block
-    inherit that Ctrl-C is none of their business.
+    inherit that Ctrl-C is blocked.
     """
     if threading.current_thread() is not threading.main_thread():  # where no handler runs
         yield

@@ -17,7 +17,7 @@ from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, Points, picture, scatter, sheet
 
 WINDOW_M = 10.0  # of the paper's Figure 9
-_SIGNED = "PuOr"  # orange and violet: told apart whatever one's colour vision
+_SIGNED = "PuOr"  # orange and violet: distinct to all kinds of colour vision
 _BINS = [0.5 * step - 5.25 for step in range(22)]
 
 _CONFIDENCE = 1.96  # standard deviations: 95 %

@@ -1,4 +1,4 @@
-"""The numbers of the bias report: what the study says, as far as it goes into figures and words."""
+"""The numbers of the bias report: the study, reduced to what figures and sentences show."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class EdgeNumbers:
     one_percent, two_percent : Spread
         Of the errors [%].
     regression : Regression or None
-        Of the distances by one edge; None, too, where these are what was measured.
+        Of the distances by one edge; None also if these are the measured distances.
     """
 
     rows: IndexArray

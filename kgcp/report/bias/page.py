@@ -86,7 +86,7 @@ def _base64(content: bytes) -> str:
 
 
 def _embedded(data: Json) -> Markup:
-    """Return JSON that may stand in a script element, whatever names it holds."""
+    """Return JSON that is safe in a script element, whatever names it contains."""
     text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"))
     # ASCII already; without these three no text can end the element or begin a comment
     for character in "<>&":

@@ -114,7 +114,7 @@ def _slope(slope: Slope | None) -> Json | None:
 
 
 def finite(value: object) -> object:
-    """Return a tree of numbers in which what is not a finite number is null."""
+    """Return a tree of numbers with null for those that are not finite."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -47,8 +47,8 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
     for sensor in sensors:
         name = sensor.get("label" if is_labelled else "id") or ""
         calibrations = sensor.findall("calibration")
-        adjusted = [one for one in calibrations if one.get("class") == "adjusted"]
-        found += [_entry(file, name, one) for one in (adjusted or calibrations)[:1]]
+        adjusted = [element for element in calibrations if element.get("class") == "adjusted"]
+        found += [_entry(file, name, element) for element in (adjusted or calibrations)[:1]]
     return tuple(found)
 
 

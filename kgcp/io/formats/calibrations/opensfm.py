@@ -58,7 +58,7 @@ def _size(camera: JsonObject) -> tuple[int, int] | None:
 
 
 def _camera(camera: JsonObject, width: int, height: int) -> Camera:
-    """Scale a camera, whose unit is the longer side of whatever frame it is for."""
+    """Return the camera for a frame, of whose longer side its lengths are shares."""
     model = camera.text("projection_type")
     if model not in _TERMS:
         raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)

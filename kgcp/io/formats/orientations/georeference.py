@@ -88,7 +88,7 @@ def read_offset(path: Path) -> FloatArray:
     Raises
     ------
     KgcpError
-        If there is none.
+        If the file has no such line.
     """
     file = ForeignFile(path, "[reference] offset")
     for _, row in file.rows:
@@ -141,15 +141,15 @@ def _is_same(crs: str, flight_crs: str | None) -> bool:
 
 
 def _moved(
-    file: ForeignFile, source: SourcePoses, here: LocalFrame, crs: str | None
+    file: ForeignFile, source: SourcePoses, local_frame: LocalFrame, crs: str | None
 ) -> SourcePoses:
-    """Bring poses from their map, that of `here`, to the flight's."""
+    """Bring poses from their map, that of `local_frame`, to the flight's."""
     if crs is None:
         raise file.error(
             "has coordinates of its own CRS, but flight.toml has none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )
-    transform = CrsTransform.to(crs, here, source.position[0], FLIGHT_TOML)
+    transform = CrsTransform.to(crs, local_frame, source.position[0], FLIGHT_TOML)
     turn = np.array([transform.axes(point) for point in source.position])
     sd = source.sd_position_m
     if sd is not None:  # the axes turn; what correlates then is left out

@@ -47,7 +47,7 @@ def _frame_of(file: ForeignFile, name: str, frames: set[str], by_name: dict[str,
         return name
     fitting = by_name.get(PurePosixPath(name).name, [])
     if len(fitting) > 1:  # folders may tell them apart
-        fitting = [one for one in fitting if _ends_alike(name, one)] or fitting
+        fitting = [frame for frame in fitting if _ends_alike(name, frame)] or fitting
     if len(fitting) > 1:
         raise file.error(
             f"image {name!r} may be {fitting[0]!r} or {fitting[1]!r}",
@@ -58,9 +58,9 @@ def _frame_of(file: ForeignFile, name: str, frames: set[str], by_name: dict[str,
 
 def _ends_alike(name: str, frame: str) -> bool:
     """Whether the longer of two paths ends in the shorter, with extension or without."""
-    one = PurePosixPath(name).parts
-    for other in (PurePosixPath(frame), PurePosixPath(frame).with_suffix("")):
-        shared = min(len(one), len(other.parts))
-        if shared > 1 and one[-shared:] == other.parts[-shared:]:
+    parts = PurePosixPath(name).parts
+    for path in (PurePosixPath(frame), PurePosixPath(frame).with_suffix("")):
+        shared = min(len(parts), len(path.parts))
+        if shared > 1 and parts[-shared:] == path.parts[-shared:]:
             return True
     return False

@@ -50,7 +50,7 @@ def read_trajectory(
     ------
     KgcpError
         Naming file and line: it is missing, of no known format or wrong, its times lack a day or
-        a time system, its positions have no way to the flight's CRS, or there is no attitude.
+        a time system, no exact way leads to the flight's CRS, or it has no attitude.
     """
     file = ForeignFile(path, "[vehicle] trajectory")
     if not file.head.strip():

@@ -17,7 +17,7 @@ from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, 
 
 GEOCENTRIC = "EPSG:4978"
 _AS_HEIGHTS = "write the solution as latitude, longitude and height (out-solformat = llh)"
-# Of each kind of solution: its columns in the order x, y, z, their deviations, and the roots of
+# For each kind of solution: its columns in the order x, y, z, their deviations, and the roots of
 # the covariances xy, yz, zx.
 _GEODETIC = (("longitude", "latitude", "height"), ("sde", "sdn", "sdu"), ("sdne", "sdun", "sdeu"))
 _ECEF = (("x-ecef", "y-ecef", "z-ecef"), ("sdx", "sdy", "sdz"), ("sdxy", "sdyz", "sdzx"))
