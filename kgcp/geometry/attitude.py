@@ -58,8 +58,7 @@ def down_in_camera(opk_deg: FloatArray) -> FloatArray:
     the meridian convergence nor the CRS matters.
     """
     photo_from_map = np.swapaxes(rotation_from_opk(opk_deg), 1, 2)
-    down: FloatArray = -photo_from_map[:, :, 2] @ CAMERA_FROM_PHOTO.T
-    return down
+    return np.asarray(-photo_from_map[:, :, 2] @ CAMERA_FROM_PHOTO.T)
 
 
 def attitude_axes(frame_from_body: FloatArray, down: FloatArray) -> FloatArray:

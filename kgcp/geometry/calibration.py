@@ -110,5 +110,4 @@ def image_by_calibration(camera: Camera, normalised: FloatArray) -> FloatArray:
         k5,
         k6,
     ]
-    derivatives: FloatArray = np.stack(columns, axis=-1).transpose(1, 0, 2)
-    return derivatives
+    return np.asarray(np.stack(columns, axis=-1).transpose(1, 0, 2))

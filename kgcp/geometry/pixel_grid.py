@@ -80,8 +80,7 @@ def rays_of_window(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatA
     fields = np.empty((6, WINDOW_ORDER, WINDOW_ORDER))
     fields[0], fields[1] = at_nodes[..., 0], at_nodes[..., 1]
     _fill_inverse(camera.distort_jacobian(at_nodes), fields[2:])
-    flat: FloatArray = (rows @ fields @ columns.T).reshape(6, -1)
-    return flat
+    return np.asarray((rows @ fields @ columns.T).reshape(6, -1))
 
 
 def _fill_inverse(matrix: FloatArray, inverse: FloatArray) -> None:

@@ -92,8 +92,7 @@ def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
 def body_from_plate(mount_deg: float) -> FloatArray:
     """Return the plate's axes (3, 3) in body axes, as columns, for a turn from the default."""
     turn = rotation_about(np.array([0.0, 0.0, math.radians(mount_deg)]))
-    mounted: FloatArray = _BODY_FROM_LEVEL_PLATE @ turn
-    return mounted
+    return np.asarray(_BODY_FROM_LEVEL_PLATE @ turn)
 
 
 def camera_priors(
@@ -180,8 +179,7 @@ def _whole_pose_cov(sighting: Sighting) -> FloatArray | None:
     """Return the pose's covariance with the errors that all frames share; None: not known."""
     if sighting.pose_cov is None or sighting.common_pose_cov is None:
         return sighting.pose_cov
-    whole: FloatArray = sighting.pose_cov + sighting.common_pose_cov
-    return whole
+    return np.asarray(sighting.pose_cov + sighting.common_pose_cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

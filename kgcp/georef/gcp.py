@@ -68,8 +68,7 @@ class Gcp:
         """Share (3, 3) of `cov_m2` that is one error in all points [m²]."""
         if self.common_m is None or self.cov_m2 is None:
             return self.cov_m2
-        product: FloatArray = self.common_m @ self.common_m.T
-        return product
+        return np.asarray(self.common_m @ self.common_m.T)
 
 
 class Flag(StrEnum):

@@ -133,8 +133,7 @@ class LocalFrame:
         around = np.asarray(enu, dtype=np.float64)[..., None, :] + steps
         moved = self.map_from_enu(around.reshape(-1, 3)).reshape(around.shape)
         differences = (moved[..., :3, :] - moved[..., 3:, :]) / (2.0 * _JACOBIAN_STEP_M)
-        jacobians: FloatArray = np.swapaxes(differences, -1, -2)
-        return jacobians
+        return np.asarray(np.swapaxes(differences, -1, -2))
 
     def grid_rotation(self, enu: FloatArray) -> FloatArray:
         """Return the rotations (..., 3, 3) from the map's axes to ENU at points (..., 3).
@@ -166,8 +165,7 @@ class LocalFrame:
 
     def level_rotations(self, enu: FloatArray) -> FloatArray:
         """Return the rotations (n, 3, 3) from east, north, up at points (n, 3) to ENU axes."""
-        rotations: FloatArray = self.ecef_from_enu.T @ _level_axes(self._geodetic_from_enu(enu))
-        return rotations
+        return np.asarray(self.ecef_from_enu.T @ _level_axes(self._geodetic_from_enu(enu)))
 
     def _geodetic(self, xyz: FloatArray) -> FloatArray:
         """Return longitude, latitude [rad] and ellipsoidal height [m] (n, 3) of map points."""
@@ -231,8 +229,7 @@ def map_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
     along_y = local_frame.enu_from_map(position + step) - local_frame.enu_from_map(position - step)
     x = np.cross(along_y, up)
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
-    axes: FloatArray = local_frame.ecef_from_enu @ np.stack((x, np.cross(up, x), up), axis=-1)
-    return axes
+    return np.asarray(local_frame.ecef_from_enu @ np.stack((x, np.cross(up, x), up), axis=-1))
 
 
 def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
@@ -244,8 +241,7 @@ def level_axes_ecef(crs: str, position: FloatArray) -> FloatArray:
     else:
         local_frame = LocalFrame.at(crs, position[0], VEHICLE_CRS)
         enu = local_frame.enu_from_map(position)
-    axes: FloatArray = local_frame.ecef_from_enu @ local_frame.level_rotations(enu)
-    return axes
+    return np.asarray(local_frame.ecef_from_enu @ local_frame.level_rotations(enu))
 
 
 def turn_covariances(
@@ -253,8 +249,7 @@ def turn_covariances(
 ) -> FloatArray:
     """Bring covariances (n, 3, 3) from one set of axes (n, 3, 3) to another."""
     turn = np.swapaxes(new_axes_ecef, -1, -2) @ old_axes_ecef
-    turned: FloatArray = turn @ cov_m2 @ np.swapaxes(turn, -1, -2)
-    return turned
+    return np.asarray(turn @ cov_m2 @ np.swapaxes(turn, -1, -2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,7 +318,6 @@ class CrsTransform:
 
 def _level_from_grid(local_frame: LocalFrame, xyz: FloatArray) -> FloatArray:
     enu = local_frame.enu_from_map(xyz)
-    rotations: FloatArray = np.swapaxes(
-        local_frame.level_rotations(enu), 1, 2
-    ) @ local_frame.grid_rotation(enu)
-    return rotations
+    return np.asarray(
+        np.swapaxes(local_frame.level_rotations(enu), 1, 2) @ local_frame.grid_rotation(enu)
+    )

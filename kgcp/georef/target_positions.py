@@ -118,8 +118,7 @@ class Vehicle:
         axes = self.local_frame.grid_rotation(states.position_m)
         if states.cov_position_m2 is None:
             return covariance_along(axes, sd_position_m)
-        turned: FloatArray = axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2)
-        return turned
+        return np.asarray(axes @ states.cov_position_m2 @ np.swapaxes(axes, -1, -2))
 
     def _attitude_cov(self, states: States, lever: FloatArray) -> FloatArray:
         """Return the share (n, 3, 3) of attitude times lever arm."""

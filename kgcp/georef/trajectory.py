@@ -33,8 +33,7 @@ def body_to_ned(roll_deg: FloatArray, pitch_deg: FloatArray, heading_deg: FloatA
     """
     angles = np.stack(np.broadcast_arrays(heading_deg, pitch_deg, roll_deg), axis=-1)
     flat = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True).as_matrix()
-    rotations: FloatArray = flat.reshape((*angles.shape[:-1], 3, 3))
-    return rotations
+    return np.asarray(flat.reshape((*angles.shape[:-1], 3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,8 +201,7 @@ def _between(
         return None
     step = samples[left + 1] - samples[left]
     share = fraction.reshape(-1, *(1 for _ in samples.shape[1:]))
-    between: FloatArray = samples[left] + share * step
-    return between
+    return np.asarray(samples[left] + share * step)
 
 
 def attitude_from_course(

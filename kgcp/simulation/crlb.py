@@ -105,8 +105,7 @@ def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
     _, triangle = np.linalg.qr(np.column_stack((nuisances, pose / scale)))
     count = nuisances.shape[1]
     inverse = np.linalg.inv(triangle[count:, count:]) / scale[:, None]
-    covariance: FloatArray = inverse @ inverse.T
-    return covariance
+    return np.asarray(inverse @ inverse.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,8 +174,7 @@ def _information(view: _View, share: FloatArray) -> FloatArray:
     electrons = sensor.full_well_e * exposure + sensor.read_noise_e**2
     variance = electrons / sensor.full_well_e**2 + 1.0 / 12.0 / slope**2
     unclipped = censored_information((1.0 - exposure) / np.sqrt(variance))
-    information: FloatArray = view.opaque().ravel() * unclipped * gain**2 / variance
-    return information
+    return np.asarray(view.opaque().ravel() * unclipped * gain**2 / variance)
 
 
 def censored_information(margin: FloatArray) -> FloatArray:
@@ -190,8 +188,7 @@ def censored_information(margin: FloatArray) -> FloatArray:
     density = np.exp(-0.5 * margin * margin) / math.sqrt(2.0 * math.pi)
     log_density = -0.5 * (margin * margin + math.log(2.0 * math.pi))
     above = np.exp(2.0 * log_density - log_ndtr(-margin))  # φ² / (1 − Φ)
-    information: FloatArray = ndtr(margin) - margin * density + above
-    return information
+    return np.asarray(ndtr(margin) - margin * density + above)
 
 
 def _pose_derivatives(view: _View) -> FloatArray:
@@ -214,8 +211,7 @@ def _pose_derivatives(view: _View) -> FloatArray:
         after = view.seen(view.white(pose.moved(size * direction)), optics)
         before = view.seen(view.white(pose.moved(-size * direction)), optics)
         columns.append((plate.white - plate.black) * (after - before).ravel() / (2.0 * size))
-    derivatives: FloatArray = np.column_stack(columns) @ directions.T
-    return derivatives
+    return np.asarray(np.column_stack(columns) @ directions.T)
 
 
 def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:

@@ -143,5 +143,4 @@ def _enlarged(coarse: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     left = np.minimum(columns.astype(int), coarse.shape[1] - 2)
     down, right = (rows - top)[:, None], columns - left
     tall = coarse[top] * (1.0 - down) + coarse[top + 1] * down
-    wide: FloatArray = tall[:, left] * (1.0 - right) + tall[:, left + 1] * right
-    return wide
+    return np.asarray(tall[:, left] * (1.0 - right) + tall[:, left + 1] * right)

@@ -138,8 +138,7 @@ class Optics:
         blurred = scipy.fft.irfft2(spectrum, s=padded_shape, overwrite_x=True)
         blurred = blurred[margin : margin + height, margin : margin + width]
         blocks = blurred.reshape(height // oversampling, oversampling, -1, oversampling)
-        irradiance: FloatArray = blocks.mean(axis=(1, 3))
-        return irradiance
+        return np.asarray(blocks.mean(axis=(1, 3)))
 
     def _transfer(self, shape: list[int], oversampling: int) -> FloatArray | ComplexArray:
         fy = scipy.fft.fftfreq(shape[0])[:, None] * oversampling  # cycles per pixel

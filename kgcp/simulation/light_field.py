@@ -109,8 +109,7 @@ class Cloud:
         middle = 0.5 * (len(self.lattice) - 1)
         places = np.stack((y_m / self.cell_m + middle, x_m / self.cell_m + middle))
         interpolated = map_coordinates(self.lattice, places, order=3, mode="nearest")
-        reflectance: FloatArray = np.maximum(interpolated, _LEAST_REFLECTANCE)
-        return reflectance
+        return np.asarray(np.maximum(interpolated, _LEAST_REFLECTANCE))
 
 
 @dataclass(frozen=True, slots=True)

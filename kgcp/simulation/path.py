@@ -49,10 +49,9 @@ class VehicleStates:
     @property
     def level_from_body(self) -> FloatArray:
         """Attitude (n, 3, 3): body axes against east, north, up at the vehicle, as columns."""
-        attitude: FloatArray = ENU_FROM_NED @ body_to_ned(
-            self.roll_deg, self.pitch_deg, self.heading_deg
+        return np.asarray(
+            ENU_FROM_NED @ body_to_ned(self.roll_deg, self.pitch_deg, self.heading_deg)
         )
-        return attitude
 
 
 def drive(elapsed_s: FloatArray) -> VehicleStates:
@@ -148,8 +147,7 @@ def hover(
 def _pixel_inside(camera: Camera, reach_px: float, rng: np.random.Generator) -> FloatArray:
     size = np.array([camera.width, camera.height], dtype=np.float64)
     margin = np.minimum(1.2 * reach_px + 4.0, 0.5 * size)
-    pixel: FloatArray = margin + rng.random(2) * (size - 2.0 * margin) - 0.5
-    return pixel
+    return np.asarray(margin + rng.random(2) * (size - 2.0 * margin) - 0.5)
 
 
 def _pixel_outside(camera: Camera, reach_px: float, rng: np.random.Generator) -> FloatArray:

@@ -103,16 +103,14 @@ class Phone:
         kept = scatter / (scatter + self.noise_reduction**2 * noise)
         smooth = uniform_filter(kept, size) * grey + uniform_filter((1.0 - kept) * mean, size)
         tints = [uniform_filter(uniform_filter(c - grey, size), size) for c in colours]
-        smoothed: FloatArray = np.maximum(smooth + np.stack(tints), 0.0)
-        return smoothed
+        return np.asarray(np.maximum(smooth + np.stack(tints), 0.0))
 
     def _local_gain(self, grey: FloatArray) -> FloatArray:
         """Return the gain (height, width) that brings the surroundings nearer to middle grey."""
         size = 2 * round(self.local_tone_px) + 1
         for _ in range(3):  # boxes of 2σ, three times: nearly a Gaussian of σ
             grey = uniform_filter(grey, size)
-        gain: FloatArray = (_MIDDLE_GREY / np.maximum(grey, _DARKEST)) ** self.local_tone
-        return gain
+        return np.asarray((_MIDDLE_GREY / np.maximum(grey, _DARKEST)) ** self.local_tone)
 
 
 def demosaic(raw: FloatArray) -> FloatArray:
@@ -145,5 +143,4 @@ def _on_mosaic(shape: tuple[int, ...]) -> FloatArray:
 
 
 def _brightness(colours: FloatArray) -> FloatArray:
-    grey: FloatArray = 0.25 * (colours[0] + colours[2]) + 0.5 * colours[1]
-    return grey
+    return np.asarray(0.25 * (colours[0] + colours[2]) + 0.5 * colours[1])

@@ -168,8 +168,7 @@ def _share_inside(distance: FloatArray, a: FloatArray, b: FloatArray) -> FloatAr
     square = np.square(mean - distance)
     square -= np.square(np.maximum(half - distance, 0.0))
     square -= np.square(np.maximum(-half - distance, 0.0))
-    share: FloatArray = square / (2.0 * wide * narrow)
-    return share
+    return np.asarray(square / (2.0 * wide * narrow))
 
 
 def outline_box(camera: Camera, pose: Pose, shape: Region) -> tuple[FloatArray, FloatArray]:

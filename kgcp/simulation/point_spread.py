@@ -96,8 +96,7 @@ def _oriented(direction_deg: float, along: float, across: float) -> FloatArray:
     """Return the covariance (2, 2) with variances along and across a direction."""
     angle = math.radians(direction_deg)
     axis = np.array([math.cos(angle), math.sin(angle)])
-    covariance: FloatArray = across * np.eye(2) + (along - across) * np.outer(axis, axis)
-    return covariance
+    return np.asarray(across * np.eye(2) + (along - across) * np.outer(axis, axis))
 
 
 def _coma_transfer(

@@ -56,8 +56,7 @@ class DiscRegion:
     def signed_distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the distance to the circle [m], negative inside."""
         dx, dy = x - self.centre_m[0], y - self.centre_m[1]
-        distance: FloatArray = np.sqrt(dx * dx + dy * dy) - self.radius_m
-        return distance
+        return np.asarray(np.sqrt(dx * dx + dy * dy) - self.radius_m)
 
     def outward(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the unit gradient of the signed distance."""

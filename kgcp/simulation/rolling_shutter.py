@@ -71,8 +71,7 @@ class RowMotion:
 
     def shift_px(self, rows: FloatArray) -> FloatArray:
         """Return how far the image has moved (n, 2) when rows (n,) are exposed [px]."""
-        shift: FloatArray = (rows - self.still_row)[:, None] * np.array(self.px_per_row)
-        return shift
+        return np.asarray((rows - self.still_row)[:, None] * np.array(self.px_per_row))
 
     def integrate(
         self,

@@ -184,8 +184,7 @@ def _candidates(dots: int, width_deg: float, grid_deg: float) -> FloatArray:
     turned = np.stack([_as_number(np.roll(gaps, turn, axis=1)) for turn in range(dots)])
     gaps = gaps[turned[0] == turned.min(axis=0)]
     starts = np.cumsum(gaps, axis=1)[:, :-1]
-    codes: FloatArray = grid_deg * np.hstack((np.zeros((len(gaps), 1)), starts))
-    return codes
+    return np.asarray(grid_deg * np.hstack((np.zeros((len(gaps), 1)), starts)))
 
 
 def _as_number(gaps: np.ndarray[tuple[int, ...], np.dtype[np.int_]]) -> FloatArray:
@@ -201,8 +200,7 @@ def _overlap(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArr
     """
     between = other[None, None, :] - codes[:, :, None]
     turns = between.reshape(len(codes), 1, 1, -1)
-    overlap: FloatArray = _share(between[..., None] - turns, width_deg).sum(axis=(1, 2))
-    return overlap
+    return np.asarray(_share(between[..., None] - turns, width_deg).sum(axis=(1, 2)))
 
 
 def _share(off_deg: FloatArray, width_deg: float) -> FloatArray:

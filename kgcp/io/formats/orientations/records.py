@@ -87,8 +87,7 @@ def photo_rotations(
     """
     for place, matrix in zip(places, frame_from_camera, strict=True):
         require_rotation(file, place, matrix)
-    rotations: FloatArray = frame_from_camera @ CAMERA_FROM_PHOTO
-    return rotations
+    return np.asarray(frame_from_camera @ CAMERA_FROM_PHOTO)
 
 
 def require_rotation(file: ForeignFile, where: str, matrix: FloatArray) -> None:

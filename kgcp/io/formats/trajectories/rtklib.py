@@ -80,7 +80,4 @@ def _covariances(deviations: FloatArray, roots: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(cov)
     if values.min() >= 0.0:
         return cov
-    positive: FloatArray = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(
-        vectors, -1, -2
-    )
-    return positive
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, -1, -2))

@@ -76,8 +76,7 @@ def _read_records(path: Path, columns: int, toml_key: str) -> FloatArray:
             f"{path}: has {len(data)} bytes, not a multiple of {size} bytes per record;"
             " it is cut or of another format: export it again"
         )
-    records: FloatArray = np.frombuffer(data, dtype="<f8").reshape(-1, columns).astype(float)
-    return records
+    return np.asarray(np.frombuffer(data, dtype="<f8").reshape(-1, columns).astype(float))
 
 
 def _check_values(path: Path, records: FloatArray) -> None:
@@ -103,8 +102,7 @@ def _attitude_deg(path: Path, records: FloatArray, wander: Wander | None) -> Flo
         )
     sign = {Wander.SUBTRACT: -1.0, Wander.ADD: 1.0}.get(wander or Wander.IGNORE, 0.0)
     attitude = np.column_stack((roll, pitch, (heading + sign * angle) % (2.0 * np.pi)))
-    attitude_deg: FloatArray = np.degrees(attitude)
-    return attitude_deg
+    return np.asarray(np.degrees(attitude))
 
 
 def _read_accuracies(path: Path, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
