@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
@@ -44,7 +44,7 @@ class Track:
     state: FloatArray
 
     @property
-    def is_found(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def is_found(self) -> BoolArray:
         """Say for each frame whether the target was found (n,)."""
         return np.asarray(np.isfinite(self.state[:, 0]))
 

@@ -48,6 +48,12 @@ _EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
 _ISO = 100
 _F_NUMBER = Fraction(28, 5)
 
+_STATE = ("x", "y", "z", "roll_deg", "pitch_deg", "heading_deg")
+_VEHICLE_COLUMNS = ("time", *_STATE, *(f"sd_{name}" for name in _STATE))
+_REFERENCE_COLUMNS = (
+    *("frame", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg"),
+    *("sd_x", "sd_y", "sd_z", "sd_angle_deg"),
+)
 _TRUTH_COLUMNS = (
     *("frame", "present", "decoy", "distance", "x", "y"),
     *(f"r{row}{column}" for row in range(3) for column in range(3)),
@@ -244,8 +250,8 @@ def write_texts(plan: FlightPlan, folder: Path) -> None:
     names = [frame_name(plan.settings, frame.index) for frame in plan.frames]
     times = [format_time(float(time_s)) for time_s in plan.recorded_times_s]
     _write_csv(folder / "frames.csv", ("frame", "time"), zip(names, times, strict=True))
-    _write_csv(folder / "vehicle.csv", _vehicle_columns(), _vehicle_rows(plan))
-    _write_csv(folder / "reference.csv", _reference_columns(), _reference_rows(plan))
+    _write_csv(folder / "vehicle.csv", _VEHICLE_COLUMNS, _vehicle_rows(plan))
+    _write_csv(folder / "reference.csv", _REFERENCE_COLUMNS, _reference_rows(plan))
     _write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(plan))
 
 
@@ -254,11 +260,6 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[objec
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(rows)
-
-
-def _vehicle_columns() -> tuple[str, ...]:
-    state = ("x", "y", "z", "roll_deg", "pitch_deg", "heading_deg")
-    return ("time", *state, *(f"sd_{name}" for name in state))
 
 
 def _vehicle_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
@@ -276,11 +277,6 @@ def _vehicle_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:
             *(f"{value:.6f}" for value in attitude),
             *deviations,
         )
-
-
-def _reference_columns() -> tuple[str, ...]:
-    position, angles = ("x", "y", "z"), ("omega_deg", "phi_deg", "kappa_deg")
-    return ("frame", *position, *angles, "sd_x", "sd_y", "sd_z", "sd_angle_deg")
 
 
 def _reference_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:

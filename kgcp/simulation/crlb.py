@@ -12,10 +12,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import log_ndtr, ndtr
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
@@ -132,7 +131,7 @@ class _View:
         plate = self.shot.plate
         return plate.black + (plate.white - plate.black) * share
 
-    def opaque(self) -> npt.NDArray[np.bool_]:
+    def opaque(self) -> BoolArray:
         """Return where (height, width) a pixel of the frame sees nothing but the plate."""
         shot, window = self.shot, self.window
         patch = PlaneRaster.of(shot.camera, shot.pose, window, self._oversampling)

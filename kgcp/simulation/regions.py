@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -14,27 +13,6 @@ from kgcp.geometry.arrays import FloatArray
 _CIRCLE_POINTS = 24
 _POINTS_PER_EDGE = 8
 _TINY_M = 1e-12  # keeps the centre of a circle, which has no outward direction, from 0/0
-
-
-class Region(Protocol):
-    """A region of a plane."""
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Curvature of the outline, positive where it is convex; 0 for straight edges [1/m]."""
-        ...
-
-    def hull(self) -> FloatArray:
-        """Return points (n, 2) whose convex hull holds the shape [m]."""
-        ...
-
-    def signed_distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the distance to the outline [m], negative inside."""
-        ...
-
-    def outward(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the unit gradient of the signed distance."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +123,9 @@ class ConvexPolygon:
         normals = np.column_stack((edges[:, 1], -edges[:, 0]))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return normals, np.sum(normals * vertices, axis=1)
+
+
+Region = DiscRegion | Annulus | ConvexPolygon
 
 
 def _circle_about(centre_m: tuple[float, float], radius_m: float) -> FloatArray:

@@ -9,18 +9,7 @@ from dataclasses import dataclass
 from kgcp.errors import SettingError
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.rulers import across, down, ruler_mm
-from kgcp.targets.shapes import (
-    Area,
-    Artwork,
-    Box,
-    Circle,
-    FilledCircle,
-    Layer,
-    Line,
-    Point,
-    Shape,
-    Text,
-)
+from kgcp.targets.shapes import Artwork, Box, Circle, Layer, Point, Polyline, Shape, Text
 
 MARGIN = 0.125
 """White around the ring, of its diameter: the search looks at 0.08, blur and tilt take some."""
@@ -118,10 +107,14 @@ def _check_plate(plate: MountingPlate, radius_mm: float) -> None:
 
 
 def _draw_ring(ring: Ring) -> Iterator[Shape]:
-    yield FilledCircle(Layer.INK, (0.0, 0.0), 500.0 * ring.outer_diameter_m)
-    yield FilledCircle(Layer.WHITE, (0.0, 0.0), 500.0 * ring.inner_diameter_m)
+    yield _disc(Layer.INK, (0.0, 0.0), ring.outer_diameter_m)
+    yield _disc(Layer.WHITE, (0.0, 0.0), ring.inner_diameter_m)
     for x, y in 1e3 * ring.dot_centres_m():
-        yield FilledCircle(Layer.WHITE, (float(x), float(y)), 500.0 * ring.dot_diameter_m)
+        yield _disc(Layer.WHITE, (float(x), float(y)), ring.dot_diameter_m)
+
+
+def _disc(layer: Layer, centre_mm: Point, diameter_m: float) -> Circle:
+    return Circle(layer, centre_mm, 500.0 * diameter_m, is_filled=True)
 
 
 def _draw_plate(plate: MountingPlate) -> Iterator[Shape]:
@@ -129,15 +122,15 @@ def _draw_plate(plate: MountingPlate) -> Iterator[Shape]:
         yield Circle(Layer.PLATE, (0.0, 0.0), 0.5 * plate.width_mm)
     else:
         corners = plate.box.corners
-        yield Line(Layer.PLATE, (*corners, corners[0]))
+        yield Polyline(Layer.PLATE, (*corners, corners[0]))
         unit = _unit(plate.width_mm)
         yield from crop_marks(plate.box, _CROP_START * unit, (_CROP_END - _CROP_START) * unit)
     for x, y in plate.holes_mm():
         hole_mm = plate.hole_mm or 0.0
         reach = _HOLE_CROSS * hole_mm
         yield Circle(Layer.HOLES, (x, y), 0.5 * hole_mm)
-        yield Line(Layer.HOLES, ((x - reach, y), (x + reach, y)))
-        yield Line(Layer.HOLES, ((x, y - reach), (x, y + reach)))
+        yield Polyline(Layer.HOLES, ((x - reach, y), (x + reach, y)))
+        yield Polyline(Layer.HOLES, ((x, y - reach), (x, y + reach)))
     yield from _axes(plate)
 
 
@@ -154,39 +147,40 @@ def _plate_name(target: Target, plate: MountingPlate, radius_mm: float) -> Itera
         yield Text(words, (aside - half, baseline), size, room)
 
 
-def _axes(plate: MountingPlate) -> Iterator[Line]:
+def _axes(plate: MountingPlate) -> Iterator[Polyline]:
     """Yield short lines outside the plate that point at its centre."""
     near = 0.5 * plate.width_mm + _CROP_START * _unit(plate.width_mm)
     far = 0.5 * plate.width_mm + _CROP_END * _unit(plate.width_mm)
     for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):
-        yield Line(Layer.CROP, ((x * near, y * near), (x * far, y * far)))
+        yield Polyline(Layer.CROP, ((x * near, y * near), (x * far, y * far)))
 
 
-def crop_marks(box: Box, gap_mm: float, length_mm: float) -> Iterator[Line]:
+def crop_marks(box: Box, gap_mm: float, length_mm: float) -> Iterator[Polyline]:
     """Yield two lines at each corner of a box that show where to cut."""
     for x, outward_x in ((box.left, -1.0), (box.right, 1.0)):
         for y, outward_y in ((box.top, -1.0), (box.bottom, 1.0)):
             near, far = gap_mm, gap_mm + length_mm
-            yield Line(Layer.CROP, ((x + outward_x * near, y), (x + outward_x * far, y)))
-            yield Line(Layer.CROP, ((x, y + outward_y * near), (x, y + outward_y * far)))
+            yield Polyline(Layer.CROP, ((x + outward_x * near, y), (x + outward_x * far, y)))
+            yield Polyline(Layer.CROP, ((x, y + outward_y * near), (x, y + outward_y * far)))
 
 
-def _up_mark(box: Box, radius_mm: float) -> Area:
+def _up_mark(box: Box, radius_mm: float) -> Polyline:
     """Return an arrow in the top left corner, as large as the circle of white allows."""
     room = math.hypot(box.left, box.top) - radius_mm
     height = min(8.0, 0.4 * room)
     return _arrow(box.left + 0.5 * height, box.top, height)
 
 
-def _up_mark_on(plate: MountingPlate) -> Area:
+def _up_mark_on(plate: MountingPlate) -> Polyline:
     """Return an arrow above the plate, at the end of its axis."""
     unit = _unit(plate.width_mm)
     return _arrow(4.0 * unit, -0.5 * plate.width_mm - _CROP_END * unit, 6.0 * unit)
 
 
-def _arrow(x: float, top: float, height: float) -> Area:
+def _arrow(x: float, top: float, height: float) -> Polyline:
     half = 0.4 * height
-    return Area(Layer.TEXT, ((x - half, top + height), (x, top), (x + half, top + height)))
+    points = (x - half, top + height), (x, top), (x + half, top + height)
+    return Polyline(Layer.TEXT, points, is_filled=True)
 
 
 def _legend(

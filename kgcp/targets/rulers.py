@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kgcp.targets.shapes import Box, Layer, Line, Point, Shape, Text, filled_rectangle
+from kgcp.targets.shapes import Box, Layer, Point, Polyline, Shape, Text, filled_rectangle
 
 _LENGTHS_MM = (1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0)
 _PIECES = 10
@@ -55,6 +55,6 @@ def down(corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
     return shapes
 
 
-def _frame(box: Box) -> Line:
+def _frame(box: Box) -> Polyline:
     corners = box.corners
-    return Line(Layer.RULER, (*corners, corners[0]))
+    return Polyline(Layer.RULER, (*corners, corners[0]))

@@ -30,37 +30,22 @@ class Layer(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class FilledCircle:
-    """A filled circle."""
-
-    layer: Layer
-    centre_mm: Point
-    radius_mm: float
-
-
-@dataclass(frozen=True, slots=True)
 class Circle:
-    """The line of a circle."""
+    """A circle: its line, or its area if it is filled."""
 
     layer: Layer
     centre_mm: Point
     radius_mm: float
+    is_filled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """A line through points."""
+class Polyline:
+    """A line through points, or the area that it surrounds if it is filled."""
 
     layer: Layer
     points_mm: tuple[Point, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Area:
-    """A filled polygon."""
-
-    layer: Layer
-    points_mm: tuple[Point, ...]
+    is_filled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +69,7 @@ class Text:
     is_bold: bool = False
 
 
-Shape = FilledCircle | Circle | Line | Area | Text
+Shape = Circle | Polyline | Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +116,9 @@ class Box:
         return float((dx * dx + dy * dy) ** 0.5)
 
 
-def filled_rectangle(layer: Layer, box: Box) -> Area:
+def filled_rectangle(layer: Layer, box: Box) -> Polyline:
     """Return a filled box."""
-    return Area(layer, box.corners)
+    return Polyline(layer, box.corners, is_filled=True)
 
 
 @dataclass(frozen=True, slots=True)

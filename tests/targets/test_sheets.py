@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -10,16 +11,28 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.targets.artwork import MountingPlate, draw_target, margin_radius_mm
 from kgcp.targets.code_design import chosen_targets, new_targets
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Area, Circle, FilledCircle, Layer, Line, Shape, Text
+from kgcp.targets.shapes import Circle, Layer, Polyline, Shape, Text
 from kgcp.targets.sheets import Paper, lay_out
 
 LARGE = TARGET_PLATE.target
 SMALL = Target(Ring("Südtor", 0.15, 0.075, 0.107, 0.021, (0.0, 40.0, 90.0, 255.0)))
 
 
+def discs_of(shapes: Sequence[Shape]) -> list[Circle]:
+    return [shape for shape in shapes if isinstance(shape, Circle) and shape.is_filled]
+
+
+def lines_of(shapes: Sequence[Shape], layer: Layer, *, is_filled: bool = False) -> list[Polyline]:
+    return [
+        shape
+        for shape in shapes
+        if isinstance(shape, Polyline) and shape.layer is layer and shape.is_filled is is_filled
+    ]
+
+
 def points(shape: Shape) -> list[tuple[float, float]]:
     """Points of a shape's outline; of a text, the corners of what it may take at most."""
-    if isinstance(shape, FilledCircle | Circle):
+    if isinstance(shape, Circle):
         (x, y), r = shape.centre_mm, shape.radius_mm
         angles = [math.radians(a) for a in range(0, 360, 5)]
         return [(x + r * math.cos(a), y + r * math.sin(a)) for a in angles]
@@ -42,7 +55,7 @@ def test_nothing_touches_the_white_margin(target: Target, ratio: tuple[float, bo
     diameter_mm = 1e3 * target.ring.outer_diameter_m
     plate = None if ratio is None else MountingPlate(ratio[0] * diameter_mm, ratio[1], hole_mm=6.0)
     artwork = draw_target(target, plate)
-    around = [s for s in artwork.shapes if s.__class__ is not FilledCircle]
+    around = [s for s in artwork.shapes if s not in discs_of(artwork.shapes)]
     assert any(isinstance(shape, Text) and target.name in shape.words for shape in around)
     for shape in around:
         for x, y in points(shape):
@@ -52,7 +65,7 @@ def test_nothing_touches_the_white_margin(target: Target, ratio: tuple[float, bo
 
 
 def test_the_rings_are_those_of_flight_toml() -> None:
-    discs = [shape for shape in draw_target(LARGE, None).shapes if isinstance(shape, FilledCircle)]
+    discs = discs_of(draw_target(LARGE, None).shapes)
     radii = [(disc.layer, round(disc.radius_mm, 3)) for disc in discs]
     assert radii[:2] == [(Layer.INK, 450.0), (Layer.WHITE, 225.0)]
     assert radii[2:6] == [(Layer.WHITE, 64.286)] * 4
@@ -97,13 +110,21 @@ def test_tiles_cover_everything_once(paper: Paper) -> None:
                 assert 4.0 < x < sheet.width_mm - 4.0
                 assert 4.0 < y < sheet.height_mm - 4.0
                 assert sheet.window.distance_to(x, y) > 0.0, "marks are outside the artwork"
-        assert sum(isinstance(mark, Line) and mark.layer is Layer.CROP for mark in sheet.marks) == 8
-        assert any(isinstance(mark, Area) and mark.layer is Layer.RULER for mark in sheet.marks)
+        assert (
+            sum(isinstance(mark, Polyline) and mark.layer is Layer.CROP for mark in sheet.marks)
+            == 8
+        )
+        assert any(
+            isinstance(mark, Polyline) and mark.is_filled and mark.layer is Layer.RULER
+            for mark in sheet.marks
+        )
 
 
 def test_a_ruler_is_as_long_as_it_says() -> None:
     shapes = draw_target(SMALL, None).shapes
-    bars = [s for s in shapes if isinstance(s, Line) and s.layer is Layer.RULER]
+    bars = [
+        s for s in shapes if isinstance(s, Polyline) and not s.is_filled and s.layer is Layer.RULER
+    ]
     sizes = [
         (max(x) - min(x), max(y) - min(y))
         for x, y in (zip(*b.points_mm, strict=True) for b in bars)

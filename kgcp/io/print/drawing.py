@@ -23,7 +23,7 @@ from PIL import Image
 
 from kgcp.errors import SettingError
 from kgcp.io.print.typeface import fit_text, font
-from kgcp.targets.shapes import LINE_MM, Area, Circle, FilledCircle, Shape, Sheet, Text
+from kgcp.targets.shapes import LINE_MM, Circle, Shape, Sheet, Text
 
 _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
@@ -122,18 +122,17 @@ def _artist(figure: Figure, shape: Shape, transform: Transform) -> Artist:
             fontsize=_PT_PER_MM * size_mm,
             parse_math=False,
         )
-    if isinstance(shape, FilledCircle | Circle):
+    if isinstance(shape, Circle):
         place = Affine2D().scale(shape.radius_mm).translate(*shape.centre_mm)
         outline = _UNIT_CIRCLE.transformed(place)
     else:
         outline = Outline(np.array(shape.points_mm), closed=False)
     ink = str(shape.layer.grey)
-    is_filled = isinstance(shape, FilledCircle | Area)
     patch = PathPatch(
         outline,
-        facecolor=ink if is_filled else "none",
-        edgecolor="none" if is_filled else ink,
-        linewidth=0.0 if is_filled else _PT_PER_MM * LINE_MM,
+        facecolor=ink if shape.is_filled else "none",
+        edgecolor="none" if shape.is_filled else ink,
+        linewidth=0.0 if shape.is_filled else _PT_PER_MM * LINE_MM,
         transform=transform,
     )
     return figure.add_artist(patch)

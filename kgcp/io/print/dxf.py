@@ -9,7 +9,7 @@ from ezdxf import units
 from ezdxf.layouts import Modelspace
 
 from kgcp.io.print.typeface import CAP_HEIGHT, fit_text
-from kgcp.targets.shapes import Area, Artwork, Circle, FilledCircle, Layer, Shape, Text
+from kgcp.targets.shapes import Artwork, Circle, Layer, Shape, Text
 
 _STYLE = "SANS"
 _COLOURS = {Layer.PLATE: 3, Layer.HOLES: 5, Layer.CROP: 8, Layer.WHITE: 1}  # AutoCAD's indices
@@ -43,9 +43,9 @@ def _add(space: Modelspace, shape: Shape) -> None:
         space.add_text(words, height=CAP_HEIGHT * size_mm, dxfattribs=look)
         return
     on_layer = {"layer": shape.layer.value}
-    if isinstance(shape, FilledCircle | Circle):
+    if isinstance(shape, Circle):
         x, y = shape.centre_mm
         space.add_circle((x, -y), shape.radius_mm, dxfattribs=on_layer)
     else:
         points = [(x, -y) for x, y in shape.points_mm]
-        space.add_lwpolyline(points, close=isinstance(shape, Area), dxfattribs=on_layer)
+        space.add_lwpolyline(points, close=shape.is_filled, dxfattribs=on_layer)

@@ -6,11 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.errors import Rejection
 from kgcp.geometry._jit import compiled, inlined
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.search.code_signal import CodeMatch
 from kgcp.measurement.search.outlines import Seeds, find_outlines, find_seeds
@@ -152,7 +151,7 @@ def _dotted(
 
 
 @compiled
-def _mark_dotted(values: FloatArray, least: float, dotted: npt.NDArray[np.bool_]) -> None:
+def _mark_dotted(values: FloatArray, least: float, dotted: BoolArray) -> None:
     """Mark outlines whose grey values, sorted, are consistent with a ring that has dots.
 
     `values` (n, 3, angles) are those on disc, code circle and plate. As in the ring check, order

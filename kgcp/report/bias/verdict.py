@@ -10,8 +10,8 @@ from enum import IntEnum
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
+    LABELS,
     exposure_sentence,
-    label_of,
     meaning_of,
     signed_amount,
     value_of,
@@ -153,7 +153,7 @@ def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         return
     basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
     if not any(term.is_significant for term in basic):
-        values = " and ".join(f"{label_of(term.name)} {value_of(term)}" for term in basic)
+        values = " and ".join(f"{LABELS[term.name]} {value_of(term)}" for term in basic)
         yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
     large = {"scale": 0.01 * limits.scale_percent, "offset_m": limits.offset_m}
     for term in regression.terms:

@@ -6,11 +6,12 @@ from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.quality.number_text import amount, minus
 
-_LABELS = {
+LABELS = {
     "scale": "scale",
     "offset_m": "constant offset",
     "edge_curvature_px2": "curved edges",
 } | {quantity.name: quantity.label for quantity in QUANTITIES}
+"""What the terms of the regression are called."""
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
 
@@ -19,11 +20,6 @@ def signed_amount(value: float, sd: float | None, unit: str, factor: float = 1.0
     text = amount(factor * value, None if sd is None else factor * sd, "+")
     number, *others = text.split(" ", 1)
     return " ".join((minus(number), *others, unit))
-
-
-def label_of(name: str) -> str:
-    """Return what a term of the regression is called."""
-    return _LABELS[name]
 
 
 def value_of(term: Term) -> str:
@@ -67,7 +63,7 @@ def meaning_of(term: Term) -> str:
             f"Displaced edges are in the distances: {share} of each pixel of δ (1: all of it, as"
             " with one edge; 0: none)."
         )
-    return f"Distances follow {_LABELS[term.name]}: the outer edge moves by {value_of(term)}."
+    return f"Distances follow {LABELS[term.name]}: the outer edge moves by {value_of(term)}."
 
 
 def _nothing(term: Term) -> str:
@@ -76,7 +72,7 @@ def _nothing(term: Term) -> str:
         "offset_m": "constant offset",
         "edge_shift_px": "part of δ in the distances",
     }
-    return nothing.get(term.name, f"effect of {_LABELS[term.name]}")
+    return nothing.get(term.name, f"effect of {LABELS[term.name]}")
 
 
 def probability_text(probability: float) -> str:
@@ -91,5 +87,5 @@ def exposure_sentence(regression: Regression) -> str:
     share = f"{100.0 * regression.exposure_share:.0f} % of the variance that scale and offset leave"
     if not regression.is_exposure_significant:
         return f"No exposure term is significant; together they explain {share}."
-    clear = [_LABELS[term.name] for term in regression.exposure_terms if term.is_significant]
+    clear = [LABELS[term.name] for term in regression.exposure_terms if term.is_significant]
     return f"The error follows the exposure ({', '.join(clear)}), which explains {share}."

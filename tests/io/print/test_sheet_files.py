@@ -37,7 +37,7 @@ from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.artwork import MountingPlate, draw_target
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Artwork, Box, FilledCircle, Layer, Sheet, Text, filled_rectangle
+from kgcp.targets.shapes import Artwork, Box, Circle, Layer, Sheet, Text, filled_rectangle
 from kgcp.targets.sheets import Paper, lay_out
 from kgcp.targets.validation import check_targets
 
@@ -122,7 +122,9 @@ def test_diameters_are_true_at_600_dpi(
 def test_painted_circles_have_their_radius_and_centre(place_mm: tuple[float, float]) -> None:
     """By area and centre of mass of the ink, whose edges are grey."""
     radius_mm = 45.0
-    disc = Artwork((FilledCircle(Layer.INK, (0.0, 0.0), radius_mm),), Box(-45.0, -45.0, 45.0, 45.0))
+    disc = Artwork(
+        (Circle(Layer.INK, (0.0, 0.0), radius_mm, is_filled=True),), Box(-45.0, -45.0, 45.0, 45.0)
+    )
     sheet = Sheet("", 100.0, 100.0, disc, place_mm, Box(0.0, 0.0, 100.0, 100.0))
     ink = 1.0 - raster_of_png(sheet, DPI) / 255.0
     assert math.sqrt(ink.sum() / math.pi) / PX_PER_MM == pytest.approx(radius_mm, abs=2e-3)
