@@ -33,26 +33,14 @@ from typing import Any, Self
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
-from kgcp.geometry.conic import Ellipse
-from kgcp.geometry.pose import Pose
-from kgcp.measurement.records import (
-    Alternative,
-    Appearance,
-    CommonUncertainty,
-    Considered,
-    ExposureSettings,
-    FrameResult,
-    Measurement,
-    Miss,
-    Uncertainty,
-)
+from kgcp.measurement import records
+from kgcp.measurement.records import Considered, FrameResult, Miss
 
+# All records that a result may consist of; `records` also imports those of other modules.
 _RECORDS: dict[str, type] = {
-    each.__name__: each
-    for each in (
-        *(FrameResult, ExposureSettings, Measurement, Miss, Considered, Pose, Ellipse),
-        *(Appearance, Uncertainty, CommonUncertainty, Alternative),
-    )
+    name: record
+    for name, record in vars(records).items()
+    if isinstance(record, type) and is_dataclass(record)
 }
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
 
