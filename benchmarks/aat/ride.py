@@ -9,10 +9,11 @@ from scipy.signal import lfilter
 
 from benchmarks.aat.settings import BlockSettings, axes_of, ground_m, map_frame, on_corridor
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.camera_priors import BODY_FROM_LEVEL_PLATE
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
-from kgcp.simulation.path import BODY_FROM_PLATE, VehicleStates
+from kgcp.simulation.path import VehicleStates
 
 _START_S = 1_781_597_700.0  # 2026-06-16T08:15:00Z
 _LEAD_S = 5.0  # trajectory before the first and after the last frame
@@ -64,7 +65,7 @@ def drive(settings: BlockSettings, times_s: FloatArray, rng: np.random.Generator
     lever_m = nominal.lever_arm_m + settings.sd_lever_arm_m * rng.standard_normal(3)
     return Ride(
         target_enu_m=states.position_enu_m + body @ lever_m,
-        enu_from_plate=body @ BODY_FROM_PLATE,
+        enu_from_plate=body @ BODY_FROM_LEVEL_PLATE,
         road_m=road_m,
         plate_scale=1.0 + settings.sd_diameter_m / 0.9 * float(rng.standard_normal()),
         trajectory=_record(settings, local_frame, nominal.correlation_s, times_s[-1], rng),

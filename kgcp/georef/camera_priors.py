@@ -36,7 +36,7 @@ from kgcp.settings import VehicleSettings
 MIN_AMBIGUITY = 2.0 * math.log(100.0)
 """Δχ² of the other pose from which on a pose counts as told apart: odds of 100 to 1."""
 
-_BODY_FROM_LEVEL_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+BODY_FROM_LEVEL_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Default mount: plate x = body y, plate y = −body x, plate z = body z, as columns."""
 
 
@@ -92,7 +92,7 @@ def opk_covs(priors: Sequence[CameraPrior]) -> list[FloatArray | None]:
 def body_from_plate(mount_deg: float) -> FloatArray:
     """Return the plate's axes (3, 3) in body axes, as columns, for a turn from the default."""
     turn = rotation_about(np.array([0.0, 0.0, math.radians(mount_deg)]))
-    return np.asarray(_BODY_FROM_LEVEL_PLATE @ turn)
+    return np.asarray(BODY_FROM_LEVEL_PLATE @ turn)
 
 
 def camera_priors(

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.pose import Pose
+from kgcp.georef.camera_priors import BODY_FROM_LEVEL_PLATE
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import Trajectory
 from kgcp.settings import VehicleSettings
@@ -19,7 +20,6 @@ from kgcp.simulation.imaging import Optics
 from kgcp.simulation.instruments import adjust_reference, record_trajectory
 from kgcp.simulation.light_field import LightField
 from kgcp.simulation.path import (
-    BODY_FROM_PLATE,
     FRAME_INTERVAL_S,
     ROAD_RADIUS_M,
     CameraState,
@@ -230,7 +230,7 @@ def _plan_frames(
             settings,
             index,
             START_S + elapsed_s[index],
-            enu_from_body[index] @ BODY_FROM_PLATE,
+            enu_from_body[index] @ BODY_FROM_LEVEL_PLATE,
             target_enu_m[index],
             _stream(seed, "frame", index),
             _stream(seed, "motion", index),

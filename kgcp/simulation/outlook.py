@@ -251,12 +251,9 @@ def chance_to_find(radius_px: float) -> tuple[float, float, float]:
 
 def _of_unit_size(ring: Ring) -> Ring:
     """Return a ring of these proportions, 1 m across."""
-    size_m = ring.outer_diameter_m
-    return Ring(
-        *("", 1.0, round(ring.inner_diameter_m / size_m, 6)),
-        *(round(ring.code_diameter_m / size_m, 6), round(ring.dot_diameter_m / size_m, 6)),
-        ring.code_deg,
-    )
+    lengths_m = (ring.inner_diameter_m, ring.code_diameter_m, ring.dot_diameter_m)
+    inner, code, dot = (round(length_m / ring.outer_diameter_m, 6) for length_m in lengths_m)
+    return Ring("", 1.0, inner, code, dot, ring.code_deg)
 
 
 @lru_cache(maxsize=8)

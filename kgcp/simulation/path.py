@@ -23,8 +23,6 @@ FRAMES_PER_CLIMB = 24  # one climb and descent
 _SPEED_M_S = 7.0
 _POINT_HEIGHT_M = 0.4
 
-# Default mount of the plate: x to the right, y backwards, z down.
-BODY_FROM_PLATE: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # A camera that looks down with north up in the image: x east, y south, z down.
 _ENU_FROM_NADIR = np.diag([1.0, -1.0, -1.0])
 

@@ -51,10 +51,9 @@ class Knots:
         first = 0
         for g, spacing in enumerate(self.spacings_px):
             part = slice(g * reach, (g + 1) * reach)
-            _weigh(
-                *(pixels, self.x0, self.y0, spacing, self.columns[g], self.rows[g], first),
-                *(knots[:, part], weights[:, part]),
-            )
+            counts = self.columns[g], self.rows[g]
+            corner = self.x0, self.y0
+            _weigh(pixels, corner, spacing, counts, first, knots[:, part], weights[:, part])
             first += self.counts[g]
         return knots, weights
 
@@ -75,15 +74,14 @@ def knots_over(
 @compiled
 def _weigh(
     pixels: FloatArray,
-    x0: float,
-    y0: float,
+    corner: tuple[float, float],
     spacing: float,
-    columns: int,
-    rows: int,
+    counts: tuple[int, int],
     first: int,
     knots: IndexArray,
     weights: FloatArray,
 ) -> None:
+    (x0, y0), (columns, rows) = corner, counts
     along_x, along_y = np.empty(3), np.empty(3)
     for i in range(pixels.shape[1]):
         x, y = (pixels[0, i] - x0) / spacing, (pixels[1, i] - y0) / spacing

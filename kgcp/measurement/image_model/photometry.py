@@ -202,8 +202,14 @@ class PhotometricModel:
         jacobian = np.empty((rows + (0 if added is None else 2), len(value)))
         has_tone = self.response is Response.UNKNOWN
         _expose_with_slopes(
-            *(share.value, share.jacobian, self.offsets, light.values, self._added(added)),
-            *(has_tone, value, jacobian),
+            share.value,
+            share.jacobian,
+            self.offsets,
+            light.values,
+            self._added(added),
+            has_tone,
+            value,
+            jacobian,
         )
         if self.response is Response.SRGB:
             jacobian *= srgb_slope(value)

@@ -86,38 +86,36 @@ class Verdict:
         return (f"{self.grade.words}.", *(finding.text for finding in self.findings))
 
 
-def assess(
-    numbers: BiasNumbers, reexposed: Sequence[Reexposed] = (), limits: Limits = LIMITS
-) -> Verdict:
+def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict:
     """Judge a flight by its numbers, and by what measuring some frames again has changed."""
     findings = [
-        _accuracy(numbers, limits),
-        _bias(numbers, limits),
-        *_causes(numbers, limits),
-        *_scatter(numbers, limits),
-        *_losses(numbers, limits),
-        *_reexposure(reexposed, limits),
-        *_detection(numbers, limits),
+        _accuracy(numbers),
+        _bias(numbers),
+        *_causes(numbers),
+        *_scatter(numbers),
+        *_losses(numbers),
+        *_reexposure(reexposed),
+        *_detection(numbers),
         *_reservations(numbers),
     ]
     return Verdict(tuple(sorted(findings, key=lambda finding: -finding.grade)))
 
 
-def _accuracy(numbers: BiasNumbers, limits: Limits) -> Finding:
+def _accuracy(numbers: BiasNumbers) -> Finding:
     count = numbers.total.percent.count
     parts = [f"{_rms(row)} {row.label} ({row.percent.count})" for row in numbers.halves]
     frames = "frame" if count == 1 else "frames"
     text = f"Distance error (RMS) over {count} {frames}: {'; '.join(parts)}."
-    if numbers.total.percent.rms > limits.unusable_rms_percent:
+    if numbers.total.percent.rms > LIMITS.unusable_rms_percent:
         return Finding(
             Grade.UNUSABLE,
-            f"{text} That is above {limits.unusable_rms_percent:g} %: something is wrong with"
+            f"{text} That is above {LIMITS.unusable_rms_percent:g} %: something is wrong with"
             " target, camera, times, reference or exposure.",
             "error",
         )
-    if count < limits.min_frames:
+    if count < LIMITS.min_frames:
         return Finding(
-            Grade.LOOK, f"{text} Fewer than {limits.min_frames} frames say little.", "error"
+            Grade.LOOK, f"{text} Fewer than {LIMITS.min_frames} frames say little.", "error"
         )
     return Finding(Grade.GOOD, text, "error")
 
@@ -126,7 +124,7 @@ def _rms(row: RangeRow) -> str:
     return f"{row.percent.rms:.3f} % ({1000.0 * row.metres.rms:.0f} mm)"
 
 
-def _bias(numbers: BiasNumbers, limits: Limits) -> Finding:
+def _bias(numbers: BiasNumbers) -> Finding:
     if numbers.total.percent.count == 1:
         return Finding(Grade.LOOK, "One frame says nothing about bias.", "error")
     if not numbers.biased:
@@ -136,7 +134,7 @@ def _bias(numbers: BiasNumbers, limits: Limits) -> Finding:
         return Finding(Grade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
     parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
-    material = any(abs(row.percent.mean) >= limits.mean_percent for row in numbers.biased)
+    material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
     text = f"Biased: distances are measured {'; '.join(parts)}."
     return Finding(Grade.LOOK if material else Grade.GOOD, text, "error")
 
@@ -145,7 +143,7 @@ def _mean(row: RangeRow) -> str:
     return signed_amount(row.percent.mean, row.sd_mean_percent, "%")
 
 
-def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
     regression = numbers.regression
     if regression is None:
         text = "Scale and offset cannot be told apart: too few frames, or distances too alike."
@@ -155,7 +153,7 @@ def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
     if not any(term.is_significant for term in basic):
         values = " and ".join(f"{LABELS[term.name]} {value_of(term)}" for term in basic)
         yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
-    large = {"scale": 0.01 * limits.scale_percent, "offset_m": limits.offset_m}
+    large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
         if term.name in large and term.is_significant:
             material = abs(term.value) >= large[term.name]
@@ -163,12 +161,12 @@ def _causes(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         elif term.name == "edge_curvature_px2":
             yield Finding(Grade.LOOK, meaning_of(term), "causes")
     material = (
-        regression.is_exposure_significant and regression.exposure_share >= limits.exposure_share
+        regression.is_exposure_significant and regression.exposure_share >= LIMITS.exposure_share
     )
     yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(regression), "exposure")
 
 
-def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Finding]:
+def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:
     changes = [again.change_percent for again in reexposed if again.change_percent is not None]
     if not changes:
         return
@@ -178,24 +176,24 @@ def _reexposure(reexposed: Sequence[Reexposed], limits: Limits) -> Iterator[Find
         f"Measured again with grey values × {' and × '.join(f'{gain:g}' for gain in GAINS)},"
         f" distances change by {rms:.3f} % (RMS of {len(changes)}; {lost} lost)."
     )
-    grade = Grade.LOOK if rms > limits.reexposure_percent else Grade.GOOD
+    grade = Grade.LOOK if rms > LIMITS.reexposure_percent else Grade.GOOD
     yield Finding(grade, text, "reexposure")
 
 
-def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
     """Say whether the reported standard deviations are true; of what scale and offset leave."""
     regression = numbers.regression
     if regression is None or numbers.standardised is None or numbers.sd_reference_m is None:
         return
     spread = regression.scatter
-    if spread > limits.standardised_high:
+    if spread > LIMITS.standardised_high:
         yield Finding(
             Grade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
             " say: those of trajectory and reference poses may be too small.",
             "standardised",
         )
-    elif spread < limits.standardised_low:
+    elif spread < LIMITS.standardised_low:
         yield Finding(
             Grade.GOOD,
             f"Residuals scatter only {spread:.2f} times as much as their reported standard"
@@ -204,7 +202,7 @@ def _scatter(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         )
 
 
-def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+def _losses(numbers: BiasNumbers) -> Iterator[Finding]:
     regression = numbers.regression
     outliers = 0 if regression is None else int(regression.outlier.sum())
     misplaced = len(numbers.misplaced)
@@ -212,9 +210,9 @@ def _losses(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
         return
     share = (outliers + misplaced) / (numbers.total.percent.count + misplaced)
     grade = Grade.GOOD
-    if share > limits.unusable_lost_share:
+    if share > LIMITS.unusable_lost_share:
         grade = Grade.UNUSABLE
-    elif share > limits.lost_share:
+    elif share > LIMITS.lost_share:
         grade = Grade.LOOK
     parts = []
     if misplaced:
@@ -234,13 +232,13 @@ def _plural(word: str, count: int) -> str:
     return word if count == 1 else f"{word}s"
 
 
-def _detection(numbers: BiasNumbers, limits: Limits) -> Iterator[Finding]:
+def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
     if not numbers.expected_visible:
         return
     share = numbers.detected / numbers.expected_visible
     kind = "the target fully in view" if numbers.attitudes_agree else "a reference pose"
     yield Finding(
-        Grade.GOOD if share >= limits.detection_rate else Grade.LOOK,
+        Grade.GOOD if share >= LIMITS.detection_rate else Grade.LOOK,
         f"Detected in {numbers.detected} of {numbers.expected_visible} frames with {kind}"
         f" ({100.0 * share:.1f} %).",
         "rate",
