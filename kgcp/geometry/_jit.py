@@ -21,7 +21,7 @@ def compiled(function: _Function) -> _Function:
 
 
 def summed(function: _Function) -> _Function:
-    """Do as `compiled`; sums may be reordered so that vector units take several terms."""
+    """Compile as `compiled`; sums may be reordered so that vector units take several terms."""
     made = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
     return cast("_Function", made)
 
@@ -33,7 +33,7 @@ def inlined(function: _Function) -> _Function:
 
 
 def fused(function: _Function) -> _Function:
-    """Do as `inlined`; a · b + c may be one step with one rounding, if the processor has it.
+    """Compile as `inlined`; a · b + c may be one step with one rounding, if the processor has it.
 
     Where, is up to the compiler. So what calls such a function is to be called by Python alone: of
     a function that others call there may be two versions, and which one they get depends on what a

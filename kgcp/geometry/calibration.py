@@ -1,4 +1,4 @@
-"""How well a camera is calibrated, and what that does to its image."""
+"""Covariance of a camera's calibration, and its effect on the image."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from kgcp.settings import require_range
 
 
 class Response(StrEnum):
-    """How grey values follow light."""
+    """Relation of grey values to light."""
 
     LINEAR = "linear"
     SRGB = "srgb"
@@ -36,7 +36,7 @@ class Response(StrEnum):
 
 
 class TimeReference(StrEnum):
-    """Which moment of the exposure the frames' times are of."""
+    """Moment of the exposure that the frames' times refer to."""
 
     START = "start"
     MIDDLE = "middle"

@@ -72,7 +72,7 @@ class Gcp:
 
 
 class Flag(StrEnum):
-    """What of a point does not fit a smooth flight."""
+    """Property of a point that does not fit a smooth flight."""
 
     DISTANCE = "distance_jump"
     HEIGHT = "height_jump"

@@ -1,4 +1,4 @@
-"""Where a target must be in frames in which it was not found.
+"""Prediction of a target's place in frames in which it was not found.
 
 There are two sources: the frames before and after, and reference poses with the target's place.
 Either is trusted as far as it agrees with the frames in which the target was found.
@@ -45,7 +45,7 @@ class Track:
 
     @property
     def is_found(self) -> BoolArray:
-        """Say for each frame whether the target was found (n,)."""
+        """Whether the target was found in each frame (n,)."""
         return np.asarray(np.isfinite(self.state[:, 0]))
 
 

@@ -1,4 +1,4 @@
-"""Which points to hand over: good enough, far enough apart, fitting a smooth flight."""
+"""Selection of points: good enough, far enough apart, fitting a smooth flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a target was at some time: carried by the vehicle, or standing still."""
+"""Positions of targets over time: carried by the vehicle, or standing still."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from kgcp.targets.layout import Target
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
-    """How the vehicle moved while it carried a target to its place.
+    """Motion of the vehicle while a target was at its place.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class VehicleState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetPosition:
-    """Where the centre of a target was.
+    """Position of a target's centre.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Vehicle:
 
 
 class NoPosition(StrEnum):
-    """Why it is not known where a target was."""
+    """Why the position of a target is not known."""
 
     NO_TIME = "no_time"
     BEFORE_TRAJECTORY = Coverage.BEFORE.value
@@ -147,7 +147,7 @@ class NoPosition(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetPositions:
-    """Where each target of a flight was at any time.
+    """Positions of all targets of a flight at any time.
 
     Attributes
     ----------

@@ -66,7 +66,7 @@ FIGURE_FILES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """What was written, and what it says."""
+    """Files of a report, and its numbers and verdict."""
 
     numbers: Json
     verdict: Verdict
@@ -205,7 +205,7 @@ def _look(
     shown: list[int],
     again: list[int],
 ) -> tuple[dict[int, tuple[bytes, tuple[FloatArray, ...]]], list[Reexposed]]:
-    """Make close-ups of some rows and measure some again, as far as their frames are there."""
+    """Draw close-ups of some rows and measure some again, where their frames exist."""
     closeups = {}
     reexposed: list[Reexposed] = []
     targets = {target.name: target for target in flight.targets}

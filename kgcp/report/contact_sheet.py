@@ -26,7 +26,7 @@ _HEAD = 2000  # characters of a page, in which the mark must be
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What the page says of one row of the table, or of a ring that was dropped.
+    """Entry of the page for one row of the table, or of a ring that was dropped.
 
     Attributes
     ----------

@@ -36,7 +36,7 @@ _Picture = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingView:
-    """What is to be shown of one ring in a frame.
+    """One ring in a frame, with the lines to draw.
 
     Attributes
     ----------

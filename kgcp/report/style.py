@@ -1,4 +1,4 @@
-"""What all figures share: style, PNG bytes, and where in it the points lie."""
+"""Common parts of all figures: style, PNG bytes, and the places of the points in them."""
 
 from __future__ import annotations
 

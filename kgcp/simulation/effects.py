@@ -18,7 +18,7 @@ _LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """How strong each effect is.
+    """Strength of each effect.
 
     Attributes
     ----------

@@ -80,7 +80,7 @@ class Ground:
     def _sample(
         self, layer: TextureLayer, x: FloatArray, y: FloatArray, gsd_m: float
     ) -> FloatArray:
-        """Look the noise up bilinearly, on the level whose texels match the pixels."""
+        """Sample the noise bilinearly, on the level whose texels match the pixels."""
         texel_m = layer.period_m / _TILE
         level = int(np.clip(np.round(np.log2(max(gsd_m / texel_m, 1.0))), 0, _LEVELS - 1))
         tile = self.pyramid[level]

@@ -71,7 +71,7 @@ class ToneCurve(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What spreads the light of one frame.
+    """Everything that spreads the light of one frame.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Optics:
 
     @property
     def reach_px(self) -> int:
-        """How far light is spread or moved, at most [px]."""
+        """Farthest distance that light is spread or moved [px]."""
         lens = self.aberration
         spread = 5.0 * self.psf_px if lens is None else lens.reach_px(self.psf_px)
         moved = 0.0 if self.motion is None else self.motion.reach_px
@@ -156,7 +156,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What makes grey values of light.
+    """Conversion of light to grey values.
 
     Attributes
     ----------

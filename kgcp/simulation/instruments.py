@@ -1,4 +1,4 @@
-"""What the surveyor's instruments say about a simulated flight: truth plus declared errors."""
+"""Records of the surveyor's instruments of a simulated flight: truth plus stated errors."""
 
 from __future__ import annotations
 

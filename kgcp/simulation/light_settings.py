@@ -1,4 +1,4 @@
-"""How light differs from place to place on the plates of a flight: settings with ranges."""
+"""Settings of uneven light on the plates of a flight, with ranges."""
 
 from __future__ import annotations
 

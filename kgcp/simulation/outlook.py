@@ -60,7 +60,7 @@ _SUB_PIXELS = 150
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """How the frames will be taken.
+    """Conditions under which the frames will be taken.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What to expect from one height.
+    """Expected detection and accuracy at one height.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where everything is at every moment: the vehicle on its ring road, the UAV above it.
+"""Positions over time: the vehicle on its ring road, the UAV above it.
 
 All in a local Cartesian frame, east, north, up; the ring road is about its origin.
 """

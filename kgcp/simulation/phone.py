@@ -1,4 +1,4 @@
-"""What a phone makes of its sensor's light: mosaic, noise reduction, local tone mapping.
+"""Image processing of a phone: mosaic, noise reduction, local tone mapping.
 
 In this order, in linear light: a Bayer mosaic (RGGB) with noise; white balance; demosaicing by
 Malvar, He & Cutler (ICASSP 2004, High-quality linear interpolation), whose filters are symmetric
@@ -53,7 +53,7 @@ _COLOUR_AT_OTHER = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Phone:
-    """How a phone processes its frames.
+    """Settings of a phone's image processing.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ class PrintedPlate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateImage:
-    """What a plate sends to the pixels of a window.
+    """Light of a plate in the pixels of a window.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ _EXTRA_NODES = 5
 
 @dataclass(frozen=True, slots=True)
 class Aberration:
-    """How a lens's point spread departs from a round Gaussian. Angles from +x towards +y [deg].
+    """Departure of a lens's point spread from a round Gaussian. Angles from +x towards +y [deg].
 
     Attributes
     ----------

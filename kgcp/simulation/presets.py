@@ -1,4 +1,4 @@
-"""What a simulated flight is like: frozen settings, and the presets by name."""
+"""Settings of a simulated flight, and the presets by name."""
 
 from __future__ import annotations
 

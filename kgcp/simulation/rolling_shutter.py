@@ -47,7 +47,7 @@ class ImageMotion:
 
 @dataclass(frozen=True, slots=True)
 class RowMotion:
-    """How the image of one frame moves from row to row.
+    """Motion of the image of one frame from row to row.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class RowMotion:
 
     @property
     def reach_px(self) -> float:
-        """How far the image moves in the frame, at most [px]."""
+        """Largest motion of the image in the frame [px]."""
         farthest = max(abs(self.still_row), abs(self.rows - 1 - self.still_row))
         return farthest * float(np.hypot(*self.px_per_row))
 

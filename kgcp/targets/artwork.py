@@ -23,7 +23,7 @@ _LEGEND_FROM, _LEGEND_TO = 190.0, 800.0  # widths between which the legend grows
 
 @dataclass(frozen=True, slots=True)
 class MountingPlate:
-    """What the target is mounted on.
+    """The plate that the target is mounted on.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class MountingPlate:
 
     @property
     def inset_mm(self) -> float:
-        """From the plate's edges to the holes' centres [mm]."""
+        """Distance of the holes' centres from the plate's edges [mm]."""
         hole_mm = self.hole_mm or 0.0
         return max(_HOLE_INSET * hole_mm, 0.5 * hole_mm + _HOLE_RIM_MM)
 

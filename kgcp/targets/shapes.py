@@ -1,4 +1,4 @@
-"""What is drawn on paper, in millimetres: x to the right, y down."""
+"""Shapes on paper, in millimetres: x to the right, y down."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LINE_MM = 0.2
 
 
 class Layer(StrEnum):
-    """What a shape is; in DXF the name of its layer."""
+    """Purpose of a shape; in DXF the name of its layer."""
 
     INK = "INK"
     WHITE = "WHITE"
@@ -23,7 +23,7 @@ class Layer(StrEnum):
 
     @property
     def grey(self) -> float:
-        """How bright it is printed, 0…1."""
+        """Printed brightness, 0…1."""
         if self is Layer.WHITE:
             return 1.0
         return 0.45 if self in {Layer.PLATE, Layer.HOLES, Layer.CROP} else 0.0
@@ -83,12 +83,12 @@ class Box:
 
     @property
     def width(self) -> float:
-        """From left to right [mm]."""
+        """Extent from left to right [mm]."""
         return self.right - self.left
 
     @property
     def height(self) -> float:
-        """From top to bottom [mm]."""
+        """Extent from top to bottom [mm]."""
         return self.bottom - self.top
 
     @property

@@ -52,7 +52,7 @@ def codes_coincide(first: Ring, second: Ring) -> bool:
 
 
 def rotations_coincide(codes: FloatArray, other: FloatArray, half_deg: float) -> BoolArray:
-    """Tell which codes coincide with another one, as `codes_coincide`.
+    """Return which codes coincide with another one, as `codes_coincide`.
 
     Parameters
     ----------

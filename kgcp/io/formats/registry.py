@@ -35,7 +35,7 @@ class Registry(Generic[Read]):
 
     @property
     def names(self) -> Iterable[str]:
-        """What flight.toml calls the formats."""
+        """Names of the formats in flight.toml."""
         return self.formats.keys()
 
     def reader(self, file: ForeignFile, name: str | None = None) -> Read:

@@ -92,7 +92,7 @@ def circular_hulls(contours: Contours, settings: DetectSettings) -> list[FloatAr
 
 
 def _goes_round(contours: Contours) -> BoolArray:
-    """Tell for each contour (m,) whether most sectors of its box's rim have a part of it."""
+    """Return for each contour (m,) whether most sectors of its box's rim have a part of it."""
     starts, counts = contours.starts[:-1], np.diff(contours.starts)
     low = np.minimum.reduceat(contours.points, starts)
     high = np.maximum.reduceat(contours.points, starts)

@@ -1,1 +1,1 @@
-"""What a plate looks like: blur, exposure, tone curve, sharpening, noise."""
+"""Image of a plate: blur, exposure, tone curve, sharpening, noise."""

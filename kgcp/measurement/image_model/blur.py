@@ -19,7 +19,7 @@ _SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blur:
-    """How an image point spreads.
+    """Spread of an image point.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Blur:
 
     @property
     def has_streak(self) -> bool:
-        """Tell whether there is motion."""
+        """Whether there is motion."""
         return bool(self.streak_x or self.streak_y)
 
     def scaled(self, factor: float) -> Blur:
@@ -91,7 +91,7 @@ def variance_in_pixels(variance: float, count: int) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeIncidence:
-    """Which of n pixels feel the edge of which of c circles.
+    """Pairs of n pixels and c circles whose edges are within reach of the blur.
 
     Attributes
     ----------

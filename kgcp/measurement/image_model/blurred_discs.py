@@ -97,7 +97,7 @@ def _long_smear(z: float, half: float) -> tuple[float, float, float, float, floa
 def _smeared_normal(
     z: float, half: float, slant: float, motion_t: float, smears: bool
 ) -> tuple[float, float, float, float]:
-    """Do as `_long_smear` for any length, 0 unless it `smears`; with what a unit of bend adds.
+    """Extend `_long_smear` to any length, 0 unless it `smears`; with what a unit of bend adds.
 
     That is the mean over s, the place on the streak, −½ … ½, of φ(y) times
     (slant · y + motion_t · s)² − slant² − motion_t²/12, where y = z − 2 · half · s is the blur

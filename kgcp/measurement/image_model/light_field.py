@@ -40,7 +40,7 @@ class Knots:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many knots each grid has in all."""
+        """Number of knots of each grid."""
         return tuple(c * r for c, r in zip(self.columns, self.rows, strict=True))
 
     def weights(self, pixels: FloatArray) -> tuple[IndexArray, FloatArray]:
@@ -98,7 +98,7 @@ def _weigh(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightField:
-    """How the levels of ink and plate differ from their means over a window.
+    """Deviations of the levels of ink and plate from their means over a window.
 
     Attributes
     ----------

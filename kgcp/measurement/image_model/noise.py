@@ -31,7 +31,7 @@ _SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # least excess there, of the pixels at the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Censoring:
-    """Which pixels are clipped.
+    """Clipped pixels, and the limits that clip them.
 
     Attributes
     ----------

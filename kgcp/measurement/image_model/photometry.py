@@ -138,7 +138,7 @@ _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotometricModel:
-    """From white share to grey value, for the n pixels of one sample.
+    """Relation of white share to grey value, for the n pixels of one sample.
 
     Attributes
     ----------
@@ -338,7 +338,7 @@ def _expose_with_slopes(
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Do as `_expose`, with derivatives by geometry (11 or 15, n), then in the order of `Param`.
+    """Extend `_expose` by derivatives: by geometry (11 or 15, n), then in the order of `Param`.
 
     Where the light is uneven, those by what is added to ink and to plate follow.
     """

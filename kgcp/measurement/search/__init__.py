@@ -1,1 +1,1 @@
-"""Where the rings of a frame are, and whose code they carry."""
+"""Search for rings in a frame, and for their codes."""

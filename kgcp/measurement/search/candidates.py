@@ -1,4 +1,4 @@
-"""Which of the rings in a frame carry a target's code."""
+"""Selection of the rings in a frame that carry a target's code."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def points_of_code(camera: Camera, pose: Pose, ring: Ring) -> FloatArray:
 def clear_of_dots(
     angles_rad: FloatArray, ring: Ring, edge_diameter_m: float, lag_deg: float, px_per_m: float
 ) -> BoolArray:
-    """Tell for each angle (n,) on an edge whether the blur of all dots stays away from it.
+    """Return for each angle (n,) on an edge whether the blur of all dots stays away from it.
 
     On a small ring with many dots no angle may be clear: then those farthest from dots are taken.
     """

@@ -1,4 +1,4 @@
-"""From places that may be a ring's to the ellipses of outer edges, one for each ring.
+"""From candidate places to the ellipses of outer edges, one for each ring.
 
 Ring filter, ring check, edge tracking and ellipse fit in turn; circles that are alike are one.
 """
@@ -57,7 +57,7 @@ def _is_first(
     near: float,
     alike: float,
 ) -> BoolArray:
-    """Tell which circles (n,) are like no clearer one, from their orders by clearness and row.
+    """Return which circles (n,) are like no clearer one, from their orders by clearness and row.
 
     Neighbours are looked for along the rows, up and down from each circle, as far as it reaches.
     """

@@ -110,7 +110,7 @@ def _halve(image: GreyArray, out: GreyArray) -> None:
 
 @compiled
 def _fill_from_three(image: GreyArray, out: GreyArray) -> None:
-    """Make two rows and columns of three, interpolating linearly between pixels' centres."""
+    """Reduce three rows and columns to two, interpolating linearly between pixels' centres."""
     height, width = out.shape[0] // 2, out.shape[1] // 2
     upper, lower = np.empty(3 * width, np.uint16), np.empty(3 * width, np.uint16)
     for i in range(height):
@@ -124,7 +124,7 @@ def _fill_from_three(image: GreyArray, out: GreyArray) -> None:
 
 @compiled
 def _fill_row(row: _Sums, out: GreyArray) -> None:
-    """Make two columns of three, of sums that are four times the grey values."""
+    """Reduce three columns to two; the sums are four times the grey values."""
     for j in range(len(out) // 2):
         left, middle, right = row[3 * j], row[3 * j + 1], row[3 * j + 2]
         out[2 * j] = np.uint16(3 * left + middle + 8) >> 4

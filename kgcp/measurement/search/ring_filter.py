@@ -1,4 +1,4 @@
-"""Where box filters answer to a ring: the first test of every pixel, which must be cheap.
+"""Box filters that respond to rings: the first test of every pixel, which must be cheap.
 
 A small ring is a bright core in a dark disc in a bright surround. From the means over 3 x 3, 5 x 5
 and 7 x 7 pixels (the last weighted less towards its corners, as the mean of nine 5 x 5 means) the

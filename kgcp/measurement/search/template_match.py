@@ -1,4 +1,4 @@
-"""How well one ring in a frame looks like a target's, whole or in part."""
+"""Comparison of a ring in a frame with a target's, whole or in part."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ _EVERYWHERE = np.ones(ANGLES, dtype=bool)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemplateMatch:
-    """How well one ring in the frame looks like a target's.
+    """Agreement of one ring in the frame with a target's.
 
     Attributes
     ----------
@@ -88,12 +88,12 @@ class TemplateMatch:
 
     @property
     def limit(self) -> float:
-        """What `misfit` may be: less where blur leaves little of the dots."""
+        """Largest `misfit` that is accepted: less where blur leaves little of the dots."""
         return min(_MAX_MISFIT, _MISFIT_FAINT + _MISFIT_BY_DOTS * self.dot_contrast)
 
     @property
     def is_clear(self) -> bool:
-        """Tell whether the whole ring looks like the target's."""
+        """Whether the whole ring looks like the target's."""
         return self.score >= _CLEAR_SCORE and self.misfit <= self.limit
 
     def check(self, min_score: float) -> None:
@@ -272,7 +272,7 @@ def _compare(
 
 
 def visible_angles(patch: FloatArray, ring: Ring) -> BoolArray | None:
-    """Tell at which angles a ring shows both of its edges.
+    """Return at which angles a ring shows both of its edges.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ def _mark_visible(outwards: FloatArray, inwards: FloatArray, visible: BoolArray)
 
 
 def may_show_code(patch: FloatArray, visible: BoolArray, ring: Ring, shift: int) -> bool:
-    """Tell whether the visible part of the code circle resembles the code at any heading.
+    """Return whether the visible part of the code circle resembles the code at any heading.
 
     Most rings of something else do not, and need no comparison with all templates.
 
@@ -342,7 +342,7 @@ def _code_circle(ring: Ring) -> Bank:
 
 
 def _tells_heading(scores: SingleArray, best: Placement, visible: BoolArray, ring: Ring) -> bool:
-    """Tell whether enough dots are visible, and whether they leave only one heading."""
+    """Return whether enough dots are visible, and whether they leave only one heading."""
     lags = np.arange(best.lag + _OTHER_LAG, best.lag + ANGLES - _OTHER_LAG + 1)
     elsewhere = scores.max(axis=(0, 1)).take(lags, mode="wrap").max()
     dots = [round(deg * ANGLES / 360.0) + best.lag for deg in ring.code_deg]

@@ -1,4 +1,4 @@
-"""What a coded ring looks like around its centre, for every blur and exposure: polar templates."""
+"""Polar templates of coded rings, for every blur and exposure."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class DaskCluster(Executor):
         return max(1, sum(threads.values()))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature
-        """Let a worker make a call; what Dask raises becomes what it means here."""
+        """Let a worker make a call; Dask's errors become those of this package."""
         future: Future[Any] = Future()
         self._waiting.add(future)
         with defer_interrupts():
@@ -89,7 +89,7 @@ class DaskCluster(Executor):
     def _settle(
         self, future: Future[Any], error: BaseException | None, result: object = None
     ) -> None:
-        """Let a future have its result or its error, whichever of two threads comes first."""
+        """Give a future its result or its error; the first of two threads does it."""
         self._waiting.discard(future)
         with suppress(InvalidStateError):
             if error is None:

@@ -1,4 +1,4 @@
-"""In a Dask worker: calls are made in processes beside it, and not in its threads.
+"""Calls in a Dask worker: made in processes beside it, and not in its threads.
 
 Every thread keeps one process and gives its frames to that. What ends a process or hangs there
 ends nothing of Dask's, and threads do not meet inside a decoder whose complaints are the whole
@@ -24,7 +24,7 @@ _processes: dict[int, tuple[str, WorkerProcess]] = {}  # by thread: a run, and o
 
 @dataclass(frozen=True, slots=True)
 class JobContext:
-    """What a worker's calls go by.
+    """Settings that a worker's calls share.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class JobContext:
 
 
 def nothing(_: object) -> None:
-    """Do nothing: to be called shows that the way there and back is open."""
+    """Do nothing: the call itself shows that the way there and back is open."""
 
 
 def on_worker(context: JobContext, function: Callable[..., Any], *args: Any) -> Any:  # noqa: ANN401 - those of any function

@@ -1,4 +1,4 @@
-"""Who works on the frames: this process, others of this machine, or those of a cluster."""
+"""Workers for the frames: this process, others of this machine, or those of a cluster."""
 
 from __future__ import annotations
 

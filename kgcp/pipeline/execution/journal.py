@@ -1,4 +1,4 @@
-"""What a run has done so far, kept beside its output until the output is there.
+"""Results of a run so far, kept beside its output until the output is there.
 
 A journal is a file of lines: a checksum, a key, and the result of one frame. The key says all that
 the result depends on: a result is found again if, and only if, all of it is the same. The first

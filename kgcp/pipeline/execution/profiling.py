@@ -1,4 +1,4 @@
-"""Where the time of one call goes, by the stages that it strings together."""
+"""Time of one call by the stages that it strings together."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PACKAGE = PurePath(__file__).parents[2]
 
 @dataclass(frozen=True, slots=True)
 class Profiled(Generic[_Result]):
-    """What a call returned, and the seconds that each stage took, by its name."""
+    """Result of a call, and the seconds that each stage took, by its name."""
 
     result: _Result
     stages_s: Mapping[str, float]

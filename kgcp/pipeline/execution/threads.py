@@ -21,7 +21,7 @@ _THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def use_one_thread_each() -> None:
-    """Tell numeric libraries not to start threads: here if not loaded yet, and in new processes.
+    """Keep numeric libraries from starting threads: here if not loaded yet, and in new processes.
 
     It overrides what the environment says, because results would depend on that.
     """

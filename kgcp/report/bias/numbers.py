@@ -24,7 +24,7 @@ from kgcp.quality.statistics import Slope, Spread, fit_slope, wilson_interval
 from kgcp.settings import Method
 
 WORST, SPREAD = 12, 24
-"""How many close-ups a report has: of the largest residuals, and evenly over the distances."""
+"""Numbers of close-ups: of the largest residuals, and evenly over the distances."""
 
 BIN_M = 10.0
 NEAR_M = 50.0  # the paper states its accuracy below and above
@@ -224,7 +224,7 @@ class BiasNumbers:
 
     @property
     def standardised_residuals(self) -> FloatArray:
-        """What scale and offset leave of the errors (n,), over its standard deviation."""
+        """Errors without scale and offset (n,), over their standard deviations."""
         left = self.residual_percent - self.explained_percent
         return np.asarray(left / (100.0 * np.sqrt(self.data.errors.total) / self.data.distance_m))
 

@@ -19,7 +19,7 @@ from kgcp.report.bias.wording import (
 
 
 class Grade(IntEnum):
-    """How good a flight is; the worst of all findings counts."""
+    """Grade of a flight; the worst of all findings counts."""
 
     GOOD = 0
     LOOK = 1
@@ -33,7 +33,7 @@ class Grade(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """From where on something is a finding."""
+    """Limits beyond which something is a finding."""
 
     min_frames: int = 10  # compared: below there is no verdict "good"
     unusable_rms_percent: float = 1.0  # of the errors; the paper has 1 % up to 100 m
@@ -181,7 +181,7 @@ def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:
 
 
 def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
-    """Say whether the reported standard deviations are true; of what scale and offset leave."""
+    """Compare the scatter of errors, without scale and offset, with their reported deviations."""
     regression = numbers.regression
     if regression is None or numbers.standardised is None or numbers.sd_reference_m is None:
         return
@@ -246,7 +246,7 @@ def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
 
 
 def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
-    """Say what speaks against taking the numbers at face value."""
+    """Yield the reservations against the numbers."""
     if numbers.sd_reference_m is not None:
         yield Finding(
             Grade.GOOD,

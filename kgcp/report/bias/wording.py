@@ -1,4 +1,4 @@
-"""What the numbers of the bias report mean, in sentences."""
+"""Sentences about the numbers of the bias report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LABELS = {
     "offset_m": "constant offset",
     "edge_curvature_px2": "curved edges",
 } | {quantity.name: quantity.label for quantity in QUANTITIES}
-"""What the terms of the regression are called."""
+"""Names of the regression's terms in print."""
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
 

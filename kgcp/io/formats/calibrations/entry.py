@@ -1,4 +1,4 @@
-"""What a reader of calibrations returns: the cameras of a file, not yet converted."""
+"""Result of a reader of calibrations: the cameras of a file, not yet converted."""
 
 from __future__ import annotations
 

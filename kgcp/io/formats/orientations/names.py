@@ -1,4 +1,4 @@
-"""Which frame of the flight another program means."""
+"""Matching of other programs' image names with the frames of the flight."""
 
 from __future__ import annotations
 

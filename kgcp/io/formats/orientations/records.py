@@ -1,4 +1,4 @@
-"""What a reader of poses is told by flight.toml, and what it returns: poses in the file's frame."""
+"""Input of a reader of poses from flight.toml, and its result: poses in the file's frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reader of trajectories is told by flight.toml, and what it returns: the file's epochs."""
+"""Input of a reader of trajectories from flight.toml, and its result: the file's epochs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kgcp.io.files.gps_time import TimeSystem
 
 
 class Wander(StrEnum):
-    """What makes the true heading of the heading and the wander angle of an SBET record."""
+    """How the wander angle of an SBET record turns its heading into the true one."""
 
     IGNORE = "ignore"
     SUBTRACT = "subtract"
