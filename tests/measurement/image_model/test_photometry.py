@@ -17,6 +17,7 @@ from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
 from kgcp.measurement.image_model.photometry import (
     PARAM_COUNT,
+    PLAIN_COUNT,
     Light,
     Param,
     PhotometricModel,
@@ -63,7 +64,7 @@ def test_levels_are_the_same_with_and_without_derivatives(
     share = make_share(photometry)
     levels, jacobian = photometry.linearised(share, light)
     np.testing.assert_allclose(levels, photometry.levels(share.value, light), atol=1e-14)
-    assert jacobian.shape == (PARAM_COUNT, len(levels))
+    assert jacobian.shape == (PLAIN_COUNT, len(levels))
 
 
 @pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
@@ -142,7 +143,8 @@ def test_srgb_decodes_to_the_light_it_encodes(light: float) -> None:
 def test_steps_add_to_every_parameter_in_order() -> None:
     start = Parameters.of(Pose(np.eye(3), np.array([0.0, 0.0, 9.0])), Blur(0.6, 0.4, 0.05), LIGHT)
     of_light = np.linspace(-0.02, 0.02, len(fields(Light)))
-    step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light])
+    skew = (0.01, -0.02, 0.03, 0.04)
+    step = np.array([0.0] * 6 + [0.1, 0.02, -0.03, 0.5, -0.4, *of_light, *skew])
     moved = start.moved(step)
     np.testing.assert_allclose(moved.vector, start.vector + step)
 
