@@ -41,7 +41,7 @@ def write_plan_figure(outlooks: Sequence[Outlook], title: str, path: Path) -> No
     check_figure_name(path)
     suffix = path.suffix.lower()
     stream = io.BytesIO()
-    with sheet(7.0, 8.0) as figure:
+    with sheet(8.0) as figure:
         distance, centre, detection = figure.subplots(3, 1, sharex=True)
         figure.suptitle(title, fontsize=12)
         _draw_distance(distance, outlooks)

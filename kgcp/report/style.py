@@ -18,6 +18,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 MARK_STEPS = 10_000  # of a picture's width and height
 _DPI = 150
+_WIDTH_IN = 7.0
 _FEW = 400  # points, up to which they are drawn large
 _FAR = 8.0  # robust standard deviations, beyond which points are drawn at the rim
 _STYLE = {
@@ -72,10 +73,10 @@ class Picture:
 
 
 @contextmanager
-def sheet(width_in: float, height_in: float) -> Iterator[Figure]:
+def sheet(height_in: float) -> Iterator[Figure]:
     """Yield an empty figure in kgcp's style, whatever the user's matplotlibrc says."""
     with style.context(["default", _STYLE]):
-        yield Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
+        yield Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, layout="constrained")
 
 
 def picture(figure: Figure, points: Sequence[Points] = ()) -> Picture:

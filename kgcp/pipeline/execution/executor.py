@@ -58,8 +58,9 @@ class WorkerPool:
                 if isinstance(result, TaskFailure):
                     yield item, result
                 else:
-                    self.stages_s.update(result.stages_s)
-                    yield item, result.result
+                    value, stages_s = result
+                    self.stages_s.update(stages_s)
+                    yield item, value
 
 
 @contextmanager

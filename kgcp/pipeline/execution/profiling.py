@@ -6,10 +6,9 @@ import cProfile
 import inspect
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import PurePath
 from types import CodeType
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -17,17 +16,9 @@ _Result = TypeVar("_Result")
 _PACKAGE = PurePath(__file__).parents[2]
 
 
-@dataclass(frozen=True, slots=True)
-class Profiled(Generic[_Result]):
-    """Result of a call, and the seconds that each stage took, by its name."""
-
-    result: _Result
-    stages_s: Mapping[str, float]
-
-
 def profiled(
     callers: tuple[Callable[..., object], ...], function: Callable[[_Item], _Result], item: _Item
-) -> Profiled[_Result]:
+) -> tuple[_Result, Mapping[str, float]]:
     """Call a function and measure its stages, at the price of some time.
 
     Parameters
@@ -35,6 +26,13 @@ def profiled(
     callers : tuple of callable
         Functions that only string stages together, as do all others of their modules: what these
         modules call elsewhere in the package are the stages.
+
+    Returns
+    -------
+    result
+        As the function's.
+    stages_s : mapping of str to float
+        Seconds of each stage, by its name.
 
     Raises
     ------
@@ -53,4 +51,4 @@ def profiled(
                     if path.is_relative_to(_PACKAGE):
                         module = path.relative_to(_PACKAGE).with_suffix("").parts
                         stages_s[".".join((*module, call.code.co_name))] += call.totaltime
-    return Profiled(result, dict(stages_s))
+    return result, dict(stages_s)
