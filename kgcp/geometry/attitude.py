@@ -15,27 +15,15 @@ CAMERA_FROM_PHOTO: FloatArray = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferencePoses:
-    """Exterior orientations of n frames.
+    """Exterior orientations of n frames."""
 
-    Attributes
-    ----------
-    frames : tuple of str
-        Names as in the detections: relative to the frames folder, with /; unique.
-    position_map : (n, 3) array
-        Projection centres x, y, z in the flight's CRS.
-    opk_deg : (n, 3) array
-        Omega, phi, kappa relative to the map's axes [deg].
-    sd_position_m : (n, 3) array or None
-        Standard deviations along the map's axes [m]; None: not given.
-    sd_angle_deg : (n,) array or None
-        Of each of the three angles [deg]; None: not given.
-    """
-
+    # names as in the detections: relative to the frames folder, with /; unique
     frames: tuple[str, ...]
-    position_map: FloatArray
-    opk_deg: FloatArray
+    position_map: FloatArray  # (n, 3): projection centres x, y, z in the flight's CRS
+    opk_deg: FloatArray  # (n, 3): omega, phi, kappa relative to the map's axes [deg]
+    # (n, 3): standard deviations along the map's axes [m]; None: not given
     sd_position_m: FloatArray | None
-    sd_angle_deg: FloatArray | None
+    sd_angle_deg: FloatArray | None  # (n,): of each of the three angles [deg]; None: not given
 
 
 def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:

@@ -22,14 +22,10 @@ _NEGATIVE_EIGENVALUE = 1e-6  # of the correlations: what rounding to six digits 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationCovariance:
-    """Covariance of the calibration: an error that all frames of a flight share.
+    """Covariance of the calibration: an error that all frames of a flight share."""
 
-    Attributes
-    ----------
-    cov : (12, 12) array
-        In the order and the units of `CALIBRATION_PARAMETERS`; rows of zeros: taken for exact.
-    """
-
+    # (12, 12): in the order and the units of `CALIBRATION_PARAMETERS`; rows of zeros: taken for
+    # exact
     cov: FloatArray
 
     @classmethod

@@ -26,17 +26,11 @@ _NO_SPREAD = 1e-20  # sum of squared relative deviations
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CirclePlane:
-    """One of the two positions in space that a circle can have, given its image.
+    """One of the two positions in space that a circle can have, given its image."""
 
-    Attributes
-    ----------
-    normal : (3,) array
-        Unit normal of the circle's plane in the camera frame, pointing away from the camera.
-    centre : (3,) array
-        The circle's centre in the camera frame, in units of the circle's radius.
-    """
-
+    # (3,): unit normal of the circle's plane in the camera frame, pointing away from the camera
     normal: FloatArray
+    # (3,): the circle's centre in the camera frame, in units of the circle's radius
     centre: FloatArray
 
     @property

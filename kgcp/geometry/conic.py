@@ -19,23 +19,15 @@ _MIN_POINTS = 6
 
 @dataclass(frozen=True, slots=True)
 class Ellipse:
-    """An ellipse by its centre, semi-axes and direction.
+    """An ellipse by its centre, semi-axes and direction."""
 
-    Attributes
-    ----------
-    x, y : float
-        Centre.
-    a, b : float
-        Semi-major and semi-minor axis, in the unit of the centre.
-    angle_rad : float
-        Direction of the major axis, from x towards y, in (-π/2, π/2].
-    """
-
+    # centre
     x: float
     y: float
+    # semi-major and semi-minor axis, in the unit of the centre
     a: float
     b: float
-    angle_rad: float
+    angle_rad: float  # direction of the major axis, from x towards y, in (-π/2, π/2]
 
     @property
     def centre(self) -> FloatArray:

@@ -22,20 +22,12 @@ _FOLD_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExteriorOrientations:
-    """Exterior orientations of n frames.
+    """Exterior orientations of n frames."""
 
-    Attributes
-    ----------
-    centre_m : (n, 3) array
-        Projection centres in the ENU frame [m].
-    enu_from_camera : (n, 3, 3) array
-        Camera axes (x right, y down, z forward) in the ENU frame, as columns.
-    cov_m2 : (n, 3, 3) array or None
-        Covariance of the centres in ENU axes [m²]; None: the poses have no deviations.
-    """
-
-    centre_m: FloatArray
+    centre_m: FloatArray  # (n, 3): projection centres in the ENU frame [m]
+    # (n, 3, 3): camera axes (x right, y down, z forward) in the ENU frame, as columns
     enu_from_camera: FloatArray
+    # (n, 3, 3): covariance of the centres in ENU axes [m²]; None: the poses have no deviations
     cov_m2: FloatArray | None
 
     @classmethod

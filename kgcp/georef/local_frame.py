@@ -38,20 +38,11 @@ class LocalFrame:
     Map coordinates are x = easting or longitude, y = northing or latitude, in this order and in
     the CRS's own units, and z = height: ellipsoidal and in metres unless the CRS is compound;
     a compound CRS says itself what its heights are.
-
-    Attributes
-    ----------
-    crs : str
-        As in flight.toml.
-    origin_ecef_m : (3,) array
-        Origin of the ENU frame, Earth-centred [m].
-    ecef_from_enu : (3, 3) array
-        Directions east, north and up of the origin, as columns.
     """
 
-    crs: str
-    origin_ecef_m: FloatArray
-    ecef_from_enu: FloatArray
+    crs: str  # as in flight.toml
+    origin_ecef_m: FloatArray  # (3,): origin of the ENU frame, Earth-centred [m]
+    ecef_from_enu: FloatArray  # (3, 3): directions east, north and up of the origin, as columns
     _geodetic_from_map: Transformer
     _ecef_from_geodetic: Transformer
     _radians_per_unit: float
@@ -254,18 +245,10 @@ def turn_covariances(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrsTransform:
-    """The way from the flight's map to another one, datum and geoid included.
+    """The way from the flight's map to another one, datum and geoid included."""
 
-    Attributes
-    ----------
-    source : LocalFrame
-        The flight's.
-    target : LocalFrame
-        Of the other CRS.
-    """
-
-    source: LocalFrame
-    target: LocalFrame
+    source: LocalFrame  # the flight's
+    target: LocalFrame  # of the other CRS
     _between: Transformer
     _where: str
 

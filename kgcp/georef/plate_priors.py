@@ -25,18 +25,11 @@ _MOUNTED_SD_DEG = 3.0  # of a plate on a roof against the vehicle's axes, if not
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraAttitudes:
-    """What is known of the camera's attitude.
+    """What is known of the camera's attitude."""
 
-    Attributes
-    ----------
-    poses : ReferencePoses or None
-        One without deviation counts as exact.
-    plumb_sd_deg : float or None
-        Standard deviation of the optical axis against the vertical, about either horizontal axis,
-        of frames without a pose [deg]; None: nothing is known of them.
-    """
-
-    poses: ReferencePoses | None
+    poses: ReferencePoses | None  # one without deviation counts as exact
+    # standard deviation of the optical axis against the vertical, about either horizontal axis, of
+    # frames without a pose [deg]; None: nothing is known of them
     plumb_sd_deg: float | None
 
     def sd_deg(self, row: int) -> float:

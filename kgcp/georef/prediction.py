@@ -30,18 +30,10 @@ _MIN_TRIPLES = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """One target through the frames of a flight, n of them in their order.
+    """One target through the frames of a flight, n of them in their order."""
 
-    Attributes
-    ----------
-    time_s : (n,) array
-        Mid-exposures [s]; NaN: not known.
-    state : (n, 3) array
-        Centre x, y [px] and logarithm of the radius [px]; NaN: not found.
-    """
-
-    time_s: FloatArray
-    state: FloatArray
+    time_s: FloatArray  # (n,): mid-exposures [s]; NaN: not known
+    state: FloatArray  # (n, 3): centre x, y [px] and logarithm of the radius [px]; NaN: not found
 
     @property
     def is_found(self) -> BoolArray:

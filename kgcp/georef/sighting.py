@@ -11,56 +11,25 @@ from kgcp.geometry.pose import Pose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """One target measured in one frame.
+    """One target measured in one frame."""
 
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    number : int
-        Position of the frame among all frames of the flight, from 1.
-    target : str
-        Name in flight.toml.
-    instance : int
-        0 for the best plate with this code in the frame.
-    time_s : float or None
-        Mid-exposure, Unix UTC [s]; None: not known.
-    centre_px : (2,) array
-        Projected circle centre in the raw image [px].
-    centre_cov_px2 : (2, 2) array or None
-        Its covariance [px²].
-    distance_m : float
-        Projection centre to target centre [m].
-    sd_distance_m : float or None
-        Its standard deviation [m].
-    sd_common_distance_m : float or None
-        Share of calibration and diameter: one error in all frames, not in `sd_distance_m` [m].
-    pose : Pose or None
-        Target → camera; None: not measured.
-    pose_cov : (6, 6) array or None
-        Its covariance: translation [m], left rotation vector in the camera frame [rad].
-    common_pose_cov : (6, 6) array or None
-        Share of calibration and diameter, not in `pose_cov`; None: not known.
-    score : float or None
-        Normalised cross-correlation of the code.
-    ambiguity : float or None
-        Δχ² by which the circle's other pose is worse.
-    """
-
-    frame: str
-    number: int
-    target: str
-    instance: int
-    time_s: float | None
-    centre_px: FloatArray
-    centre_cov_px2: FloatArray | None
-    distance_m: float
-    sd_distance_m: float | None
+    frame: str  # path relative to the frames folder
+    number: int  # position of the frame among all frames of the flight, from 1
+    target: str  # name in flight.toml
+    instance: int  # 0 for the best plate with this code in the frame
+    time_s: float | None  # mid-exposure, Unix UTC [s]; None: not known
+    centre_px: FloatArray  # (2,): projected circle centre in the raw image [px]
+    centre_cov_px2: FloatArray | None  # (2, 2): its covariance [px²]
+    distance_m: float  # projection centre to target centre [m]
+    sd_distance_m: float | None  # its standard deviation [m]
+    # share of calibration and diameter: one error in all frames, not in `sd_distance_m` [m]
     sd_common_distance_m: float | None
-    pose: Pose | None = None
+    pose: Pose | None = None  # target → camera; None: not measured
+    # (6, 6): its covariance: translation [m], left rotation vector in the camera frame [rad]
     pose_cov: FloatArray | None = None
-    score: float | None = None
-    ambiguity: float | None = None
+    score: float | None = None  # normalised cross-correlation of the code
+    ambiguity: float | None = None  # Δχ² by which the circle's other pose is worse
+    # (6, 6): share of calibration and diameter, not in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
 
     def row_time_s(self, camera: Camera) -> float | None:
@@ -95,20 +64,11 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One target looked for in one readable frame.
+    """One target looked for in one readable frame."""
 
-    Attributes
-    ----------
-    frame, target : str
-        As in the detections.
-    time_s : float or None
-        Mid-exposure, Unix UTC [s].
-    sighting : Sighting or None
-        None where the target was not measured.
-    """
-
+    # as in the detections
     frame: str
     target: str
-    time_s: float | None
-    sighting: Sighting | None
+    time_s: float | None  # mid-exposure, Unix UTC [s]
+    sighting: Sighting | None  # None where the target was not measured
     exposure: Exposure

@@ -21,58 +21,32 @@ from kgcp.targets.layout import Target
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
-    """Motion of the vehicle while a target was at its place.
+    """Motion of the vehicle while a target was at its place."""
 
-    Attributes
-    ----------
-    velocity_m_s : (3,) array
-        Of the target's centre, in the ENU frame [m/s].
-    frame_from_body : (3, 3) array
-        The vehicle's body axes in the ENU frame, as columns.
-    """
-
-    velocity_m_s: FloatArray
-    frame_from_body: FloatArray
+    velocity_m_s: FloatArray  # (3,): of the target's centre, in the ENU frame [m/s]
+    frame_from_body: FloatArray  # (3, 3): the vehicle's body axes in the ENU frame, as columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetPosition:
-    """Position of a target's centre.
+    """Position of a target's centre."""
 
-    Attributes
-    ----------
-    position_m : (3,) array
-        In the ENU frame [m].
-    cov_m2 : (3, 3) array or None
-        Covariance in ENU axes [m²]; None where the trajectory has no standard deviations.
-    common_m : (3, 4) array or None
-        How one standard deviation of lever arm x, y, z and of the synchronisation moves the
-        place, ENU axes, as columns [m]. These four errors are the same in all frames; between
-        the places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
-    vehicle_state : VehicleState or None
-        None: the target stands still.
-    """
-
-    position_m: FloatArray
+    position_m: FloatArray  # (3,): in the ENU frame [m]
+    # (3, 3): covariance in ENU axes [m²]; None where the trajectory has no standard deviations
     cov_m2: FloatArray | None
+    # (3, 4): how one standard deviation of lever arm x, y, z and of the synchronisation moves the
+    # place, ENU axes, as columns [m]. These four errors are the same in all frames; between the
+    # places i and j they make the covariance C_i C_jᵀ. None: the target stands still.
     common_m: FloatArray | None = None
-    vehicle_state: VehicleState | None = None
+    vehicle_state: VehicleState | None = None  # None: the target stands still
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicle:
-    """The vehicle that carries the target.
+    """The vehicle that carries the target."""
 
-    Attributes
-    ----------
-    motion : Motion
-        Its trajectory in the ENU frame of `local_frame`.
-    settings : VehicleSettings
-        Lever arm, time offset and their standard deviations.
-    """
-
-    motion: Motion
-    settings: VehicleSettings
+    motion: Motion  # its trajectory in the ENU frame of `local_frame`
+    settings: VehicleSettings  # lever arm, time offset and their standard deviations
     local_frame: LocalFrame
 
     @classmethod
@@ -147,21 +121,11 @@ class NoPosition(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetPositions:
-    """Positions of all targets of a flight at any time.
+    """Positions of all targets of a flight at any time."""
 
-    Attributes
-    ----------
-    local_frame : LocalFrame
-        The flight's map, and the ENU frame of all places.
-    static : mapping of str to TargetPosition
-        Targets that stand still, by name.
-    vehicle : Vehicle or None
-        The vehicle that carries the other one.
-    """
-
-    local_frame: LocalFrame
-    static: Mapping[str, TargetPosition]
-    vehicle: Vehicle | None
+    local_frame: LocalFrame  # the flight's map, and the ENU frame of all places
+    static: Mapping[str, TargetPosition]  # targets that stand still, by name
+    vehicle: Vehicle | None  # the vehicle that carries the other one
 
     @classmethod
     def of(

@@ -38,30 +38,18 @@ def body_to_ned(roll_deg: FloatArray, pitch_deg: FloatArray, heading_deg: FloatA
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """A vehicle's trajectory as its file gives it: map positions, angles against true north.
+    """A vehicle's trajectory as its file gives it: map positions, angles against true north."""
 
-    Attributes
-    ----------
-    time_s : (n,) array
-        Unix time, UTC, strictly ascending, n ≥ 2 [s].
-    position_map : (n, 3) array
-        x, y, z in the flight's CRS.
-    attitude_deg : (n, 3) array
-        Roll, pitch, heading against the local level and true north [deg].
-    sd_position_m : (n, 3) array or None
-        Standard deviations along the map's axes [m]; None: the file has none.
-    sd_attitude_deg : (n, 3) array or None
-        Of roll, pitch, heading [deg]; None: the file has none.
-    cov_position_m2 : (n, 3, 3) array or None
-        Covariances along the map's axes [m²], of which `sd_position_m` is the diagonal; None: the
-        file tells no more than standard deviations.
-    """
-
-    time_s: FloatArray
-    position_map: FloatArray
+    time_s: FloatArray  # (n,): Unix time, UTC, strictly ascending, n ≥ 2 [s]
+    position_map: FloatArray  # (n, 3): x, y, z in the flight's CRS
+    # (n, 3): roll, pitch, heading against the local level and true north [deg]
     attitude_deg: FloatArray
+    # (n, 3): standard deviations along the map's axes [m]; None: the file has none
     sd_position_m: FloatArray | None
+    # (n, 3): of roll, pitch, heading [deg]; None: the file has none
     sd_attitude_deg: FloatArray | None
+    # (n, 3, 3): covariances along the map's axes [m²], of which `sd_position_m` is the diagonal;
+    # None: the file tells no more than standard deviations
     cov_position_m2: FloatArray | None = None
 
 
@@ -76,25 +64,14 @@ class Coverage(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """The vehicle at n times, in the Cartesian frame of its `Motion`.
+    """The vehicle at n times, in the Cartesian frame of its `Motion`."""
 
-    Attributes
-    ----------
-    position_m, velocity_m_s : (n, 3) array
-        Of the trajectory point [m, m/s].
-    frame_from_body : (n, 3, 3) array
-        Attitude.
-    angular_velocity_rad_s : (n, 3) array
-        In the frame's axes [rad/s].
-    sd_position_m, sd_attitude_deg : (n, 3) array or None
-    cov_position_m2 : (n, 3, 3) array or None
-        As in `Trajectory`.
-    """
-
+    # (n, 3): of the trajectory point [m, m/s]
     position_m: FloatArray
     velocity_m_s: FloatArray
-    frame_from_body: FloatArray
-    angular_velocity_rad_s: FloatArray
+    frame_from_body: FloatArray  # (n, 3, 3): attitude
+    angular_velocity_rad_s: FloatArray  # (n, 3): in the frame's axes [rad/s]
+    # as in `Trajectory`
     sd_position_m: FloatArray | None
     sd_attitude_deg: FloatArray | None
     cov_position_m2: FloatArray | None
@@ -102,24 +79,12 @@ class States:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A trajectory in a Cartesian frame, ready to be interpolated.
+    """A trajectory in a Cartesian frame, ready to be interpolated."""
 
-    Attributes
-    ----------
-    time_s : (n,) array
-        Unix time, UTC, strictly ascending, n ≥ 2 [s].
-    position_m : (n, 3) array
-        In the frame [m].
-    frame_from_body : (n, 3, 3) array
-        Body axes in the frame, as columns.
-    sd_position_m, sd_attitude_deg : (n, 3) array or None
-    cov_position_m2 : (n, 3, 3) array or None
-        As in `Trajectory`.
-    """
-
-    time_s: FloatArray
-    position_m: FloatArray
-    frame_from_body: FloatArray
+    time_s: FloatArray  # (n,): Unix time, UTC, strictly ascending, n ≥ 2 [s]
+    position_m: FloatArray  # (n, 3): in the frame [m]
+    frame_from_body: FloatArray  # (n, 3, 3): body axes in the frame, as columns
+    # as in `Trajectory`
     sd_position_m: FloatArray | None
     sd_attitude_deg: FloatArray | None
     cov_position_m2: FloatArray | None = None

@@ -26,32 +26,23 @@ _HEAD = 2000  # characters of a page, in which the mark must be
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Entry of the page for one row of the table, or of a ring that was dropped.
+    """Entry of the page for one row of the table, or of a ring that was dropped."""
 
-    Attributes
-    ----------
-    frame, target, status, reason : str
-        As in the table; or the status `DROPPED`.
-    headline, text : str
-        The main value, and the others.
-    distance_m, sd_percent, radius_px, residual_percent : float or None
-        What the page can sort by.
-    stem : str or None
-        Of the picture's files; None: there is none.
-    """
-
+    # as in the table; or the status `DROPPED`
     frame: str
     target: str
     instance: int
     status: str
     reason: str
+    # the main value, and the others
     headline: str
     text: str
+    # what the page can sort by
     distance_m: float | None = None
     sd_percent: float | None = None
     radius_px: float | None = None
     residual_percent: float | None = None
-    stem: str | None = None
+    stem: str | None = None  # of the picture's files; None: there is none
 
 
 class ContactSheet:

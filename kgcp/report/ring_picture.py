@@ -36,24 +36,12 @@ _Picture = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingView:
-    """One ring in a frame, with the lines to draw.
+    """One ring in a frame, with the lines to draw."""
 
-    Attributes
-    ----------
-    centre_px : (2,) array
-        Its centre in the raw frame [px].
-    radius_px : float
-        Of its outer edge [px].
-    curves : sequence of (m, 2) array
-        Contours, fitted or of the outline that was dropped [px].
-    residual_image : ResidualImage or None
-        What the fit leaves; None: there is no fit.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
-    curves: Sequence[FloatArray]
-    residual_image: ResidualImage | None = None
+    centre_px: FloatArray  # (2,): its centre in the raw frame [px]
+    radius_px: float  # of its outer edge [px]
+    curves: Sequence[FloatArray]  # contours, fitted or of the outline that was dropped [px]
+    residual_image: ResidualImage | None = None  # what the fit leaves; None: there is no fit
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,36 +39,22 @@ _STYLE = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Measurements drawn in one panel.
-
-    Attributes
-    ----------
-    rows : (m,) array of int
-        Which measurements, by their place in time.
-    x, y : (m,) array
-        Where, in the panel's coordinates.
-    """
+    """Measurements drawn in one panel."""
 
     axes: Axes
-    rows: IndexArray
+    rows: IndexArray  # (m,): which measurements, by their place in time
+    # (m,): where, in the panel's coordinates
     x: FloatArray
     y: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A figure as a file, with the places of its points.
-
-    Attributes
-    ----------
-    rows : (m,) array of int
-        Measurements that are drawn; one may be in several panels.
-    places : (m, 2) array of int
-        Theirs, from the picture's left and top, in `MARK_STEPS` of its width and height.
-    """
+    """A figure as a file, with the places of its points."""
 
     png: bytes
-    rows: IndexArray
+    rows: IndexArray  # (m,): measurements that are drawn; one may be in several panels
+    # (m, 2): theirs, from the picture's left and top, in `MARK_STEPS` of its width and height
     places: IndexArray
 
 

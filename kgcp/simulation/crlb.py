@@ -29,48 +29,25 @@ _WHITE_LEVEL = 255.0
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Least standard deviations of one view.
+    """Least standard deviations of one view."""
 
-    Attributes
-    ----------
-    distance_percent : float
-        Of the distance [%].
-    centre_px : float
-        Of the projected centre: root of the summed variances of x and y [px].
-    normal_deg : float
-        Of the plate's normal: root of the summed variances of its two angles [deg].
-    """
-
-    distance_percent: float
-    centre_px: float
-    normal_deg: float
+    distance_percent: float  # of the distance [%]
+    centre_px: float  # of the projected centre: root of the summed variances of x and y [px]
+    normal_deg: float  # of the plate's normal: root of the summed variances of its two angles [deg]
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One view of a plate: how it lies, and what takes the picture.
-
-    Attributes
-    ----------
-    plate : PrintedPlate
-        With the radiances of plate and ink.
-    pose : Pose
-        Target → camera.
-    gain : float
-        Exposure relative to the one at which radiance 1 fills the well.
-    has_unknown_streak : bool
-        Whether a measurement has to find out how the image moved.
-    sub_pixels : int
-        Across the ring's window: 150 are good for 1 %, 600 for a per mille of the bound.
-    """
+    """One view of a plate: how it lies, and what takes the picture."""
 
     camera: Camera
-    plate: PrintedPlate
-    pose: Pose
+    plate: PrintedPlate  # with the radiances of plate and ink
+    pose: Pose  # target → camera
     optics: Optics
     sensor: Sensor
-    gain: float
-    has_unknown_streak: bool
+    gain: float  # exposure relative to the one at which radiance 1 fills the well
+    has_unknown_streak: bool  # whether a measurement has to find out how the image moved
+    # across the ring's window: 150 are good for 1 %, 600 for a per mille of the bound
     sub_pixels: int = 600
 
 

@@ -18,41 +18,19 @@ _LEAST_PEAK = 1.0 / 3.0  # of the largest peak of highlights
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """Strength of each effect.
+    """Strength of each effect."""
 
-    Attributes
-    ----------
-    shadow : float
-        Share of the light that is left behind a shadow edge; 1: no edge.
-    stripes : int
-        Number of stripe-shaped shadows.
-    dirt : float
-        Relative standard deviation of the reflectance.
-    stains : int
-        Number of stains.
-    glare : float
-        Peak of highlights, as a share of full scale; it varies between a third of this and this.
-    astigmatism : float
-        Ratio of the largest σ of the point spread to the smallest.
-    coma : float
-        Third central moment of the point spread along its tail, over psf³.
-    phone : bool
-        Whether frames are processed as a phone does it.
-    rolling : float
-        Time from the first row to the last [s].
-    motion : tuple of float or None
-        Motion of the image during that time [px/s]; None: random, anew in each frame.
-    """
-
-    shadow: float = 1.0
-    stripes: int = 0
-    dirt: float = 0.0
-    stains: int = 0
+    shadow: float = 1.0  # share of the light that is left behind a shadow edge; 1: no edge
+    stripes: int = 0  # number of stripe-shaped shadows
+    dirt: float = 0.0  # relative standard deviation of the reflectance
+    stains: int = 0  # number of stains
+    # peak of highlights, as a share of full scale; it varies between a third of this and this
     glare: float = 0.0
-    astigmatism: float = 1.0
-    coma: float = 0.0
-    phone: bool = False
-    rolling: float = 0.0
+    astigmatism: float = 1.0  # ratio of the largest σ of the point spread to the smallest
+    coma: float = 0.0  # third central moment of the point spread along its tail, over psf³
+    phone: bool = False  # whether frames are processed as a phone does it
+    rolling: float = 0.0  # time from the first row to the last [s]
+    # motion of the image during that time [px/s]; None: random, anew in each frame
     motion: tuple[float, float] | None = None
 
     @classmethod

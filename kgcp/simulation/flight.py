@@ -58,61 +58,32 @@ DECOY_PLATE = PrintedPlate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramePlan:
-    """The truth of one frame.
-
-    Attributes
-    ----------
-    time_s : float
-        Mid-exposure of the row of the target's centre, Unix UTC, without error [s].
-    camera : CameraState
-        Exterior orientation at that time, without error.
-    target : Pose
-        Target → camera; also where the target is not `present`.
-    target_enu_m : (3,) array
-        Target centre [m].
-    present : bool
-        Whether the whole ring is in the frame; otherwise nothing of the plate is.
-    decoys : tuple of Pose
-        Decoy plates that are wholly in the frame.
-    """
+    """The truth of one frame."""
 
     index: int
-    time_s: float
-    camera: CameraState
-    target: Pose
-    target_enu_m: FloatArray
-    present: bool
-    decoys: tuple[Pose, ...]
+    time_s: float  # mid-exposure of the row of the target's centre, Unix UTC, without error [s]
+    camera: CameraState  # exterior orientation at that time, without error
+    target: Pose  # target → camera; also where the target is not `present`
+    target_enu_m: FloatArray  # (3,): target centre [m]
+    present: bool  # whether the whole ring is in the frame; otherwise nothing of the plate is
+    decoys: tuple[Pose, ...]  # decoy plates that are wholly in the frame
     optics: Optics
     gain: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightPlan:
-    """Everything about a simulated flight but its pixels.
-
-    Attributes
-    ----------
-    target_map : (n, 3) array
-        Target centres in the flight's CRS.
-    recorded_times_s : (n,) array
-        The frames' times with their error: mid-exposure of the middle row [s].
-    vehicle : VehicleSettings
-        As the surveyor knows it; the true lever arm differs by its error.
-    trajectory : Trajectory
-        With its errors.
-    reference : ReferencePoses
-        With their errors.
-    """
+    """Everything about a simulated flight but its pixels."""
 
     settings: SimulationSettings
     seed: int
     frames: tuple[FramePlan, ...]
-    target_map: FloatArray
+    target_map: FloatArray  # (n, 3): target centres in the flight's CRS
+    # (n,): the frames' times with their error: mid-exposure of the middle row [s]
     recorded_times_s: FloatArray
-    vehicle: VehicleSettings
-    trajectory: Trajectory
-    reference: ReferencePoses
+    vehicle: VehicleSettings  # as the surveyor knows it; the true lever arm differs by its error
+    trajectory: Trajectory  # with its errors
+    reference: ReferencePoses  # with their errors
 
 
 def frame_name(settings: SimulationSettings, index: int) -> str:

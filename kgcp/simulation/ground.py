@@ -36,18 +36,11 @@ _GRAINS = TextureLayer(period_m=11.3, cos=-0.6, sin=0.8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """A textured plane with fields and a ring road.
+    """A textured plane with fields and a ring road."""
 
-    Attributes
-    ----------
-    pyramid : tuple of array
-        A periodic noise tile of zero mean and unit variance, and its reductions by two.
-    road_radius_m : float
-        Radius of the road's middle line about the origin [m].
-    """
-
+    # a periodic noise tile of zero mean and unit variance, and its reductions by two
     pyramid: tuple[FloatArray, ...]
-    road_radius_m: float
+    road_radius_m: float  # radius of the road's middle line about the origin [m]
 
     @classmethod
     def grown(cls, rng: np.random.Generator, road_radius_m: float) -> Ground:

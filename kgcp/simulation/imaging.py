@@ -71,24 +71,15 @@ class ToneCurve(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """Everything that spreads the light of one frame.
+    """Everything that spreads the light of one frame."""
 
-    Attributes
-    ----------
-    psf_px : float
-        σ of the Gaussian point spread; with an aberration, the root of the product of the
-        largest and the smallest [px].
-    streak_px : tuple of float
-        Motion of the image during the exposure, x and y [px]; symmetric about mid-exposure.
-    aberration : Aberration or None
-        None: the point spread is a round Gaussian.
-    motion : RowMotion or None
-        Motion of the image from row to row; None: all rows are exposed at once.
-    """
-
+    # σ of the Gaussian point spread; with an aberration, the root of the product of the largest and
+    # the smallest [px]
     psf_px: float
+    # motion of the image during the exposure, x and y [px]; symmetric about mid-exposure
     streak_px: tuple[float, float] = (0.0, 0.0)
-    aberration: Aberration | None = None
+    aberration: Aberration | None = None  # None: the point spread is a round Gaussian
+    # motion of the image from row to row; None: all rows are exposed at once
     motion: RowMotion | None = None
 
     @property
@@ -156,25 +147,13 @@ class Optics:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Conversion of light to grey values.
+    """Conversion of light to grey values."""
 
-    Attributes
-    ----------
-    full_well_e : float
-        Electrons at which a pixel clips.
-    read_noise_e : float
-        Standard deviation of the read noise [e⁻].
-    sharpening : float
-        Amount of the unsharp mask; 0: none.
-    sharpening_px : float
-        σ of its Gaussian [px].
-    """
-
-    full_well_e: float = 10_000.0
-    read_noise_e: float = 8.0
+    full_well_e: float = 10_000.0  # electrons at which a pixel clips
+    read_noise_e: float = 8.0  # standard deviation of the read noise [e⁻]
     tone: ToneCurve = ToneCurve.LINEAR
-    sharpening: float = 0.0
-    sharpening_px: float = 1.0
+    sharpening: float = 0.0  # amount of the unsharp mask; 0: none
+    sharpening_px: float = 1.0  # σ of its Gaussian [px]
 
     def __post_init__(self) -> None:
         require_range("full_well_e", self.full_well_e, 100.0, 1e7, unit="e⁻")

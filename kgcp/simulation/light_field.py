@@ -33,22 +33,13 @@ _GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(4)  # per side o
 
 @dataclass(frozen=True, slots=True)
 class Shade:
-    """A straight strip of shade between two parallel edges.
+    """A straight strip of shade between two parallel edges."""
 
-    Attributes
-    ----------
-    normal : tuple of float
-        Unit vector across the strip.
-    middle_m, width_m : float
-        Position of its middle line along `normal`, and its width at half shade [m].
-    penumbra_m : float
-        Width of either edge [m].
-    """
-
-    normal: tuple[float, float]
+    normal: tuple[float, float]  # unit vector across the strip
+    # position of its middle line along `normal`, and its width at half shade [m]
     middle_m: float
     width_m: float
-    penumbra_m: float
+    penumbra_m: float  # width of either edge [m]
 
     def sunlight(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Return the share of the sun's disc that is visible from places on the plate."""
@@ -129,15 +120,9 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightField:
-    """The light on one plate in one frame, in the plate's axes.
+    """The light on one plate in one frame, in the plate's axes."""
 
-    Attributes
-    ----------
-    light_left : float
-        Share of the light where every ray of the sun is hidden.
-    """
-
-    light_left: float = 1.0
+    light_left: float = 1.0  # share of the light where every ray of the sun is hidden
     shades: tuple[Shade, ...] = ()
     stains: tuple[Stain, ...] = ()
     cloud: Cloud | None = None

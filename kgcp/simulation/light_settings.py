@@ -9,28 +9,16 @@ from kgcp.settings import require_range
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """Shadows of straight things on a plate. Pairs are ranges.
+    """Shadows of straight things on a plate. Pairs are ranges."""
 
-    Attributes
-    ----------
-    light_left : float
-        Share of the light in full shade, which the sky sends; the sun sends the rest.
-    edges : int
-        Shadows with one edge, as of a wall.
-    stripes : int
-        Shadows with two edges, as of an antenna.
-    penumbra_m : tuple of float
-        Width on the plate from full light to full shade, uniform in the logarithm [m]. The sun
-        is 9.3 mrad wide: a thing 10 m away casts a penumbra of 0.09 m.
-    stripe_m : tuple of float
-        Width of a stripe, uniform [m].
-    """
-
+    # share of the light in full shade, which the sky sends; the sun sends the rest
     light_left: float = 0.45
-    edges: int = 1
-    stripes: int = 0
+    edges: int = 1  # shadows with one edge, as of a wall
+    stripes: int = 0  # shadows with two edges, as of an antenna
+    # width on the plate from full light to full shade, uniform in the logarithm [m]. The sun is 9.3
+    # mrad wide: a thing 10 m away casts a penumbra of 0.09 m.
     penumbra_m: tuple[float, float] = (0.03, 0.25)
-    stripe_m: tuple[float, float] = (0.02, 0.08)
+    stripe_m: tuple[float, float] = (0.02, 0.08)  # width of a stripe, uniform [m]
 
     def __post_init__(self) -> None:
         require_range("light_left", self.light_left, 0.0, 1.0)
@@ -42,27 +30,13 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class Dirt:
-    """Reflectance that varies over a plate, and stains. Pairs are ranges, uniform.
+    """Reflectance that varies over a plate, and stains. Pairs are ranges, uniform."""
 
-    Attributes
-    ----------
-    sd : float
-        Standard deviation of the reflectance, relative.
-    correlation_m : float
-        σ of the Gaussian autocorrelation on the plate [m].
-    stains : int
-        Number of round stains on the plate.
-    stain_radius_m : tuple of float
-        Radius at half their darkness [m].
-    darkness : tuple of float
-        Share of the light that a stain takes.
-    """
-
-    sd: float = 0.05
-    correlation_m: float = 0.1
-    stains: int = 8
-    stain_radius_m: tuple[float, float] = (0.006, 0.016)
-    darkness: tuple[float, float] = (0.3, 0.9)
+    sd: float = 0.05  # standard deviation of the reflectance, relative
+    correlation_m: float = 0.1  # σ of the Gaussian autocorrelation on the plate [m]
+    stains: int = 8  # number of round stains on the plate
+    stain_radius_m: tuple[float, float] = (0.006, 0.016)  # radius at half their darkness [m]
+    darkness: tuple[float, float] = (0.3, 0.9)  # share of the light that a stain takes
 
     def __post_init__(self) -> None:
         require_range("sd", self.sd, 0.0, 0.5)
@@ -74,18 +48,11 @@ class Dirt:
 
 @dataclass(frozen=True, slots=True)
 class Glare:
-    """A highlight on a plate. Pairs are ranges, uniform.
+    """A highlight on a plate. Pairs are ranges, uniform."""
 
-    Attributes
-    ----------
-    peak : tuple of float
-        What it adds at its middle, as a share of the exposure that fills the well.
-    radius_m : tuple of float
-        σ of its Gaussian on the plate [m].
-    """
-
+    # what it adds at its middle, as a share of the exposure that fills the well
     peak: tuple[float, float] = (0.2, 0.6)
-    radius_m: tuple[float, float] = (0.12, 0.3)
+    radius_m: tuple[float, float] = (0.12, 0.3)  # σ of its Gaussian on the plate [m]
 
     def __post_init__(self) -> None:
         _require_pair("peak", self.peak, 0.0, 10.0)

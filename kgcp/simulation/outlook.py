@@ -60,22 +60,12 @@ _SUB_PIXELS = 150
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions under which the frames will be taken.
+    """Conditions under which the frames will be taken."""
 
-    Attributes
-    ----------
-    blur_px : float
-        Motion of the image during the exposure, at most [px].
-    psf_px : float
-        σ of the point spread of lens and sensor [px].
-    accuracy_percent : float
-        Wanted standard deviation of one distance [% of it].
-    """
-
-    blur_px: float = 1.0
+    blur_px: float = 1.0  # motion of the image during the exposure, at most [px]
     exposure_s: float = 0.001
-    psf_px: float = 0.7
-    accuracy_percent: float = 0.05
+    psf_px: float = 0.7  # σ of the point spread of lens and sensor [px]
+    accuracy_percent: float = 0.05  # wanted standard deviation of one distance [% of it]
 
     def __post_init__(self) -> None:
         require_range("blur", self.blur_px, 0.0, 30.0, unit="px")
@@ -86,38 +76,23 @@ class Conditions:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Expected detection and accuracy at one height.
+    """Expected detection and accuracy at one height."""
 
-    Attributes
-    ----------
-    height_m : float
-        Camera above target.
-    ring : str or None
-        The largest ring that is wholly in the image; None: none is.
-    radius_px : float
-        Of that ring, or of the main one [px].
-    found, found_low, found_high : float
-        Probability that it is found, and Wilson's interval of 95 %.
-    sd_distance_m, sd_centre_px : float or None
-        Standard deviations of one frame, of the centre per axis; None where nothing is found.
-    sd_common_distance_m : float or None
-        Of calibration and print, in all frames alike; None: flight.toml does not say.
-    largest_speed_mps : float
-        Over ground, relative to the target, that blurs by no more than `blur_px`.
-    smallest_diameter_m : float
-        Of the main ring, for the wanted accuracy, and to be found for sure.
-    """
-
-    height_m: float
-    ring: str | None
-    radius_px: float
+    height_m: float  # camera above target
+    ring: str | None  # the largest ring that is wholly in the image; None: none is
+    radius_px: float  # of that ring, or of the main one [px]
+    # probability that it is found, and Wilson's interval of 95 %
     found: float
     found_low: float
     found_high: float
+    # standard deviations of one frame, of the centre per axis; None where nothing is found
     sd_distance_m: float | None
     sd_centre_px: float | None
+    # of calibration and print, in all frames alike; None: flight.toml does not say
     sd_common_distance_m: float | None
+    # over ground, relative to the target, that blurs by no more than `blur_px`
     largest_speed_mps: float
+    # of the main ring, for the wanted accuracy, and to be found for sure
     smallest_diameter_m: float
 
 

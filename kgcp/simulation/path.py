@@ -29,17 +29,10 @@ _ENU_FROM_NADIR = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleStates:
-    """The vehicle at n times.
+    """The vehicle at n times."""
 
-    Attributes
-    ----------
-    position_enu_m : (n, 3) array
-        Trajectory point [m].
-    roll_deg, pitch_deg, heading_deg : (n,) arrays
-        Attitude against local level and true north [deg].
-    """
-
-    position_enu_m: FloatArray
+    position_enu_m: FloatArray  # (n, 3): trajectory point [m]
+    # (n,): attitude against local level and true north [deg]
     roll_deg: FloatArray
     pitch_deg: FloatArray
     heading_deg: FloatArray

@@ -53,24 +53,14 @@ _COLOUR_AT_OTHER = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Phone:
-    """Settings of a phone's image processing.
+    """Settings of a phone's image processing."""
 
-    Attributes
-    ----------
-    noise_reduction : float
-        Differences of fewer noise standard deviations than this are smoothed away; 0: none are.
-    noise_radius_px : int
-        Half the side of the smoothing window [px].
-    local_tone : float
-        Share of the difference in brightness between regions, in logarithms, that is taken away.
-    local_tone_px : float
-        σ of a region [px].
-    """
-
+    # differences of fewer noise standard deviations than this are smoothed away; 0: none are
     noise_reduction: float = 2.0
-    noise_radius_px: int = 2
+    noise_radius_px: int = 2  # half the side of the smoothing window [px]
+    # share of the difference in brightness between regions, in logarithms, that is taken away
     local_tone: float = 0.3
-    local_tone_px: float = 60.0
+    local_tone_px: float = 60.0  # σ of a region [px]
 
     def __post_init__(self) -> None:
         require_range("noise_reduction", self.noise_reduction, 0.0, 20.0)

@@ -15,18 +15,12 @@ from kgcp.simulation.regions import Region
 
 @dataclass(frozen=True, slots=True)
 class PixelWindow:
-    """A rectangle of whole pixels; it may reach beyond the frame.
+    """A rectangle of whole pixels; it may reach beyond the frame."""
 
-    Attributes
-    ----------
-    column, row : int
-        First pixel.
-    width, height : int
-        Number of pixels.
-    """
-
+    # first pixel
     column: int
     row: int
+    # number of pixels
     width: int
     height: int
 
@@ -48,22 +42,14 @@ class PixelWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneRaster:
-    """The plane coordinates of every sub-pixel of a window.
-
-    Attributes
-    ----------
-    pose : Pose
-        Plane → camera; the plane is z = 0.
-    oversampling : int
-        Sub-pixels per pixel and axis.
-    x_m, y_m : (height · oversampling, width · oversampling) arrays
-        Where the rays through the sub-pixels' centres meet the plane [m].
-    """
+    """The plane coordinates of every sub-pixel of a window."""
 
     camera: Camera
-    pose: Pose
+    pose: Pose  # plane → camera; the plane is z = 0
     window: PixelWindow
-    oversampling: int
+    oversampling: int  # sub-pixels per pixel and axis
+    # (height · oversampling, width · oversampling): where the rays through the sub-pixels' centres
+    # meet the plane [m]
     x_m: FloatArray
     y_m: FloatArray
 

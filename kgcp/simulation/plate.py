@@ -21,18 +21,11 @@ _SUB_PIXELS_ACROSS = 1000  # of a window: memory and time are bounded, small tar
 
 @dataclass(frozen=True, slots=True)
 class PrintedPlate:
-    """A target as it was printed.
-
-    Attributes
-    ----------
-    outline : ConvexPolygon
-        Of the white plate [m].
-    white, black : float
-        Radiance of plate and ink under the frame's light, 0…1.
-    """
+    """A target as it was printed."""
 
     target: Target
-    outline: ConvexPolygon
+    outline: ConvexPolygon  # of the white plate [m]
+    # radiance of plate and ink under the frame's light, 0…1
     white: float = 0.88
     black: float = 0.05
 
@@ -50,19 +43,11 @@ class PrintedPlate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateImage:
-    """Light of a plate in the pixels of a window.
-
-    Attributes
-    ----------
-    opacity : (height, width) array
-        How much of what lies behind the plate is hidden, 0…1.
-    irradiance : (height, width) array
-        Light that comes from the plate.
-    """
+    """Light of a plate in the pixels of a window."""
 
     window: PixelWindow
-    opacity: FloatArray
-    irradiance: FloatArray
+    opacity: FloatArray  # (height, width): how much of what lies behind the plate is hidden, 0…1
+    irradiance: FloatArray  # (height, width): light that comes from the plate
 
     def paste(self, frame: FloatArray) -> None:
         """Put the plate into a frame's irradiance, in place; the window must meet the frame."""

@@ -30,24 +30,12 @@ _EXTRA_NODES = 5
 
 @dataclass(frozen=True, slots=True)
 class Aberration:
-    """Departure of a lens's point spread from a round Gaussian. Angles from +x towards +y [deg].
+    """Departure of a lens's point spread from a round Gaussian. Angles from +x towards +y [deg]."""
 
-    Attributes
-    ----------
-    astigmatism : float
-        Ratio of the largest σ to the smallest; their product is psf².
-    astigmatism_deg : float
-        Direction of the largest σ.
-    coma : float
-        Third central moment along the tail, over psf³.
-    coma_deg : float
-        Where the tail points.
-    """
-
-    astigmatism: float = 1.0
-    astigmatism_deg: float = 35.0
-    coma: float = 0.0
-    coma_deg: float = 110.0
+    astigmatism: float = 1.0  # ratio of the largest σ to the smallest; their product is psf²
+    astigmatism_deg: float = 35.0  # direction of the largest σ
+    coma: float = 0.0  # third central moment along the tail, over psf³
+    coma_deg: float = 110.0  # where the tail points
 
     def __post_init__(self) -> None:
         require_range("astigmatism", self.astigmatism, 1.0, 5.0)

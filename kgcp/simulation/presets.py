@@ -32,66 +32,39 @@ _MOTION = ImageMotion()
 
 @dataclass(frozen=True, slots=True)
 class SimulationSettings:
-    """Parameters of a simulated flight. Pairs are ranges.
+    """Parameters of a simulated flight. Pairs are ranges."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the flight.
-    frames : int
-        Number of frames.
-    distance_m : tuple of float
-        Camera to target; the UAV climbs and descends between the two, uniform in the logarithm.
-    tilt_deg : tuple of float
-        Optical axis against the vertical, uniform [deg].
-    gain : tuple of float
-        Exposure relative to the one at which radiance 1 fills the well, uniform in the logarithm.
-    psf_px : tuple of float
-        σ of the point spread, uniform [px].
-    streak_px : tuple of float
-        Length of the motion streak, uniform, in any direction [px].
-    shadow, dirt, glare : Shadow, Dirt, Glare or None
-        Light on the plates that is not the same everywhere; None: none of the kind.
-    lens : Aberration or None
-        None: the point spread is a round Gaussian.
-    phone : Phone or None
-        None: grey values are what the `sensor` makes of the light.
-    motion : ImageMotion
-        While rows are read: without effect if the camera's `readout_s` is 0.
-    absent_share, decoy_share : float
-        Share of frames without the target, and with a plate of another code where there is room.
-    jpeg_quality : int or None
-        None: PNG.
-    sd_position_m, sd_attitude_deg : tuple of float
-        Errors of the trajectory: map x, y, z [m]; roll, pitch, heading [deg].
-    sd_lever_arm_m, sd_time_s : float
-        Errors of the lever arm, per axis and flight [m], and of the frames' times [s].
-    sd_reference_m, sd_reference_deg : float
-        Errors of the reference poses, per axis [m, deg].
-    """
-
-    name: str
+    name: str  # name of the flight
     camera: Camera = _CAMERA
     sensor: Sensor = _SENSOR
-    frames: int = 60
+    frames: int = 60  # number of frames
+    # camera to target; the UAV climbs and descends between the two, uniform in the logarithm
     distance_m: tuple[float, float] = (8.0, 110.0)
-    tilt_deg: tuple[float, float] = (0.0, 12.0)
+    tilt_deg: tuple[float, float] = (0.0, 12.0)  # optical axis against the vertical, uniform [deg]
+    # exposure relative to the one at which radiance 1 fills the well, uniform in the logarithm
     gain: tuple[float, float] = (0.7, 1.0)
-    psf_px: tuple[float, float] = (0.55, 0.75)
+    psf_px: tuple[float, float] = (0.55, 0.75)  # σ of the point spread, uniform [px]
+    # length of the motion streak, uniform, in any direction [px]
     streak_px: tuple[float, float] = (0.0, 0.0)
+    # light on the plates that is not the same everywhere; None: none of the kind
     shadow: Shadow | None = None
     dirt: Dirt | None = None
     glare: Glare | None = None
-    lens: Aberration | None = None
-    phone: Phone | None = None
+    lens: Aberration | None = None  # None: the point spread is a round Gaussian
+    phone: Phone | None = None  # None: grey values are what the `sensor` makes of the light
+    # while rows are read: without effect if the camera's `readout_s` is 0
     motion: ImageMotion = _MOTION
+    # share of frames without the target, and with a plate of another code where there is room
     absent_share: float = 0.1
     decoy_share: float = 0.2
-    jpeg_quality: int | None = None
+    jpeg_quality: int | None = None  # None: PNG
+    # errors of the trajectory: map x, y, z [m]; roll, pitch, heading [deg]
     sd_position_m: tuple[float, float, float] = (0.010, 0.010, 0.018)
     sd_attitude_deg: tuple[float, float, float] = (0.02, 0.02, 0.05)
+    # errors of the lever arm, per axis and flight [m], and of the frames' times [s]
     sd_lever_arm_m: float = 0.003
     sd_time_s: float = 0.001
+    # errors of the reference poses, per axis [m, deg]
     sd_reference_m: float = 0.004
     sd_reference_deg: float = 0.003
 

@@ -76,15 +76,9 @@ class Annulus:
 
 @dataclass(frozen=True, slots=True)
 class ConvexPolygon:
-    """A convex polygon: the intersection of half-planes.
+    """A convex polygon: the intersection of half-planes."""
 
-    Attributes
-    ----------
-    vertices_m : tuple of (x, y)
-        In the order from +x to +y [m].
-    """
-
-    vertices_m: tuple[tuple[float, float], ...]
+    vertices_m: tuple[tuple[float, float], ...]  # in the order from +x to +y [m]
 
     @property
     def reach_m(self) -> float:

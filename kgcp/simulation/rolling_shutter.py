@@ -20,18 +20,10 @@ from kgcp.simulation.point_spread import ComplexArray
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """Motion of the image, relative to the camera, while the rows of a frame are exposed.
+    """Motion of the image, relative to the camera, while the rows of a frame are exposed."""
 
-    Attributes
-    ----------
-    mean_px_s : tuple of float
-        In all frames, x and y [px/s].
-    sd_px_s : float
-        Standard deviation from frame to frame, per axis [px/s].
-    """
-
-    mean_px_s: tuple[float, float] = (0.0, 0.0)
-    sd_px_s: float = 150.0
+    mean_px_s: tuple[float, float] = (0.0, 0.0)  # in all frames, x and y [px/s]
+    sd_px_s: float = 150.0  # standard deviation from frame to frame, per axis [px/s]
 
     def __post_init__(self) -> None:
         for value in self.mean_px_s:
@@ -47,21 +39,11 @@ class ImageMotion:
 
 @dataclass(frozen=True, slots=True)
 class RowMotion:
-    """Motion of the image of one frame from row to row.
+    """Motion of the image of one frame from row to row."""
 
-    Attributes
-    ----------
-    px_per_row : tuple of float
-        x and y [px].
-    still_row : float
-        The row to whose moment all poses belong.
-    rows : int
-        Of the frame.
-    """
-
-    px_per_row: tuple[float, float]
-    still_row: float
-    rows: int
+    px_per_row: tuple[float, float]  # x and y [px]
+    still_row: float  # the row to whose moment all poses belong
+    rows: int  # of the frame
 
     @property
     def reach_px(self) -> float:

@@ -37,21 +37,11 @@ class PlatePose:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedScene:
-    """Everything that one frame may see.
+    """Everything that one frame may see."""
 
-    Attributes
-    ----------
-    ground : Pose
-        Ground plane (x east, y south, z down) → camera.
-    carrier : PlatePose or None
-        A plate on its vehicle; None: there is no vehicle.
-    others : tuple of PlatePose
-        Plates without a vehicle.
-    """
-
-    ground: Pose
-    carrier: PlatePose | None
-    others: tuple[PlatePose, ...]
+    ground: Pose  # ground plane (x east, y south, z down) → camera
+    carrier: PlatePose | None  # a plate on its vehicle; None: there is no vehicle
+    others: tuple[PlatePose, ...]  # plates without a vehicle
 
 
 def render_irradiance(

@@ -23,19 +23,11 @@ _LEGEND_FROM, _LEGEND_TO = 190.0, 800.0  # widths between which the legend grows
 
 @dataclass(frozen=True, slots=True)
 class MountingPlate:
-    """The plate that the target is mounted on.
+    """The plate that the target is mounted on."""
 
-    Attributes
-    ----------
-    width_mm : float
-        Of the square, or diameter.
-    hole_mm : float or None
-        Diameter of four mounting holes; None: no holes.
-    """
-
-    width_mm: float
+    width_mm: float  # of the square, or diameter
     is_round: bool = False
-    hole_mm: float | None = None
+    hole_mm: float | None = None  # diameter of four mounting holes; None: no holes
 
     @property
     def box(self) -> Box:

@@ -231,25 +231,14 @@ def _apart(codes: FloatArray, other: FloatArray, width_deg: float) -> FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidates:
-    """Codes on the grid, and their distances as far as they were needed.
+    """Codes on the grid, and their distances as far as they were needed."""
 
-    Attributes
-    ----------
-    codes : (m, n) array
-        [deg]
-    own : (m,) array
-        Distances to themselves, turned, and to known codes.
-    width_deg, grid_deg : float
-        Of a dot, and from one place of a dot to the next.
-    rows : dict
-        Index of a candidate → distances (m,) of all to it.
-    """
-
-    codes: FloatArray
-    own: FloatArray
+    codes: FloatArray  # (m, n): [deg]
+    own: FloatArray  # (m,): distances to themselves, turned, and to known codes
+    # of a dot, and from one place of a dot to the next
     width_deg: float
     grid_deg: float
-    rows: dict[int, FloatArray]
+    rows: dict[int, FloatArray]  # index of a candidate → distances (m,) of all to it
 
     def apart(self, index: int) -> FloatArray:
         """Return the distances (m,) of all candidates to one of them; as `_apart`, but quicker.

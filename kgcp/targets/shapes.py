@@ -50,22 +50,12 @@ class Polyline:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A line of text, made smaller where it would be wider than its room.
-
-    Attributes
-    ----------
-    start_mm : Point
-        Left end of the baseline.
-    size_mm : float
-        Of the type: from line to line, set solid.
-    room_mm : float
-        How wide it may be.
-    """
+    """A line of text, made smaller where it would be wider than its room."""
 
     words: str
-    start_mm: Point
-    size_mm: float
-    room_mm: float
+    start_mm: Point  # left end of the baseline
+    size_mm: float  # of the type: from line to line, set solid
+    room_mm: float  # how wide it may be
     is_bold: bool = False
 
 
@@ -123,40 +113,20 @@ def filled_rectangle(layer: Layer, box: Box) -> Polyline:
 
 @dataclass(frozen=True, slots=True)
 class Artwork:
-    """All there is to print of one target, about its centre.
+    """All there is to print of one target, about its centre."""
 
-    Attributes
-    ----------
-    shapes : tuple of Shape
-        In painting order.
-    box : Box
-        What has to be on the paper.
-    """
-
-    shapes: tuple[Shape, ...]
-    box: Box
+    shapes: tuple[Shape, ...]  # in painting order
+    box: Box  # what has to be on the paper
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """One sheet of paper; its own axes begin at its top left corner.
+    """One sheet of paper; its own axes begin at its top left corner."""
 
-    Attributes
-    ----------
-    label : str
-        Of one sheet among several: `r1c2`, row and column; else empty.
-    centre_mm : Point
-        Where the artwork's origin is on the sheet.
-    window : Box
-        The part of the sheet that shows the artwork.
-    marks : tuple of Shape
-        Of the sheet itself.
-    """
-
-    label: str
+    label: str  # of one sheet among several: `r1c2`, row and column; else empty
     width_mm: float
     height_mm: float
     artwork: Artwork
-    centre_mm: Point
-    window: Box
-    marks: tuple[Shape, ...] = ()
+    centre_mm: Point  # where the artwork's origin is on the sheet
+    window: Box  # the part of the sheet that shows the artwork
+    marks: tuple[Shape, ...] = ()  # of the sheet itself

@@ -16,21 +16,12 @@ _OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsh
 
 @dataclass(frozen=True, slots=True)
 class Registry(Generic[Read]):
-    """The formats that a file of one kind may have.
+    """The formats that a file of one kind may have."""
 
-    Attributes
-    ----------
-    kind : str
-        What a file of these formats is, for messages: "a calibration".
-    remedy : str
-        What to do with a file of another format.
-    formats : mapping
-        Name in flight.toml → whether a file is of this format, and its reader. They are tried in
-        this order: the most specific first.
-    """
-
-    kind: str
-    remedy: str
+    kind: str  # what a file of these formats is, for messages: "a calibration"
+    remedy: str  # what to do with a file of another format
+    # name in flight.toml → whether a file is of this format, and its reader. They are tried in this
+    # order: the most specific first.
     formats: Mapping[str, tuple[Callable[[ForeignFile], bool], Read]]
 
     @property

@@ -51,20 +51,11 @@ class RingEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedRing:
-    """One of the two poses that explain the outer circle, with what the rest says of it.
+    """One of the two poses that explain the outer circle, with what the rest says of it."""
 
-    Attributes
-    ----------
-    pose : Pose
-        Target → camera.
-    score : float
-        Normalised cross-correlation of the code seen with this pose.
-    centre_misfit_px : float
-        Distance of the inner ellipse's centre from where this pose puts it [px].
-    """
-
-    pose: Pose
-    score: float
+    pose: Pose  # target → camera
+    score: float  # normalised cross-correlation of the code seen with this pose
+    # distance of the inner ellipse's centre from where this pose puts it [px]
     centre_misfit_px: float
 
 

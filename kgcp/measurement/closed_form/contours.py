@@ -26,18 +26,10 @@ _MIN_CORNERS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contours:
-    """All contours of a frame, end to end.
+    """All contours of a frame, end to end."""
 
-    Attributes
-    ----------
-    points : (n, 2) array
-        Pixels of the contours in order, x and y [px].
-    starts : (m + 1,) array
-        Contour i is `points[starts[i]:starts[i + 1]]`.
-    """
-
-    points: FloatArray
-    starts: IndexArray
+    points: FloatArray  # (n, 2): pixels of the contours in order, x and y [px]
+    starts: IndexArray  # (m + 1,): contour i is `points[starts[i]:starts[i + 1]]`
 
     def __len__(self) -> int:
         """Count the contours."""

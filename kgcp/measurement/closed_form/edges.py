@@ -33,21 +33,11 @@ _MAX_RMS_SHARE = 0.005  # of the radius: the raw image of a large circle is not 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
-    """One circle's edge, measured.
+    """One circle's edge, measured."""
 
-    Attributes
-    ----------
-    points_px : (n, 2) array
-        Sub-pixel edge points in the raw frame [px].
-    ellipse : Ellipse
-        Through them, in the raw frame [px].
-    conic : (3, 3) array
-        Through them in normalised coordinates, free of distortion.
-    """
-
-    points_px: FloatArray
-    ellipse: Ellipse
-    conic: FloatArray
+    points_px: FloatArray  # (n, 2): sub-pixel edge points in the raw frame [px]
+    ellipse: Ellipse  # through them, in the raw frame [px]
+    conic: FloatArray  # (3, 3): through them in normalised coordinates, free of distortion
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,23 +19,16 @@ _SLACK_PX = 0.6  # what a circle may move before the pairs are made anew
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blur:
-    """Spread of an image point.
+    """Spread of an image point."""
 
-    Attributes
-    ----------
-    xx, yy, xy : float
-        Covariance of the Gaussian part, pixel integration included [px²].
-    streak_x, streak_y : float
-        Motion during exposure [px].
-    skew : (4,) tuple of float
-        Third cumulants xxx, xxy, xyy, yyy [px³].
-    """
-
+    # covariance of the Gaussian part, pixel integration included [px²]
     xx: float
     yy: float
     xy: float
+    # motion during exposure [px]
     streak_x: float = 0.0
     streak_y: float = 0.0
+    # (4,): third cumulants xxx, xxy, xyy, yyy [px³]
     skew: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @property
@@ -91,21 +84,13 @@ def variance_in_pixels(variance: float, count: int) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeIncidence:
-    """Pairs of n pixels and c circles whose edges are within reach of the blur.
+    """Pairs of n pixels and c circles whose edges are within reach of the blur."""
 
-    Attributes
-    ----------
-    circles : (c, 5) array
-        Centre x, y, radius [m], sign and rule of integration.
-    starts : (c + 1,) array of int, members : (m,) array of int
-        The pixels that feel circle i are members[starts[i]:starts[i + 1]].
-    background : (n,) array
-        White share of every pixel from the circles whose edge it does not feel.
-    """
-
-    circles: FloatArray
+    circles: FloatArray  # (c, 5): centre x, y, radius [m], sign and rule of integration
+    # (c + 1,): the pixels that feel circle i are members[starts[i]:starts[i + 1]]
     starts: IndexArray
     members: IndexArray
+    # (n,): white share of every pixel from the circles whose edge it does not feel
     background: FloatArray
 
 

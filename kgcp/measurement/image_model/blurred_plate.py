@@ -26,22 +26,13 @@ from kgcp.measurement.image_model.ray_plate import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteShare:
-    """White share of n pixels and its derivatives.
+    """White share of n pixels and its derivatives."""
 
-    Attributes
-    ----------
-    points_m : (2, n) array
-        Where the pixels' rays meet the plate.
-    value : (n,) array
-        0: ink, 1: plate.
-    jacobian : (11, n) array
-        With respect to translation [m], rotation vector [rad] (left perturbation in the camera
-        frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) where only the
-        levels were asked for.
-    """
-
-    points_m: FloatArray
-    value: FloatArray
+    points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
+    value: FloatArray  # (n,): 0: ink, 1: plate
+    # (11, n): with respect to translation [m], rotation vector [rad] (left perturbation in the
+    # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) where only
+    # the levels were asked for
     jacobian: FloatArray
 
 

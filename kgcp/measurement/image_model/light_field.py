@@ -21,20 +21,13 @@ ANGLE, OFFSET, LOG_WIDTH, INK, PLATE = range(5)  # of a shadow's edge
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knots:
-    """Grids of knots over a window.
+    """Grids of knots over a window."""
 
-    Attributes
-    ----------
-    x0, y0 : float
-        The corner of the first cell [px].
-    spacings_px : (g,) tuple of float
-    columns, rows : (g,) tuples of int
-        How many knots each grid has.
-    """
-
+    # the corner of the first cell [px]
     x0: float
     y0: float
-    spacings_px: tuple[float, ...]
+    spacings_px: tuple[float, ...]  # (g,)
+    # (g,): how many knots each grid has
     columns: tuple[int, ...]
     rows: tuple[int, ...]
 
@@ -98,26 +91,16 @@ def _weigh(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightField:
-    """Deviations of the levels of ink and plate from their means over a window.
-
-    Attributes
-    ----------
-    values : (2, k) array
-        Of ink and plate at all knots.
-    precision : (2, k) array
-        Of the values' prior, about 0.
-    edges : (s, 5) array
-        Straight edges of shadows: direction of its normal [rad], offset along that from the
-        centre [px], logarithm of the penumbra's σ [px], and what is added beyond to the levels of
-        ink and plate.
-    centre_px : (2,) array
-    """
+    """Deviations of the levels of ink and plate from their means over a window."""
 
     knots: Knots
-    values: FloatArray
-    precision: FloatArray
+    values: FloatArray  # (2, k): of ink and plate at all knots
+    precision: FloatArray  # (2, k): of the values' prior, about 0
+    # (s, 5): straight edges of shadows: direction of its normal [rad], offset along that from the
+    # centre [px], logarithm of the penumbra's σ [px], and what is added beyond to the levels of ink
+    # and plate
     edges: FloatArray
-    centre_px: FloatArray
+    centre_px: FloatArray  # (2,)
 
     @property
     def penalty(self) -> float:

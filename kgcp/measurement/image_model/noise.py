@@ -31,18 +31,12 @@ _SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # least excess there, of the pixels at the 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Censoring:
-    """Clipped pixels, and the limits that clip them.
+    """Clipped pixels, and the limits that clip them."""
 
-    Attributes
-    ----------
-    high, low : float
-        Levels at and beyond which a value only says "at least" and "at most".
-    at_high, at_low : (n,) arrays
-        The pixels concerned.
-    """
-
+    # levels at and beyond which a value only says "at least" and "at most"
     high: float
     low: float
+    # (n,): the pixels concerned
     at_high: BoolArray
     at_low: BoolArray
 
@@ -111,18 +105,10 @@ def _smeared_over(number: IndexArray, pixels: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GreyNoise:
-    """Noise of n pixels.
+    """Noise of n pixels."""
 
-    Attributes
-    ----------
-    sd : (n,) array
-        As level.
-    plateau_sd : (n,) array
-        Without what only edges have.
-    """
-
-    sd: FloatArray
-    plateau_sd: FloatArray
+    sd: FloatArray  # (n,): as level
+    plateau_sd: FloatArray  # (n,): without what only edges have
 
 
 def estimate_noise(
@@ -228,21 +214,11 @@ def _trimmed_variance(squares: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misfit:
-    """Negative log-likelihood of a window, and what Newton's method needs of it.
+    """Negative log-likelihood of a window, and what Newton's method needs of it."""
 
-    Attributes
-    ----------
-    total : float
-        Up to a constant.
-    score : (n,) array
-        Its derivative with respect to the standardised model, times −1.
-    weight : (n,) array
-        Its second derivative, made positive.
-    """
-
-    total: float
-    score: FloatArray
-    weight: FloatArray
+    total: float  # up to a constant
+    score: FloatArray  # (n,): its derivative with respect to the standardised model, times −1
+    weight: FloatArray  # (n,): its second derivative, made positive
 
 
 def misfit(levels: FloatArray, model: FloatArray, sd: FloatArray, censoring: Censoring) -> Misfit:

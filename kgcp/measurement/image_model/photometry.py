@@ -48,28 +48,19 @@ PLAIN_COUNT = 19  # without the skew
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Photometric parameters.
+    """Photometric parameters."""
 
-    Attributes
-    ----------
-    black, white : float
-        Levels of ink and plate before clipping, 1 = full scale.
-    slope_x, slope_y : float
-        Relative gradient of the light over one ring radius.
-    tone_1, tone_2, tone_3 : float
-        Shape of an unknown tone curve between black and white; 0, 0, 0 is linear.
-    sharpening : float
-        Strength of the unsharp mask.
-    """
-
+    # levels of ink and plate before clipping, 1 = full scale
     black: float
     white: float
+    # relative gradient of the light over one ring radius
     slope_x: float = 0.0
     slope_y: float = 0.0
+    # shape of an unknown tone curve between black and white; 0, 0, 0 is linear
     tone_1: float = 0.0
     tone_2: float = 0.0
     tone_3: float = 0.0
-    sharpening: float = 0.0
+    sharpening: float = 0.0  # strength of the unsharp mask
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -138,21 +129,12 @@ _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotometricModel:
-    """Relation of white share to grey value, for the n pixels of one sample.
+    """Relation of white share to grey value, for the n pixels of one sample."""
 
-    Attributes
-    ----------
-    offsets : (2, n) array
-        From the target's centre, in ring radii.
-    response : Response
-        `linear` and `srgb` are applied as known; `unknown` uses the tone parameters.
-    mask : Mask or None
-        Of the camera's sharpening; None: it does not sharpen.
-    """
-
-    offsets: FloatArray
+    offsets: FloatArray  # (2, n): from the target's centre, in ring radii
+    # `linear` and `srgb` are applied as known; `unknown` uses the tone parameters
     response: Response
-    mask: Mask | None
+    mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
 
     def levels(
         self, share: FloatArray, light: Light, added: FloatArray | None = None

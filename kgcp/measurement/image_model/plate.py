@@ -19,19 +19,11 @@ EVEN = np.array([1.0, 0.0, 1.0])  # a blur that is spread evenly
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circles:
-    """Circles on the plate, as arrays.
+    """Circles on the plate, as arrays."""
 
-    Attributes
-    ----------
-    centres_m : (2, c) array
-    radii_m : (c,) array
-    signs : (c,) array
-        +1: white within; −1: black within.
-    """
-
-    centres_m: FloatArray
-    radii_m: FloatArray
-    signs: FloatArray
+    centres_m: FloatArray  # (2, c)
+    radii_m: FloatArray  # (c,)
+    signs: FloatArray  # (c,): +1: white within; −1: black within
 
     def part(self, which: slice) -> Circles:
         """Return some of the circles."""

@@ -19,21 +19,12 @@ from kgcp.measurement.plate_prior import SceneRotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RollingShutter:
-    """When the pixels of a window are exposed.
+    """When the pixels of a window are exposed."""
 
-    Attributes
-    ----------
-    delay_s : (n,) array
-        How much later every pixel is exposed than the row of the target's centre [s].
-    delay_s_px : float
-        From one row to the next [s/px].
-    rotation : SceneRotation
-        Of the scene meanwhile.
-    """
-
+    # (n,): how much later every pixel is exposed than the row of the target's centre [s]
     delay_s: FloatArray
-    delay_s_px: float
-    rotation: SceneRotation
+    delay_s_px: float  # from one row to the next [s/px]
+    rotation: SceneRotation  # of the scene meanwhile
 
     @classmethod
     def of(

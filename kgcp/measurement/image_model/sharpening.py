@@ -24,22 +24,14 @@ class Mask:
     The mask is separable. Its first pass, along rows, makes the m values that the second one, along
     columns, needs; both draw on the modelled pixels alone. All others stay as they are, between ink
     and plate.
-
-    Attributes
-    ----------
-    along_rows : (m, 7) array of int
-        What the first pass adds up: modelled pixels by number; n: none.
-    along_columns : (n, 7) array of int
-        What the second pass adds up for each modelled pixel; m: nothing.
-    kernel : (7,) array
-        Weights of either pass, which add up to 1.
-    ink, plate : (n,) arrays
-        What part of the smoothed value the others are, at each modelled pixel.
     """
 
+    # (m, 7): what the first pass adds up: modelled pixels by number; n: none
     along_rows: NumberArray
+    # (n, 7): what the second pass adds up for each modelled pixel; m: nothing
     along_columns: NumberArray
-    kernel: FloatArray
+    kernel: FloatArray  # (7,): weights of either pass, which add up to 1
+    # (n,): what part of the smoothed value the others are, at each modelled pixel
     ink: FloatArray
     plate: FloatArray
 

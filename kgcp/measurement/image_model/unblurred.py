@@ -15,27 +15,15 @@ from kgcp.measurement.image_model.plate import EVEN, Circles, find_skips, plate_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnblurredPlate:
-    """The plate under n pixels.
+    """The plate under n pixels."""
 
-    Attributes
-    ----------
-    points_m : (2, n) array
-        Where the pixels' rays meet the plate.
-    rho_m : (n,) array
-        Distance of the points from the target's centre.
-    share : (n,) array
-        0: ink, 1: plate.
-    off_edge_m : (n,) array
-        Distance to the nearest edge; 0 in a small disc. Beyond the reach it may be too large.
-    off_measured_m : (n,) array
-        The same, of the circles that are measured, and without regard to small discs; more, where
-        there is less blur across that edge than there may be.
-    """
-
-    points_m: FloatArray
-    rho_m: FloatArray
-    share: FloatArray
+    points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
+    rho_m: FloatArray  # (n,): distance of the points from the target's centre
+    share: FloatArray  # (n,): 0: ink, 1: plate
+    # (n,): distance to the nearest edge; 0 in a small disc. Beyond the reach it may be too large.
     off_edge_m: FloatArray
+    # (n,): the same, of the circles that are measured, and without regard to small discs; more,
+    # where there is less blur across that edge than there may be
     off_measured_m: FloatArray
 
 

@@ -24,35 +24,22 @@ class Window:
     """A rectangle of pixels, flattened row by row.
 
     Of a large target, bins take the place of pixels: means over squares of the frame's.
-
-    Attributes
-    ----------
-    x0, y0, width, height : int
-        The rectangle in the frame [px].
-    levels : (n,) array
-        Grey values, 0…1 of the data type's range.
-    smooth : (n,) array
-        The same, median of three by three.
-    levels_per_count : float
-        One grey value's step.
-    rays : (6, n) array
-        Normalised image coordinates x, y of the pixel centres, free of distortion, and their
-        derivatives xx, xy, yx, yy with respect to the raw pixel coordinates.
-    binning : int
-        Binning factor: each window pixel is the mean of `binning` × `binning` frame pixels.
-    clipped : (n,) array or None
-        Share of clipped pixels in every bin; None without bins.
     """
 
+    # the rectangle in the frame [px]
     x0: int
     y0: int
     width: int
     height: int
-    levels: FloatArray
-    smooth: FloatArray
-    levels_per_count: float
+    levels: FloatArray  # (n,): grey values, 0…1 of the data type's range
+    smooth: FloatArray  # (n,): the same, median of three by three
+    levels_per_count: float  # one grey value's step
+    # (6, n): normalised image coordinates x, y of the pixel centres, free of distortion, and their
+    # derivatives xx, xy, yx, yy with respect to the raw pixel coordinates
     rays: FloatArray
+    # binning factor: each window pixel is the mean of `binning` × `binning` frame pixels
     binning: int = 1
+    # (n,): share of clipped pixels in every bin; None without bins
     clipped: FloatArray | None = None
 
     def nearest(self, point_px: FloatArray) -> int:

@@ -34,37 +34,21 @@ _DIGITS = 6  # of proportions that are the same
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A dark ring with brighter places, between a bright disc and a bright plate.
+    """A dark ring with brighter places, between a bright disc and a bright plate."""
 
-    Attributes
-    ----------
-    outline : Ellipse
-        Of its outer circle [px].
-    patch : (radii, angles) array
-        Grey values around it, for `kgcp.measurement.search.template_match.match_templates`.
-    """
-
-    outline: Ellipse
+    outline: Ellipse  # of its outer circle [px]
+    # (radii, angles): grey values around it, for
+    # `kgcp.measurement.search.template_match.match_templates`
     patch: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A ring in the frame that is not the one looked for.
+    """A ring in the frame that is not the one looked for."""
 
-    Attributes
-    ----------
-    outline : Ellipse
-        Of its outer circle [px].
-    score : float
-        Normalised cross-correlation of the whole ring, -1…1.
-    rejection : Rejection
-        What speaks against it.
-    """
-
-    outline: Ellipse
-    score: float
-    rejection: Rejection
+    outline: Ellipse  # of its outer circle [px]
+    score: float  # normalised cross-correlation of the whole ring, -1…1
+    rejection: Rejection  # what speaks against it
 
 
 def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:

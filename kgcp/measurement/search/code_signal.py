@@ -30,26 +30,13 @@ _LAGS_AT_HEADING = np.arange(-6, 7)  # degrees that a replica's heading may be o
 
 @dataclass(frozen=True, slots=True)
 class CodeMatch:
-    """A ring in the frame that carries the code of a target's.
+    """A ring in the frame that carries the code of a target's."""
 
-    Attributes
-    ----------
-    ring : Ring
-        Whose code it is.
-    outer : Ellipse
-        Preliminary outer ellipse [px].
-    score : float
-        Normalised cross-correlation of the code, -1…1.
-    lag_deg : float
-        Heading of the plate's +x axis as an angle of `Ellipse.points` [deg].
-    black, white : float
-        Grey levels of ring and plate, in grey values.
-    """
-
-    ring: Ring
-    outer: Ellipse
-    score: float
-    lag_deg: float
+    ring: Ring  # whose code it is
+    outer: Ellipse  # preliminary outer ellipse [px]
+    score: float  # normalised cross-correlation of the code, -1…1
+    lag_deg: float  # heading of the plate's +x axis as an angle of `Ellipse.points` [deg]
+    # grey levels of ring and plate, in grey values
     black: float
     white: float
 

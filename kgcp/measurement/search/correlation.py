@@ -28,31 +28,20 @@ SingleArray = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bank:
-    """Polar templates, prepared for `correlate`: t of them.
+    """Polar templates, prepared for `correlate`: t of them."""
 
-    Attributes
-    ----------
-    images : (t, rows, angles) array
-    weights : (rows,) array
-        Of each row's samples; they sum to 1 over all samples.
-    spectra : (t, rows, 2 frequencies) array of float32
-        Of the standardised images along the angle, weighted: real parts, then imaginary ones.
-    moments : (2 t, 2 angles) array of float32
-        Weighted sums over the rows, of the standardised images and then of their squares, as
-        functions of the turn: backwards and twice around, so that the turns by 0, 1, … of what
-        is at the angle a are the slice that begins at angles − a.
-    to_spectrum : (angles, 2 frequencies) array of float32
-        Takes samples along the angle to their Fourier coefficients.
-    to_turns : (2 frequencies, angles) array of float32
-        Takes Fourier coefficients back to samples.
-    """
-
-    images: FloatArray
-    weights: FloatArray
+    images: FloatArray  # (t, rows, angles)
+    weights: FloatArray  # (rows,): of each row's samples; they sum to 1 over all samples
+    # (t, rows, 2 frequencies): of the standardised images along the angle, weighted: real parts,
+    # then imaginary ones
     spectra: SingleArray
+    # (2 t, 2 angles): weighted sums over the rows, of the standardised images and then of their
+    # squares, as functions of the turn: backwards and twice around, so that the turns by 0, 1, … of
+    # what is at the angle a are the slice that begins at angles − a
     moments: SingleArray
+    # (angles, 2 frequencies): takes samples along the angle to their Fourier coefficients
     to_spectrum: SingleArray
-    to_turns: SingleArray
+    to_turns: SingleArray  # (2 frequencies, angles): takes Fourier coefficients back to samples
 
 
 def bank_of(images: FloatArray, row_weights: FloatArray, frequencies: int) -> Bank:

@@ -85,21 +85,11 @@ def _is_first(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Places that may be a ring's.
+    """Places that may be a ring's."""
 
-    Attributes
-    ----------
-    centres_px : (n, 2) array
-        In the frame.
-    radii_px : (n,) array
-        Of the outer circle, to a fifth.
-    contrasts : (n,) array
-        Grey values by which core and surround are brighter than the ring.
-    """
-
-    centres_px: FloatArray
-    radii_px: FloatArray
-    contrasts: FloatArray
+    centres_px: FloatArray  # (n, 2): in the frame
+    radii_px: FloatArray  # (n,): of the outer circle, to a fifth
+    contrasts: FloatArray  # (n,): grey values by which core and surround are brighter than the ring
 
     def __len__(self) -> int:
         """Count the places."""

@@ -24,22 +24,13 @@ _Sums = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """A frame and its reduced images.
+    """A frame and its reduced images."""
 
-    Attributes
-    ----------
-    frame : (height, width) array of uint8
-        Contiguous.
-    reduced : (n,) array of uint8
-        The reduced images row by row, one behind the other: their pixels are 2, 3, 4, 6, 8, …
-        pixels of the frame wide.
-    levels : (m, 4) array of int
-        Of each of them: begin and end in `reduced`, height, width.
-    """
-
-    frame: GreyArray
+    frame: GreyArray  # (height, width): contiguous
+    # (n,): the reduced images row by row, one behind the other: their pixels are 2, 3, 4, 6, 8, …
+    # pixels of the frame wide
     reduced: GreyArray
-    levels: IndexArray
+    levels: IndexArray  # (m, 4): of each of them: begin and end in `reduced`, height, width
 
 
 def factor_of(level: int) -> float:

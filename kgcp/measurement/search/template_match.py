@@ -59,31 +59,19 @@ _EVERYWHERE = np.ones(ANGLES, dtype=bool)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemplateMatch:
-    """Agreement of one ring in the frame with a target's.
+    """Agreement of one ring in the frame with a target's."""
 
-    Attributes
-    ----------
-    score : float
-        Normalised cross-correlation with the best template, of the visible part, -1…1.
-    lag_deg : float
-        Heading of the plate's +x axis, as an angle of the sampled circles [deg].
-    black, white : float
-        Levels of ink and plate [grey values].
-    misfit : float
-        Largest difference to the template along the code, of a dot's contrast: 1 is a dot too
-        many or too few.
-    dot_contrast : float
-        Of the template's dots, of the ring's contrast: less than 1 where they are blurred.
-    visible : (angles,) array of bool, or None
-        Where the ring is seen, by angles of the sampled circles; None: everywhere.
-    """
-
-    score: float
-    lag_deg: float
+    score: float  # normalised cross-correlation with the best template, of the visible part, -1…1
+    lag_deg: float  # heading of the plate's +x axis, as an angle of the sampled circles [deg]
+    # levels of ink and plate [grey values]
     black: float
     white: float
+    # largest difference to the template along the code, of a dot's contrast: 1 is a dot too many or
+    # too few
     misfit: float
+    # of the template's dots, of the ring's contrast: less than 1 where they are blurred
     dot_contrast: float
+    # (angles,): where the ring is seen, by angles of the sampled circles; None: everywhere
     visible: BoolArray | None
 
     @property

@@ -24,24 +24,12 @@ _processes: dict[int, tuple[str, WorkerProcess]] = {}  # by thread: a run, and o
 
 @dataclass(frozen=True, slots=True)
 class JobContext:
-    """Settings that a worker's calls share.
+    """Settings that a worker's calls share."""
 
-    Attributes
-    ----------
-    run : str
-        Tells runs apart.
-    limit_s : float
-        Time for one call [s].
-    versions : mapping of str
-        Of what results depend on: others may give other bytes.
-    folders : tuple of Path
-        What must be seen from everywhere.
-    """
-
-    run: str
-    limit_s: float
-    versions: Mapping[str, str]
-    folders: tuple[Path, ...]
+    run: str  # tells runs apart
+    limit_s: float  # time for one call [s]
+    versions: Mapping[str, str]  # of what results depend on: others may give other bytes
+    folders: tuple[Path, ...]  # what must be seen from everywhere
 
 
 def nothing(_: object) -> None:

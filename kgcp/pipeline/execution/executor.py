@@ -28,22 +28,13 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class WorkerPool:
-    """Workers, the same for all that a run does.
+    """Workers, the same for all that a run does."""
 
-    Attributes
-    ----------
-    jobs : int
-        How many there are; 0: this process.
-    callers : tuple of callable
-        Whose callees are the stages to be timed; empty: nothing is timed.
-    stages_s : Counter of float
-        Takes the time of all workers by stage [s].
-    """
-
-    jobs: int
+    jobs: int  # how many there are; 0: this process
     executor: Executor
+    # whose callees are the stages to be timed; empty: nothing is timed
     callers: tuple[Callable[..., object], ...]
-    stages_s: Counter[str]
+    stages_s: Counter[str]  # takes the time of all workers by stage [s]
 
     def map(
         self, function: Callable[[_Item], _Result], items: Iterable[_Item]

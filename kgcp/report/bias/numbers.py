@@ -34,21 +34,13 @@ _RADIUS_PX, _RADII_PER_OCTAVE = 13.0, 2.0  # borders at 13 px and at every facto
 
 @dataclass(frozen=True, slots=True)
 class RangeRow:
-    """Errors of one range of reference distances.
+    """Errors of one range of reference distances."""
 
-    Attributes
-    ----------
-    label : str
-        The range.
-    percent, metres : Spread
-        Of the errors [%] and [m].
-    sd_reference_percent : float or None
-        Mean standard deviation of the reference distances [%]; None where none is known.
-    """
-
-    label: str
+    label: str  # the range
+    # of the errors [%] and [m]
     percent: Spread
     metres: Spread
+    # mean standard deviation of the reference distances [%]; None where none is known
     sd_reference_percent: float | None
 
     @property
@@ -70,20 +62,14 @@ class RangeRow:
 
 @dataclass(frozen=True, slots=True)
 class DetectionRate:
-    """Share of the frames that must show the target in which it was measured, for one range.
+    """Share of the frames that must show the target in which it was measured, for one range."""
 
-    Attributes
-    ----------
-    low, high : float
-        Borders of the range: of distances [m] or of radii [px].
-    confidence_low, confidence_high : float
-        Of the rate, 0…1.
-    """
-
+    # borders of the range: of distances [m] or of radii [px]
     low: float
     high: float
     detected: int
     frames: int
+    # of the rate, 0…1
     confidence_low: float
     confidence_high: float
 
@@ -95,114 +81,59 @@ class DetectionRate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Influence:
-    """One exposure quantity that varies, and what follows it.
-
-    Attributes
-    ----------
-    rows : (m,) array of int
-        Of the measurements that have it.
-    values : (m,) array
-        As in the detections.
-    residual : Slope or None
-        Of the error [%], without scale and offset, by the quantity's own unit.
-    edge_shift : Slope or None
-        Of δ [px], the same; None for δ itself.
-    """
+    """One exposure quantity that varies, and what follows it."""
 
     quantity: Quantity
-    rows: IndexArray
-    values: FloatArray
-    residual: Slope | None
-    edge_shift: Slope | None
+    rows: IndexArray  # (m,): of the measurements that have it
+    values: FloatArray  # (m,): as in the detections
+    residual: Slope | None  # of the error [%], without scale and offset, by the quantity's own unit
+    edge_shift: Slope | None  # of δ [px], the same; None for δ itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeNumbers:
-    """Distances by one edge against those by two.
+    """Distances by one edge against those by two."""
 
-    Attributes
-    ----------
-    rows : (m,) array of int
-        Of the measurements that have both.
-    one_m, two_m : (m,) array
-        Errors [m].
-    one_percent, two_percent : Spread
-        Of the errors [%].
-    regression : Regression or None
-        Of the distances by one edge; None also if these are the measured distances.
-    """
-
-    rows: IndexArray
+    rows: IndexArray  # (m,): of the measurements that have both
+    # (m,): errors [m]
     one_m: FloatArray
     two_m: FloatArray
+    # of the errors [%]
     one_percent: Spread
     two_percent: Spread
+    # of the distances by one edge; None also if these are the measured distances
     regression: Regression | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiasNumbers:
-    """All numbers of one report.
+    """All numbers of one report."""
 
-    Attributes
-    ----------
-    compared : tuple of n Comparison
-        The trusted measurements, in time.
-    data : DistanceResiduals
-        Theirs.
-    residual_percent : (n,) array
-        Errors in percent of the reference distance.
-    explained_percent : (n,) array
-        What the regression explains of them without exposure; 0 without a regression.
-    sd_m : (n,) array
-        Reported standard deviations of the errors, of measurement and reference; NaN where
-        the measurement has none.
-    halves : tuple of RangeRow
-        Below and above 50 m.
-    bins : tuple of RangeRow
-        Per 10 m.
-    rates, radius_rates : tuple of DetectionRate
-        Per 10 m, and per radius of the ring.
-    regression : Regression or None
-        None where there is too little for one.
-    edges : EdgeNumbers or None
-        None where no measurement has δ.
-    influences : tuple of Influence
-        Of the exposure quantities that vary.
-    standardised : Spread or None
-        Of the errors over their reported standard deviations.
-    sd_reference_m : float or None
-        Median standard deviation of the reference distances.
-    misplaced : tuple of str
-        Frames in which something else was measured.
-    detected, expected_visible : int
-        Over all distances.
-    left_out : tuple of (str, int)
-        Frames that could not be compared: why and how many.
-    attitudes_agree : bool
-        As in the study.
-    """
-
-    compared: tuple[Comparison, ...]
-    data: DistanceResiduals
-    residual_percent: FloatArray
+    compared: tuple[Comparison, ...]  # the trusted measurements, in time
+    data: DistanceResiduals  # theirs
+    residual_percent: FloatArray  # (n,): errors in percent of the reference distance
+    # (n,): what the regression explains of them without exposure; 0 without a regression
     explained_percent: FloatArray
+    # (n,): reported standard deviations of the errors, of measurement and reference; NaN where the
+    # measurement has none
     sd_m: FloatArray
     total: RangeRow
-    halves: tuple[RangeRow, ...]
-    bins: tuple[RangeRow, ...]
+    halves: tuple[RangeRow, ...]  # below and above 50 m
+    bins: tuple[RangeRow, ...]  # per 10 m
+    # per 10 m, and per radius of the ring
     rates: tuple[DetectionRate, ...]
     radius_rates: tuple[DetectionRate, ...]
-    regression: Regression | None
-    edges: EdgeNumbers | None
-    influences: tuple[Influence, ...]
-    standardised: Spread | None
-    sd_reference_m: float | None
-    misplaced: tuple[str, ...]
+    regression: Regression | None  # None where there is too little for one
+    edges: EdgeNumbers | None  # None where no measurement has δ
+    influences: tuple[Influence, ...]  # of the exposure quantities that vary
+    standardised: Spread | None  # of the errors over their reported standard deviations
+    sd_reference_m: float | None  # median standard deviation of the reference distances
+    misplaced: tuple[str, ...]  # frames in which something else was measured
+    # over all distances
     detected: int
     expected_visible: int
-    left_out: tuple[tuple[str, int], ...]
-    attitudes_agree: bool
+    left_out: tuple[tuple[str, int], ...]  # frames that could not be compared: why and how many
+    attitudes_agree: bool  # as in the study
 
     @property
     def frames(self) -> list[str]:

@@ -29,30 +29,18 @@ _DIGITS = 7  # significant, of the values in the page; bias.parquet has all
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """All that a page shows.
+    """All that a page shows."""
 
-    Attributes
-    ----------
-    name : str
-        Of the flight.
-    pictures : mapping of str to Picture
-        By the name of the figure; one that is missing is left out of the page.
-    rows : sequence of mapping
-        Of `bias.parquet`, for the measurements in time.
-    closeups : mapping of int to (bytes, tuple of (m, 2) array)
-        By the measurement's place in time, as `draw_closeup` returns them.
-    summary : mapping
-        What `bias_summary.json` holds.
-    """
-
-    name: str
+    name: str  # of the flight
     numbers: BiasNumbers
     verdict: Verdict
+    # by the name of the figure; one that is missing is left out of the page
     pictures: Mapping[str, Picture]
-    rows: Sequence[Mapping[str, object]]
+    rows: Sequence[Mapping[str, object]]  # of `bias.parquet`, for the measurements in time
+    # by the measurement's place in time, as `draw_closeup` returns them
     closeups: Mapping[int, tuple[bytes, tuple[FloatArray, ...]]]
     reexposed: Sequence[Reexposed]
-    summary: Json
+    summary: Json  # what `bias_summary.json` holds
 
 
 def render_page(content: Content) -> str:

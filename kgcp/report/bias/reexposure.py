@@ -22,30 +22,14 @@ _LEAST_REACH_PX = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Reexposed:
-    """One target measured again.
+    """One target measured again."""
 
-    Attributes
-    ----------
-    row : int
-        Of the measurement, by its place in time.
-    gain : float
-        What the grey values were multiplied by.
-    radius_px : float
-        Of the ring.
-    change_percent : float or None
-        Of the distance; None: the target was not measured again.
-    sd_percent : float or None
-        Standard deviation of the new distance.
-    saturated : float or None
-        Share of clipped pixels in the changed frame.
-    """
-
-    row: int
-    gain: float
-    radius_px: float
-    change_percent: float | None
-    sd_percent: float | None
-    saturated: float | None
+    row: int  # of the measurement, by its place in time
+    gain: float  # what the grey values were multiplied by
+    radius_px: float  # of the ring
+    change_percent: float | None  # of the distance; None: the target was not measured again
+    sd_percent: float | None  # standard deviation of the new distance
+    saturated: float | None  # share of clipped pixels in the changed frame
 
 
 def reexposed(grey: GreyArray, gain: float) -> GreyArray:

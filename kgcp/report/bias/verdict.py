@@ -54,19 +54,11 @@ LIMITS = Limits()
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One sentence of the verdict.
+    """One sentence of the verdict."""
 
-    Attributes
-    ----------
-    grade : Grade
-        What it makes of the flight; `GOOD` where it only informs.
-    section : str
-        Where the page shows it: the id of a section.
-    """
-
-    grade: Grade
+    grade: Grade  # what it makes of the flight; `GOOD` where it only informs
     text: str
-    section: str
+    section: str  # where the page shows it: the id of a section
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,25 +15,15 @@ CORNER_TO_CENTRE_PX = -0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One camera of a file.
+    """One camera of a file."""
 
-    Attributes
-    ----------
-    name : str
-        What `[camera] camera` calls it.
-    size : tuple of int or None
-        Width and height [px] that the file gives; None: it does not.
-    convert : callable
-        Makes the `Camera` for a width and height [px], or raises `KgcpError` where the model
-        cannot be represented exactly.
-    is_relative : bool
-        Whether the parameters are relative to the frame's size, so that they hold for any size
-        of the same shape.
-    """
-
-    name: str
-    size: tuple[int, int] | None
+    name: str  # what `[camera] camera` calls it
+    size: tuple[int, int] | None  # width and height [px] that the file gives; None: it does not
+    # makes the `Camera` for a width and height [px], or raises `KgcpError` where the model cannot
+    # be represented exactly
     convert: Callable[[int, int], Camera]
+    # whether the parameters are relative to the frame's size, so that they hold for any size of the
+    # same shape
     is_relative: bool = False
 
 

@@ -18,60 +18,36 @@ _MAX_DISTORTION = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class OrientationFileOptions:
-    """The keys of [reference] about its file.
+    """The keys of [reference] about its file."""
 
-    Attributes
-    ----------
-    form : str or None
-        Name of the format; None: the content tells.
-    crs : str or None
-        Of the file's coordinates, for pyproj, where the file does not give it; None: the flight's,
-        or the format's default.
-    offset_file : Path or None
-        Holds what was subtracted from the file's coordinates; None: nothing was.
-    """
-
-    form: str | None = None
+    form: str | None = None  # name of the format; None: the content tells
+    # of the file's coordinates, for pyproj, where the file does not give it; None: the flight's, or
+    # the format's default
     crs: str | None = None
+    # holds what was subtracted from the file's coordinates; None: nothing was
     offset_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourcePoses:
-    """Exterior orientations of n frames.
+    """Exterior orientations of n frames."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the frames, as the other program calls them.
-    position : (n, 3) array
-        Projection centres.
-    frame_from_photo : (n, 3, 3) array
-        Rotations from the axes of photogrammetry (x right, y up, z backward) to those of the
-        file's frame: of a map its x, y and z at the projection centre.
-    crs : str or None
-        Of the positions, x first; None: the file does not say it.
-    level : LocalFrame or None
-        Where the file's frame is east, north, up in metres over a point that it names.
-    unreferenced : str or None
-        Why the coordinates belong to no map unless flight.toml names one; None: they are in the
-        flight's.
-    sd_position_m : (n, 3) array or None
-        Standard deviations along the map's axes [m]; None: not given.
-    sd_angle_deg : (n,) array or None
-        Of each of the three angles [deg]; None: not given.
-    has_our_names : bool
-        Whether the names are those of the flight's frames already, and no other program's.
-    """
-
-    names: tuple[str, ...]
-    position: FloatArray
+    names: tuple[str, ...]  # of the frames, as the other program calls them
+    position: FloatArray  # (n, 3): projection centres
+    # (n, 3, 3): rotations from the axes of photogrammetry (x right, y up, z backward) to those of
+    # the file's frame: of a map its x, y and z at the projection centre
     frame_from_photo: FloatArray
-    crs: str | None = None
+    crs: str | None = None  # of the positions, x first; None: the file does not say it
+    # where the file's frame is east, north, up in metres over a point that it names
     level: LocalFrame | None = None
+    # why the coordinates belong to no map unless flight.toml names one; None: they are in the
+    # flight's
     unreferenced: str | None = None
+    # (n, 3): standard deviations along the map's axes [m]; None: not given
     sd_position_m: FloatArray | None = None
+    # (n,): of each of the three angles [deg]; None: not given
     sd_angle_deg: FloatArray | None = None
+    # whether the names are those of the flight's frames already, and no other program's
     has_our_names: bool = False
 
 

@@ -25,66 +25,38 @@ class Wander(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFileOptions:
-    """The keys of [vehicle] about its trajectory's file.
+    """The keys of [vehicle] about its trajectory's file."""
 
-    Attributes
-    ----------
-    format : str or None
-        Its name; None: the content tells.
-    crs : str or None
-        Of the file's positions, for pyproj; None: the format's default.
-    time_system : TimeSystem or None
-        Of the file's times; None: the format's default.
-    first_day : date or None
-        When the trajectory begins, by its own clock; given, the file's numbers are seconds of the
-        week.
-    accuracies_file : Path or None
-        With SBET: smrmsg file of its standard deviations.
-    wander : Wander or None
-        With SBET: what to do with the wander angle; None: it has to be zero.
-    course_sd_deg : tuple of float or None
-        Given, the attitude is that of the course over ground, level, with these standard
-        deviations of roll, pitch and heading; None: the file has the attitude.
-    """
-
-    format: str | None = None
-    crs: str | None = None
-    time_system: TimeSystem | None = None
+    format: str | None = None  # its name; None: the content tells
+    crs: str | None = None  # of the file's positions, for pyproj; None: the format's default
+    time_system: TimeSystem | None = None  # of the file's times; None: the format's default
+    # when the trajectory begins, by its own clock; given, the file's numbers are seconds of the
+    # week
     first_day: date | None = None
-    accuracies_file: Path | None = None
+    accuracies_file: Path | None = None  # with SBET: smrmsg file of its standard deviations
+    # with SBET: what to do with the wander angle; None: it has to be zero
     wander: Wander | None = None
+    # given, the attitude is that of the course over ground, level, with these standard deviations
+    # of roll, pitch and heading; None: the file has the attitude
     course_sd_deg: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epochs:
-    """A trajectory in the coordinates of its file.
+    """A trajectory in the coordinates of its file."""
 
-    Attributes
-    ----------
-    time_s : (n,) array
-        Unix time, UTC, strictly ascending, n ≥ 2 [s].
-    crs : str
-        Of the positions, for pyproj.
-    position : (n, 3) array
-        x = easting or longitude, y = northing or latitude, z, in the units of `crs`.
-    attitude_deg : (n, 3) array or None
-        Roll, pitch, heading against the local level and true north [deg]; None: not in the file.
-    sd_position_m : (n, 3) array or None
-        Standard deviations along the axes of `crs` [m].
-    cov_position_m2 : (n, 3, 3) array or None
-        Covariances along the axes of `crs` [m²], where the file has more than deviations.
-    sd_attitude_deg : (n, 3) array or None
-        Of roll, pitch, heading [deg].
-    """
-
-    time_s: FloatArray
-    crs: str
+    time_s: FloatArray  # (n,): Unix time, UTC, strictly ascending, n ≥ 2 [s]
+    crs: str  # of the positions, for pyproj
+    # (n, 3): x = easting or longitude, y = northing or latitude, z, in the units of `crs`
     position: FloatArray
+    # (n, 3): roll, pitch, heading against the local level and true north [deg]; None: not in the
+    # file
     attitude_deg: FloatArray | None
+    # (n, 3): standard deviations along the axes of `crs` [m]
     sd_position_m: FloatArray | None = None
+    # (n, 3, 3): covariances along the axes of `crs` [m²], where the file has more than deviations
     cov_position_m2: FloatArray | None = None
-    sd_attitude_deg: FloatArray | None = None
+    sd_attitude_deg: FloatArray | None = None  # (n, 3): of roll, pitch, heading [deg]
 
 
 def check_times(path: Path, time_s: FloatArray, place: Callable[[int], str]) -> None:
