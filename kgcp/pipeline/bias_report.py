@@ -22,7 +22,7 @@ from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.io.tables.detections import read_attempts, read_settings
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
-from kgcp.io.tables.provenance import provenance
+from kgcp.io.tables.provenance import derived_provenance
 from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
@@ -87,11 +87,14 @@ class FlightBias:
         That the distances were measured with.
     study : BiasStudy
         Every comparison.
+    provenance : mapping of str
+        What the comparisons were made from: the metadata of their table.
     """
 
     flight: Flight
     settings: DetectSettings
     study: BiasStudy
+    provenance: Mapping[str, str]
 
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, without re-exposed frames."""
@@ -137,7 +140,7 @@ class FlightBias:
             )
         table = folder / "bias.parquet"
         rows = (bias_row(pair, study.method) for pair in study.measured)
-        write_table(table, BIAS_COLUMNS, rows, provenance(flight))
+        write_table(table, BIAS_COLUMNS, rows, self.provenance)
         content = self._content(stored_frames or flight.frames_folder, reexpose)
         files = {FIGURE_FILES[name]: figure.png for name, figure in content.pictures.items()}
         text = json.dumps(finite(content.summary), indent=1, allow_nan=False)
@@ -183,7 +186,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         If flight.toml names no reference poses, or a file is missing or unreadable.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    attempts = read_attempts(table, flight.targets)
+    attempts = read_attempts(table, flight)
     settings = read_settings(table)
     data = FlightData(flight, [attempt.frame for attempt in attempts])
     study = study_bias(
@@ -194,7 +197,8 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         flight.targets,
         settings.method,
     )
-    return FlightBias(flight, settings, study)
+    provenance = derived_provenance(flight, table, {}, has_reference=True)
+    return FlightBias(flight, settings, study, provenance)
 
 
 def _look(

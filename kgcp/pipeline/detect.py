@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from kgcp import __version__
 from kgcp.errors import KgcpError
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.frame_times import read_times
 from kgcp.io.images.remote import StoredFolder, frames_below
-from kgcp.io.tables.columns import SCHEMA_VERSION, Row
+from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
 from kgcp.io.tables.parquet import write_table
-from kgcp.io.tables.provenance import versions, write_run_record
+from kgcp.io.tables.provenance import detections_provenance, versions, write_run_record
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
@@ -124,10 +121,8 @@ def detect_flight(
     frames_folder = options.stored_frames or flight.frames_folder
     with stopwatch.stage("preparation"):
         frames = frames_below(frames_folder)
-        times = {}
-        if flight.times_file is not None:
-            times = read_times(flight.times_file, frames, flight.times_format)
         data = FlightData(flight, frames)
+        times = data.frame_times
         priors = priors_of_frames(flight, data, frames, times)
         inputs = [
             FrameInput(frame, times.get(frame), known)
@@ -167,7 +162,8 @@ def detect_flight(
                 sheet.clear()
             with stopwatch.stage("table"):
                 rows = _rows(run, predictions, builder)
-                write_table(table, DETECTION_COLUMNS, rows, _provenance(flight, settings))
+                about = detections_provenance(flight, settings, run.frame_sizes, times)
+                write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
                 with stopwatch.stage("overlay"):
                     not_drawn = draw_overlay(sheet, flight.name, run, job, predictions)
@@ -227,12 +223,3 @@ def _rows(
     for row, result in enumerate(run.results()):
         builder.add(result)
         yield from detection_rows(with_predictions(result, predictions.get(row, {})))
-
-
-def _provenance(flight: Flight, settings: DetectSettings) -> dict[str, str]:
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "version": __version__,
-        "settings": json.dumps(asdict(settings), sort_keys=True),
-        "flight_toml": flight.toml_text,
-    }

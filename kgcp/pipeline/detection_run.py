@@ -62,6 +62,8 @@ class DetectionRun:
         Of the results so far.
     kept : int
         Frames whose first look the journal had.
+    frame_sizes : dict of int
+        Bytes of the file of every frame; None: missing.
     """
 
     def __init__(
@@ -75,7 +77,11 @@ class DetectionRun:
         self._job, self._inputs, self._journal = job, inputs, journal
         self._pool, self._listener = pool, listener
         self._rows = {frame_input.frame: row for row, frame_input in enumerate(inputs)}
-        stamps = stamps_of(job.frames_folder, [frame_input.frame for frame_input in inputs])
+        stamps = [*stamps_of(job.frames_folder, [frame_input.frame for frame_input in inputs])]
+        self.frame_sizes = {
+            frame_input.frame: None if stamp is None else stamp[0]
+            for frame_input, stamp in zip(inputs, stamps, strict=True)
+        }
         self._keys = [
             _key(frame_input, stamp) for frame_input, stamp in zip(inputs, stamps, strict=True)
         ]

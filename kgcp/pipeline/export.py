@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from kgcp.io.tables.consistency import write_consistency
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
-from kgcp.io.tables.provenance import provenance
+from kgcp.io.tables.provenance import derived_provenance
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.consistency import Consistency, study_consistency
@@ -51,6 +51,8 @@ class GcpSet:
         None if no target is carried by a vehicle.
     consistency : Consistency or None
         None if there are no reference poses, or too few frames to compare.
+    provenance : mapping of str
+        What the points were made from: the metadata of their tables.
     """
 
     flight: Flight
@@ -60,6 +62,7 @@ class GcpSet:
     camera_priors: tuple[CameraPrior, ...]
     vehicle: Vehicle | None
     consistency: Consistency | None
+    provenance: Mapping[str, str]
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the points as a table with the columns of `kgcps.parquet`."""
@@ -94,7 +97,7 @@ def make_gcps(
         If nothing was measured or can be placed, a file is unreadable, or a CRS unusable.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    attempts = read_attempts(table, flight.targets)
+    attempts = read_attempts(table, flight)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     if not sightings:
         raise KgcpError(
@@ -121,6 +124,12 @@ def make_gcps(
         camera_priors=camera_priors(gcps, sightings, target_positions, local_frame),
         vehicle=target_positions.vehicle,
         consistency=consistency,
+        provenance=derived_provenance(
+            flight,
+            table,
+            {"selection": asdict(selection), "crs": crs},
+            has_reference=data.has_reference,
+        ),
     )
 
 
@@ -161,7 +170,7 @@ def write_gcps(gcp_set: GcpSet, folder: Path) -> list[Path]:
     KgcpError
         If a file cannot be written.
     """
-    about = provenance(gcp_set.flight)
+    about = gcp_set.provenance
     table = folder / "kgcps.parquet"
     write_table(table, GCP_COLUMNS, map(gcp_row, gcp_set.gcps), {**about, "crs": gcp_set.crs})
     if gcp_set.consistency is None:

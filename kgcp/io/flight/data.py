@@ -9,6 +9,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.settings import VehicleSettings
@@ -16,9 +17,9 @@ from kgcp.targets.layout import Target
 
 
 class FlightData:
-    """Reference poses of the camera and positions of the targets of one flight.
+    """Times of the frames, reference poses of the camera and positions of the targets.
 
-    Both files may come later than the frames: detections need neither, and reference poses are
+    The last two may come later than the frames: detections need neither, and reference poses are
     mostly made with the points that kgcp exports. `has_reference` and `has_position_of` tell
     whether they are there; here, and nowhere else, this is decided.
 
@@ -43,6 +44,20 @@ class FlightData:
         is_driven = vehicle is not None and vehicle.trajectory_file.exists()
         is_placed = target.position_m is not None or is_driven
         return self._flight.crs is not None and is_placed
+
+    @cached_property
+    def frame_times(self) -> dict[str, float]:
+        """What the times file says, Unix UTC [s], also of frames that are not there; else empty.
+
+        Raises
+        ------
+        KgcpError
+            As `read_times`.
+        """
+        flight = self._flight
+        if flight.times_file is None:
+            return {}
+        return read_times(flight.times_file, self._frames, flight.times_format)
 
     @cached_property
     def reference_poses(self) -> ReferencePoses:

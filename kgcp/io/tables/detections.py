@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.files.safe_read import is_file
+from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -34,6 +35,7 @@ from kgcp.io.tables.columns import (
     time_cell,
 )
 from kgcp.io.tables.parquet import read_table
+from kgcp.io.tables.staleness import require_current
 from kgcp.measurement.records import (
     Alternative,
     CommonUncertainty,
@@ -44,7 +46,6 @@ from kgcp.measurement.records import (
     Uncertainty,
 )
 from kgcp.settings import DetectSettings, Method
-from kgcp.targets.layout import Target
 
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
@@ -186,7 +187,7 @@ def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFr
     return table if status is None else table[table["status"] == status].reset_index(drop=True)
 
 
-def read_attempts(path: Path, targets: Sequence[Target]) -> list[Attempt]:
+def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     """Read the detections of a flight, without unreadable frames, in the frames' order.
 
     A frame is numbered by its place among all frames, unreadable ones included, so that the
@@ -195,10 +196,12 @@ def read_attempts(path: Path, targets: Sequence[Target]) -> list[Attempt]:
     Raises
     ------
     KgcpError
-        If the table is missing or unreadable, or names a target that flight.toml does not have.
+        If the table is missing or unreadable, was made from another flight.toml or times file, or
+        names a target that flight.toml does not have.
     """
     table = read_detections(path)
-    strange = sorted(set(table["target"]) - {target.name for target in targets})
+    require_current(path, table, flight)
+    strange = sorted(set(table["target"]) - {target.name for target in flight.targets})
     if strange:
         raise KgcpError(
             f"{path}: has target {strange[0]!r}, which flight.toml does not;"

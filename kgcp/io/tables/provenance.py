@@ -1,12 +1,20 @@
-"""What a table says about its making, and `run.json`, which says it of a run."""
+"""What a table says about its making, and `run.json`, which says it of a run.
+
+The metadata of a table hold a digest of each part that it depends on, so that two tables, or a
+table and a flight, can be compared. The table of detections also holds the values of the keys of
+flight.toml that it depends on, so that a change can be named; tables made from it repeat that.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
 import resource
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import cv2
@@ -14,23 +22,188 @@ import numba
 import numpy as np
 import PIL
 import pyarrow as pa
+import pyarrow.parquet as pq
 import scipy
 
 from kgcp import __version__
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
+from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.columns import SCHEMA_VERSION
+from kgcp.settings import DetectSettings
+from kgcp.targets.layout import Ring, Target
+
+TARGET_TABLE = "[[target]]"
+"""What the keys of targets begin with, among those that detections depend on."""
 
 _KB_PER_MB = 1024.0
+_NOT_FOR_DETECTIONS = "readout_s"  # tells when a target was exposed, which is asked later
+_SCALE_DIGITS = 12  # of a replica, which is kept as diameters
+_DIGITS = 32  # of a digest: 128 bits
+_PREFIX = b"kgcp."  # of the keys of Parquet's metadata
 
 
-def provenance(flight: Flight) -> dict[str, str]:
-    """Return the metadata of a table made from a flight: schema, program and flight.toml."""
+def detections_provenance(
+    flight: Flight,
+    settings: DetectSettings,
+    frame_sizes: Mapping[str, int | None],
+    times: Mapping[str, float],
+) -> dict[str, str]:
+    """Return the metadata of a table of detections.
+
+    Parameters
+    ----------
+    frame_sizes : mapping of str to int
+        Bytes of the file of every frame; None: missing.
+    times : mapping of str to float
+        What the times file says, Unix UTC [s]; entries of no frame are passed over.
+    """
+    values = detection_inputs(flight)
+    by_part: dict[str, dict[str, object]] = defaultdict(dict)
+    for key, value in values.items():
+        by_part[_part_of(key)][key] = value
+    parts = {
+        **by_part,
+        "times": {frame: times.get(frame) for frame in frame_sizes},
+        "frames": frame_sizes,
+        "settings": asdict(settings),
+        "version": __version__,
+    }
+    return {
+        **_program_and_flight(flight),
+        "settings": json.dumps(asdict(settings), sort_keys=True),
+        "inputs": json.dumps(values),
+        "digests": _digests(parts),
+    }
+
+
+def derived_provenance(
+    flight: Flight,
+    detections: Path,
+    choices: Mapping[str, object],
+    *,
+    has_reference: bool,
+) -> dict[str, str]:
+    """Return the metadata of a table that is made from detections.
+
+    Parameters
+    ----------
+    detections : Path
+        Their table, whose own metadata are repeated under `detections`.
+    choices : mapping
+        What else was asked for, by name.
+    has_reference : bool
+        Whether reference poses were used.
+    """
+    vehicle, reference = flight.vehicle, flight.reference
+    parts: dict[str, object] = {
+        "detections": _digest_of_file(detections),
+        "targets": [(each.name, each.position_m, each.sd_position_m) for each in flight.targets],
+        "camera": asdict(flight.camera),
+        "crs": flight.crs,
+        "choices": choices,
+        "version": __version__,
+    }
+    if vehicle is not None:
+        options = asdict(vehicle.options)
+        accuracies_file = options.pop("accuracies_file")
+        parts["vehicle"] = (asdict(vehicle.settings), options)
+        parts["trajectory"] = [
+            _digest_of_file(path)
+            for path in (vehicle.trajectory_file, accuracies_file)
+            if path is not None
+        ]
+    if reference is not None and has_reference:
+        parts["reference"] = _digest_of_file(reference.file)
+    metadata = pq.read_schema(detections).metadata or {}
+    return {
+        **_program_and_flight(flight),
+        "digests": _digests(parts),
+        "detections": json.dumps(
+            {
+                key.removeprefix(_PREFIX).decode(): value.decode()
+                for key, value in sorted(metadata.items())
+                if key.startswith(_PREFIX)
+            }
+        ),
+    }
+
+
+def detection_inputs(flight: Flight) -> dict[str, object]:
+    """Return what detections depend on in flight.toml, and in a calibration file that it names.
+
+    Returns
+    -------
+    dict
+        Table and key, as in "[camera] fx", to a number, a text, a list of numbers or None.
+    """
+    camera, vehicle = flight.camera, flight.vehicle
+    values: dict[str, object] = {
+        f"[camera] {field.name}": getattr(camera, field.name)
+        for field in fields(Camera)
+        if field.name != _NOT_FOR_DETECTIONS
+    }
+    if flight.calibration_covariance is not None:
+        cov = flight.calibration_covariance.cov
+        for name, variance in zip(CALIBRATION_PARAMETERS, np.diag(cov), strict=True):
+            if variance:
+                values[f"[camera] sd_{name}"] = float(np.sqrt(variance))
+        if np.count_nonzero(cov) > np.count_nonzero(np.diag(cov)):
+            values["[camera] cov"] = cov.ravel().tolist()
+    values["[camera] plumb_sd_deg"] = flight.plumb_sd_deg
+    values["[vehicle] level_sd_deg"] = None if vehicle is None else vehicle.settings.level_sd_deg
+    for target in flight.targets:
+        for ring in target.rings:
+            for key, value in _target_table(target, ring).items():
+                values[f"{TARGET_TABLE} {ring.name} {key}"] = value
+    return values
+
+
+def _target_table(target: Target, ring: Ring) -> dict[str, object]:
+    """Return what flight.toml says of a plate, or of a replica on it."""
+    if ring is target.ring:
+        table = {field.name: getattr(ring, field.name) for field in fields(Ring)}
+        del table["name"]
+        return table
+    scale = ring.outer_diameter_m / target.ring.outer_diameter_m
+    return {
+        "replica_of": target.name,
+        "scale": float(f"{scale:.{_SCALE_DIGITS}g}"),
+        "code_deg": ring.code_deg,
+    }
+
+
+def _part_of(key: str) -> str:
+    return "targets" if key.startswith(TARGET_TABLE) else "camera"
+
+
+def _program_and_flight(flight: Flight) -> dict[str, str]:
     return {
         "schema_version": SCHEMA_VERSION,
         "version": __version__,
         "flight_toml": flight.toml_text,
     }
+
+
+def _digests(parts: Mapping[str, object]) -> str:
+    """Return the digest of each part, as JSON."""
+    return json.dumps({name: digest(value) for name, value in sorted(parts.items())})
+
+
+def digest(value: object) -> str:
+    """Return 32 hexadecimal digits that tell plain values from all others."""
+    text = json.dumps(value, sort_keys=True, default=str)  # dates
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+def _digest_of_file(path: Path) -> str | None:
+    """Return a digest of a file's content; None where there is no such file."""
+    if not is_file(path):
+        return None
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:_DIGITS]
 
 
 def versions() -> dict[str, str]:

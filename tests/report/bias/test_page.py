@@ -88,6 +88,10 @@ def sighted(row: pd.Series[float], frame: str, delta_px: float) -> Comparison:
     )
 
 
+def of_sample(compared: BiasStudy) -> FlightBias:
+    return FlightBias(read_flight(SAMPLE), DetectSettings(), compared, {})
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, study: Study) -> Made:
     folder = tmp_path_factory.mktemp("report")
@@ -96,8 +100,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, study: Study) -> Made:
         sighted(row, HOSTILE if index == 3 else row["frame"], 0.02 * (index % 5))
         for index, (_, row) in enumerate(truth.iterrows())
     ]
-    settings = DetectSettings()
-    FlightBias(read_flight(SAMPLE), settings, study(*compared)).write_report(folder, reexpose=3)
+    of_sample(study(*compared)).write_report(folder, reexpose=3)
     return Made(folder, [])
 
 
@@ -215,8 +218,7 @@ def test_names_of_files_are_text_in_the_page(made: Made) -> None:
 
 
 def test_without_frames_there_is_a_page_too(compare: Compare, study: Study, tmp_path: Path) -> None:
-    bias = FlightBias(read_flight(SAMPLE), DetectSettings(), study(compare(30.0, 0.1)))
-    report = bias.write_report(tmp_path, reexpose=5)
+    report = of_sample(study(compare(30.0, 0.1))).write_report(tmp_path, reexpose=5)
     text = (tmp_path / "bias_report.html").read_text(encoding="utf-8")
     assert "One frame says nothing about bias." in text
     assert "The frames are not where" in text or "the frames are not where" in text
@@ -234,8 +236,7 @@ def test_without_times_deviations_or_poses_there_is_a_page_too(
         assert one.attempt.sighting is not None
         bare = replace(one.attempt.sighting, time_s=None, pose=None)
         compared.append(replace(one, attempt=replace(one.attempt, time_s=None, sighting=bare)))
-    bias = FlightBias(read_flight(SAMPLE), DetectSettings(), study(*compared))
-    bias.write_report(tmp_path, reexpose=0)
+    of_sample(study(*compared)).write_report(tmp_path, reexpose=0)
     summary = json.loads((tmp_path / "bias_summary.json").read_text(encoding="utf-8"))
     assert summary["standardised"] is None
     assert summary["edges"] is None

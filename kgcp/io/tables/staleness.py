@@ -1,0 +1,174 @@
+"""Whether a table of detections still belongs to its flight, and what has changed since."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+
+from kgcp.errors import KgcpError, Status
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.time_text import format_time
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import list_frames
+from kgcp.io.images.remote import sizes_of
+from kgcp.io.tables.provenance import TARGET_TABLE, detection_inputs, digest
+from kgcp.settings import DetectSettings
+
+_SAME_TIME_S = 2e-6  # tables hold microseconds
+_SAME_SHIFT_S = 1e-3  # spread of differences that are called one shift
+_LONGEST_VALUE = 40  # characters of a value that is shown
+_MOST_SHOWN = 6  # changes that are named one by one
+
+
+def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
+    """Refuse detections that were made from another camera, other targets, times or frames.
+
+    What later commands read anew, as trajectory, lever arm, CRS and reference poses, may differ. A
+    table that does not say what it was made from passes: kgcp has not written it.
+
+    Parameters
+    ----------
+    path : Path
+        The table's file, whose metadata say what it was made from.
+    table : DataFrame
+        Its rows.
+
+    Raises
+    ------
+    KgcpError
+        Naming what has changed, and the command to repeat.
+    """
+    metadata = pq.read_schema(path).metadata or {}
+    inputs = _json(metadata, b"kgcp.inputs")
+    if not inputs:
+        return
+    changes = [
+        *_changed_keys(inputs, detection_inputs(flight)),
+        *_changed_times(table, flight),
+        *_changed_frames(table, flight, _json(metadata, b"kgcp.digests")),
+    ]
+    if changes:
+        more = len(changes) - _MOST_SHOWN
+        listed = ", ".join([*changes[:_MOST_SHOWN], *([f"{more} more"] if more > 0 else [])])
+        raise KgcpError(
+            f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
+            f" {listed}; {_remedy(path, flight, _json(metadata, b'kgcp.settings'))}"
+        )
+
+
+def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
+    try:
+        values = json.loads(metadata.get(key, b"{}"))
+    except (ValueError, RecursionError):
+        values = {}
+    return values if isinstance(values, dict) else {}
+
+
+def _remedy(path: Path, flight: Flight, settings: Mapping[str, object]) -> str:
+    """Return the command to repeat, with the settings that were not the default ones."""
+    folder = str(flight.folder)
+    named = f'"{folder}"' if " " in folder else folder
+    remedy = f"repeat 'kgcp detect {named}'"
+    if path.parent.parent.resolve() != flight.folder.resolve():
+        remedy = f"{remedy} with {path.parent} as the results folder"
+    defaults = asdict(DetectSettings())
+    chosen = [f"{key} = {value}" for key, value in settings.items() if defaults.get(key) != value]
+    return f"{remedy} (its settings were {', '.join(chosen)})" if chosen else remedy
+
+
+def _changed_keys(then: Mapping[str, object], now: Mapping[str, object]) -> Iterator[str]:
+    """Yield the keys of flight.toml that have other values now, with both where they are short."""
+    now = json.loads(json.dumps(now))
+    targets_then, targets_now = _targets(then), _targets(now)
+    yield from (f"{target} is new" for target in targets_now if target not in targets_then)
+    yield from (f"{target} is gone" for target in targets_then if target not in targets_now)
+    kept = {target for target in targets_then if target in targets_now}
+    for key in (*now, *(key for key in then if key not in now)):
+        is_of_both = not key.startswith(TARGET_TABLE) or _target(key) in kept
+        if is_of_both and then.get(key) != now.get(key):
+            yield f"{key}{_from_to(then.get(key), now.get(key))}"
+
+
+def _targets(values: Mapping[str, object]) -> list[str]:
+    keys = (key for key in values if key.startswith(TARGET_TABLE))
+    return [*dict.fromkeys(map(_target, keys))]
+
+
+def _target(key: str) -> str:
+    """Return the table that a key of a target belongs to."""
+    return key.rpartition(" ")[0]
+
+
+def _from_to(then: object, now: object) -> str:
+    shown = [_shown(then), _shown(now)]
+    return f" ({' → '.join(shown)})" if max(map(len, shown)) <= _LONGEST_VALUE else ""
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_shown, value))}]"
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _changed_times(table: pd.DataFrame, flight: Flight) -> Iterator[str]:
+    """Yield what the times file says otherwise than the table, if it does."""
+    frames = table.drop_duplicates("frame")
+    data = FlightData(flight, frames["frame"].to_list())
+    if not data.frame_times:
+        return
+    readable = frames[frames["status"] != Status.UNREADABLE.value]
+    listed = readable[readable["frame"].isin(data.frame_times)]
+    names = listed["frame"].to_list()
+    then_s = _unix_s(listed["time"])
+    now_s = np.array([data.frame_times[name] for name in names]) + _to_middle_s(listed, flight)
+    differences_s = now_s - then_s
+    changed = np.flatnonzero(~(np.abs(differences_s) <= _SAME_TIME_S))  # NaN: none before
+    if not changed.size:
+        return
+    of_all = f"[frames] times of {len(changed)} of {len(frames)} frames"
+    differences_s = differences_s[changed]
+    if np.ptp(differences_s) <= _SAME_SHIFT_S:
+        yield f"{of_all} (by {np.median(differences_s):+.6g} s)"
+    else:
+        first = changed[0]
+        was = "none" if np.isnan(then_s[first]) else format_time(float(then_s[first]))
+        yield f"{of_all} ({names[first]}: {was} → {format_time(float(now_s[first]))})"
+
+
+def _unix_s(times: pd.Series) -> FloatArray:
+    """Return timestamps as Unix seconds, NaN for null."""
+    return np.array([np.nan if pd.isna(time) else time.timestamp() for time in times])
+
+
+def _to_middle_s(frames: pd.DataFrame, flight: Flight) -> FloatArray:
+    """Return what leads from the times of the file to mid-exposure [s]."""
+    exposures_s = frames["exposure_time_s"].to_numpy(dtype=np.float64, na_value=np.nan)
+    shift_s = flight.camera.time_reference.to_middle_s(1.0)
+    return shift_s * exposures_s if shift_s else np.zeros(len(frames))
+
+
+def _changed_frames(
+    table: pd.DataFrame, flight: Flight, digests: Mapping[str, object]
+) -> Iterator[str]:
+    """Yield what is new in the frames' folder; frames that are not there any more are no change."""
+    try:
+        today = list_frames(flight.frames_folder)
+    except KgcpError:  # moved to an archive, or in an object store
+        return
+    known = set(table["frame"])
+    new = [frame for frame in today if frame not in known]
+    if new:
+        yield f"{len(new)} new frames ({new[0]}, …)" if len(new) > 1 else f"a new frame ({new[0]})"
+    elif "frames" in digests and len(today) == len(known):
+        sizes = sizes_of(flight.frames_folder, today)
+        if digest(sizes) != digests["frames"]:
+            yield "files of frames"
