@@ -176,22 +176,35 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
         lines.append(f"second pass without reference poses: {summary.guide_problem}")
     if summary.not_drawn:
         lines.append(f"rings not drawn because their frames are missing: {summary.not_drawn}")
-    if summary.frames_without_time:
-        lines.append(
-            f"frames without a time: {summary.frames_without_time}; to turn them into KGCPs, name a"
-            " times file in flight.toml ([frames] times)"
-        )
-    if summary.exif_times_in_whole_seconds:
-        lines.append(
-            f"frames with EXIF times in whole seconds only: {summary.exif_times_in_whole_seconds};"
-            " a vehicle moves metres in a second: to turn them into KGCPs, name a times file in"
-            " flight.toml ([frames] times)"
-        )
+    lines += _about_times(summary)
     if summary.frames_without_attitude:
         lines.append(
             f"frames without a camera attitude: {summary.frames_without_attitude}; a level plate"
             " cannot tell their two poses apart: give [camera] plumb_sd_deg"
         )
-    if summary.times_without_frame:
-        lines.append(f"times without a frame of that name: {summary.times_without_frame}")
     click.echo("\n".join(lines), err=True)
+
+
+def _about_times(summary: DetectionSummary) -> Iterator[str]:
+    not_named = summary.frames_not_in_times_file
+    if summary.frames_without_time and not not_named:
+        yield (
+            f"frames without a time: {summary.frames_without_time}; to turn them into KGCPs, name a"
+            " times file in flight.toml ([frames] times)"
+        )
+    if not_named:
+        untimed = summary.frames_without_time
+        has = f"{untimed} of them have no time" if untimed else "they have EXIF's time"
+        yield (
+            f"frames that the times file does not name: {not_named}; {has}: complete the file"
+            + (", or set [frames] exif_fallback = true" if untimed == not_named else "")
+        )
+    if summary.times_without_frame:
+        why = "" if summary.name_difference is None else f" ({summary.name_difference})"
+        yield f"times without a frame of that name: {summary.times_without_frame}{why}"
+    if summary.exif_times_in_whole_seconds:
+        yield (
+            f"frames with EXIF times in whole seconds only: {summary.exif_times_in_whole_seconds};"
+            " a vehicle moves metres in a second: to turn them into KGCPs, name a times file in"
+            " flight.toml ([frames] times)"
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -237,6 +238,14 @@ class ExposureSettings:
     f_number: float | None = None
 
 
+class TimeSource(StrEnum):
+    """Where the time of a frame is from."""
+
+    TIMES_FILE = "times_file"
+    EXIF = "exif"
+    NONE = ""  # the time is not known
+
+
 @dataclass(frozen=True, slots=True)
 class FrameResult:
     """All that was learned from one frame.
@@ -253,6 +262,8 @@ class FrameResult:
         When the camera itself says it took the frame, Unix UTC [s].
     dropped : tuple of Considered
         Rings that were compared with a target's and dropped, if they are to be shown.
+    time_source : TimeSource
+        Who said so.
     """
 
     frame: str
@@ -261,6 +272,7 @@ class FrameResult:
     outcomes: tuple[Outcome, ...]
     camera_time_s: float | None = None
     dropped: tuple[Considered, ...] = ()
+    time_source: TimeSource = TimeSource.NONE
 
 
 def is_unreadable(outcome: Outcome) -> bool:

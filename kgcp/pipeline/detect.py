@@ -125,7 +125,7 @@ def detect_flight(
         times = data.frame_times
         priors = priors_of_frames(flight, data, frames, times)
         inputs = [
-            FrameInput(frame, times.get(frame), known)
+            FrameInput(frame, times.get(frame), known, flight.may_use_exif_times)
             for frame, known in zip(frames, priors, strict=True)
         ]
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)

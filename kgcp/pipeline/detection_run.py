@@ -210,7 +210,8 @@ class DetectionRun:
 
 def _key(frame_input: FrameInput, file: tuple[int, int] | None) -> str:
     name = fingerprint(frame_input.frame)[:16]
-    return f"first-{name}-{fingerprint(file, frame_input.time_s, frame_input.priors)[:16]}"
+    known = (frame_input.time_s, frame_input.may_use_exif_time, frame_input.priors)
+    return f"first-{name}-{fingerprint(file, *known)[:16]}"
 
 
 def _name_of(key: str) -> str:

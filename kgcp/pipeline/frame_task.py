@@ -24,6 +24,7 @@ from kgcp.measurement.records import (
     Measurement,
     Miss,
     Outcome,
+    TimeSource,
     is_unreadable,
 )
 from kgcp.measurement.search.template_match import CODE_LIKE
@@ -62,14 +63,17 @@ class FrameInput:
     frame : str
         Path relative to the frames folder.
     time_s : float or None
-        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: EXIF decides.
+        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: it has none.
     priors : mapping of str to PlatePrior
         What is known of its targets, by their names.
+    may_use_exif_time : bool
+        Whether EXIF gives the time if the times file does not.
     """
 
     frame: str
     time_s: float | None
     priors: Mapping[str, PlatePrior]
+    may_use_exif_time: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +112,22 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in job.targets
         )
-    time_s = exif.time_s if frame_input.time_s is None else frame_input.time_s
+    time_s, time_source = frame_input.time_s, TimeSource.TIMES_FILE
+    if time_s is None and frame_input.may_use_exif_time:
+        time_s, time_source = exif.time_s, TimeSource.EXIF
     reference = job.camera.time_reference
     if time_s is not None and reference is not TimeReference.MIDDLE:
         is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
         time_s = _mid_exposure_s(time_s, exif.exposure, reference, place) if is_readable else None
-    return FrameResult(frame_input.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped)
+    return FrameResult(
+        frame_input.frame,
+        time_s,
+        exif.exposure,
+        outcomes,
+        exif.time_s,
+        dropped,
+        TimeSource.NONE if time_s is None else time_source,
+    )
 
 
 @single_threaded()
@@ -159,7 +173,10 @@ def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> Fr
     outcomes = tuple(Miss(target.name, reason) for target in job.targets)
     is_known = job.camera.time_reference is TimeReference.MIDDLE
     time_s = frame_input.time_s if is_known else None
-    return FrameResult(frame_input.frame, time_s, ExposureSettings(), outcomes)
+    time_source = TimeSource.NONE if time_s is None else TimeSource.TIMES_FILE
+    return FrameResult(
+        frame_input.frame, time_s, ExposureSettings(), outcomes, time_source=time_source
+    )
 
 
 def kept_frame(guided_input: GuidedInput, reason: Reason) -> FrameResult:

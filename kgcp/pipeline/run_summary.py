@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from kgcp.errors import Reason, Status
-from kgcp.measurement.records import FrameResult, Miss
+from kgcp.io.formats.frame_names import likely_difference
+from kgcp.measurement.records import FrameResult, Miss, TimeSource
+
+_COMPARED = 1000  # names that differ, in search of two that resemble each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +32,12 @@ class DetectionSummary:
         Rows per reason, most frequent first.
     frames_without_time : int
         Frames that neither the times file nor EXIF gives a time.
+    frames_not_in_times_file : int
+        Frames that the times file, if there is one, does not name.
     times_without_frame : int
         Entries of the times file that name no frame.
+    name_difference : str or None
+        How a name of such an entry differs from that of a frame which it probably means.
     exif_times_in_whole_seconds : int
         Frames whose time is EXIF's, if all of these times are whole seconds; else 0.
     frames_without_attitude : int
@@ -53,7 +60,9 @@ class DetectionSummary:
     status: Mapping[str, int]
     reasons: Mapping[str, int]
     frames_without_time: int
+    frames_not_in_times_file: int
     times_without_frame: int
+    name_difference: str | None
     exif_times_in_whole_seconds: int
     frames_without_attitude: int
     kept: int
@@ -100,7 +109,9 @@ class SummaryBuilder:
 
     def __init__(self, times: Mapping[str, float]) -> None:
         self._times = times
-        self._frames = self._timed = self._without_time = self._guided = 0
+        self._frames = self._without_time = self._guided = 0
+        self._named: set[str] = set()
+        self._not_named: list[str] = []
         self._status: Counter[Status] = Counter()
         self._reasons: Counter[Reason] = Counter()
         self._from_exif: Counter[bool] = Counter()  # by whether the time has no fraction
@@ -110,8 +121,10 @@ class SummaryBuilder:
         self._frames += 1
         self._without_time += result.time_s is None
         if result.frame in self._times:
-            self._timed += 1
-        elif result.camera_time_s is not None:
+            self._named.add(result.frame)
+        elif self._times:
+            self._not_named.append(result.frame)
+        if result.time_source is TimeSource.EXIF and result.camera_time_s is not None:
             self._from_exif[result.camera_time_s.is_integer()] += 1
         for outcome in result.outcomes:
             if isinstance(outcome, Miss):
@@ -132,13 +145,16 @@ class SummaryBuilder:
         stages_s: Mapping[str, float],
     ) -> DetectionSummary:
         """Return the counts, with what else there is to say."""
+        unused = [name for name in self._times if name not in self._named]
         return DetectionSummary(
             table=table,
             frames=self._frames,
             status={kind.value: self._status[kind] for kind in Status},
             reasons={reason.value: count for reason, count in self._reasons.most_common()},
             frames_without_time=self._without_time,
-            times_without_frame=len(self._times) - self._timed,
+            frames_not_in_times_file=len(self._not_named),
+            times_without_frame=len(unused),
+            name_difference=_name_difference(unused, self._not_named),
             exif_times_in_whole_seconds=0 if self._from_exif[False] else self._from_exif[True],
             frames_without_attitude=frames_without_attitude,
             kept=kept,
@@ -147,3 +163,9 @@ class SummaryBuilder:
             guide_problem=guide_problem,
             stages_s=dict(stages_s),
         )
+
+
+def _name_difference(names: Sequence[str], frames: Sequence[str]) -> str | None:
+    """Tell how a name differs from that of a frame that it resembles."""
+    difference = likely_difference(names[:_COMPARED], frames[:_COMPARED])
+    return None if difference is None else "{!r} for {!r}: {}".format(*difference)

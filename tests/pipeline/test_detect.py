@@ -220,7 +220,9 @@ def test_common_errors_stand_apart(flight: Path, tmp_path: Path) -> None:
 def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     (folder / "frames" / "east").mkdir(parents=True)
-    shutil.copy(flight / "flight.toml", folder)
+    toml = (flight / "flight.toml").read_text(encoding="utf-8")
+    toml = toml.replace("[frames]\n", "[frames]\nexif_fallback = true\n")
+    (folder / "flight.toml").write_text(toml, encoding="utf-8")
     for name in ("frame_0000.png", "frame_0003.png"):
         shutil.copy(flight / "frames" / name, folder / "frames")
     shutil.copy(flight / "frames" / "frame_0002.png", folder / "frames" / "east")
@@ -241,6 +243,7 @@ def test_an_unreadable_frame_is_a_row_among_the_others(flight: Path, tmp_path: P
     assert table["status"].to_list() == ["measured", "measured", "unreadable", "measured"]
     assert table["reason"].to_list() == ["", "", "decode_failed", ""]
     assert table["time"].notna().all(), "from EXIF where the times file has none"
+    assert table["time_source"].to_list() == ["exif", "exif", "times_file", "exif"]
     assert (summary.frames, summary.times_without_frame) == (4, 1)
     assert summary.reasons == {"decode_failed": 1}
     metadata = pq.read_schema(tmp_path / "0" / "detections.parquet").metadata

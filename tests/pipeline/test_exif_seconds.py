@@ -52,7 +52,7 @@ def test_only_times_that_are_used_count(
     tmp_path: Path, subsecs: tuple[str, str], times: str, count: int
 ) -> None:
     (tmp_path / "frames").mkdir()
-    (tmp_path / "flight.toml").write_text(FLIGHT)
+    (tmp_path / "flight.toml").write_text(f"[frames]\nexif_fallback = true\n{FLIGHT}")
     for name, subsec in zip(("1.png", "2.png"), subsecs, strict=True):
         frame(tmp_path, name, subsec)
     if times:

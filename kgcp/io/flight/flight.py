@@ -29,7 +29,7 @@ from kgcp.targets.layout import Target
 REFERENCE_KEYS = ("poses", "format", "crs", "offset")
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
-FRAMES_KEYS = ("folder", "times", "times_format")
+FRAMES_KEYS = ("folder", "times", "times_format", "exif_fallback")
 _MOST_BYTES = 1 << 18
 _TOML_REMEDY = "correct that line"
 # What tomllib says of frequent mistakes, and what to do.
@@ -72,6 +72,8 @@ class Flight:
         Frame times; None: EXIF gives them.
     times_format : str or None
         Of that file; None: its content tells.
+    may_use_exif_times : bool
+        Whether EXIF gives the time of a frame that the times file, if there is one, does not name.
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
     plumb_sd_deg : float or None
@@ -87,6 +89,7 @@ class Flight:
     frames_folder: Path
     times_file: Path | None
     times_format: str | None
+    may_use_exif_times: bool
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     plumb_sd_deg: float | None
@@ -109,6 +112,9 @@ def read_flight(folder: Path | str) -> Flight:
     folder = Path(folder)
     table, text = _read_toml(folder / "flight.toml")
     frames_folder, times_file, times_format = _read_frames(table, folder)
+    exif_fallback = table.table("frames", FRAMES_KEYS, required=False).boolean(
+        "exif_fallback", default=False
+    )
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
     plumb_sd_deg = read_plumb_sd_deg(camera)
@@ -121,6 +127,7 @@ def read_flight(folder: Path | str) -> Flight:
         frames_folder=frames_folder,
         times_file=times_file,
         times_format=times_format,
+        may_use_exif_times=times_file is None or exif_fallback,
         camera=read_camera(camera, folder),
         calibration_covariance=read_calibration_covariance(camera),
         plumb_sd_deg=plumb_sd_deg,

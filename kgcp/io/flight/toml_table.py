@@ -105,6 +105,13 @@ class TomlTable:
         listed = ", ".join(f'"{word}"' for word in words)
         raise self.error(key, f"{text!r} is not known", f"give one of {listed}")
 
+    def boolean(self, key: str, *, default: bool) -> bool:
+        """Return true or false, or the default where the key is absent."""
+        value = self.values.get(key, default)
+        if not isinstance(value, bool):
+            raise self._wrong_type(key, value, "true or false")
+        return value
+
     def integer(self, key: str) -> int:
         """Return a whole number; booleans are refused."""
         value = self._required(key, "give it as a whole number")

@@ -15,6 +15,7 @@ from kgcp.io.files.gps_time import clock_from_week, unix_from_gps, unwrap_week
 from kgcp.io.files.safe_read import read_lines
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.files.time_text import is_in_calendar, parse_time
+from kgcp.io.formats.frame_names import likely_difference
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution, read_solution
 
@@ -53,7 +54,7 @@ def read_times(
     return times
 
 
-def _read_csv(file: ForeignFile, _frames: Sequence[str]) -> dict[str, float]:
+def _read_csv(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
     """Return the columns frame and time; times are mid-exposure, in the notations of `parse_time`.
 
     Frames are named as `kgcp.io.images.frames.list_frames` does.
@@ -66,7 +67,19 @@ def _read_csv(file: ForeignFile, _frames: Sequence[str]) -> dict[str, float]:
             times[frame] = parse_time(text)
         except SettingError as error:
             raise KgcpError(f"{file.path}, line {line}: {error}") from None
+    if times and frames and times.keys().isdisjoint(frames):
+        raise _no_common_name(file, [*times], frames)
     return times
+
+
+def _no_common_name(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) -> KgcpError:
+    name, frame, why = likely_difference(names, frames) or (names[0], frames[0], "")
+    because = f" ({why})" if why else ""
+    return file.error(
+        f"none of its {len(names)} names is a frame's: it has {name!r}, the frames folder has"
+        f" {frame!r}{because}",
+        "write names as paths below the frames folder, or give the times of these frames",
+    )
 
 
 def _looks_like_marks(file: ForeignFile) -> bool:

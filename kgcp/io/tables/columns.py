@@ -19,7 +19,7 @@ from kgcp.io.files.time_text import date_of
 Row = Mapping[str, object]
 Record = TypeVar("Record")
 
-SCHEMA_VERSION = "2"
+SCHEMA_VERSION = "3"
 
 
 class ColumnType(StrEnum):

@@ -104,6 +104,7 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("frame", TEXT, _frame(lambda result: result.frame)),
     Column("target", TEXT, lambda record: record[1].target),
     Column("time", TIME, _frame(lambda result: time_cell(result.time_s))),
+    Column("time_source", TEXT, _frame(lambda result: result.time_source.value)),
     Column("instance", INTEGER, _outcome(lambda seen: seen.instance, lambda _: 0)),
     Column("status", TEXT, _outcome(lambda _: _MEASURED, lambda miss: miss.reason.status.value)),
     Column("reason", TEXT, _outcome(lambda _: "", lambda miss: miss.reason.value)),

@@ -13,7 +13,7 @@ import os
 import platform
 import resource
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from kgcp.io.files.atomic import write_bytes
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.tables.columns import SCHEMA_VERSION
+from kgcp.measurement.records import TimeSource
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -66,7 +67,7 @@ def detections_provenance(
         by_part[_part_of(key)][key] = value
     parts = {
         **by_part,
-        "times": {frame: times.get(frame) for frame in frame_sizes},
+        "times": digested_times(flight, frame_sizes, times),
         "frames": frame_sizes,
         "settings": asdict(settings),
         "version": __version__,
@@ -173,6 +174,14 @@ def _target_table(target: Target, ring: Ring) -> dict[str, object]:
         "scale": float(f"{scale:.{_SCALE_DIGITS}g}"),
         "code_deg": ring.code_deg,
     }
+
+
+def digested_times(
+    flight: Flight, frames: Iterable[str], times: Mapping[str, float]
+) -> list[tuple[str, object]]:
+    """Return what is known of each frame's time before it is read: microseconds, or who tells."""
+    otherwise = TimeSource.EXIF if flight.may_use_exif_times else TimeSource.NONE
+    return [(frame, round(1e6 * times[frame]) if frame in times else otherwise) for frame in frames]
 
 
 def _part_of(key: str) -> str:

@@ -11,14 +11,20 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from kgcp.errors import KgcpError, Status
+from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames
 from kgcp.io.images.remote import sizes_of
-from kgcp.io.tables.provenance import TARGET_TABLE, detection_inputs, digest
+from kgcp.io.tables.provenance import (
+    TARGET_TABLE,
+    detection_inputs,
+    digest,
+    digested_times,
+)
+from kgcp.measurement.records import TimeSource
 from kgcp.settings import DetectSettings
 
 _SAME_TIME_S = 2e-6  # tables hold microseconds
@@ -49,10 +55,11 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     inputs = _json(metadata, b"kgcp.inputs")
     if not inputs:
         return
+    digests = _json(metadata, b"kgcp.digests")
     changes = [
         *_changed_keys(inputs, detection_inputs(flight)),
-        *_changed_times(table, flight),
-        *_changed_frames(table, flight, _json(metadata, b"kgcp.digests")),
+        *_changed_times(table, flight, digests),
+        *_changed_frames(table, flight, digests),
     ]
     if changes:
         more = len(changes) - _MOST_SHOWN
@@ -119,29 +126,37 @@ def _shown(value: object) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def _changed_times(table: pd.DataFrame, flight: Flight) -> Iterator[str]:
-    """Yield what the times file says otherwise than the table, if it does."""
+def _changed_times(
+    table: pd.DataFrame, flight: Flight, digests: Mapping[str, object]
+) -> Iterator[str]:
+    """Yield that frames have other times now, or none, if so."""
     frames = table.drop_duplicates("frame")
-    data = FlightData(flight, frames["frame"].to_list())
-    if not data.frame_times:
+    names = frames["frame"].to_list()
+    times = FlightData(flight, names).frame_times
+    if digest(digested_times(flight, names, times)) == digests.get("times"):
         return
-    readable = frames[frames["status"] != Status.UNREADABLE.value]
-    listed = readable[readable["frame"].isin(data.frame_times)]
-    names = listed["frame"].to_list()
-    then_s = _unix_s(listed["time"])
-    now_s = np.array([data.frame_times[name] for name in names]) + _to_middle_s(listed, flight)
-    differences_s = now_s - then_s
-    changed = np.flatnonzero(~(np.abs(differences_s) <= _SAME_TIME_S))  # NaN: none before
+    then_s = _unix_s(frames["time"])
+    now_s = np.array([times.get(name, np.nan) for name in names]) + _to_middle_s(frames, flight)
+    if flight.may_use_exif_times:
+        is_exif = (frames["time_source"] == TimeSource.EXIF.value).to_numpy()
+        now_s = np.where(np.isnan(now_s) & is_exif, then_s, now_s)
+    is_same = (np.abs(now_s - then_s) <= _SAME_TIME_S) | (np.isnan(now_s) & np.isnan(then_s))
+    changed = np.flatnonzero(~is_same)
     if not changed.size:
+        yield "[frames] times"
         return
     of_all = f"[frames] times of {len(changed)} of {len(frames)} frames"
-    differences_s = differences_s[changed]
-    if np.ptp(differences_s) <= _SAME_SHIFT_S:
-        yield f"{of_all} (by {np.median(differences_s):+.6g} s)"
+    shifts_s = (now_s - then_s)[changed]
+    if np.ptp(shifts_s) <= _SAME_SHIFT_S:
+        yield f"{of_all} (by {np.median(shifts_s):+.6g} s)"
     else:
         first = changed[0]
-        was = "none" if np.isnan(then_s[first]) else format_time(float(then_s[first]))
-        yield f"{of_all} ({names[first]}: {was} → {format_time(float(now_s[first]))})"
+        was, now = (_shown_time(float(time_s[first])) for time_s in (then_s, now_s))
+        yield f"{of_all} ({names[first]}: {was} → {now})"
+
+
+def _shown_time(time_s: float) -> str:
+    return "none" if np.isnan(time_s) else format_time(time_s)
 
 
 def _unix_s(times: pd.Series) -> FloatArray:

@@ -34,7 +34,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.measurement import records
-from kgcp.measurement.records import Considered, FrameResult, Miss
+from kgcp.measurement.records import Considered, FrameResult, Miss, TimeSource
 
 # All records that a result may consist of; `records` also imports those of other modules.
 _RECORDS: dict[str, type] = {
@@ -43,6 +43,7 @@ _RECORDS: dict[str, type] = {
     if isinstance(record, type) and is_dataclass(record)
 }
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
+_TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeSource}
 
 _MADE_BY = "made-by"  # the key of the first line
 _SHORTEST_S = 1.0  # between two waits for the disk: what a power failure may cost
@@ -101,6 +102,8 @@ def _record(cells: dict[str, Any]) -> object:
     kind = _RECORDS[cells.pop("record")]
     if kind in {Miss, Considered}:
         cells["reason"] = _REASONS[cells["reason"]]
+    if kind is FrameResult:
+        cells["time_source"] = _TIME_SOURCES[cells["time_source"]]
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in cells.items()})
 
 

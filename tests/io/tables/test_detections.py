@@ -46,7 +46,7 @@ BARE = replace(FULL, instance=1, alternative=None, uncertainty=None, common=None
 NAMES = [column.name for column in DETECTION_COLUMNS]
 ABOUT_THE_FRAME = {
     *("frame", "target", "time", "instance", "status", "reason", "detail", "candidates"),
-    *("guided", "scale_used"),
+    *("guided", "scale_used", "time_source"),
 }
 EXPOSURE = {"exposure_time_s", "iso", "f_number"}
 FRAME = FrameResult(
