@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -61,6 +62,37 @@ def select(
     good, faulty = pass_gates(flag_jumps(gcps, sightings, local_frame), wanted)
     spaced, close = thin(good, local_frame, camera, wanted.min_spacing_m)
     return set_checkpoints(spaced, local_frame, wanted.checkpoint_share), (*faulty, *close)
+
+
+def explain_none_left(
+    gcps: Sequence[Gcp], skipped: Sequence[SkippedSighting], wanted: Selection
+) -> str:
+    """Return, in one line, what all points have failed on, and how good the best one is.
+
+    Parameters
+    ----------
+    gcps : sequence of Gcp
+        Before the selection; at least one.
+    skipped : sequence of SkippedSighting
+        By the selection.
+    """
+    counts = Counter(each.reason.value for each in skipped)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    best = []
+    if wanted.max_sd_m is not None:
+        sds_m = [longest_semi_axis(point.cov_m2) for point in gcps]
+        best.append(_best("standard deviation", np.fmin.reduce(sds_m), " m"))
+    if wanted.min_score is not None:
+        best.append(_best("score", np.fmax.reduce([_or_nan(point.score) for point in gcps])))
+    if wanted.min_ambiguity is not None:
+        values = [_or_nan(point.ambiguity) for point in gcps]
+        best.append(_best("ambiguity", np.fmax.reduce(values)))
+    shown = f"; {', '.join(best)}" if best else ""
+    return f"no points left after selection: {reasons} of {len(gcps)}{shown}; select less strictly"
+
+
+def _best(name: str, value: float, unit: str = "") -> str:
+    return f"no {name} is known" if np.isnan(value) else f"the best {name} is {value:.3g}{unit}"
 
 
 def flag_jumps(

@@ -18,6 +18,10 @@ from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Traje
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
 
+_DAY_S = 86400.0
+_TWO_WEEKS_S = 14 * _DAY_S  # longer than any seconds of the week, with a flight over its end
+_GPS_EPOCH_S = 315_964_800  # 1980-01-06 as Unix seconds
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
@@ -217,13 +221,41 @@ def _moving_positions(
 
 def _no_overlap(vehicle: Vehicle, time_s: FloatArray) -> str:
     covered, gap_s = vehicle.motion.time_s, vehicle.motion.max_gap_s
+    remedy = _gps_remedy(float(time_s.min()), float(covered[0])) or (
+        "correct [vehicle] time_offset_s in flight.toml (GPS time is 18 s ahead of UTC) or give the"
+        " trajectory of this flight"
+    )
     return (
         f"none of the {len(time_s)} frames with the target lies within the vehicle's trajectory:"
         f" frames {_utc(time_s.min())} to {_utc(time_s.max())}, time_offset_s ="
         f" {vehicle.settings.time_offset_s:g}, trajectory {_utc(covered[0])} to"
-        f" {_utc(covered[-1])} without gaps over {gap_s:g} s; correct [vehicle] time_offset_s in"
-        " flight.toml (GPS time is 18 s ahead of UTC) or give the trajectory of this flight"
+        f" {_utc(covered[-1])} without gaps over {gap_s:g} s; {remedy}"
     )
+
+
+def _gps_remedy(frames_s: float, trajectory_s: float) -> str | None:
+    """Return what to do about times that count from the start of a GPS week, or of GPS itself."""
+    if 0.0 <= trajectory_s < _TWO_WEEKS_S <= frames_s:
+        return (
+            "the trajectory's times are seconds of a GPS week: give [vehicle] date ="
+            f' {_utc(frames_s)[:10]}, the day of its first epoch, and time_system = "gps" in'
+            " flight.toml"
+        )
+    if 0.0 <= frames_s < _TWO_WEEKS_S <= trajectory_s:
+        return (
+            "the frames' times are seconds of a GPS week: write them as UTC,"
+            f" {_utc(trajectory_s)}, and run 'kgcp detect' again"
+        )
+    for whose, behind_s in (
+        ("trajectory's", frames_s - trajectory_s),
+        ("frames'", trajectory_s - frames_s),
+    ):
+        if abs(behind_s - _GPS_EPOCH_S) < _DAY_S:
+            return (
+                f"the {whose} times count from 1980-01-06, as GPS does: add {_GPS_EPOCH_S} s, and"
+                " take off the leap seconds (18 since 2017), to make them Unix seconds"
+            )
+    return None
 
 
 def _utc(unix_s: float) -> str:

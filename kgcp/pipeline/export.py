@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
-from kgcp.georef.selection import Selection, select
+from kgcp.georef.selection import Selection, explain_none_left, select
 from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
@@ -109,6 +109,8 @@ def make_gcps(
     local_frame = target_positions.local_frame
     placed, absent = build_gcps(sightings, target_positions, flight.camera)
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
+    if placed and not gcps:
+        raise KgcpError(explain_none_left(placed, unwanted, selection))
     consistency = None
     if data.has_reference:
         poses = data.reference_poses

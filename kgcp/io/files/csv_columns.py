@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,12 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.files.safe_read import is_sound, read_lines
+
+SEPARATOR_REMEDY = "save it with commas between the cells and points in the numbers"
+"""What to do with a file whose cells are not separated by commas."""
+
+_SEPARATORS = ((r";", "';'"), (r"\t", "tabs"), (r" +", "spaces"))
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +129,7 @@ def read_csv_columns(
         if len(cells) != len(header):
             raise KgcpError(
                 f"{path}, line {line}: has {len(cells)} cells, the first line has {len(header)};"
-                " repair the line"
+                f" {_remedy_for(cells, header)}"
             )
         lines.append(line)
         text_cells.append([cells[header.index(name)].strip() for name in texts])
@@ -135,13 +142,33 @@ def read_csv_columns(
     return CsvColumns(path, tuple(lines), dict(zip(texts, columns, strict=True)), names, block)
 
 
+def foreign_separator(first_line: str, names: Sequence[str]) -> str | None:
+    """Return what separates the names in a first line that has no commas, in words.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of which the line must have one; None is returned for any other line.
+    """
+    for separator, words in _SEPARATORS:
+        cells = [cell.strip().strip('"') for cell in re.split(separator, first_line.strip())]
+        if len(cells) > 1 and not set(cells).isdisjoint(names):
+            return words
+    return None
+
+
+def _remedy_for(cells: Sequence[str], header: Sequence[str]) -> str:
+    """Return what to do about a row with more or less cells than the header."""
+    if len(cells) > len(header) and any(cell.strip().isdigit() for cell in cells[1:]):
+        return "write decimal points, not commas, or repair the line"
+    return "repair the line"
+
+
 def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> None:
     lacking = [name for name in wanted if name not in header]
-    if lacking and len(header) == 1 and ";" in header[0]:
-        raise KgcpError(
-            f"{where}: its cells are separated by ';';"
-            " save it with commas between the cells and points in the numbers"
-        )
+    separator = foreign_separator(header[0], wanted) if lacking and len(header) == 1 else None
+    if separator is not None:
+        raise KgcpError(f"{where}: its cells are separated by {separator}; {SEPARATOR_REMEDY}")
     if lacking:
         raise KgcpError(
             f"{where}: lacks the columns {', '.join(lacking)};"
@@ -166,6 +193,8 @@ def _number(text: str, where: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
+    if _DECIMAL_COMMA.fullmatch(text.strip()):
+        raise KgcpError(f"{where} is {text.strip()!r}, with a decimal comma; write a point")
     if not is_sound(value):
         raise KgcpError(f"{where} is {text.strip()!r}; give a finite number")
     return value

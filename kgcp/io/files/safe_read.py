@@ -6,6 +6,7 @@ limit, so that nothing can block the program or fill the memory.
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from kgcp.errors import KgcpError
 MOST_BYTES = 1 << 29
 """Of a file that is read as a whole: a large reconstruction has a tenth of it."""
 _LONGEST_LINE = 1 << 20  # characters
+_HEAD = 4096  # bytes that tell an encoding
 _UNTOLD = 1 << 20  # bytes, where the system does not tell
 LARGEST = 1e15
 """What no coordinate, angle, time or parameter reaches: more of it would overflow somewhere."""
@@ -87,11 +89,22 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             yield from _bounded_lines(path, stream)
     except UnicodeDecodeError as error:
-        raise KgcpError(
-            f"{path}: is not text in UTF-8 ({error.reason}); save it as UTF-8"
-        ) from error
+        with path.open("rb") as start:
+            likely = likely_encoding(start.read(_HEAD))
+        raise KgcpError(f"{path}: is not text in UTF-8 but {likely}; save it as UTF-8") from error
     except OSError as error:
         raise KgcpError(f"{path}: {error.strerror}; correct {toml_key}") from error
+
+
+def likely_encoding(content: bytes) -> str:
+    """Return in words what a content that is not UTF-8 probably is."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "UTF-16"
+    if content.startswith(b"PK\x03\x04"):
+        return "a spreadsheet or archive"
+    if b"\0" in content[:_HEAD]:
+        return "a binary file"
+    return "of another encoding (Latin-1 or Windows-1252?)"
 
 
 def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:

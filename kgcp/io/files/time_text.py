@@ -13,6 +13,7 @@ _EARLIEST_S = datetime(1, 1, 3, tzinfo=UTC).timestamp()
 _LATEST_S = datetime(9999, 12, 29, tzinfo=UTC).timestamp()
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 """A decimal number, written out: neither nan nor inf, no underscores."""
+_GPS_WEEK = re.compile(r"\d{4}[\s:;/]+\d{1,6}(\.\d*)?")
 _REMEDY = "give UTC as 2026-05-04T09:30:05.25Z or as Unix seconds"
 
 
@@ -38,6 +39,13 @@ def parse_time(text: str) -> float:
     text = text.strip()
     if NUMBER.fullmatch(text):
         return _in_calendar(float(text), f"{text} is out of range as Unix seconds")
+    if _GPS_WEEK.fullmatch(text):
+        raise SettingError(
+            "time",
+            f"{text!r} is a GPS week with seconds",
+            f"{_REMEDY}; a trajectory may have the seconds alone, with [vehicle] date and"
+            " time_system",
+        )
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

@@ -11,7 +11,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.safe_read import is_file, is_folder, read_bytes
+from kgcp.io.files.safe_read import is_file, is_folder, likely_encoding, read_bytes
 from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
     read_calibration_covariance,
@@ -19,6 +19,7 @@ from kgcp.io.flight.camera_table import (
     read_plumb_sd_deg,
 )
 from kgcp.io.flight.target_table import read_targets
+from kgcp.io.flight.toml_mistakes import explain
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
@@ -31,13 +32,6 @@ REFERENCE_KEYS = ("poses", "format", "crs", "offset")
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format", "exif_fallback")
 _MOST_BYTES = 1 << 18
-_TOML_REMEDY = "correct that line"
-# What tomllib says of frequent mistakes, and what to do.
-_TOML_HINTS = (
-    ("Cannot declare", "name each table once, and head every target [[target]]"),
-    ("Unescaped '\\'", "write / instead of \\ in paths"),
-    ("Expected newline or end of document", f"{_TOML_REMEDY}: decimals take a point, texts quotes"),
-)
 # tomllib takes the square of the number of a key's parts.
 _LONG_KEY = re.compile(
     r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')[ \t]*+\.[ \t]*+){50}"""
@@ -174,16 +168,18 @@ def _read_toml(path: Path) -> tuple[TomlTable, str]:
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
     try:
-        text = read_bytes(path, "FLIGHT", _MOST_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
+        content = read_bytes(path, "FLIGHT", _MOST_BYTES)
+        text = content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise KgcpError(f"{path}: is not UTF-8 ({error}); save it as UTF-8") from error
+        likely = likely_encoding(content)
+        raise KgcpError(f"{path}: is not UTF-8 but {likely}; save it as UTF-8") from error
     if _LONG_KEY.search(text):
         raise KgcpError(f"{path}: has a key of very many parts; delete it")
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        remedy = next((hint for word, hint in _TOML_HINTS if word in str(error)), _TOML_REMEDY)
-        raise KgcpError(f"{path}: is not TOML: {error}; {remedy}") from error
+        problem, remedy = explain(text, str(error))
+        raise KgcpError(f"{path}: is not TOML: {problem}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
         raise KgcpError(f"{path}: is not readable TOML ({error}); rewrite it") from error
     return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
@@ -192,7 +188,7 @@ def _read_toml(path: Path) -> tuple[TomlTable, str]:
 def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, str | None]:
     """Return the frames' folder, the times file and its format, all but the last by default."""
     table = flight.table("frames", FRAMES_KEYS, required=False)
-    name = table.optional("folder", table.text) or "frames"
+    name = table.optional("folder", lambda key: table.path(key, folder)) or "frames"
     if not is_folder(folder / name):
         raise table.error("folder", f"{name!r} is not a folder", "create or correct it")
     default = folder / "frames.csv"
@@ -216,4 +212,4 @@ def _read_reference(flight: TomlTable, folder: Path) -> Reference | None:
         crs=table.optional("crs", table.text),
         offset_file=table.optional("offset", lambda key: table.existing_file(key, folder)),
     )
-    return Reference(folder / table.text("poses"), options)
+    return Reference(folder / table.path("poses", folder), options)

@@ -27,6 +27,7 @@ _TYPE_NAMES = {
     dict: "a table",
 }
 _LONGEST_NAME = 200
+_ESCAPED = "\b\t\n\f\r"  # what TOML makes of a backslash and a letter
 _CONTROLS = ("Cc", "Zl", "Zp")  # Unicode's: control characters, ends of lines and paragraphs
 
 
@@ -154,9 +155,17 @@ class TomlTable:
         except ValueError:
             raise self.error(key, f"{value!r} is not a date", "give it as 2026-05-04") from None
 
+    def path(self, key: str, folder: Path) -> str:
+        """Return a path relative to the folder, of a file that may come later."""
+        text = self.text(key)
+        has_escape = not set(text).isdisjoint(_ESCAPED)  # "data\track.csv" has a tab
+        if has_escape or ("\\" in text and not os.path.lexists(folder / text)):
+            raise self.error(key, f"{text!r} has a backslash", "write / instead of \\ in paths")
+        return text
+
     def existing_file(self, key: str, folder: Path) -> Path:
         """Return a file that lies in the folder or below it."""
-        path = folder / self.text(key)
+        path = folder / self.path(key, folder)
         if not is_file(path):
             if os.path.lexists(path):
                 raise self.error(key, f"{self.text(key)!r} is not a regular file", "name a file")
@@ -175,7 +184,8 @@ class TomlTable:
         values = self.numbers(key, example)
         if len(values) != 3:
             problem = f"has {len(values)} numbers instead of 3"
-            raise self.error(key, problem, f"give it as {example}")
+            points = "; decimals take a point" if len(values) == 6 else ""
+            raise self.error(key, problem, f"give it as {example}{points}")
         return values[0], values[1], values[2]
 
     def table(self, key: str, known: Sequence[str], *, required: bool = True) -> TomlTable:

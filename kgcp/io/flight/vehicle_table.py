@@ -17,6 +17,7 @@ VEHICLE_KEYS = (
     *("sd_time_s", "time_offset_s", "level_sd_deg", "correlation_s"),
 )
 _COURSE = "course"
+_LEVER_ARM = "[forward, right, down] in metres from the trajectory point to the target's centre"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> VehicleTable | None:
     with table.located():
         settings = VehicleSettings(
             # Without a default: of a forgotten one the points would be off by metres.
-            lever_arm_m=table.vector("lever_arm_m", example="[forward, right, down]"),
+            lever_arm_m=table.vector("lever_arm_m", example=_LEVER_ARM),
             sd_lever_arm_m=table.vector("sd_lever_arm_m", (0.0, 0.0, 0.0)),
             mount_deg=table.number("mount_deg", 0.0),
             sd_time_s=table.number("sd_time_s", 0.0),
@@ -57,7 +58,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> VehicleTable | None:
             level_sd_deg=table.optional("level_sd_deg", table.number),
             correlation_s=table.number("correlation_s", 60.0),
         )
-    accuracies = table.optional("accuracies", table.text)
+    accuracies = table.optional("accuracies", lambda key: table.path(key, folder))
     options = TrajectoryFileOptions(
         format=table.optional("format", lambda key: table.choice(key, FORMATS.names)),
         crs=table.optional("crs", table.text),
@@ -67,7 +68,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> VehicleTable | None:
         wander=table.optional("wander", lambda key: table.choice(key, Wander)),
         course_sd_deg=_read_course(table),
     )
-    return VehicleTable(settings, folder / table.text("trajectory"), options)
+    return VehicleTable(settings, folder / table.path("trajectory", folder), options)
 
 
 def _read_course(table: TomlTable) -> tuple[float, float, float] | None:

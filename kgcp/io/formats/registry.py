@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from kgcp.io.files.csv_columns import SEPARATOR_REMEDY, foreign_separator
 from kgcp.io.files.sniff import ForeignFile
 
 Read = TypeVar("Read")
 """Type of the function that reads a file of some format."""
 
+_CSV_NAMES = ("time", "frame", "x", "y", "z")  # of columns, that every CSV file has some of
 _OTHER_TEXTS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"PK": "a spreadsheet or archive"}
 
 
@@ -54,10 +56,11 @@ class Registry(Generic[Read]):
         for start, text in _OTHER_TEXTS.items():
             if file.head.startswith(start):
                 raise file.error(f"is {text}, not {self.kind}", "save it as text in UTF-8")
-        if "csv" in self.formats and ";" in file.first_line:
+        separator = foreign_separator(file.first_line, _CSV_NAMES)
+        if "csv" in self.formats and separator is not None:
             raise file.error(
-                f"is not {self.kind} of a known format: ';' separates its cells",
-                "save it with commas between the cells and points in the numbers",
+                f"is not {self.kind} of a known format: its cells are separated by {separator}",
+                SEPARATOR_REMEDY,
             )
         known = ", ".join(sorted(self.formats))
         raise file.error(f"is not {self.kind} of a known format ({known})", self.remedy)

@@ -27,6 +27,13 @@ FRAME_SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 )
 
+_RAW_SUFFIXES = frozenset(
+    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".fff", ".iiq", ".mef", ".nef", ".nrw"}
+    | {".orf", ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f"}
+)
+_VIDEO_SUFFIXES = frozenset({".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mts", ".webm"})
+_PHONE_SUFFIXES = frozenset({".avif", ".heic", ".heif"})
+
 # The pixels as they lie in the file: raw orientation, full depth, one channel.
 _RAW_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -78,16 +85,34 @@ def frames_among(names: Sequence[str], folder: str) -> list[str]:
     frames = [name for name in shown if PurePosixPath(name).suffix.lower() in FRAME_SUFFIXES]
     if frames:
         return sorted(frames)
-    other = Counter(PurePosixPath(name).suffix.lower() for name in shown).most_common(1)
-    if other and other[0][0]:
-        suffix, count = other[0]
+    counts = Counter(PurePosixPath(name).suffix.lower() for name in shown)
+    counts.pop("", None)
+    if not counts:
         raise KgcpError(
-            f"{folder}: holds no images that kgcp reads, but {count} {suffix} files; convert them"
-            " to JPEG, PNG or TIFF, or correct [frames] folder in flight.toml"
+            f"{folder}: holds no images; put the frames there or correct [frames] folder in"
+            " flight.toml"
         )
+    suffix, count = counts.most_common(1)[0]
+    kind, remedy = _kind_of(suffix)
     raise KgcpError(
-        f"{folder}: holds no images; put the frames there or correct [frames] folder in flight.toml"
+        f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {remedy}"
     )
+
+
+def _kind_of(suffix: str) -> tuple[str, str]:
+    """Return what files of a suffix are that is not an image's, and what to do with them."""
+    if suffix in _RAW_SUFFIXES:
+        return "raw files", (
+            "develop them to JPEG, PNG or TIFF without lens correction, cropping or sharpening"
+        )
+    if suffix in _VIDEO_SUFFIXES:
+        return "videos", (
+            "extract the frames with the time of each ('ffmpeg -i FILE frames/%05d.png'), and give"
+            " the times in frames.csv"
+        )
+    if suffix in _PHONE_SUFFIXES:
+        return "files of a phone", "convert them to JPEG or PNG of the same size"
+    return "files", ("convert them to JPEG, PNG or TIFF, or correct [frames] folder in flight.toml")
 
 
 def _refuse_folder(error: OSError) -> None:

@@ -55,7 +55,9 @@ class TestListFrames:
     def test_files_of_another_kind_are_named(self, tmp_path: Path) -> None:
         for name in ("1.DNG", "2.dng", "notes.txt", ".hidden.heic"):
             (tmp_path / name).touch()
-        with pytest.raises(KgcpError, match=r"no images that kgcp reads, but 2 \.dng files; conv"):
+        with pytest.raises(
+            KgcpError, match=r"no images that kgcp reads, but 2 \.dng raw files; dev"
+        ):
             list_frames(tmp_path)
 
     def test_a_missing_folder_is_an_error(self, tmp_path: Path) -> None:
