@@ -31,6 +31,10 @@ CHANGES = {
         [("fx = 1903.0", "fx = 1903.0\nsd_fx = 0.5")],
         "[camera] sd_fx (none → 0.5)",
     ),
+    "shutter": (
+        [('response = "linear"', 'response = "linear"\nreadout_s = 0.001')],
+        "[camera] readout_s (0 → 0.001)",
+    ),
     "level plate": (
         [("sd_time_s", "level_sd_deg = 2.0\nsd_time_s")],
         "[vehicle] level_sd_deg (none → 2)",
@@ -47,7 +51,6 @@ HARMLESS = {
     "spelling": [("fx = 1903.0", "fx = 1.903e3"), ("[0, 43, 78, 180]", "[180, 0, 43, 78]")],
     "lever arm": [("[-0.8, 0.15, -1.95]", "[-0.7, 0.15, -1.95]")],
     "clock": [("sd_time_s = 0.001", "sd_time_s = 0.001\ntime_offset_s = 0.01")],
-    "shutter": [('response = "linear"', 'response = "linear"\nreadout_s = 0.001')],
     "CRS": [("EPSG:25832", "EPSG:32632")],
     "no reference": [('[reference]\nposes = "reference.csv"\n', "")],
 }

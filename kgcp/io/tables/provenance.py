@@ -40,7 +40,6 @@ TARGET_TABLE = "[[target]]"
 """What the keys of targets begin with, among those that detections depend on."""
 
 _KB_PER_MB = 1024.0
-_NOT_FOR_DETECTIONS = "readout_s"  # tells when a target was exposed, which is asked later
 _SCALE_DIGITS = 12  # of a replica, which is kept as diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
@@ -142,9 +141,7 @@ def detection_inputs(flight: Flight) -> dict[str, object]:
     """
     camera, vehicle = flight.camera, flight.vehicle
     values: dict[str, object] = {
-        f"[camera] {field.name}": getattr(camera, field.name)
-        for field in fields(Camera)
-        if field.name != _NOT_FOR_DETECTIONS
+        f"[camera] {field.name}": getattr(camera, field.name) for field in fields(Camera)
     }
     if flight.calibration_covariance is not None:
         cov = flight.calibration_covariance.cov
