@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from kgcp.measurement.records import Measurement as Measurement
     from kgcp.measurement.records import Miss as Miss
     from kgcp.pipeline.bias_report import bias_study as bias_study
+    from kgcp.pipeline.check import check_flight as check_flight
     from kgcp.pipeline.detect import RunOptions as RunOptions
     from kgcp.pipeline.detect import detect_flight as detect_flight
     from kgcp.pipeline.export import export_gcps as export_gcps
@@ -42,6 +43,7 @@ _MODULES = {
     "Selection": "kgcp.georef.selection",
     "Target": "kgcp.targets.layout",
     "bias_study": "kgcp.pipeline.bias_report",
+    "check_flight": "kgcp.pipeline.check",
     "detect_flight": "kgcp.pipeline.detect",
     "export_gcps": "kgcp.pipeline.export",
     "make_gcps": "kgcp.pipeline.export",

@@ -19,6 +19,7 @@ from kgcp.io.tables.columns import Column
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
+from kgcp.quality.checks.doubt import Cause
 from tests.test_layers import LAYERS, MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,6 +66,11 @@ def test_exactly_the_columns_that_exist_are_documented(
 def test_every_reason_is_documented_in_its_own_words() -> None:
     lines = [line for line in section("Reasons").splitlines() if line.startswith("| `")]
     assert lines == [f"| `{r.value}` | `{r.status.value}` | {r.description} |" for r in Reason]
+
+
+def test_every_cause_of_a_doubt_is_documented_in_its_own_words() -> None:
+    lines = [line for line in section("Doubts").splitlines() if line.startswith("| `")]
+    assert lines == [f"| `{cause.value}` | {cause.description} |" for cause in Cause]
 
 
 @pytest.mark.parametrize(

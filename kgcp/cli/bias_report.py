@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from kgcp.cli.doubts import doubt_json, print_doubts
 from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def command(
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         bias = bias_study(the_flight, detections or workspace.out / DETECTIONS)
+        print_doubts(bias.doubts)
         report = bias.write_report(
             workspace.out, reexpose=reexpose, stored_frames=workspace.frames_of(the_flight)
         )
@@ -59,7 +61,9 @@ def command(
         import json
 
         summary = report.summary()
-        click.echo(json.dumps({**summary, "files": [*map(workspace.named, report.files)]}))
+        files = [*map(workspace.named, report.files)]
+        doubts = [*map(doubt_json, bias.doubts)]
+        click.echo(json.dumps({**summary, "doubts": doubts, "files": files}))
     for sentence in report.verdict.sentences:
         click.echo(sentence, err=True)
     for path in report.files:

@@ -141,7 +141,9 @@ def command(
         raise click.UsageError("--jobs 0 and --scheduler exclude each other; give one of them")
     if all_candidates and overlay is None:
         raise click.UsageError("--all-candidates needs a contact sheet: give --overlay DIR, too")
+    from kgcp.cli.doubts import print_doubts
     from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.check import doubts_before_detecting
     from kgcp.pipeline.detect import RunOptions, detect_flight
     from kgcp.pipeline.workspace import open_workspace
 
@@ -154,6 +156,9 @@ def command(
     )
     with open_workspace(flight, out) as workspace:
         the_flight = read_flight(workspace.flight)
+        stored_frames = workspace.frames_of(the_flight)
+        doubts = doubts_before_detecting(the_flight, stored_frames)
+        print_doubts(doubts, is_quiet=is_quiet, as_json=log_json)
         start = time.perf_counter()
         with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
             options = RunOptions(
@@ -164,7 +169,7 @@ def command(
                 scheduler=scheduler,
                 overlay=overlay,
                 all_candidates=all_candidates,
-                stored_frames=workspace.frames_of(the_flight),
+                stored_frames=stored_frames,
             )
             summary = detect_flight(
                 the_flight, settings, out=workspace.out, options=options, listener=log

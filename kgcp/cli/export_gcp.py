@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from kgcp.cli.doubts import doubt_json, print_doubts
 from kgcp.cli.options import (
     detections_option,
     flight_place_argument,
@@ -145,6 +146,7 @@ def _report(
             "checkpoints": checks,
             "skipped": dict(reasons),
             "advice": _advice(made.consistency),
+            "doubts": [*map(doubt_json, made.doubts)],
             "files": [*map(named, written)],
             "left_out": left_out,
             "not_renewed": older,
@@ -159,6 +161,7 @@ def _report(
     _report_deviations(made.vehicle)
     if made.consistency is not None:
         _report_consistency(made.consistency)
+    print_doubts(made.doubts)
     for path in _named(written):
         click.echo(f"wrote {named(path)}", err=True)
     for name, reason in left_out.items():

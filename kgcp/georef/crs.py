@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -152,3 +153,102 @@ def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> Flo
     )
     x, y, z = np.array(positions).T
     return np.column_stack(to_wgs84.transform(x, y, z, errcheck=True))
+
+
+@dataclass(frozen=True, slots=True)
+class AreaOfUse:
+    """Where a CRS is meant to be used.
+
+    Attributes
+    ----------
+    name : str
+        Of the region, as PROJ's database has it.
+    west_deg, south_deg, east_deg, north_deg : float
+        Its bounds; west is larger than east where it holds the antimeridian.
+    """
+
+    name: str
+    west_deg: float
+    south_deg: float
+    east_deg: float
+    north_deg: float
+
+    @property
+    def is_world(self) -> bool:
+        """Whether it holds all longitudes, so that nothing lies outside."""
+        return self.east_deg - self.west_deg >= 360.0
+
+    def degrees_outside(self, longitude_deg: float, latitude_deg: float) -> float:
+        """Return how far a place is from the area, along a parallel or a meridian [deg]."""
+        width = (self.east_deg - self.west_deg) % 360.0 if not self.is_world else 360.0
+        from_west = (longitude_deg - self.west_deg) % 360.0
+        beside = 0.0 if from_west <= width else min(from_west - width, 360.0 - from_west)
+        above = max(self.south_deg - latitude_deg, latitude_deg - self.north_deg, 0.0)
+        return max(beside, above)
+
+
+def area_of_use(crs: str) -> AreaOfUse | None:
+    """Return where a CRS is meant to be used; None: PROJ does not know.
+
+    Raises
+    ------
+    KgcpError
+        If pyproj cannot read the CRS.
+    """
+    parsed = parse_crs(crs)
+    area = parsed.area_of_use or next(
+        (part.area_of_use for part in parsed.sub_crs_list if part.area_of_use), None
+    )
+    if area is None:
+        return None
+    return AreaOfUse(area.name, area.west, area.south, area.east, area.north)
+
+
+def is_geographic(crs: str) -> bool:
+    """Tell whether the coordinates are longitude and latitude.
+
+    Raises
+    ------
+    KgcpError
+        If pyproj cannot read the CRS.
+    """
+    return bool(parse_crs(crs).is_geographic)
+
+
+def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
+    """Return longitude and latitude (n, 2) of map points (n, 2), of the CRS's datum [deg].
+
+    NaN where the map has no such point.
+
+    Raises
+    ------
+    KgcpError
+        If pyproj cannot read the CRS.
+    """
+    parsed = parse_crs(crs)
+    flat = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
+    geodetic = flat.geodetic_crs
+    if geodetic is None:
+        return np.full(xy.shape, np.nan)
+    transformer = Transformer.from_crs(flat, geodetic.to_2d(), always_xy=True)
+    x, y = xy.T
+    columns = np.column_stack(transformer.transform(x, y))
+    columns[~np.isfinite(columns).all(axis=1)] = np.nan
+    return columns
+
+
+def geoid_height_m(longitude_deg: float, latitude_deg: float) -> float | None:
+    """Return the height of the EGM2008 or EGM96 geoid above WGS 84; None: no grid is installed."""
+    for model in ("EPSG:3855", "EPSG:5773"):
+        try:
+            to_ellipsoid = best_transformer(
+                CRS.from_user_input(f"EPSG:4326+{model.removeprefix('EPSG:')}"),
+                CRS.from_user_input(WGS84_3D),
+                model,
+            )
+        except KgcpError:
+            continue
+        height = float(to_ellipsoid.transform(longitude_deg, latitude_deg, 0.0)[2])
+        if np.isfinite(height):
+            return height
+    return None

@@ -36,6 +36,12 @@ def body_to_ned(roll_deg: FloatArray, pitch_deg: FloatArray, heading_deg: FloatA
     return np.asarray(flat.reshape((*angles.shape[:-1], 3, 3)))
 
 
+def roll_pitch_heading_deg(body_in_ned: FloatArray) -> FloatArray:
+    """Return roll, pitch, heading (n, 3) [deg] of rotations (n, 3, 3); undoes `body_to_ned`."""
+    angles = Rotation.from_matrix(body_in_ned).as_euler("ZYX", degrees=True)
+    return np.asarray(angles[:, ::-1])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """A vehicle's trajectory as its file gives it: map positions, angles against true north."""

@@ -26,8 +26,10 @@ from kgcp.io.tables.provenance import derived_provenance
 from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.flight_inputs import SAMPLED_FRAMES, FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.bias_study import BiasStudy, study_bias
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -89,12 +91,15 @@ class FlightBias:
         Every comparison.
     provenance : mapping of str
         What the comparisons were made from: the metadata of their table.
+    doubts : tuple of Doubt
+        What does not fit, with its likely cause, grave doubts first.
     """
 
     flight: Flight
     settings: DetectSettings
     study: BiasStudy
     provenance: Mapping[str, str]
+    doubts: tuple[Doubt, ...] = ()
 
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, without re-exposed frames."""
@@ -134,10 +139,12 @@ class FlightBias:
         study, flight = self.study, self.flight
         folder = results_folder(flight.folder) if folder is None else Path(folder)
         if not study.trusted:
-            raise KgcpError(
-                f"none of {len(study.measured)} measurements lies where a reference pose and the"
-                " trajectory put the target; check [reference] poses, [vehicle] trajectory and crs"
-            )
+            with naming_causes(self.doubts):
+                raise KgcpError(
+                    f"none of {len(study.measured)} measurements lies where a reference pose and"
+                    " the trajectory put the target; check [reference] poses, [vehicle] trajectory"
+                    " and crs"
+                )
         table = folder / "bias.parquet"
         rows = (bias_row(pair, study.method) for pair in study.measured)
         write_table(table, BIAS_COLUMNS, rows, self.provenance)
@@ -188,17 +195,20 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
     settings = read_settings(table)
-    data = FlightData(flight, [attempt.frame for attempt in attempts])
-    study = study_bias(
-        attempts,
-        data.reference_poses,
-        data.target_positions,
-        flight.camera,
-        flight.targets,
-        settings.method,
-    )
+    frames = [attempt.frame for attempt in attempts]
+    data = FlightData(flight, frames)
+    doubts = FlightInputs.of(flight, frames, most_headers=SAMPLED_FRAMES, data=data).plausibility
+    with naming_causes(doubts):
+        study = study_bias(
+            attempts,
+            data.reference_poses,
+            data.target_positions,
+            flight.camera,
+            flight.targets,
+            settings.method,
+        )
     provenance = derived_provenance(flight, table, {}, has_reference=True)
-    return FlightBias(flight, settings, study, provenance)
+    return FlightBias(flight, settings, study, provenance, doubts)
 
 
 def _look(

@@ -26,7 +26,9 @@ from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.flight_inputs import SAMPLED_FRAMES, FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency, study_consistency
 
 _DEFAULT_SELECTION = Selection()
@@ -53,6 +55,8 @@ class GcpSet:
         None if there are no reference poses, or too few frames to compare.
     provenance : mapping of str
         What the points were made from: the metadata of their tables.
+    doubts : tuple of Doubt
+        What does not fit, with its likely cause, grave doubts first.
     """
 
     flight: Flight
@@ -63,6 +67,7 @@ class GcpSet:
     vehicle: Vehicle | None
     consistency: Consistency | None
     provenance: Mapping[str, str]
+    doubts: tuple[Doubt, ...] = ()
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the points as a table with the columns of `kgcps.parquet`."""
@@ -104,10 +109,13 @@ def make_gcps(
             f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
-    data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
-    target_positions = data.target_positions
+    frames = sorted({attempt.frame for attempt in attempts})
+    data = FlightData(flight, frames)
+    doubts = FlightInputs.of(flight, frames, most_headers=SAMPLED_FRAMES, data=data).plausibility
+    with naming_causes(doubts):
+        target_positions = data.target_positions
+        placed, absent = build_gcps(sightings, target_positions, flight.camera)
     local_frame = target_positions.local_frame
-    placed, absent = build_gcps(sightings, target_positions, flight.camera)
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     if placed and not gcps:
         raise KgcpError(explain_none_left(placed, unwanted, selection))
@@ -132,6 +140,7 @@ def make_gcps(
             {"selection": asdict(selection), "crs": crs},
             has_reference=data.has_reference,
         ),
+        doubts=doubts,
     )
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from kgcp.errors import KgcpError
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import TargetPositions
+from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import read_reference_poses
@@ -38,11 +39,15 @@ class FlightData:
         reference = self._flight.reference
         return reference is not None and reference.file.exists()
 
+    @property
+    def has_trajectory(self) -> bool:
+        """Whether flight.toml names a trajectory that exists."""
+        vehicle = self._flight.vehicle
+        return vehicle is not None and vehicle.trajectory_file.exists()
+
     def has_position_of(self, target: Target) -> bool:
         """Tell whether there is what a target's position is made from."""
-        vehicle = self._flight.vehicle
-        is_driven = vehicle is not None and vehicle.trajectory_file.exists()
-        is_placed = target.position_m is not None or is_driven
+        is_placed = target.position_m is not None or self.has_trajectory
         return self._flight.crs is not None and is_placed
 
     @cached_property
@@ -88,14 +93,30 @@ class FlightData:
             If flight.toml has no crs, its crs is unusable, no target has a position, or the
             trajectory cannot be read.
         """
+        flight, crs = self._flight, self._crs
+        settings = VehicleSettings() if flight.vehicle is None else flight.vehicle.settings
+        return TargetPositions.of(crs, flight.targets, self.trajectory, settings)
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """The vehicle's trajectory; None: no target is carried by a vehicle.
+
+        Raises
+        ------
+        KgcpError
+            If flight.toml has no crs, or as `read_trajectory`.
+        """
+        vehicle = self._flight.vehicle
+        if vehicle is None:
+            return None
+        return read_trajectory(vehicle.trajectory_file, self._crs, vehicle.options)
+
+    @property
+    def _crs(self) -> str:
         flight = self._flight
         if flight.crs is None:
             raise KgcpError(
                 f"{flight.folder / 'flight.toml'}: has no crs; name that of the coordinates,"
                 ' for example crs = "EPSG:25831"'
             )
-        trajectory, settings = None, VehicleSettings()
-        if (vehicle := flight.vehicle) is not None:
-            trajectory = read_trajectory(vehicle.trajectory_file, flight.crs, vehicle.options)
-            settings = vehicle.settings
-        return TargetPositions.of(flight.crs, flight.targets, trajectory, settings)
+        return flight.crs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,15 +12,19 @@ from pathlib import Path
 from typing import Any, SupportsFloat
 
 from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import GPS, IFD, Base
 
 from kgcp.errors import SettingError
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.files.time_text import parse_time
-from kgcp.io.images.header import FORMATS, is_greedy
+from kgcp.io.images.header import FORMATS, image_size, is_greedy
 from kgcp.measurement.records import ExposureSettings
+from kgcp.quality.checks.frame_header import FrameHeader
 
 _EXIF_MARK = b"Exif\0\0"
+_RELATIVE_ALTITUDE = re.compile(
+    rb"""drone-dji:RelativeAltitude(?:="|>)\s*([+-]?\d{1,5}(?:\.\d{0,9})?)"""
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +57,7 @@ def read_exif(path: Path) -> Exif:
         return Exif()
     try:
         with warnings.catch_warnings(action="ignore"):
-            tags = _exif_tags(path)
+            tags = _exif_tags(path).main
     except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
         return Exif()
     exposure = ExposureSettings(
@@ -63,21 +68,99 @@ def read_exif(path: Path) -> Exif:
     return Exif(_time_s(tags), exposure)
 
 
-def _exif_tags(path: Path) -> Mapping[int, Any]:
+@dataclass(frozen=True, slots=True)
+class _Tags:
+    """What the metadata of a file hold: EXIF with its main part, GPS, and XMP as it lies there."""
+
+    main: Mapping[int, Any] = field(default_factory=dict)
+    gps: Mapping[int, Any] = field(default_factory=dict)
+    xmp: bytes = b""
+    size_px: tuple[int, int] | None = None
+
+
+def _exif_tags(path: Path) -> _Tags:
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None  # the limit guards decoding; aerial cameras exceed it
     try:
         with path.open("rb") as stream:
             if is_greedy(stream):
-                return {}
+                return _Tags()
         with Image.open(path, "r", (*FORMATS, "TIFF")) as image:
             if is_greedy(BytesIO(image.info.get("exif", b"").removeprefix(_EXIF_MARK))):
-                return {}
+                return _Tags()
             # The method of the base class: that of PNG would decode all pixels.
             exif = Image.Image.getexif(image)
-            return {**exif, **exif.get_ifd(IFD.Exif)}
+            xmp = image.info.get("xmp", b"")
+            return _Tags(
+                {**exif, **exif.get_ifd(IFD.Exif)},
+                exif.get_ifd(IFD.GPSInfo),
+                xmp if isinstance(xmp, bytes) else b"",
+                image.size,
+            )
     finally:
         Image.MAX_IMAGE_PIXELS = limit
+
+
+def read_frame_header(path: Path, frame: str) -> FrameHeader:
+    """Read what the header of a frame says, without decoding its pixels.
+
+    Whatever is damaged or absent is None; nothing is raised.
+
+    Parameters
+    ----------
+    frame : str
+        Its name in the flight.
+    """
+    if not is_file(path):
+        return FrameHeader(frame)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            tags = _exif_tags(path)
+        words = (_text(tags.main, tag) for tag in (Base.Make, Base.Model, Base.BodySerialNumber))
+        longitude_deg = _angle_deg(tags.gps, GPS.GPSLongitude, GPS.GPSLongitudeRef, "W", 180.0)
+        latitude_deg = _angle_deg(tags.gps, GPS.GPSLatitude, GPS.GPSLatitudeRef, "S", 90.0)
+        is_placed = longitude_deg is not None and latitude_deg is not None
+        return FrameHeader(
+            frame,
+            tags.size_px or _size_px(path),
+            camera=" ".join(filter(None, words)),
+            focal_mm=_positive(tags.main.get(Base.FocalLength)),
+            focal_35_mm=_positive(tags.main.get(Base.FocalLengthIn35mmFilm)),
+            time_s=_time_s(tags.main),
+            longitude_deg=longitude_deg if is_placed else None,
+            latitude_deg=latitude_deg if is_placed else None,
+            altitude_m=_altitude_m(tags.xmp),
+        )
+    except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
+        return FrameHeader(frame, _size_px(path))
+
+
+def _size_px(path: Path) -> tuple[int, int] | None:
+    """Return width and height also of files that Pillow refuses."""
+    try:
+        with path.open("rb") as stream:
+            return image_size(stream)
+    except OSError:
+        return None
+
+
+def _angle_deg(
+    gps: Mapping[int, Any], tag: GPS, reference: GPS, negative: str, limit: float
+) -> float | None:
+    """Return a longitude or latitude of degrees, minutes and seconds; 0, 0 is no fix."""
+    parts = gps.get(tag)
+    if not isinstance(parts, tuple) or len(parts) != 3:
+        return None
+    degrees = sum(float(part) / 60.0**power for power, part in enumerate(parts))
+    if not 0.0 < degrees <= limit:
+        return None
+    return -degrees if _text(gps, reference).upper() == negative else degrees
+
+
+def _altitude_m(xmp: bytes) -> float | None:
+    """Return the altitude above the take-off point, as DJI's drones write it."""
+    match = _RELATIVE_ALTITUDE.search(xmp)
+    return None if match is None else float(match[1])
 
 
 def _positive(value: object) -> float | None:
@@ -104,5 +187,5 @@ def _time_s(tags: Mapping[int, Any]) -> float | None:
         return None
 
 
-def _text(tags: Mapping[int, Any], tag: Base) -> str:
+def _text(tags: Mapping[int, Any], tag: Base | GPS) -> str:
     return str(tags.get(tag, "")).strip(" \0")

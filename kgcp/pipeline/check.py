@@ -1,0 +1,269 @@
+"""A dry run: what a flight's folder holds, what follows from it, and what does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.georef.prediction import reference_states
+from kgcp.io.flight.flight import Flight
+from kgcp.io.images.remote import StoredFolder, frames_below
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.flight_inputs import (
+    SAMPLED_FRAMES,
+    FlightInputs,
+    missing_files,
+    timed_frames,
+)
+from kgcp.quality.checks.clock import time_span
+from kgcp.quality.checks.doubt import Doubt, ranked
+from kgcp.quality.checks.lever_arm import lever_arm_text
+from kgcp.quality.checks.place import place_text
+from kgcp.settings import DetectSettings
+
+_TYPICAL_M = 50.0  # a distance to name, where no reference tells any
+
+
+@dataclass(frozen=True, slots=True)
+class FlightCheck:
+    """What a dry run has found.
+
+    Attributes
+    ----------
+    name : str
+        Of the flight.
+    facts : mapping of str to str
+        What there is, and what follows from it, by its heading.
+    doubts : tuple of Doubt
+        What does not fit, grave doubts first.
+    """
+
+    name: str
+    facts: Mapping[str, str]
+    doubts: tuple[Doubt, ...]
+
+    @property
+    def is_grave(self) -> bool:
+        """Whether results would be worthless if a doubt is right."""
+        return any(doubt.is_grave for doubt in self.doubts)
+
+
+@single_threaded()
+def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -> FlightCheck:
+    """Read everything but the pixels of a flight, and tell what does not fit.
+
+    Parameters
+    ----------
+    stored_frames : StoredFolder, optional
+        Where the frames are, if not in the flight's folder.
+
+    Raises
+    ------
+    KgcpError
+        If there are no frames. Other files that are missing or wrong are doubts.
+    """
+    inputs = FlightInputs.of(
+        flight, frames_below(stored_frames or flight.frames_folder), stored_frames
+    )
+    doubts = ranked((*inputs.doubts(), *missing_files(flight)))
+    return FlightCheck(flight.name, facts_of(inputs), doubts)
+
+
+def doubts_before_detecting(
+    flight: Flight, stored_frames: StoredFolder | None = None
+) -> tuple[Doubt, ...]:
+    """Return the doubts about a flight by some of its headers, grave ones first.
+
+    Files that are missing or wrong are not among them: who needs them says so.
+
+    Raises
+    ------
+    KgcpError
+        If there are no frames.
+    """
+    inputs = FlightInputs.of(
+        flight,
+        frames_below(stored_frames or flight.frames_folder),
+        stored_frames,
+        most_headers=SAMPLED_FRAMES,
+    )
+    return inputs.plausibility
+
+
+def facts_of(inputs: FlightInputs) -> dict[str, str]:
+    """Return what there is and what follows from it, in words, by its heading."""
+    facts = {
+        "frames": _frames_text(inputs),
+        "camera": _camera_text(inputs.flight.camera),
+        "targets": _targets_text(inputs.flight),
+        "times": _times_text(inputs),
+        "trajectory": _trajectory_text(inputs),
+        "overlap": _overlap_text(inputs),
+        "place": _place_text(inputs),
+        "lever arm": _lever_arm_text(inputs),
+        "heading": _heading_text(inputs),
+        "reference": _reference_text(inputs),
+        "expected": _expected_text(inputs),
+    }
+    return {heading: text for heading, text in facts.items() if text}
+
+
+def _frames_text(inputs: FlightInputs) -> str:
+    sizes = sorted({header.size_px for header in inputs.headers if header.size_px is not None})
+    cameras = sorted({header.camera for header in inputs.headers if header.camera})
+    text = f"{len(inputs.frames)} in {inputs.flight.frames_folder.name}/"
+    if sizes:
+        text += ", " + " and ".join(f"{width} x {height} px" for width, height in sizes[:4])
+    if cameras:
+        text += f", by {', '.join(cameras[:3])}"
+    return text
+
+
+def _camera_text(camera: Camera) -> str:
+    angles = [
+        np.degrees(2.0 * np.arctan(0.5 * size / focal))
+        for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
+    ]
+    shift = camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1)
+    shutter = f", {1000.0 * camera.readout_s:g} ms rolling shutter" if camera.readout_s else ""
+    return (
+        f"{camera.width} x {camera.height} px, fx {camera.fx:g} px ({angles[0]:.0f}° x"
+        f" {angles[1]:.0f}°), principal point {_signed(shift[0])}, {_signed(shift[1])} px from the"
+        f" centre{shutter}"
+    )
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.0f}".replace("-", "−")
+
+
+def _targets_text(flight: Flight) -> str:
+    parts = []
+    for target in flight.targets:
+        ring = target.ring
+        dots = " ".join(f"{angle:g}" for angle in ring.code_deg)
+        inside = f", {len(target.replicas)} inside" if target.replicas else ""
+        where = "static" if target.position_m is not None else "on the vehicle"
+        if flight.vehicle is None and target.position_m is None:
+            where = "not placed"
+        parts.append(f"{target.name} {ring.outer_diameter_m:g} m, dots {dots}°{inside} ({where})")
+    return "; ".join(parts)
+
+
+def _times_text(inputs: FlightInputs) -> str:
+    names, times_s = timed_frames(inputs)
+    file = inputs.flight.times_file
+    source = "EXIF" if file is None else file.name
+    text = f"{len(names)} of {len(inputs.frames)} frames, from {source}"
+    return text if not names else f"{text}: {time_span(times_s)} UTC"
+
+
+def _trajectory_text(inputs: FlightInputs) -> str:
+    trajectory, positions = inputs.trajectory, inputs.target_positions
+    if trajectory is None:
+        return ""
+    interval = float(np.median(np.diff(trajectory.time_s)))
+    span = time_span(trajectory.time_s)
+    text = f"{len(trajectory.time_s)} epochs, {1.0 / interval:.3g} Hz, {span} UTC"
+    if positions is not None and positions.vehicle is not None:
+        steps = np.linalg.norm(np.diff(positions.vehicle.motion.position_m, axis=0), axis=1)
+        way = float(steps.sum())
+        text += f", {way:.0f} m" if way < 10_000.0 else f", {way / 1000.0:.0f} km"
+    return text + _sds_text(trajectory.sd_position_m)
+
+
+def _sds_text(sd_position_m: FloatArray | None) -> str:
+    if sd_position_m is None:
+        return ", no standard deviations"
+    values = 100.0 * np.median(sd_position_m, axis=0)
+    return ", σ " + "/".join(f"{value:.2g}" for value in values.tolist()) + " cm"
+
+
+def _overlap_text(inputs: FlightInputs) -> str:
+    positions = inputs.target_positions
+    names, times_s = timed_frames(inputs)
+    if positions is None or positions.vehicle is None or not names:
+        return ""
+    coverage = positions.vehicle.coverage(times_s)
+    inside = sum(kind.value == "inside" for kind in coverage)
+    return f"{inside} of {len(names)} frames with a time lie within the trajectory"
+
+
+def _place_text(inputs: FlightInputs) -> str:
+    positions, crs = inputs.target_positions, inputs.flight.crs
+    if positions is None or crs is None:
+        return ""
+    longitude, latitude, height = positions.local_frame.geodetic_deg(np.zeros((1, 3)))[0].tolist()
+    return f"{place_text(crs, longitude, latitude)}; {height:.0f} m above the ellipsoid"
+
+
+def _lever_arm_text(inputs: FlightInputs) -> str:
+    vehicle = inputs.flight.vehicle
+    if vehicle is None:
+        return ""
+    return f"target seen from the trajectory point: {lever_arm_text(vehicle.settings)}"
+
+
+def _heading_text(inputs: FlightInputs) -> str:
+    if inputs.target_positions is None or inputs.target_positions.vehicle is None:
+        return ""
+    if inputs.course is None:
+        return "the vehicle hardly moves: headings cannot be compared with its course"
+    return f"{inputs.course.median_off_deg:.1f}° from the course while driving (median)"
+
+
+def _reference_text(inputs: FlightInputs) -> str:
+    poses = inputs.reference_poses
+    if poses is None:
+        return ""
+    count = len(set(poses.frames) & set(inputs.frames))
+    return f"{count} of {len(inputs.frames)} frames have a pose{_sds_text(poses.sd_position_m)}"
+
+
+def _expected_text(inputs: FlightInputs) -> str:
+    """Return distances and radii: by the reference, or at a typical distance."""
+    camera = inputs.flight.camera
+    states = _expected_states(inputs)
+    target = inputs.flight.targets[0]
+    scale = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
+    if states is None:
+        least = DetectSettings().min_radius_px
+        return (
+            f"{target.name} has a radius of {scale / _TYPICAL_M:.0f} px at {_TYPICAL_M:g} m;"
+            f" it is found to some {scale / least:.0f} m ({least:g} px)"
+        )
+    margin = np.exp(states[:, 2])[:, None]
+    size = np.array([camera.width, camera.height])
+    inside = np.all((states[:, :2] >= margin) & (states[:, :2] <= size - 1 - margin), axis=1)
+    if not inside.any():
+        return f"{target.name} is in no frame, by the reference poses"
+    radii = np.exp(states[inside, 2])
+    return (
+        f"{target.name} in {int(inside.sum())} frames, {scale / radii.max():.1f} …"
+        f" {scale / radii.min():.1f} m away, radius {radii.max():.0f} … {radii.min():.0f} px"
+    )
+
+
+def _expected_states(inputs: FlightInputs) -> FloatArray | None:
+    """Return the states (n, 3) that reference poses give the first target; None: not known."""
+    positions, poses = inputs.target_positions, inputs.reference_poses
+    if positions is None or poses is None:
+        return None
+    try:
+        states = reference_states(
+            inputs.frames,
+            [inputs.times_s.get(frame) for frame in inputs.frames],
+            inputs.flight.targets[0],
+            poses,
+            positions,
+            inputs.flight.camera,
+        )
+    except KgcpError:  # no time, or outside the trajectory: that is a doubt
+        return None
+    with np.errstate(invalid="ignore"):
+        return states[np.isfinite(states).all(axis=1)]

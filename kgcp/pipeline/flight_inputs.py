@@ -1,0 +1,280 @@
+"""Everything that a flight's folder says before anything is measured, and the doubts about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.georef.crs import longitude_latitude
+from kgcp.georef.target_positions import TargetPositions
+from kgcp.georef.trajectory import Trajectory
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import read_times
+from kgcp.io.images.exif import read_frame_header
+from kgcp.io.images.remote import StoredFolder, at_hand
+from kgcp.quality.checks.calibration import check_camera
+from kgcp.quality.checks.camera_position import check_camera_position
+from kgcp.quality.checks.clock import check_exif_times, check_overlap
+from kgcp.quality.checks.course import Course, check_attitude, course_of
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
+from kgcp.quality.checks.frame_header import FrameHeader, check_frames
+from kgcp.quality.checks.lever_arm import check_lever_arm
+from kgcp.quality.checks.place import check_place
+from kgcp.quality.checks.plate import check_targets
+from kgcp.quality.checks.reference import check_reference
+
+SAMPLED_FRAMES = 100
+"""Headers that are read where a command has other work to do."""
+
+_STORED_FRAMES = 5
+_PLACES = 1000  # of a trajectory that are compared with the frames' own
+
+_OF_PLACES = frozenset({Cause.AXES_SWAPPED, Cause.ANGLE_UNIT, Cause.CRS})
+_CAUSES_OF_ERRORS = _OF_PLACES | {Cause.CLOCK, Cause.NO_OVERLAP, Cause.CAMERA_POSITION}
+
+_Input = TypeVar("_Input")
+
+
+@contextmanager
+def naming_causes(doubts: Sequence[Doubt]) -> Iterator[None]:
+    """Let an error about places or times in the block say what caused it, if a grave doubt does.
+
+    Raises
+    ------
+    KgcpError
+        That of the block, or the doubt in its place.
+    """
+    try:
+        yield
+    except KgcpError as error:
+        causes = [doubt for doubt in doubts if doubt.is_grave and doubt.code in _CAUSES_OF_ERRORS]
+        if not causes:
+            raise
+        raise KgcpError(causes[0]) from error
+
+
+@dataclass(frozen=True)
+class FlightInputs:
+    """The records of a flight, each read when it is first needed, or why it cannot be.
+
+    Attributes
+    ----------
+    frames : tuple of str
+        All of them, sorted.
+    headers : tuple of FrameHeader
+        Of all frames, or of some, evenly spaced.
+    """
+
+    flight: Flight
+    data: FlightData
+    frames: tuple[str, ...]
+    headers: tuple[FrameHeader, ...]
+
+    @classmethod
+    def of(
+        cls,
+        flight: Flight,
+        frames: Sequence[str],
+        folder: StoredFolder | None = None,
+        *,
+        most_headers: int | None = None,
+        data: FlightData | None = None,
+    ) -> FlightInputs:
+        """Read the headers of a flight's frames.
+
+        Parameters
+        ----------
+        folder : StoredFolder, optional
+            Where the frames are, if not in the flight's folder.
+        most_headers : int, optional
+            How many headers to read; by default all.
+        data : FlightData, optional
+            If it is at hand already.
+        """
+        return cls(
+            flight,
+            data or FlightData(flight, frames),
+            tuple(frames),
+            read_headers(flight, frames, folder, most_headers),
+        )
+
+    @cached_property
+    def problems(self) -> list[Doubt]:
+        """What could not be read, as far as it was tried."""
+        return []
+
+    @cached_property
+    def times_s(self) -> Mapping[str, float]:
+        """Times of frames [s], by the times file; without one those of the headers."""
+        flight = self.flight
+        if flight.times_file is None:
+            return {
+                header.frame: header.time_s for header in self.headers if header.time_s is not None
+            }
+        file, frames = flight.times_file, set(self.frames)
+        times = self._read(lambda: read_times(file, self.frames, flight.times_format)) or {}
+        return {frame: time_s for frame, time_s in times.items() if frame in frames}
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """The vehicle's trajectory; None: there is none, or it cannot be read."""
+        if not self.data.has_trajectory:
+            return None
+        return self._read(lambda: self.data.trajectory)
+
+    @cached_property
+    def target_positions(self) -> TargetPositions | None:
+        """Where the targets were; None: not known."""
+        is_placed = any(map(self.data.has_position_of, self.flight.targets))
+        if not is_placed or (self.data.has_trajectory and self.trajectory is None):
+            return None
+        return self._read(lambda: self.data.target_positions)
+
+    @cached_property
+    def reference_poses(self) -> ReferencePoses | None:
+        """Reference poses; None: there are none, or they cannot be read."""
+        if not self.data.has_reference:
+            return None
+        return self._read(lambda: self.data.reference_poses)
+
+    @cached_property
+    def course(self) -> Course | None:
+        """The vehicle's course; None: it is not known, or the vehicle stands."""
+        positions, trajectory = self.target_positions, self.trajectory
+        if positions is None or positions.vehicle is None or trajectory is None:
+            return None
+        return course_of(positions.vehicle, trajectory.attitude_deg)
+
+    @cached_property
+    def plausibility(self) -> tuple[Doubt, ...]:
+        """What does not fit, grave doubts first; without what cannot be read."""
+        flight = self.flight
+        found = [
+            *check_camera(flight.camera),
+            *check_targets(flight.targets),
+            *check_frames(self.headers, flight.camera),
+            *self._doubts_of_places(),
+            *self._doubts_of_times(),
+        ]
+        if flight.vehicle is not None:
+            found += check_lever_arm(flight.vehicle.settings)
+        if self.target_positions is not None:
+            found += check_attitude(self.course)
+            if self.reference_poses is not None:
+                found += check_reference(self.reference_poses, self.target_positions)
+        return ranked(found)
+
+    def doubts(self) -> tuple[Doubt, ...]:
+        """Return what does not fit or cannot be read, grave doubts first."""
+        found = self.plausibility
+        if any(doubt.code in _OF_PLACES for doubt in found):
+            return found  # what cannot be read then is the consequence
+        return ranked((*self.problems, *found))
+
+    def _doubts_of_places(self) -> list[Doubt]:
+        crs = self.flight.crs
+        if crs is None:
+            return []
+        places = []
+        if self.trajectory is not None:
+            places.append((self.trajectory.position_map, "the trajectory"))
+        places += [
+            (np.array([target.position_m]), f"the static target {target.name!r}")
+            for target in self.flight.targets
+            if target.position_m is not None
+        ]
+        if self.reference_poses is not None and len(self.reference_poses.frames):
+            places.append((self.reference_poses.position_map, "the reference poses"))
+        found = self._read(lambda: self._doubts_of_areas(crs, places)) or []
+        if places and not found and not self.problems:
+            position, where = places[0]
+            few = position[:: max(1, len(position) // _PLACES), :2]
+            ground = longitude_latitude(crs, few)
+            ground = ground[np.isfinite(ground).all(axis=1)]
+            found += check_camera_position(self.headers, crs, ground, where)
+        return found
+
+    @staticmethod
+    def _doubts_of_areas(crs: str, places: Sequence[tuple[FloatArray, str]]) -> list[Doubt]:
+        return [doubt for position, where in places for doubt in check_place(crs, position, where)]
+
+    def _doubts_of_times(self) -> list[Doubt]:
+        times = self.times_s
+        found: list[Doubt] = []
+        if self.trajectory is not None and self.flight.vehicle is not None:
+            offset_s = self.flight.vehicle.settings.time_offset_s
+            frame_s = np.array([times[frame] for frame in sorted(times)])
+            found += check_overlap(frame_s, self.trajectory.time_s, offset_s)
+        if self.flight.times_file is not None:
+            both = [
+                (times[header.frame], header.time_s)
+                for header in self.headers
+                if header.time_s is not None and header.frame in times
+            ]
+            found += check_exif_times(*zip(*both, strict=True)) if both else ()
+        return found
+
+    def _read(self, read: Callable[[], _Input]) -> _Input | None:
+        try:
+            return read()
+        except KgcpError as error:
+            sentence, _, remedy = str(error).rpartition("; ")
+            doubt = grave(Cause.UNREADABLE, sentence or remedy, remedy if sentence else "")
+            if doubt.sentence not in {problem.sentence for problem in self.problems}:
+                self.problems.append(doubt)
+            return None
+
+
+def missing_files(flight: Flight) -> tuple[Doubt, ...]:
+    """Return the files that flight.toml names and that do not exist yet."""
+    named = []
+    if flight.vehicle is not None:
+        named.append((flight.vehicle.trajectory_file, "[vehicle] trajectory", "export-gcp"))
+    if flight.reference is not None:
+        named.append((flight.reference.file, "[reference] poses", "bias-report"))
+    return tuple(
+        mild(
+            Cause.UNREADABLE,
+            f"{file}: does not exist; {key} names it and 'kgcp {command}' needs it",
+            "put it there or correct flight.toml",
+        )
+        for file, key, command in named
+        if not file.exists()
+    )
+
+
+def read_headers(
+    flight: Flight,
+    frames: Sequence[str],
+    folder: StoredFolder | None = None,
+    most: int | None = None,
+) -> tuple[FrameHeader, ...]:
+    """Read the headers of frames, of at most so many, evenly spaced.
+
+    Objects of a store are read as a whole, so that only a few of them are.
+    """
+    if folder is not None:
+        most = min(most or _STORED_FRAMES, _STORED_FRAMES)
+    chosen = frames
+    if most is not None and most < len(frames):
+        chosen = [frames[row] for row in np.linspace(0, len(frames) - 1, most).astype(int).tolist()]
+    headers = []
+    for frame in chosen:
+        with at_hand(folder or flight.frames_folder, frame) as path:
+            headers.append(read_frame_header(path, frame))
+    return tuple(headers)
+
+
+def timed_frames(inputs: FlightInputs) -> tuple[list[str], FloatArray]:
+    """Return the frames that have a time, in their order, and their times (n,) [s]."""
+    names = [frame for frame in inputs.frames if frame in inputs.times_s]
+    return names, np.array([inputs.times_s[frame] for frame in names])

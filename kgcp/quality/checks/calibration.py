@@ -1,0 +1,90 @@
+"""Whether a camera's numbers can be those of a frame camera, in pixels."""
+
+from __future__ import annotations
+
+from kgcp.geometry.camera import Camera
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+
+_WIDEST = 0.2  # fx over the width: 136 degrees, beyond lenses of this distortion model
+_LONGEST = 30.0  # a lens of 1000 mm on small format
+_MIDDLE = 1.0 / 3.0, 2.0 / 3.0
+_SQUARE = 0.9  # no sensor has pixels less square
+_SIZE_TOLERANCE = 0.12  # how far off the centre a principal point may be, in frame sizes
+
+
+def check_camera(camera: Camera) -> tuple[Doubt, ...]:
+    """Tell focal lengths in millimetres, and principal points of other frames."""
+    return (*_check_focal_length(camera), *_check_principal_point(camera))
+
+
+def _check_focal_length(camera: Camera) -> tuple[Doubt, ...]:
+    share = min(camera.fx, camera.fy) / max(camera.width, camera.height)
+    figures = {"fx_px": camera.fx, "fy_px": camera.fy}
+    if share < _WIDEST:
+        return (
+            grave(
+                Cause.FOCAL_LENGTH,
+                f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too short for frames of"
+                f" {camera.width} px: is this in millimetres?",
+                "divide the focal length in mm by the size of a pixel in mm",
+                figures,
+            ),
+        )
+    if max(camera.fx, camera.fy) / min(camera.width, camera.height) > _LONGEST:
+        return (
+            grave(
+                Cause.FOCAL_LENGTH,
+                f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too long for frames of"
+                f" {camera.width} px: is this in micrometres?",
+                "give the focal length in pixels",
+                figures,
+            ),
+        )
+    if min(camera.fx, camera.fy) < _SQUARE * max(camera.fx, camera.fy):
+        return (
+            mild(
+                Cause.FOCAL_LENGTH,
+                f"fx = {camera.fx:g} and fy = {camera.fy:g} px differ as those of no sensor with"
+                " square pixels",
+                "look both up in the calibration",
+                figures,
+            ),
+        )
+    return ()
+
+
+def _check_principal_point(camera: Camera) -> tuple[Doubt, ...]:
+    low, high = _MIDDLE
+    x, y = camera.cx / camera.width, camera.cy / camera.height
+    if low <= x <= high and low <= y <= high:
+        return ()
+    figures = {"cx_px": camera.cx, "cy_px": camera.cy}
+    sentence = (
+        f"the principal point ({camera.cx:g}, {camera.cy:g}) px is not in the middle third of a"
+        f" frame of {camera.width} x {camera.height} px"
+    )
+    for scale, word in ((2.0, "double"), (0.5, "half"), (4.0, "four times the"), (0.25, "quarter")):
+        if max(abs(x / scale - 0.5), abs(y / scale - 0.5)) < _SIZE_TOLERANCE:
+            return (
+                grave(
+                    Cause.CALIBRATION_SIZE,
+                    f"{sentence}, but in the middle of one of {word} size",
+                    "give the calibration of frames of this size, or scale fx, fy, cx, cy by"
+                    f" {1.0 / scale:g}",
+                    {**figures, "scale": scale},
+                ),
+            )
+    is_exchanged = all(
+        abs(value - 0.5) < _SIZE_TOLERANCE
+        for value in (camera.cy / camera.width, camera.cx / camera.height)
+    )
+    if is_exchanged:
+        remedy = "exchange cx and cy, or width and height, in [camera]"
+    elif max(abs(camera.cx), abs(camera.cy)) < 0.05 * camera.width:
+        remedy = (
+            "give it in pixels from the centre of the top-left pixel; offsets from the frame's"
+            " centre in mm are divided by the size of a pixel and added to half the frame's size"
+        )
+    else:
+        remedy = "look cx and cy up in the calibration, in pixels from the top-left pixel"
+    return (grave(Cause.PRINCIPAL_POINT, sentence, remedy, figures),)

@@ -1,0 +1,191 @@
+"""Frames against trajectory and EXIF in time: the errors that clocks make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+
+_WEEK_S = 604_800.0
+_ROLLOVER_S = 1024 * _WEEK_S
+_HOUR_S, _DAY_S = 3600.0, 86_400.0
+GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0
+_LEAP_TOLERANCE_S = 1.2  # EXIF has whole seconds
+_HOUR_TOLERANCE_S = 60.0
+_STEADY_S = 2.0
+_MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
+_UNIX_1990_S = 631_152_000.0
+
+
+def clock_shifts_s() -> list[tuple[float, str]]:
+    """Return what clocks differ by, the likelier first, as seconds and in words.
+
+    A shift is what is to be added to frame times.
+    """
+    shifts = []
+    for sign in (-1.0, 1.0):
+        ahead = "the frames'" if sign < 0.0 else "the trajectory's"
+        shifts.append((sign * GPS_MINUS_UTC_S, f"{ahead} times seem to be GPS time, not UTC"))
+        shifts.append((sign * TAI_MINUS_UTC_S, f"{ahead} times seem to be TAI, not UTC"))
+        shifts.append(
+            (sign * (TAI_MINUS_UTC_S - GPS_MINUS_UTC_S), f"{ahead} times seem to be TAI, not GPS")
+        )
+    quarters = [*range(4, 57, 4), 22, 14, 18, 23, 26, 38, 42, 46, 51]  # zones of ½ and ¾ hours, too
+    for quarter in quarters:
+        shifts += [
+            (sign * quarter * 0.25 * _HOUR_S, "one of them seems to be local time")
+            for sign in (-1.0, 1.0)
+        ]
+    shifts += [(sign * _DAY_S, "they are of another day") for sign in (-1.0, 1.0)]
+    shifts += [
+        (sign * (hours * _HOUR_S + leap), "one of them seems to be local time, and of GPS")
+        for hours in range(1, 15)
+        for leap in (GPS_MINUS_UTC_S, -GPS_MINUS_UTC_S)
+        for sign in (-1.0, 1.0)
+    ]
+    shifts += [(sign * _WEEK_S, "they are of another GPS week") for sign in (-1.0, 1.0)]
+    shifts += [
+        (sign * rollovers * _ROLLOVER_S, "GPS weeks are counted modulo 1024 in one of them")
+        for rollovers in (1, 2)
+        for sign in (-1.0, 1.0)
+    ]
+    return shifts
+
+
+def check_overlap(
+    frame_s: FloatArray, trajectory_s: FloatArray, time_offset_s: float
+) -> tuple[Doubt, ...]:
+    """Tell frames (n,) outside of a trajectory (m,) in time; try what would bring them inside.
+
+    Both in Unix UTC [s]; `time_offset_s` is that of flight.toml.
+    """
+    if not len(frame_s):
+        return ()
+    first, last = float(trajectory_s[0]), float(trajectory_s[-1])
+    times = frame_s + time_offset_s
+    outside = float(np.mean((times < first) | (times > last)))
+    if outside <= _MOST_OUTSIDE:
+        return ()
+    count = round(outside * len(times))
+    figures = {"frames_outside": float(count), "frames": float(len(times))}
+    offset = f", time_offset_s = {time_offset_s:g}" if time_offset_s else ""
+    sentence = (
+        f"{count} of {len(times)} frames with a time lie outside the trajectory (frames"
+        f" {time_span(frame_s)}{offset}; trajectory {time_span(trajectory_s)})"
+    )
+    for shift_s, words in clock_shifts_s():
+        if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
+            return (
+                grave(
+                    Cause.CLOCK,
+                    f"{sentence}: {words}; {_shifted(shift_s)} all would lie inside",
+                    "give [vehicle] time_system, correct the times file, or set [vehicle]"
+                    f" time_offset_s = {time_offset_s + shift_s:g}",
+                    {**figures, "shift_s": shift_s},
+                ),
+            )
+    days = _whole_days(times, first, last)
+    if days is not None:
+        is_week = days % 7 == 0
+        words = f"{abs(days)} days" + (f", {abs(days) // 7} GPS weeks," if is_week else "")
+        return (
+            grave(
+                Cause.CLOCK,
+                f"{sentence}: they are {words} apart",
+                "check the date and GPS week of both files: [vehicle] date names the first day of"
+                " a trajectory in seconds of the week",
+                {**figures, "shift_s": days * _DAY_S},
+            ),
+        )
+    if outside < 0.5:
+        return (
+            mild(
+                Cause.NO_OVERLAP,
+                sentence,
+                "give the whole trajectory if those frames show the target",
+                figures,
+            ),
+        )
+    return (
+        grave(
+            Cause.NO_OVERLAP,
+            sentence,
+            "give the trajectory of this flight, or correct [vehicle] time_offset_s and"
+            " time_system",
+            figures,
+        ),
+    )
+
+
+def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> tuple[Doubt, ...]:
+    """Compare the times of frames with those that their EXIF has, both Unix UTC [s], in pairs.
+
+    A camera's clock is often set by hand and drifts. Only a steady difference of leap seconds,
+    hours or weeks tells something.
+    """
+    if len(times_s) < 3:
+        return ()
+    difference = np.asarray(times_s) - np.asarray(exif_s)
+    middle = float(np.median(difference))
+    spread = float(np.median(np.abs(difference - middle)))
+    if spread > _STEADY_S:
+        return (
+            mild(
+                Cause.FRAME_ORDER,
+                f"the frames' times and those of their EXIF differ by {difference.min():.1f} …"
+                f" {difference.max():.1f} s: the times may belong to other frames",
+                "check that every line of the times file has the time of the frame it names",
+                {"spread_s": spread},
+            ),
+        )
+    likely = [
+        words
+        for shift_s, words in clock_shifts_s()
+        if abs(middle + shift_s)
+        < (_LEAP_TOLERANCE_S if abs(shift_s) < _HOUR_TOLERANCE_S else _HOUR_TOLERANCE_S)
+    ]
+    if not likely:
+        return ()
+    words = likely[0].replace("the trajectory's times seem", "EXIF times seem")
+    words = words.replace("the frames' times seem", "those of the times file seem")
+    return (
+        mild(
+            Cause.CLOCK,
+            f"the frames' times are {_seconds(abs(middle))} {'after' if middle > 0 else 'before'}"
+            f" those of their EXIF: {words}",
+            "check which clock is right; correct the times file, or set [vehicle] time_offset_s",
+            {"difference_s": middle},
+        ),
+    )
+
+
+def _whole_days(times: FloatArray, first: float, last: float) -> int | None:
+    """Return the whole days (of any number) that bring all times inside, if any do."""
+    days = round((0.5 * (first + last) - float(np.median(times))) / _DAY_S)
+    if not days:
+        return None
+    moved = times + days * _DAY_S
+    return days if np.mean((moved >= first) & (moved <= last)) > 1.0 - 0.02 else None
+
+
+def _shifted(shift_s: float) -> str:
+    return f"{_seconds(abs(shift_s))} {'later' if shift_s > 0.0 else 'earlier'}"
+
+
+def time_span(times_s: FloatArray) -> str:
+    """Return the first and the last of some times, Unix UTC [s], in words."""
+    first, last = (datetime.fromtimestamp(float(t), UTC) for t in (times_s.min(), times_s.max()))
+    end = last.strftime("%H:%M:%S" if last.date() == first.date() else "%Y-%m-%d %H:%M:%S")
+    return f"{first:%Y-%m-%d %H:%M:%S} to {end}"
+
+
+def _seconds(seconds: float) -> str:
+    """Return a time span in the unit that suits it."""
+    for unit_s, unit in ((_DAY_S, "days"), (_HOUR_S, "h")):
+        if seconds >= unit_s:
+            return f"{seconds / unit_s:.6g} {unit}"
+    return f"{seconds:.4g} s"

@@ -1,0 +1,123 @@
+"""What does not fit in a flight, with its likely cause and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Self
+
+from kgcp.errors import one_line
+
+
+class Severity(StrEnum):
+    """How sure a doubt is that the results are wrong."""
+
+    GRAVE = "grave"
+    DOUBT = "doubt"
+
+    @property
+    def words(self) -> str:
+        """As it is printed in front of a sentence."""
+        return "doubt" if self is Severity.DOUBT else "grave doubt"
+
+
+class Cause(StrEnum):
+    """What may be wrong with a flight: the `code` of a doubt, and a sentence for the documents."""
+
+    description: str
+
+    def __new__(cls, word: str, description: str) -> Self:
+        """Make a member whose value is the word alone."""
+        member = str.__new__(cls, word)
+        member._value_ = word
+        member.description = description
+        return member
+
+    UNREADABLE = "unreadable", "a file is missing, or cannot be used as it is"
+    FRAME_SIZE = "frame_size", "the frames have another size than the camera, or several sizes"
+    TWO_CAMERAS = "two_cameras", "the frames are of several cameras or focal lengths"
+    FOCAL_LENGTH = "focal_length", "fx and fy are in millimetres, or do not belong to the frames"
+    PRINCIPAL_POINT = (
+        "principal_point",
+        "cx and cy are not near the frame's centre: in millimetres, or exchanged",
+    )
+    CALIBRATION_SIZE = (
+        "calibration_size",
+        "the calibration is of frames of half, double or another size",
+    )
+    DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
+    DIAMETERS = (
+        "diameters",
+        "diameters are radii, or in millimetres, inches or feet",
+    )
+    DISTANCE_SCALE = (
+        "distance_scale",
+        "all distances are wrong by one factor: focal length or diameters",
+    )
+    AXES_SWAPPED = "axes_swapped", "x and y, or longitude and latitude, are exchanged"
+    ANGLE_UNIT = "angle_unit", "angles or geographic coordinates are in radians or gon"
+    CRS = "crs", "the coordinates are not in the CRS that is named"
+    HEADING = "heading", "headings do not follow the course: another zero or sense of rotation"
+    ATTITUDE = "attitude", "roll or pitch are not those of a vehicle on a road"
+    LEVER_ARM = "lever_arm", "an axis of the lever arm has the wrong sign, place or unit"
+    MOUNT = "mount_deg", "the plate is mounted in another direction than mount_deg says"
+    HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"
+    CLOCK = "clock", "times are of another clock: leap seconds, hours, days or GPS weeks"
+    NO_OVERLAP = "no_overlap", "frames and trajectory are not of the same time"
+    FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
+    REFERENCE = "reference", "reference poses are of another place, or turned"
+    CAMERA_POSITION = (
+        "camera_position",
+        "the frames' own GPS position or altitude is not near the vehicle",
+    )
+    UNEXPLAINED = "unexplained", "vehicle and camera disagree, and no single cause explains it"
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """One thing that does not fit.
+
+    Attributes
+    ----------
+    sentence : str
+        What does not fit, with figures.
+    remedy : str
+        What to do, beginning with a verb.
+    figures : mapping of str to float
+        The numbers behind it, with their units in their names.
+    """
+
+    code: Cause
+    severity: Severity
+    sentence: str
+    remedy: str
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_grave(self) -> bool:
+        """Whether the results are worthless if it is right."""
+        return self.severity is Severity.GRAVE
+
+    def __str__(self) -> str:
+        return one_line("; ".join(filter(None, (self.sentence, self.remedy))))
+
+
+def grave(
+    code: Cause, sentence: str, remedy: str, figures: Mapping[str, float] | None = None
+) -> Doubt:
+    """Return a doubt that makes the results worthless if it is right."""
+    return Doubt(code, Severity.GRAVE, sentence, remedy, figures or {})
+
+
+def mild(
+    code: Cause, sentence: str, remedy: str, figures: Mapping[str, float] | None = None
+) -> Doubt:
+    """Return a doubt that may have an innocent explanation."""
+    return Doubt(code, Severity.DOUBT, sentence, remedy, figures or {})
+
+
+def ranked(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
+    """Return doubts with the grave ones first, else in their order, and each only once."""
+    once = {(doubt.code, doubt.sentence): doubt for doubt in doubts}
+    return tuple(sorted(once.values(), key=lambda doubt: not doubt.is_grave))

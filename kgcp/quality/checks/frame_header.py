@@ -1,0 +1,146 @@
+"""Frames against the camera, by what their headers say: size, maker, focal length."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.camera import Camera
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+
+_SMALL_FRAME_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal that equivalents refer to
+_FOCAL_TOLERANCE = 1.25  # equivalents are rounded, by width or diagonal, and of cropped video, too
+_SIZE_TOLERANCE = 1.1
+
+
+@dataclass(frozen=True, slots=True)
+class FrameHeader:
+    """What the header of one frame says; None where it says nothing.
+
+    Attributes
+    ----------
+    frame : str
+        Path relative to the frames folder.
+    size_px : tuple of int or None
+        Width and height.
+    camera : str
+        Maker, model and serial number; empty: not known.
+    focal_mm, focal_35_mm : float or None
+        Focal length, and the one of a small-format camera with the same angle of view.
+    time_s : float or None
+        Unix UTC, as far as the header names its time zone [s].
+    longitude_deg, latitude_deg : float or None
+        Of the camera, WGS 84.
+    altitude_m : float or None
+        Above the take-off point.
+    """
+
+    frame: str
+    size_px: tuple[int, int] | None = None
+    camera: str = ""
+    focal_mm: float | None = None
+    focal_35_mm: float | None = None
+    time_s: float | None = None
+    longitude_deg: float | None = None
+    latitude_deg: float | None = None
+    altitude_m: float | None = None
+
+
+def check_frames(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+    """Compare sizes, makers and focal lengths of the frames with each other and the camera."""
+    return (
+        *_check_sizes(headers, camera),
+        *_check_cameras(headers),
+        *_check_focal_length(headers, camera),
+    )
+
+
+def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+    sizes = Counter(header.size_px for header in headers if header.size_px is not None)
+    wrong = sizes.total() - sizes[camera.width, camera.height]
+    if not wrong:
+        return ()
+    (width, height), _ = next(
+        item for item in sizes.most_common() if item[0] != (camera.width, camera.height)
+    )
+    name = next(header.frame for header in headers if header.size_px == (width, height))
+    sentence = (
+        f"{wrong} of {sizes.total()} frames are not {camera.width} x {camera.height} px as the"
+        f" camera: {name} is {width} x {height} px"
+    )
+    figures = {"frames": float(wrong), "width_px": float(width), "height_px": float(height)}
+    if (width, height) == (camera.height, camera.width):
+        remedy = (
+            "exchange width and height in [camera] if the calibration is of upright frames;"
+            " do not turn frames: kgcp reads them as the sensor did"
+        )
+    elif abs(width / camera.width - height / camera.height) < 0.01 * width / camera.width:
+        remedy = (
+            f"give the calibration of frames of this size: this one is {camera.width / width:.4g}"
+            " times as large"
+        )
+    else:
+        remedy = "give the calibration of these frames, or take frames of other cameras out"
+    doubt = grave if 10 * wrong > sizes.total() else mild
+    return (doubt(Cause.FRAME_SIZE, sentence, remedy, figures),)
+
+
+def _check_cameras(headers: Sequence[FrameHeader]) -> tuple[Doubt, ...]:
+    cameras = Counter(
+        (header.camera, header.focal_mm)
+        for header in headers
+        if header.camera or header.focal_mm is not None
+    )
+    if len(cameras) < 2:
+        return ()
+    (first, _), (second, count) = cameras.most_common(2)
+    name = next(header.frame for header in headers if (header.camera, header.focal_mm) == second)
+    return (
+        grave(
+            Cause.TWO_CAMERAS,
+            f"the frames are of {len(cameras)} cameras or focal lengths: most of {_named(first)},"
+            f" but {count} of {_named(second)}, such as {name}",
+            "make a flight folder of its own for each camera and zoom",
+            {"cameras": float(len(cameras)), "frames": float(count)},
+        ),
+    )
+
+
+def _named(camera: tuple[str, float | None]) -> str:
+    name, focal_mm = camera
+    return f"{name or 'an unnamed camera'}{'' if focal_mm is None else f' with {focal_mm:g} mm'}"
+
+
+def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+    known = [header.focal_35_mm for header in headers if header.focal_35_mm is not None]
+    if not known:
+        return ()
+    focal_35_mm = float(np.median(known))
+    sizes = max(camera.width, camera.height), math.hypot(camera.width, camera.height)
+    expected = [
+        focal_35_mm / film * pixels for film, pixels in zip(_SMALL_FRAME_MM, sizes, strict=True)
+    ]
+    ratio = camera.mean_focal_px / math.sqrt(expected[0] * expected[1])
+    if 1.0 / _FOCAL_TOLERANCE < ratio < _FOCAL_TOLERANCE:
+        return ()
+    figures = {"exif_focal_35_mm": focal_35_mm, "expected_fx_px": expected[0], "ratio": ratio}
+    sentence = (
+        f"the frames' EXIF has a focal length of {focal_35_mm:g} mm (35 mm equivalent), that is fx"
+        f" = {expected[0]:.0f} px, but the camera has {camera.fx:.6g}"
+    )
+    for factor, word in ((2.0, "double"), (0.5, "half")):
+        if 1.0 / _SIZE_TOLERANCE < ratio / factor < _SIZE_TOLERANCE:
+            return (
+                grave(
+                    Cause.CALIBRATION_SIZE,
+                    f"{sentence}, {factor:g} times as much",
+                    f"give the calibration of frames of {camera.width} x {camera.height} px: this"
+                    f" one seems to be of {word} size",
+                    figures,
+                ),
+            )
+    return (grave(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures),)

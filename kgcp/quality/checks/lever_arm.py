@@ -1,0 +1,53 @@
+"""Whether a lever arm can lead from a vehicle's trajectory point to a plate on its roof."""
+
+from __future__ import annotations
+
+import math
+
+from kgcp.quality.checks.doubt import Cause, Doubt, mild
+from kgcp.settings import VehicleSettings
+
+_DEEPEST_M = 1.0  # below the trajectory point: an antenna on a mast beside the plate
+_LONGEST_M = 10.0
+
+
+def check_lever_arm(settings: VehicleSettings) -> tuple[Doubt, ...]:
+    """Tell a target below the vehicle, or beyond its length."""
+    forward, right, down = settings.lever_arm_m
+    figures = {"forward_m": forward, "right_m": right, "down_m": down}
+    if math.hypot(forward, right, down) > _LONGEST_M:
+        return (
+            mild(
+                Cause.LEVER_ARM,
+                f"the lever arm is {math.hypot(forward, right, down):.1f} m long",
+                "give it in metres, as forward, right, down",
+                figures,
+            ),
+        )
+    if down > _DEEPEST_M:
+        return (
+            mild(
+                Cause.LEVER_ARM,
+                f"the lever arm puts the target {down:.2f} m below the trajectory point",
+                f"if the plate lies higher, give lever_arm_m[2] = {-down:g}: its third number"
+                " counts down",
+                figures,
+            ),
+        )
+    return ()
+
+
+def lever_arm_text(settings: VehicleSettings) -> str:
+    """Return where the target is, seen from the trajectory point, in words."""
+    forward, right, down = settings.lever_arm_m
+    parts = (
+        (forward, "in front", "behind"),
+        (right, "to the right", "to the left"),
+        (-down, "above", "below"),
+    )
+    words = [
+        f"{abs(value):.2f} m {positive if value > 0.0 else negative}"
+        for value, positive, negative in parts
+        if abs(value) >= 0.005
+    ]
+    return ", ".join(words) or "the point itself"

@@ -1,0 +1,151 @@
+"""Whether coordinates lie where their CRS is meant to be used; if not, what they seem to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.crs import AreaOfUse, area_of_use, is_geographic, longitude_latitude
+from kgcp.quality.checks.doubt import Cause, Doubt, grave
+
+_FAR_DEG = 3.5  # national zones serve their neighbours: EPSG:25832 all of Bavaria and Denmark
+_NEAR_DEG = 1.0
+_DEGREES = np.array([180.0, 90.0])
+_CIRCLE = np.array([np.pi, 0.5 * np.pi])
+_LONG_NAME = 75
+_ZONE = 1e6  # zone numbers stand before eastings of six digits: 32 689586
+
+
+def check_place(crs: str, position_map: FloatArray, where: str) -> tuple[Doubt, ...]:
+    """Compare map positions (n, 2 or 3) with the area in which their CRS is used.
+
+    Parameters
+    ----------
+    where : str
+        What the positions are of, for sentences: "the trajectory".
+    """
+    area = area_of_use(crs)
+    xy = np.median(position_map[:, :2], axis=0)
+    is_angular = is_geographic(crs)
+    outside = _outside(area, crs, xy)
+    looks_radian = is_angular and bool(np.all(np.abs(xy) <= _CIRCLE))
+    if outside <= _FAR_DEG and not looks_radian:
+        return ()
+    x, y = xy.tolist()
+    longitude, latitude = longitude_latitude(crs, xy[None])[0].tolist()
+    figures = {"x": x, "y": y, "longitude_deg": longitude, "latitude_deg": latitude}
+    sentence = f"{where} at x = {x:.9g}, y = {y:.9g} lies {_spot(longitude, latitude)}"
+    if area is not None and not area.is_world:
+        sentence += f", {outside:.0f}° outside the area of {crs} ({_short(area.name)})"
+    guess = (_angular_guess if is_angular else _projected_guess)(area, crs, xy)
+    if guess is None:
+        remedy = "give the CRS of the coordinates, x = easting or longitude first"
+        return (grave(Cause.CRS, sentence, remedy, figures),)
+    code, words, remedy = guess
+    return (grave(code, f"{sentence}: {words}", remedy, figures),)
+
+
+def place_text(crs: str, longitude_deg: float, latitude_deg: float) -> str:
+    """Return a place in words: latitude, longitude and the area of its CRS."""
+    area = area_of_use(crs)
+    spot = _degrees(longitude_deg, latitude_deg)
+    return spot if area is None else f"{spot}; {crs} is for: {_short(area.name)}"
+
+
+def _degrees(longitude_deg: float, latitude_deg: float) -> str:
+    north = "N" if latitude_deg >= 0.0 else "S"
+    east = "E" if longitude_deg >= 0.0 else "W"
+    return f"{abs(latitude_deg):.4f}° {north} {abs(longitude_deg):.4f}° {east}"
+
+
+def _spot(longitude_deg: float, latitude_deg: float) -> str:
+    if not np.isfinite(longitude_deg + latitude_deg) or abs(latitude_deg) > 90.0:
+        return "nowhere on Earth"
+    return f"at {_degrees(longitude_deg, latitude_deg)}"
+
+
+def _short(name: str) -> str:
+    """Return the name of a region, cut behind one of its parts if it is long."""
+    if len(name) <= _LONG_NAME:
+        return name
+    end = max(name.rfind(mark, 0, _LONG_NAME) for mark in ";,:")
+    return f"{name[: end if end > 0 else _LONG_NAME]} …"
+
+
+def _outside(area: AreaOfUse | None, crs: str, xy: FloatArray) -> float:
+    """Return how far a map point is outside the area [deg]; 0 where there is no area."""
+    place = longitude_latitude(crs, xy[None])[0]
+    if not np.isfinite(place).all() or np.any(np.abs(place) > 2.0 * _DEGREES):
+        return 180.0
+    if abs(float(place[1])) > 90.0:
+        return 180.0
+    return 0.0 if area is None else area.degrees_outside(float(place[0]), float(place[1]))
+
+
+Guess = tuple[Cause, str, str]
+
+
+def _angular_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | None:
+    """Name what longitude and latitude seem to be."""
+    degrees = np.degrees(xy)
+    if np.all(np.abs(xy) <= _CIRCLE) and _outside(area, crs, degrees) < _NEAR_DEG:
+        return (
+            Cause.ANGLE_UNIT,
+            f"in radians they would be {_degrees(*degrees.tolist())}",
+            "give longitude and latitude in degrees",
+        )
+    if np.all(np.abs(xy) <= np.flip(_DEGREES)) and _outside(area, crs, xy[::-1]) < _NEAR_DEG:
+        return (
+            Cause.AXES_SWAPPED,
+            "with x and y exchanged it fits",
+            "put the longitude into x and the latitude into y",
+        )
+    if np.any(np.abs(xy) > _DEGREES):
+        return (
+            Cause.CRS,
+            "these are no degrees but seem to be metres",
+            "give the projected CRS of the coordinates, for example EPSG:25832",
+        )
+    return None
+
+
+def _projected_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | None:
+    """Name what easting and northing seem to be."""
+    if _outside(area, crs, xy[::-1]) < _NEAR_DEG:
+        return (
+            Cause.AXES_SWAPPED,
+            "with x and y exchanged it fits",
+            "put the easting into x and the northing into y",
+        )
+    for values, words in _geographic_readings(xy):
+        if area is not None and area.degrees_outside(*values) < _NEAR_DEG:
+            return (
+                Cause.CRS,
+                f"these are {words}",
+                "convert them, or give their CRS, such as EPSG:4326, with x = longitude",
+            )
+    zoned = np.array([xy[0] % _ZONE, xy[1]])
+    if abs(xy[0]) > _ZONE and _outside(area, crs, zoned) < _NEAR_DEG:
+        return (
+            Cause.CRS,
+            f"x seems to begin with a zone number, {xy[0] // _ZONE:.0f}",
+            "leave it out",
+        )
+    return None
+
+
+def _geographic_readings(xy: FloatArray) -> list[tuple[tuple[float, float], str]]:
+    readings: list[tuple[tuple[float, float], str]] = []
+    x, y = xy.tolist()
+    units: tuple[tuple[FloatArray, Callable[[float], float], str], ...] = (
+        (_CIRCLE, lambda angle: float(np.degrees(angle)), "in radians"),
+        (_DEGREES, lambda angle: angle, "in degrees"),
+    )
+    for limit, degrees, unit in units:
+        if np.all(np.abs(xy) <= limit):
+            readings.append(((degrees(x), degrees(y)), f"longitude and latitude {unit}"))
+        if np.all(np.abs(xy) <= limit[::-1]):
+            readings.append(((degrees(y), degrees(x)), f"latitude and longitude {unit}"))
+    return readings

@@ -1,0 +1,97 @@
+"""Reference poses against the vehicle, before anything is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.georef.target_positions import TargetPositions, Vehicle
+from kgcp.quality.checks.doubt import Cause, Doubt, grave
+
+_FAR_M = 3000.0  # from a camera to the vehicle that it shows
+
+
+def check_reference(poses: ReferencePoses, target_positions: TargetPositions) -> tuple[Doubt, ...]:
+    """Tell reference poses far from the vehicle, or below it."""
+    vehicle = target_positions.vehicle
+    if vehicle is None or not len(poses.frames):
+        return ()
+    ground = vehicle.motion.position_m
+    off_m = _distance(poses.position_map, vehicle, ground)
+    if off_m > _FAR_M:
+        return (_far(poses, vehicle, ground, off_m),)
+    cameras = vehicle.local_frame.enu_from_map(poses.position_map)
+    above_m = float(np.median(cameras[:, 2]) - np.median(ground[:, 2]))
+    if above_m < 0.0:
+        return (
+            grave(
+                Cause.HEIGHTS,
+                f"the reference poses put the camera {-above_m:.1f} m below the vehicle (medians)",
+                "give both in heights of one kind: ellipsoidal ones, or a compound crs that names"
+                " the geoid; [reference] crs and [vehicle] crs may differ",
+                {"camera_above_vehicle_m": above_m},
+            ),
+        )
+    return ()
+
+
+def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: float) -> Doubt:
+    figures = {"distance_m": off_m}
+    sentence = f"reference poses and trajectory are {off_m / 1000.0:.4g} km apart (medians)"
+    swapped_poses = poses.position_map[:, [1, 0, 2]]
+    if _distance(swapped_poses, vehicle, ground) < _FAR_M:
+        return grave(
+            Cause.AXES_SWAPPED,
+            f"{sentence}: with x and y of the reference poses exchanged they fit",
+            "put the easting (or longitude) of the poses into x and the northing into y",
+            figures,
+        )
+    on_map = vehicle.local_frame.map_from_enu(ground[:1])[:, [1, 0, 2]]
+    try:
+        moved = vehicle.local_frame.enu_from_map(on_map)
+    except KgcpError:
+        moved = None
+    if moved is not None and _distance(poses.position_map, vehicle, moved) < _FAR_M:
+        return grave(
+            Cause.AXES_SWAPPED,
+            f"{sentence}: with x and y of the trajectory exchanged they fit",
+            "put the easting (or longitude) of the trajectory into x and the northing into y",
+            figures,
+        )
+    for words, convert in _UNITS:
+        if _distance(convert(poses.position_map), vehicle, ground) < _FAR_M:
+            return grave(
+                Cause.ANGLE_UNIT,
+                f"{sentence}: with longitude and latitude of the poses {words} they fit",
+                "give longitude and latitude in degrees",
+                figures,
+            )
+    return grave(
+        Cause.REFERENCE,
+        sentence,
+        "give [reference] crs if the poses are not in the flight's crs, and check zones and"
+        " hemispheres",
+        figures,
+    )
+
+
+_UNITS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
+    ("in radians", lambda xyz: np.column_stack((np.degrees(xyz[:, :2]), xyz[:, 2]))),
+)
+
+
+def _distance(position_map: FloatArray, vehicle: Vehicle, ground: FloatArray) -> float:
+    """Return the horizontal distance [m] of places from the ground (medians), less its extent."""
+    try:
+        cameras = vehicle.local_frame.enu_from_map(position_map)
+    except KgcpError:
+        return np.inf
+    middle = 0.5 * (ground[:, :2].min(axis=0) + ground[:, :2].max(axis=0))
+    extent = 0.5 * float(np.linalg.norm(np.ptp(ground[:, :2], axis=0)))
+    vertical = float(abs(np.median(cameras[:, 2]) - np.median(ground[:, 2])))
+    flat = float(np.linalg.norm(np.median(cameras[:, :2], axis=0) - middle))
+    return max(0.0, flat - extent, vertical - _FAR_M)

@@ -1,0 +1,62 @@
+"""What headers of frames say: size, maker, focal length, position and altitude."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from kgcp.io.images.exif import read_frame_header
+from kgcp.quality.checks.frame_header import FrameHeader
+
+XMP = b'<x:xmpmeta><rdf:Description drone-dji:RelativeAltitude="%s"/></x:xmpmeta>'
+
+
+def write(path: Path, altitude: bytes = b"+40.10", latitude: str = "N") -> None:
+    image = Image.fromarray(np.full((48, 64), 90, dtype=np.uint8))
+    exif = Image.Exif()
+    exif[Base.Make], exif[Base.Model] = "DJI\0", "FC300S"
+    exif.get_ifd(IFD.Exif).update({Base.FocalLength: 3.61, Base.FocalLengthIn35mmFilm: 20})
+    exif.get_ifd(IFD.GPSInfo).update(
+        {
+            GPS.GPSLatitudeRef: latitude,
+            GPS.GPSLatitude: (46.0, 50.0, 34.5),
+            GPS.GPSLongitudeRef: "W",
+            GPS.GPSLongitude: (91.0, 59.0, 38.25),
+        }
+    )
+    image.save(path, exif=exif, xmp=XMP % altitude)
+
+
+def test_a_drone_s_frame(tmp_path: Path) -> None:
+    write(tmp_path / "a.jpg")
+    header = read_frame_header(tmp_path / "a.jpg", "day/a.jpg")
+    assert (header.frame, header.size_px) == ("day/a.jpg", (64, 48))
+    assert header.camera == "DJI FC300S"
+    assert header.focal_mm == pytest.approx(3.61)
+    assert header.focal_35_mm == 20.0
+    assert header.latitude_deg == pytest.approx(46.84292, abs=1e-5)
+    assert header.longitude_deg == pytest.approx(-91.99396, abs=1e-5)
+    assert header.altitude_m == pytest.approx(40.1)
+
+
+def test_the_south_and_altitudes_below_take_off(tmp_path: Path) -> None:
+    write(tmp_path / "a.jpg", b"-3.5", "S")
+    header = read_frame_header(tmp_path / "a.jpg", "a.jpg")
+    assert header.latitude_deg == pytest.approx(-46.84292, abs=1e-5)
+    assert header.altitude_m == -3.5
+
+
+def test_what_is_absent_or_damaged_is_none(tmp_path: Path) -> None:
+    assert read_frame_header(tmp_path / "gone.jpg", "gone.jpg") == FrameHeader("gone.jpg")
+    (tmp_path / "noise.jpg").write_bytes(bytes(range(256)))
+    assert read_frame_header(tmp_path / "noise.jpg", "n") == FrameHeader("n")
+    Image.fromarray(np.zeros((48, 64), dtype=np.uint8)).save(tmp_path / "plain.png")
+    assert read_frame_header(tmp_path / "plain.png", "p") == FrameHeader("p", (64, 48))
+    write(tmp_path / "a.jpg", b"high")
+    assert read_frame_header(tmp_path / "a.jpg", "a").altitude_m is None
+    Image.fromarray(np.zeros((48, 64), dtype=np.uint8)).save(tmp_path / "plain.tif")
+    assert read_frame_header(tmp_path / "plain.tif", "t") == FrameHeader("t", (64, 48))

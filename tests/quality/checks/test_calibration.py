@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from kgcp.geometry.camera import Camera
+from kgcp.quality.checks.calibration import check_camera
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.plate import check_targets
+from kgcp.targets.layout import Ring, Target
+
+CAMERA = Camera(1200, 900, 1903.0, 1901.0, 606.2, 446.1)
+
+
+def test_cameras_in_pixels_raise_no_doubt() -> None:
+    wide = replace(CAMERA, fx=700.0, fy=700.0)
+    tele = replace(CAMERA, fx=15_000.0, fy=15_000.0)
+    for camera in (CAMERA, wide, tele, CAMERA.binned(4)):
+        assert check_camera(camera) == ()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "code", "words"),
+    [
+        ({"fx": 8.8, "fy": 8.8}, Cause.FOCAL_LENGTH, "is this in millimetres?"),
+        ({"fx": 8800.0 * 6, "fy": 8800.0 * 6}, Cause.FOCAL_LENGTH, "is this in micrometres?"),
+        ({"fy": 1091.0}, Cause.FOCAL_LENGTH, "no sensor with square pixels"),
+        ({"cx": 6.2, "cy": -4.1}, Cause.PRINCIPAL_POINT, "divided by the size of a pixel"),
+        ({"cx": 0.0, "cy": 0.0}, Cause.PRINCIPAL_POINT, "half the frame's size"),
+        ({"cx": 1212.4, "cy": 892.2}, Cause.CALIBRATION_SIZE, "of double size"),
+        ({"cx": 303.0, "cy": 223.0}, Cause.CALIBRATION_SIZE, "of half size"),
+        ({"cx": 650.0, "cy": 700.0}, Cause.PRINCIPAL_POINT, "look cx and cy up"),
+    ],
+)
+def test_other_units_and_sizes_are_named(numbers: dict[str, Any], code: Cause, words: str) -> None:
+    (doubt,) = check_camera(replace(CAMERA, **numbers))
+    assert doubt.code is code
+    assert words in str(doubt)
+
+
+def test_an_upright_calibration_is_told() -> None:
+    (doubt,) = check_camera(Camera(900, 1350, 1903.0, 1903.0, 672.0, 440.0))
+    assert "exchange cx and cy" in doubt.remedy
+
+
+@pytest.mark.parametrize(
+    ("diameter", "words"),
+    [(35.4, "0.899 m if these are inches"), (90.0, "0.9 m if these are centimetres"), (0.009, "")],
+)
+def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
+    ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
+    (doubt,) = check_targets([Target(ring)])
+    assert doubt.code is Cause.DIAMETERS
+    assert words in doubt.sentence
+
+
+@pytest.mark.parametrize("diameter", [0.05, 0.3, 0.9, 3.0])
+def test_usual_diameters_raise_no_doubt(diameter: float) -> None:
+    ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
+    assert check_targets([Target(ring)]) == ()

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.quality.checks.clock import check_exif_times, check_overlap
+from kgcp.quality.checks.doubt import Cause
+
+START_S = 1_781_597_700.0
+TRAJECTORY_S: FloatArray = START_S + np.arange(0.0, 45.0, 0.05)
+FRAMES_S: FloatArray = START_S + 5.0 + 1.5 * np.arange(24.0)
+
+
+def test_frames_within_the_trajectory_raise_no_doubt() -> None:
+    assert check_overlap(FRAMES_S, TRAJECTORY_S, 0.0) == ()
+    assert check_overlap(FRAMES_S + 6.0, TRAJECTORY_S, 0.0) == ()  # the last 2 of 24 are outside
+    assert check_overlap(FRAMES_S - 18.0, TRAJECTORY_S, 18.0) == ()
+    assert check_overlap(np.array([]), TRAJECTORY_S, 0.0) == ()
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "words"),
+    [
+        (18.0, "the frames' times seem to be GPS time"),
+        (-18.0, "the trajectory's times seem to be GPS time"),
+        (37.0, "the frames' times seem to be TAI"),
+        (7200.0, "local time; 2 h earlier"),
+        (-5.5 * 3600.0, "local time; 5.5 h later"),
+        (3600.0 + 18.0, "local time, and of GPS"),
+        (86_400.0, "another day"),
+        (-604_800.0, "another GPS week"),
+        (1024 * 604_800.0, "modulo 1024"),
+        (3 * 604_800.0, "21 days, 3 GPS weeks, apart"),
+        (40 * 86_400.0, "40 days apart"),
+    ],
+)
+def test_the_shift_that_fits_is_named(ahead_s: float, words: str) -> None:
+    (doubt,) = check_overlap(FRAMES_S + ahead_s, TRAJECTORY_S, 0.0)
+    assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, True)
+    assert words in doubt.sentence
+    assert doubt.figures["shift_s"] == pytest.approx(-ahead_s)
+
+
+def test_frames_of_another_drive_are_told() -> None:
+    (doubt,) = check_overlap(FRAMES_S + 500.0, TRAJECTORY_S, 0.0)
+    assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, True)
+    assert "24 of 24 frames" in doubt.sentence
+    long = START_S + 5.0 + 1.5 * np.arange(40.0)
+    (doubt,) = check_overlap(long, TRAJECTORY_S, 0.0)
+    assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, False)
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "words"),
+    [
+        (18.0, "those of the times file seem to be GPS time"),
+        (-18.0, "EXIF times seem to be GPS time"),
+        (3600.0, "local time"),
+    ],
+)
+def test_exif_tells_another_clock(ahead_s: float, words: str) -> None:
+    exif = np.floor(FRAMES_S)
+    (doubt,) = check_exif_times([*(FRAMES_S + ahead_s)], [*exif])
+    assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, False)
+    assert words in doubt.sentence
+
+
+def test_clocks_of_cameras_are_off_and_that_is_no_doubt() -> None:
+    for ahead_s in (0.0, 0.4, 5.0, -61.0, 1000.0):
+        assert check_exif_times([*(FRAMES_S + ahead_s)], [*FRAMES_S]) == ()
+
+
+def test_times_of_other_frames_are_told() -> None:
+    (doubt,) = check_exif_times([*FRAMES_S[::-1]], [*FRAMES_S])
+    assert doubt.code is Cause.FRAME_ORDER

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.target_positions import Vehicle
+from kgcp.georef.trajectory import Trajectory
+from kgcp.quality.checks.course import Course, check_attitude, course_of
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.lever_arm import check_lever_arm, lever_arm_text
+from kgcp.settings import VehicleSettings
+
+TIME_S = np.arange(0.0, 60.0, 0.05)
+ANGLE = 0.05 * TIME_S + 0.3
+
+
+def drive(
+    turned: Callable[[FloatArray], FloatArray] = lambda heading: heading,
+    roll: float = 0.3,
+) -> Course | None:
+    """A bend of nearly half a circle to the left, first to the north."""
+    origin = np.array([689586.0, 5336252.0, 500.0])
+    xy = 150.0 * np.column_stack((np.cos(ANGLE), np.sin(ANGLE)))
+    course = (-np.degrees(ANGLE)) % 360.0
+    # grid north is 1.9° from true north there, far less than what is told apart
+    attitude = np.column_stack((0 * course + roll, 0 * course, turned(course)))
+    position = origin + np.column_stack((xy, 0.0 * TIME_S))
+    trajectory = Trajectory(TIME_S, position, attitude, None, None)
+    vehicle = Vehicle.on(trajectory, VehicleSettings(), LocalFrame.at("EPSG:25832", origin))
+    return course_of(vehicle, attitude)
+
+
+def test_headings_along_the_course_raise_no_doubt() -> None:
+    course = drive()
+    assert course is not None
+    assert course.median_off_deg == pytest.approx(1.9, abs=0.3)
+    assert check_attitude(course) == ()
+    assert check_attitude(drive(lambda heading: heading + 15.0)) == ()
+
+
+@pytest.mark.parametrize(
+    ("turned", "code", "words"),
+    [
+        (lambda h: -h, Cause.HEADING, "anticlockwise from north"),
+        (lambda h: 90.0 - h, Cause.HEADING, "anticlockwise from east"),
+        (lambda h: h + 180.0, Cause.HEADING, "180° from the course"),
+        (np.radians, Cause.ANGLE_UNIT, "in radians"),
+        (lambda h: np.radians((h + 180.0) % 360.0 - 180.0), Cause.ANGLE_UNIT, "in radians"),
+        (lambda h: h / 0.9, Cause.ANGLE_UNIT, "in gon"),
+        (lambda h: h + 90.0, Cause.HEADING, "90° ahead of the course"),
+        (lambda h: 47.0 + 2.0 * h, Cause.HEADING, "no other reading of the angles fits"),
+    ],
+)
+def test_the_reading_that_fits_is_named(
+    turned: Callable[[FloatArray], FloatArray], code: Cause, words: str
+) -> None:
+    (doubt,) = check_attitude(drive(turned))
+    assert doubt.is_grave
+    assert doubt.code is code
+    assert words in doubt.sentence.partition(", or ")[0]
+
+
+def test_in_a_straight_line_all_readings_that_fit_are_named() -> None:
+    course = np.full(100, 90.0)
+    attitude = np.column_stack((np.zeros((100, 2)), np.full(100, 270.0)))
+    (doubt,) = check_attitude(Course(course, attitude))
+    assert "180° from the course" in doubt.sentence
+    assert "anticlockwise from" in doubt.sentence
+
+
+def test_axes_that_point_up_are_told() -> None:
+    (doubt,) = check_attitude(drive(roll=179.5))
+    assert doubt.code is Cause.ATTITUDE
+    assert "its z axis points up" in doubt.sentence
+
+
+def test_a_vehicle_that_stands_has_no_course() -> None:
+    position = np.tile([689586.0, 5336252.0, 500.0], (len(TIME_S), 1))
+    attitude = np.zeros((len(TIME_S), 3))
+    standing = Trajectory(TIME_S, position, attitude, None, None)
+    frame = LocalFrame.at("EPSG:25832", position[0])
+    assert course_of(Vehicle.on(standing, VehicleSettings(), frame), attitude) is None
+    assert check_attitude(None) == ()
+
+
+def test_lever_arms_in_words_and_beyond_belief() -> None:
+    arm = VehicleSettings(lever_arm_m=(-0.8, 0.15, -1.95))
+    assert lever_arm_text(arm) == "0.80 m behind, 0.15 m to the right, 1.95 m above"
+    assert check_lever_arm(arm) == ()
+    (below,) = check_lever_arm(VehicleSettings(lever_arm_m=(-0.8, 0.15, 1.95)))
+    assert "1.95 m below" in below.sentence
+    assert "lever_arm_m[2] = -1.95" in below.remedy
+    (far,) = check_lever_arm(VehicleSettings(lever_arm_m=(-80.0, 15.0, 0.0)))
+    assert "81.4 m long" in far.sentence

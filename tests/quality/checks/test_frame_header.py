@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from kgcp.geometry.camera import Camera
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.frame_header import FrameHeader, check_frames
+
+CAMERA = Camera(4000, 3000, 2900.0, 2900.0, 2010.0, 1490.0)
+DJI = [FrameHeader(f"{number}.jpg", (4000, 3000), "DJI FC300S", 3.61, 26.0) for number in range(20)]
+
+
+def test_frames_of_the_camera_raise_no_doubt() -> None:
+    assert check_frames(DJI, CAMERA) == ()
+    assert check_frames([FrameHeader("a.png", (4000, 3000))], CAMERA) == ()
+    assert check_frames([FrameHeader("damaged.jpg")], CAMERA) == ()
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((3000, 4000), "exchange width and height"),
+        ((2000, 1500), "this one is 2 times as large"),
+        ((3000, 3000), "give the calibration of these frames"),
+    ],
+)
+def test_frames_of_another_size_are_counted(size: tuple[int, int], words: str) -> None:
+    (doubt,) = check_frames([replace(header, size_px=size) for header in DJI], CAMERA)
+    assert (doubt.code, doubt.is_grave) == (Cause.FRAME_SIZE, True)
+    assert "20 of 20 frames are not 4000 x 3000 px" in doubt.sentence
+    assert words in doubt.remedy
+
+
+def test_a_stray_frame_is_no_grave_doubt() -> None:
+    (doubt,) = check_frames([*DJI, FrameHeader("logo.png", (64, 64))], CAMERA)
+    assert not doubt.is_grave
+    assert "logo.png is 64 x 64 px" in doubt.sentence
+
+
+def test_two_cameras_and_two_zooms_are_named() -> None:
+    others = [replace(DJI[0], frame="b.jpg", camera="SONY ILCE-7RM4")]
+    (doubt,) = check_frames([*DJI, *others], CAMERA)
+    assert doubt.code is Cause.TWO_CAMERAS
+    assert "1 of SONY ILCE-7RM4 with 3.61 mm, such as b.jpg" in doubt.sentence
+    zoomed = [replace(DJI[0], frame="c.jpg", focal_mm=7.2)]
+    assert [one.code for one in check_frames([*DJI, *zoomed], CAMERA)] == [Cause.TWO_CAMERAS]
+
+
+@pytest.mark.parametrize(
+    ("factor", "code", "words"),
+    [
+        (2.0, Cause.CALIBRATION_SIZE, "double size"),
+        (0.5, Cause.CALIBRATION_SIZE, "half size"),
+        (1.5, Cause.FOCAL_LENGTH, "this camera and zoom"),
+    ],
+)
+def test_exif_tells_another_focal_length(factor: float, code: Cause, words: str) -> None:
+    wrong = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
+    (doubt,) = check_frames(DJI, wrong)
+    assert doubt.code is code
+    assert words in doubt.remedy
+    assert doubt.figures["expected_fx_px"] == pytest.approx(2889.0, abs=1.0)
+
+
+@pytest.mark.parametrize("focal_35_mm", [24.0, 29.0])
+def test_equivalents_are_rough(focal_35_mm: float) -> None:
+    assert check_frames([replace(DJI[0], focal_35_mm=focal_35_mm)], CAMERA) == ()
