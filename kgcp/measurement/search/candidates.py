@@ -24,7 +24,7 @@ from kgcp.targets.layout import Ring
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
-_UNEVEN = 0.8  # spread of ink, disc and plate, of the contrast: half of it may lie in shade
+_UNEVEN = 0.7  # spread of ink, disc and plate, of the contrast in light: shade leaves a third
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _SEED_REACH = 2.0  # around expected places, of their radii
@@ -146,6 +146,7 @@ def _mark_dotted(values: FloatArray, least: float, dotted: BoolArray) -> None:
         disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
         black = code[_rank(0.25)]
         contrast = min(disc[_rank(0.5)], plate[_rank(0.5)]) - black
+        brightest = min(disc[_rank(0.7)], plate[_rank(0.8)]) - black
         uneven = max(
             code[_rank(0.35)] - code[_rank(0.05)],
             disc[_rank(0.7)] - disc[_rank(0.3)],
@@ -154,7 +155,7 @@ def _mark_dotted(values: FloatArray, least: float, dotted: BoolArray) -> None:
         dotted[i] = (
             contrast > least
             and code[_rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
-            and uneven < _UNEVEN * contrast
+            and uneven < _UNEVEN * brightest
         )
 
 
