@@ -1,4 +1,4 @@
-"""Dask's workers instead of a pool: the same bytes, whoever dies."""
+"""Dask's workers instead of a pool: the same bytes, whatever dies."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch)
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
-def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
+def test_a_map_that_is_closed_early_does_not_wait(tmp_path: Path) -> None:
     start_s = time.monotonic()
 
     def stop() -> Iterator[int]:
