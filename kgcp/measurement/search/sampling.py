@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray, SingleArray
 from kgcp.geometry.conic import Ellipse
 
 FAINTEST_SLOPE = 0.25  # of an edge, in grey values per pixel: less is rounding
@@ -68,7 +68,7 @@ def _place_points(
     angle_rad: float,
     factors: FloatArray,
     circle: FloatArray,
-    points: npt.NDArray[np.float32],
+    points: SingleArray,
 ) -> None:
     """Fill in points (m, k, 2) on ellipses about one centre."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)

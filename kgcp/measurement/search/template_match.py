@@ -10,12 +10,12 @@ import numpy as np
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, SingleArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.correlation import Bank, SingleArray, bank_of, correlate
+from kgcp.measurement.search.correlation import Bank, bank_of, correlate
 from kgcp.measurement.search.sampling import sample_ellipses, sample_grey
 from kgcp.measurement.search.templates import (
     ANGLES,
