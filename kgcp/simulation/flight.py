@@ -125,10 +125,7 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
 def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
     """Render one frame (height, width) of grey values, or (height, width, 3) of a phone (uint8).
 
-    Parameters
-    ----------
-    ground : Ground
-        That of `grow_ground`.
+    `ground` is that of `grow_ground`.
     """
     settings, frame = plan.settings, plan.frames[index]
     rng = _stream(plan.seed, "pixels", index)

@@ -28,18 +28,9 @@ def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray
 def sample_ellipses(
     grey: GreyArray, outlines: Sequence[Ellipse], factors: FloatArray, circle: FloatArray
 ) -> FloatArray:
-    """Sample a frame on outlines enlarged by some factors, as `sample_grey`.
+    """Sample a frame on n outlines enlarged by factors (m,), as `sample_grey`: (n, m, k).
 
-    Parameters
-    ----------
-    grey : (height, width) array
-    factors : (m,) array
-    circle : (k, 2) array
-        Points of the unit circle, of which `Ellipse.points` makes those of the ellipse.
-
-    Returns
-    -------
-    (n, m, k) array
+    `circle` (k, 2) has the points of the unit circle that become those of the ellipses.
     """
     shape = len(outlines), len(factors), len(circle)
     if not outlines:

@@ -260,17 +260,9 @@ def _compare(
 
 
 def visible_angles(patch: FloatArray, ring: Ring) -> BoolArray | None:
-    """Return at which angles a ring shows both of its edges.
+    """Return at which angles (angles,) a ring shows both of its edges.
 
-    Parameters
-    ----------
-    patch : (rows, angles) array
-        Grey values at `TEMPLATE_RADII`.
-
-    Returns
-    -------
-    (angles,) array of bool, or None
-        None if nothing is hidden, or too much.
+    None if nothing is hidden, or too much. The patch (rows, angles) is sampled at `TEMPLATE_RADII`.
     """
     plate, outside, disc, inside = edge_rows(ring)
     visible = np.empty(ANGLES, dtype=bool)
