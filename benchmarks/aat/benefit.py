@@ -101,9 +101,11 @@ def main(
     rows = rows_of(trials)
     print("\n".join(table_lines(rows)))
     benefit = rows["free", Way.DISTANCES].benefit
-    astray = max(float(np.abs(row.scatter - 1.0).max()) for row in rows.values())
+    deviation = max(float(np.abs(row.scatter - 1.0).max()) for row in rows.values())
     print(f"\nheights {benefit:.1f} times better with KGCPs and distances (wanted: {_WANTED:g})")
-    print(f"scatter within {100 * astray:.0f} % of the prediction (wanted: {100 * _TOLERANCE:.0f})")
+    print(
+        f"scatter within {100 * deviation:.0f} % of the prediction (wanted: {100 * _TOLERANCE:.0f})"
+    )
     if figure is not None:
         figure.write_bytes(draw_benefit(trials, settings.checks_along_m))
 

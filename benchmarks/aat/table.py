@@ -72,7 +72,7 @@ class Row:
     scatter : (3,) array
         Root mean square of error over predicted deviation, ideally 1.
     sd_scatter : (3,) array
-        How well so many blocks know it.
+        Its standard deviation, as known from this number of blocks.
     whole_scatter : float
         The same of all errors of a block together, by their joint covariance.
     benefit : float

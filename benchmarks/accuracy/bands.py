@@ -141,7 +141,7 @@ def _angles_deg(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _squared_mahalanobis(errors: FloatArray, covariances: pd.Series[float]) -> FloatArray:
-    """Return eᵀ C⁻¹ e of errors (n, 6); NaN where there is no covariance."""
+    """Return eᵀ C⁻¹ e of errors (n, 6); NaN without a covariance."""
     result = np.full(len(errors), np.nan)
     for i, (error, cells) in enumerate(zip(errors, covariances, strict=True)):
         if isinstance(cells, np.ndarray | list):
@@ -217,7 +217,7 @@ def table_lines(results: list[BandResult]) -> Iterator[str]:
 
 
 def _cell(value: float, width: int, decimals: int, sign: str = "") -> str:
-    """Return a number, or a dash where there is none."""
+    """Return a number, or a dash if it is missing."""
     return f"{'–':>{width}}" if np.isnan(value) else f"{value:{sign}{width}.{decimals}f}"
 
 

@@ -93,8 +93,10 @@ def speed_between(taken: Sequence[Sample], first: float, last: float) -> Speed:
     Only those count in which there were looks to come: later on, workers have ended, and their CPU
     time is not seen any more.
     """
-    looking = [one for one in taken if one.is_looking]
-    begin, end = (min(looking, key=lambda one: abs(one.done - done)) for done in (first, last))
+    looking = [sample for sample in taken if sample.is_looking]
+    begin, end = (
+        min(looking, key=lambda sample: abs(sample.done - done)) for done in (first, last)
+    )
     done = end.done - begin.done
     return Speed(done / (end.time_s - begin.time_s), done / (end.cpu_s - begin.cpu_s))
 
@@ -114,10 +116,14 @@ def main(frames: int, jobs: int) -> None:
         taken = list(samples(life))
         if life.end() != 0:
             raise RuntimeError("".join(life.lines[-20:]))
-    warm = [one for one in taken if one.done >= _WARM_UP * frames]
+    warm = [sample for sample in taken if sample.done >= _WARM_UP * frames]
     growth_mb, table_mb = (
         max(
-            (one.parent_mb - warm[0].parent_mb for one in warm if one.is_looking is looking),
+            (
+                sample.parent_mb - warm[0].parent_mb
+                for sample in warm
+                if sample.is_looking is looking
+            ),
             default=0.0,
         )
         for looking in (True, False)
@@ -130,7 +136,7 @@ def main(frames: int, jobs: int) -> None:
         f"{frames} frames on {jobs} processes in {taken[-1].time_s - taken[0].time_s:.0f} s;"
         f" parent {warm[0].parent_mb:.0f} MB after {_WARM_UP:.0%}, then at most"
         f" {growth_mb:+.1f} MB (wanted: {_MOST_GROWTH_MB:.0f}), {table_mb:+.1f} MB with the table;"
-        f" workers at most {max(one.workers_mb for one in taken):.0f} MB"
+        f" workers at most {max(sample.workers_mb for sample in taken):.0f} MB"
     )
     print(
         f"first tenth {first.per_cpu_s:.2f} frames per CPU second ({first.per_s:.2f} per second),"

@@ -1,6 +1,6 @@
 """Kill `kgcp detect` and its workers at random moments, until it is done all the same.
 
-The table must be, byte for byte, that of a run that nobody disturbed. Linux only: it finds the
+The table must be, byte for byte, that of an undisturbed run. Linux only: it finds the
 workers in /proc.
 """
 
@@ -114,7 +114,7 @@ class Life:
         return [int(child) for child in children if is_worker(int(child))]
 
     def wait_for(self, done: float, seconds: float) -> None:
-        """Wait until so many looks are done, and some seconds more, but not beyond the end."""
+        """Wait until some number of frames is done, and some seconds more, at most to the end."""
         while not self.is_over and self.done < done:
             time.sleep(0.05)
         until = time.monotonic() + seconds

@@ -110,14 +110,14 @@ def alarm_of(task: tuple[Path, int, int]) -> Alarm:
     except Rejection as rejection:
         return Alarm(path.name, variant, (), (rejection.reason.value,))
     accepted, reasons = [], []
-    for seen in outcomes:
-        if isinstance(seen, Miss):
-            reasons.append(seen.reason.value)
+    for outcome in outcomes:
+        if isinstance(outcome, Miss):
+            reasons.append(outcome.reason.value)
             continue
-        x, y = seen.centre_px
+        x, y = outcome.centre_px
         accepted.append(
-            f"{seen.target} by ring {seen.ring} at ({x:.0f}, {y:.0f}),"
-            f" R {seen.appearance.radius_px:.1f} px, score {seen.score:.3f}"
+            f"{outcome.target} by ring {outcome.ring} at ({x:.0f}, {y:.0f}),"
+            f" R {outcome.appearance.radius_px:.1f} px, score {outcome.score:.3f}"
         )
     return Alarm(path.name, variant, tuple(accepted), tuple(reasons))
 

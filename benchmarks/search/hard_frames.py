@@ -80,7 +80,7 @@ def show_frame(frame_set: FrameSet, seed: int, index: int, save: Path | None) ->
     shot, grey = frame_set.shot(seed, index), picture(frame_set, seed, index)
     if save is not None:
         cv2.imwrite(str(save), grey)
-    plates: list[tuple[str, PlatePose]] = [("wanted", seen) for seen in shot.wanted]
+    plates: list[tuple[str, PlatePose]] = [("wanted", placed) for placed in shot.wanted]
     for kind, seen in (*plates, *shot.decoys):
         print(f"{kind}: {describe(shot, seen)}")
     outcomes = measured(grey, frame_set, seed, index)

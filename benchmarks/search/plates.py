@@ -32,7 +32,7 @@ check_targets(TARGETS)
 
 @dataclass(frozen=True, slots=True)
 class PaintedPlate(PrintedPlate):
-    """A plate that is no coded target; `target` says only how large it is.
+    """A plate that is not a coded target; `target` only says how large it is.
 
     Attributes
     ----------

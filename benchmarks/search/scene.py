@@ -174,7 +174,7 @@ def place_apart(
     tilt: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[PlatePose | None, ...]:
-    """Put plates where they do not hide each other; None where there is no room."""
+    """Put plates where they do not hide each other; None if there is not enough room."""
     taken: list[tuple[FloatArray, float]] = []
     placed: list[PlatePose | None] = []
     for plate in plates:

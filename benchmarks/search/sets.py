@@ -177,7 +177,7 @@ def _several(first: Target, second: Target) -> Planner:
         camera, look = some_camera(rng)
         plates = [plate_of(target, rng) for target in (first, second)]
         placed = place_apart(camera, plates, (10.0, 60.0), _LEANING, rng)
-        return _shot(camera, look, [seen for seen in placed if seen is not None], rng)
+        return _shot(camera, look, [plate for plate in placed if plate is not None], rng)
 
     return plan
 

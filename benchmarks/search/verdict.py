@@ -33,7 +33,7 @@ class FrameVerdict:
         Plates that should not be found.
     missed, off, wrong : tuple of (word, text)
         A reason or a kind, and the numbers: plates not measured, measured badly, and
-        measurements of what is no such plate.
+        measurements of something else.
     """
 
     index: int
@@ -62,14 +62,14 @@ def judge_frame(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> FrameVer
     """
     left = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     notes = _Notes()
-    for seen in shot.wanted:
-        observation = _nearest(shot.camera, seen, left)
-        words = f"{describe(shot, seen)}"
+    for placed in shot.wanted:
+        observation = _nearest(shot.camera, placed, left)
+        words = f"{describe(shot, placed)}"
         if observation is None:
-            notes.missed.append(_miss_of(seen, outcomes, words))
+            notes.missed.append(_miss_of(placed, outcomes, words))
             continue
         left.remove(observation)
-        problems = "; ".join(_problems(shot.camera, seen, observation))
+        problems = "; ".join(_problems(shot.camera, placed, observation))
         if problems:
             notes.off.append((observation.ring, f"{words}: {problems}"))
     notes.wrong += [_wrong(shot, observation) for observation in left]
@@ -136,7 +136,7 @@ def _wrong(shot: Shot, observation: Measurement) -> tuple[str, str]:
         f"{observation.target} by ring {observation.ring} at ({x:.1f}, {y:.1f}),"
         f" R {observation.appearance.radius_px:.1f} px, score {observation.score:.3f}"
     )
-    plates = [(seen.plate.target.name, seen) for seen in shot.wanted] + list(shot.decoys)
+    plates = [(placed.plate.target.name, placed) for placed in shot.wanted] + list(shot.decoys)
     for kind, seen in plates:
         if _distance_px(shot.camera, seen, observation) < radius_px(shot.camera, seen):
             return kind, f"{text}; there is {kind}: {describe(shot, seen)}"

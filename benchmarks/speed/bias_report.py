@@ -28,7 +28,7 @@ _MOST_S, _MOST_MB = 20.0, 15.0
 
 
 def repeat_flight(flight: Path, table: Path, frames: int) -> None:
-    """Append a flight to itself, shifted in time, until it has so many frames."""
+    """Append a flight to itself, shifted in time, until it has enough frames."""
     times = pd.read_csv(flight / "frames.csv", parse_dates=["time"])
     vehicle = pd.read_csv(flight / "vehicle.csv", parse_dates=["time"])
     reference = pd.read_csv(flight / "reference.csv")

@@ -109,7 +109,7 @@ def cost_of(path: Path, camera: Camera, targets: tuple[Target, ...]) -> FrameCos
     decode_s, grey = _timed(lambda: read_grey(path, camera))
     search_s, _ = _timed(lambda: find_rings(grey, settings))
     measure_s, seen = _timed(lambda: measure_frame(grey, camera, targets, settings))
-    found = sum(isinstance(one, Measurement) for one in seen)
+    found = sum(isinstance(outcome, Measurement) for outcome in seen)
     return FrameCost(grey.size, decode_s, search_s, measure_s, found)
 
 

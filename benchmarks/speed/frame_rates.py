@@ -61,7 +61,7 @@ def main() -> None:
                 print(
                     f"{size}, {jobs} jobs: {speed.per_s:.1f} frames/s,"
                     f" {1e3 / speed.per_cpu_s:.0f} ms of CPU time per frame,"
-                    f" {max(one.workers_mb for one in taken):.0f} MB per worker",
+                    f" {max(sample.workers_mb for sample in taken):.0f} MB per worker",
                     flush=True,
                 )
 

@@ -39,7 +39,7 @@ class Source:
     frames: tuple[str, ...]
 
     def spread(self, count: int) -> Source:
-        """Return the source with so many of its frames, or all of fewer."""
+        """Return the source with some of its frames, or all of them if there are fewer."""
         chosen = np.unique(np.linspace(0, len(self.frames) - 1, count).round().astype(int))
         return replace(self, frames=tuple(self.frames[i] for i in chosen))
 

@@ -144,23 +144,15 @@ def _spread_slopes(centre: FloatArray, conic: FloatArray, step: float) -> FloatA
 
 
 def circle_planes(conic: FloatArray) -> tuple[CirclePlane, CirclePlane]:
-    """Return both positions of a circle in space, from its image alone.
+    """Return both positions of a circle in space, from its normalised image (3, 3) alone.
+
+    They are mirror images about the cone's axis, and equal for a circle seen exactly along it.
 
     The cone Q' over the image is cut in circles by two families of planes. With its eigenvalues
     λ1 ≥ λ2 > 0 > λ3 and axes e1, e2, e3 their normals are
     √((λ1 - λ2)/(λ1 - λ3)) (±e1) + √((λ2 - λ3)/(λ1 - λ3)) e3; the centre's ray is the pole of the
     plane's horizon, Q'⁻¹ n, and the plane lies at r λ2 / √(-λ1 λ3). The two projected centres
     are the two minima of the paper's Figure 7, in the closed form that it asks for.
-
-    Parameters
-    ----------
-    conic : (3, 3) array
-        Image of the circle, normalised coordinates.
-
-    Returns
-    -------
-    tuple of two CirclePlane
-        Mirror images about the cone's axis; equal for a circle seen exactly along its axis.
 
     Raises
     ------

@@ -124,20 +124,11 @@ def _direction(axis: FloatArray) -> float:
 
 
 def fit_ellipse(points: FloatArray) -> FloatArray:
-    """Fit an ellipse to points by the direct least-squares method.
+    """Fit an ellipse to points (n, 2), at least six, and return it as a conic (3, 3).
 
-    Fitzgibbon's constraint 4ac - b² = 1 in the block form of Halíř & Flusser (1998), "Numerically
-    stable direct least squares fitting of ellipses", on points centred and scaled to unit size.
-
-    Parameters
-    ----------
-    points : (n, 2) array
-        At least six points.
-
-    Returns
-    -------
-    (3, 3) array
-        The conic, in the coordinates of the points.
+    Direct least squares: Fitzgibbon's constraint 4ac - b² = 1 in the block form of Halíř & Flusser
+    (1998), "Numerically stable direct least squares fitting of ellipses", on points centred and
+    scaled to unit size.
 
     Raises
     ------

@@ -106,12 +106,7 @@ def best_transformer(
 
 
 def convert_positions(file: str, position: FloatArray, source: str, target: str) -> FloatArray:
-    """Bring a trajectory's positions (n, 3) from one CRS to another.
-
-    Parameters
-    ----------
-    file : str
-        Where the positions come from, for messages.
+    """Bring a trajectory's positions (n, 3), read from a file, from one CRS to another.
 
     Raises
     ------

@@ -47,17 +47,10 @@ def state_of(observation: Measurement) -> FloatArray:
 
 
 def predict_position(track: Track, by_reference: FloatArray | None) -> list[Prediction | None]:
-    """Return what is expected of the frames (n,) in which a target was not found.
+    """Return what is expected of the n frames in which a target was not found.
 
-    Parameters
-    ----------
-    by_reference : (n, 3) array or None
-        States by `reference_states`.
-
-    Returns
-    -------
-    list of Prediction or None
-        The surer one of the two sources; None where neither tells, and where it was found.
+    It is the surer one of the two sources, of which `by_reference` (n, 3) is that of
+    `reference_states`; None where neither tells, and where the target was found.
     """
     sources = [predict_between(track)]
     if by_reference is not None:

@@ -175,11 +175,11 @@ def write_simulated_flight(
     Raises
     ------
     KgcpError
-        If `out` holds something already or cannot be written.
+        If `out` is not empty or cannot be written.
     """
     out = out.resolve()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise KgcpError(f"{out}: holds something already; choose a new folder or empty it first")
+        raise KgcpError(f"{out}: is not empty; choose a new folder or empty it first")
     partial = out.with_name(f".{out.name}.part")
     try:
         shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed

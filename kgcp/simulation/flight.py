@@ -18,7 +18,7 @@ from kgcp.settings import VehicleSettings
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.instruments import adjust_reference, record_trajectory
-from kgcp.simulation.light_field import LightField
+from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.path import (
     FRAME_INTERVAL_S,
     ROAD_RADIUS_M,
@@ -125,10 +125,7 @@ def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
 def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
     """Render one frame (height, width) of grey values, or (height, width, 3) of a phone (uint8).
 
-    Parameters
-    ----------
-    ground : Ground
-        That of `grow_ground`.
+    `ground` is that of `grow_ground`.
     """
     settings, frame = plan.settings, plan.frames[index]
     rng = _stream(plan.seed, "pixels", index)
@@ -144,7 +141,7 @@ def render_frame(plan: FlightPlan, ground: Ground, index: int) -> GreyArray:
     return settings.sensor.expose(irradiance, frame.gain, rng)
 
 
-def _light_field(plan: FlightPlan, frame: FramePlan) -> LightField | None:
+def _light_field(plan: FlightPlan, frame: FramePlan) -> PlateLight | None:
     """Return the light on the plates of a frame, each in its own axes.
 
     It is drawn anew for every frame, dirt included, so that a flight averages over many plates.
@@ -152,7 +149,7 @@ def _light_field(plan: FlightPlan, frame: FramePlan) -> LightField | None:
     settings = plan.settings
     if settings.shadow is None and settings.dirt is None and settings.glare is None:
         return None
-    return LightField.drawn(
+    return PlateLight.drawn(
         settings.shadow,
         settings.dirt,
         settings.glare,

@@ -119,7 +119,7 @@ class Highlight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LightField:
+class PlateLight:
     """The light on one plate in one frame, in the plate's axes."""
 
     light_left: float = 1.0  # share of the light where every ray of the sun is hidden
@@ -136,7 +136,7 @@ class LightField:
         glare: Glare | None,
         gain: float,
         rng: np.random.Generator,
-    ) -> LightField:
+    ) -> PlateLight:
         """Draw the light of one frame; `gain` is its exposure, to which a highlight refers."""
         return cls(
             1.0 if shadow is None else shadow.light_left,

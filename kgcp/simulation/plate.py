@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import LightField
+from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
 from kgcp.targets.layout import Ring, Target
@@ -82,7 +82,7 @@ def image_plate(
     pose: Pose,
     optics: Optics,
     window: PixelWindow | None = None,
-    field: LightField | None = None,
+    field: PlateLight | None = None,
 ) -> PlateImage:
     """Ray-cast a plate through the full distorted camera.
 
@@ -92,7 +92,7 @@ def image_plate(
         Target → camera.
     window : PixelWindow, optional
         Where to look; default: everything that the plate sends light to.
-    field : LightField, optional
+    field : PlateLight, optional
         Default: the same light everywhere.
     """
     if window is None:

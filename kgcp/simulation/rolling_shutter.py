@@ -64,7 +64,7 @@ class RowMotion:
         rows: FloatArray,
         columns: int,
     ) -> FloatArray:
-        """Integrate a blurred image over the pixels of some rows, each at its own moment.
+        """Integrate a blurred image over pixels (n, columns), each row at its own moment.
 
         Parameters
         ----------
@@ -80,10 +80,6 @@ class RowMotion:
             Rows of the frame: the first is the first pixel's.
         columns : int
             Pixels per row.
-
-        Returns
-        -------
-        (n, columns) array
         """
         height, width = padded_shape
         shift = self.shift_px(rows) * oversampling

@@ -12,7 +12,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import LightField
+from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.plate import PrintedPlate, image_plate, plate_window
 from kgcp.simulation.regions import Annulus, ConvexPolygon, DiscRegion, Region, polygon, rectangle
@@ -32,7 +32,7 @@ class PlatePose:
 
     plate: PrintedPlate
     pose: Pose
-    field: LightField | None = None
+    field: PlateLight | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -348,7 +348,9 @@ def _model(known: Sequence[Target], diameter_m: float | None) -> Ring:
         first = known[0].ring
         scale = 1.0 if diameter_m is None else diameter_m / first.outer_diameter_m
     elif diameter_m is None:
-        raise SettingError("diameter", "is missing", "give it in metres, or a FLIGHT to take it of")
+        raise SettingError(
+            "diameter", "is missing", "give it in metres, or name a FLIGHT to take it from"
+        )
     else:
         first, scale = Ring("new", 1.0, _INNER, _CODE, _DOT, (0.0,)), diameter_m
     return replace(

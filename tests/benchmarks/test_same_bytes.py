@@ -1,4 +1,4 @@
-"""The same bytes, whatever the number of threads and jobs, and whoever has loaded numpy before.
+"""The same bytes, for any number of threads and jobs, also if numpy was loaded before.
 
 `python -m benchmarks.reliability.same_bytes` has more circumstances: what is compiled when, and by
 whom.

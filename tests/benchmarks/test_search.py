@@ -48,14 +48,14 @@ def test_rings_have_the_promised_radii_and_are_in_the_frame(
     name: str, low: float, high: float
 ) -> None:
     for shot in shots(name):
-        for seen in shot.wanted:
-            assert low <= radius_px(shot.camera, seen) <= high * 1.0001
-            ring = seen.plate.target.ring
-            assert share_in_frame(shot, seen, ring.outer_diameter_m) == 1.0
+        for placed in shot.wanted:
+            assert low <= radius_px(shot.camera, placed) <= high * 1.0001
+            ring = placed.plate.target.ring
+            assert share_in_frame(shot, placed, ring.outer_diameter_m) == 1.0
 
 
 def test_oblique_plates_are_tilted_against_their_rays() -> None:
-    tilts = [tilt_deg(seen.pose) for shot in shots("oblique") for seen in shot.wanted]
+    tilts = [tilt_deg(placed.pose) for shot in shots("oblique") for placed in shot.wanted]
     assert 30.0 <= min(tilts) < 33.0
     assert 42.0 < max(tilts) <= 45.0
 

@@ -39,7 +39,7 @@ def test_photographs_are_put_together_by_size_and_timed(source: Source, tmp_path
     for name, shape in (("a.png", (90, 160)), ("b.png", (90, 160)), ("c.png", (120, 100))):
         cv2.imwrite(str(tmp_path / name), rng.integers(0, 255, shape, dtype=np.uint8))
     found = photographs_of(tmp_path, source)
-    assert [one.frames for one in found] == [("a.png", "b.png"), ("c.png",)]
+    assert [source.frames for source in found] == [("a.png", "b.png"), ("c.png",)]
     assert (found[0].flight.camera.width, found[0].flight.camera.height) == (160, 90)
     cost = cost_of(tmp_path / "a.png", found[0].flight.camera, found[0].flight.targets)
     assert (cost.pixels, cost.found) == (160 * 90, 0)

@@ -51,7 +51,7 @@ def test_a_used_folder_ends_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("")
     result = CliRunner().invoke(main, ["simulate", str(tmp_path), "--frames", "1", "--jobs", "1"])
     assert result.exit_code == 1
-    assert "holds something already" in result.stderr
+    assert "is not empty" in result.stderr
 
 
 EFFECTS: dict[str, Any] = {

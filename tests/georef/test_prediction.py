@@ -35,10 +35,15 @@ def test_errors_between_neighbours_are_those_stated() -> None:
         missing = np.arange(3, FRAMES - 3, 5)
         predictions = predict_between(Track(time_s, without(state, missing)))
         for row in missing:
-            one = predictions[row]
-            assert one is not None
-            z.append([*((one.centre_px - state[row, :2]) / one.sd_px), np.log(one.radius_px)])
-            z[-1][2] = (z[-1][2] - state[row, 2]) / one.sd_log_radius
+            prediction = predictions[row]
+            assert prediction is not None
+            z.append(
+                [
+                    *((prediction.centre_px - state[row, :2]) / prediction.sd_px),
+                    np.log(prediction.radius_px),
+                ]
+            )
+            z[-1][2] = (z[-1][2] - state[row, 2]) / prediction.sd_log_radius
     scatter = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all((scatter[:2] > 0.4) & (scatter[:2] < 1.2)), scatter
     assert scatter[2] < 1.2
@@ -59,7 +64,7 @@ def test_a_wild_motion_is_not_sure() -> None:
     time_s = np.arange(40.0)
     state = np.column_stack((rng.uniform(0, 1600, 40), rng.uniform(0, 1200, 40), np.full(40, 2.5)))
     predictions = predict_between(Track(time_s, without(state, np.arange(2, 38, 4))))
-    assert not any(one.is_sure for one in predictions if one is not None)
+    assert not any(each.is_sure for each in predictions if each is not None)
 
 
 def test_nothing_is_extrapolated_nor_made_of_few_frames() -> None:
@@ -80,11 +85,11 @@ def test_a_reference_is_believed_as_far_as_it_has_proved_itself() -> None:
     seen = without(truth, np.arange(0, 90, 3))
     seen[4, :2] += 400.0  # a wrong one does no harm
     predictions = predict_by_reference(Track(np.full(90, np.nan), seen), predicted)
-    one = predictions[3]
-    assert one is not None
-    assert one.sd_px == pytest.approx(3.0, rel=0.25)
-    assert one.sd_log_radius == pytest.approx(0.04, rel=0.3)
-    np.testing.assert_array_equal(one.centre_px, predicted[3, :2])
+    prediction = predictions[3]
+    assert prediction is not None
+    assert prediction.sd_px == pytest.approx(3.0, rel=0.25)
+    assert prediction.sd_log_radius == pytest.approx(0.04, rel=0.3)
+    np.testing.assert_array_equal(prediction.centre_px, predicted[3, :2])
 
 
 @pytest.mark.parametrize(("found", "shift_px"), [(3, 0.0), (40, 60.0)])
@@ -100,9 +105,11 @@ def test_a_reference_without_proof_or_far_off_says_nothing(found: int, shift_px:
 def test_a_bias_of_the_reference_counts_as_its_deviation() -> None:
     truth = np.column_stack((np.arange(50.0), np.arange(50.0), np.full(50, 3.0)))
     seen = without(truth, np.arange(40, 50))
-    one = predict_by_reference(Track(np.arange(50.0), seen), truth + np.array([12.0, 0.0, 0.0]))[45]
-    assert one is not None
-    assert one.sd_px == pytest.approx(12.0 / 1.177, rel=0.01)
+    prediction = predict_by_reference(
+        Track(np.arange(50.0), seen), truth + np.array([12.0, 0.0, 0.0])
+    )[45]
+    assert prediction is not None
+    assert prediction.sd_px == pytest.approx(12.0 / 1.177, rel=0.01)
 
 
 def test_the_surer_source_is_taken_and_found_frames_are_left() -> None:
@@ -111,6 +118,6 @@ def test_the_surer_source_is_taken_and_found_frames_are_left() -> None:
     track = Track(time_s, without(truth, np.array([5, 11])))
     reference = truth + np.array([2.0, 0.0, 0.0])
     predictions = predict_position(track, reference)
-    assert [one is not None for one in predictions] == [row in {5, 11} for row in range(12)]
-    by = [one.source for one in predictions if one is not None]
+    assert [each is not None for each in predictions] == [row in {5, 11} for row in range(12)]
+    by = [each.source for each in predictions if each is not None]
     assert by == ["its neighbours", "the reference"]

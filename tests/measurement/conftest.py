@@ -19,7 +19,7 @@ from kgcp.measurement.image_model.window import contour_px, cut_window, semi_maj
 from kgcp.measurement.records import InitialPose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.light_field import LightField
+from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plate import PrintedPlate, image_plate
 from kgcp.targets.layout import Ring, Target
 
@@ -159,7 +159,7 @@ def photograph() -> Callable[..., GreyArray]:
         sensor: Sensor = Sensor(),  # noqa: B008 - frozen
         gain: float = 0.9,
         shade: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
-        field: LightField | None = None,
+        field: PlateLight | None = None,
         optics: Optics = Optics(0.7),  # noqa: B008 - frozen
     ) -> GreyArray:
         irradiance = np.full((camera.height, camera.width), 0.2)

@@ -21,7 +21,7 @@ from kgcp.measurement.records import InitialPose, Measurement, Miss
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade
+from kgcp.simulation.light_field import Cloud, Highlight, PlateLight, Shade
 from kgcp.simulation.light_settings import Dirt
 from kgcp.simulation.plate import PrintedPlate
 from kgcp.simulation.point_spread import Aberration
@@ -31,7 +31,7 @@ LENS = Camera(420, 340, 900.0, 901.0, 208.2, 171.7, response=Response.LINEAR)
 RADIUS_PX, FRAMES = 45.0, 4
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
-Lights = Callable[[np.random.Generator], LightField]
+Lights = Callable[[np.random.Generator], PlateLight]
 
 
 def some_pose(rng: np.random.Generator) -> Pose:
@@ -41,20 +41,20 @@ def some_pose(rng: np.random.Generator) -> Pose:
     return Pose((tilt * turn).as_matrix(), ray * 0.45 * LENS.mean_focal_px / RADIUS_PX)
 
 
-def shadow_edge(rng: np.random.Generator) -> LightField:
+def shadow_edge(rng: np.random.Generator) -> PlateLight:
     """Half of the light is taken from one side of a line across the ring."""
     way = rng.uniform(0.0, 2.0 * math.pi)
     shade = Shade((math.cos(way), math.sin(way)), 50.0 + rng.uniform(-0.3, 0.3), 100.0, 0.06)
-    return LightField(light_left=0.5, shades=(shade,))
+    return PlateLight(light_left=0.5, shades=(shade,))
 
 
-def highlight(rng: np.random.Generator) -> LightField:
+def highlight(rng: np.random.Generator) -> PlateLight:
     way = rng.uniform(0.0, 2.0 * math.pi)
-    return LightField(highlight=Highlight((0.3 * math.cos(way), 0.3 * math.sin(way)), 0.2, 0.3))
+    return PlateLight(highlight=Highlight((0.3 * math.cos(way), 0.3 * math.sin(way)), 0.2, 0.3))
 
 
-def dirt(rng: np.random.Generator) -> LightField:
-    return LightField(cloud=Cloud.drawn(Dirt(sd=0.06, correlation_m=0.12), rng))
+def dirt(rng: np.random.Generator) -> PlateLight:
+    return PlateLight(cloud=Cloud.drawn(Dirt(sd=0.06, correlation_m=0.12), rng))
 
 
 def measured(

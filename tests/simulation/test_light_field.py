@@ -16,7 +16,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.light_field import Cloud, Highlight, LightField, Shade, Stain
+from kgcp.simulation.light_field import Cloud, Highlight, PlateLight, Shade, Stain
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.simulation.plate import image_plate
@@ -44,7 +44,7 @@ def half_plane(direction_deg: float, edge_m: float, penumbra_m: float) -> Shade:
 def test_uniform_light_changes_nothing() -> None:
     plain = image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7))
     far_away = half_plane(30.0, 7.0, 0.1)
-    for field in (LightField(), LightField(0.45, (far_away,), (Stain((5.0, 0.0), 0.1, 0.9),))):
+    for field in (PlateLight(), PlateLight(0.45, (far_away,), (Stain((5.0, 0.0), 0.1, 0.9),))):
         lit = image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7), field=field)
         assert_array_equal(lit.irradiance, plain.irradiance)
         assert_array_equal(lit.opacity, plain.opacity)
@@ -52,7 +52,7 @@ def test_uniform_light_changes_nothing() -> None:
 
 def test_full_shade_leaves_the_share_that_was_asked_for() -> None:
     plain = image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7))
-    field = LightField(0.45, (half_plane(30.0, -7.0, 0.1),))
+    field = PlateLight(0.45, (half_plane(30.0, -7.0, 0.1),))
     shaded = image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7), field=field)
     assert_allclose(shaded.irradiance, 0.45 * plain.irradiance, atol=1e-12)
 
@@ -63,7 +63,7 @@ def test_a_shadow_edge_takes_the_light_of_the_area_behind_it(
     direction_deg: float, penumbra_m: float
 ) -> None:
     patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4)
-    light = LightField(0.3, (half_plane(direction_deg, 0.0137, penumbra_m),)).share(patch)
+    light = PlateLight(0.3, (half_plane(direction_deg, 0.0137, penumbra_m),)).share(patch)
     # Penumbras are symmetric: in every row, light is lost as beyond a sharp edge.
     angle = math.radians(direction_deg)
     edge_m = (0.0137 - math.sin(angle) * patch.y_m[:, 0]) / math.cos(angle)
@@ -93,7 +93,7 @@ def test_narrow_stripes_never_reach_full_shade() -> None:
     assert hidden.sum() * 0.001 == pytest.approx(0.05, rel=1e-6)  # takes what a sharp one takes
 
 
-def supersampled(field: LightField, edge: ConvexPolygon, factor: int) -> FloatArray:
+def supersampled(field: PlateLight, edge: ConvexPolygon, factor: int) -> FloatArray:
     """Mean light of sub-pixels by brute force: a plate half black, on a `factor`² finer grid."""
     patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4 * factor)
     painted = np.ones_like(patch.x_m)
@@ -107,7 +107,7 @@ def supersampled(field: LightField, edge: ConvexPolygon, factor: int) -> FloatAr
 @pytest.mark.parametrize("direction_deg", [0.0, 17.0, 45.0])
 def test_edges_of_the_print_are_shared_by_area_in_a_penumbra(direction_deg: float) -> None:
     ink = rectangle((0.5021, 0.0013), 1.0, 2.0, 33.0)
-    field = LightField(0.45, (half_plane(33.0 + direction_deg, -0.003, 0.02),))
+    field = PlateLight(0.45, (half_plane(33.0 + direction_deg, -0.003, 0.02),))
     patch = PlaneRaster.of(FLAT, FACING, WINDOW, 4)
     painted = np.ones_like(patch.x_m)
     patch.paint(painted, ink, 0.1)
@@ -139,7 +139,7 @@ def test_dirt_has_the_declared_deviation_and_correlation() -> None:
 def test_stains_take_the_light_of_their_area() -> None:
     patch = PlaneRaster.of(FLAT, FACING, WINDOW, 8)
     for radius_m in (0.02, 0.05):
-        light = LightField(stains=(Stain((0.0131, -0.0072), radius_m, 0.8),)).share(patch)
+        light = PlateLight(stains=(Stain((0.0131, -0.0072), radius_m, 0.8),)).share(patch)
         lost = (1.0 - light).sum() * (PIXEL_M / 8.0) ** 2
         # The soft outline is symmetric; its second moment adds to the area.
         soft = 1.0 + 0.3**2 * (1.0 - 8.0 / math.pi**2)
@@ -151,7 +151,7 @@ def test_a_highlight_adds_the_same_to_ink_and_white() -> None:
     highlight = Highlight((0.1, 0.05), 0.2, 0.5)
     plain = image_plate(CAMERA, TARGET_PLATE, POSE, Optics(0.7))
     shiny = image_plate(
-        CAMERA, TARGET_PLATE, POSE, Optics(0.7), field=LightField(highlight=highlight)
+        CAMERA, TARGET_PLATE, POSE, Optics(0.7), field=PlateLight(highlight=highlight)
     )
     added = shiny.irradiance - plain.irradiance
     middle = CAMERA.project(POSE.transform(np.array([[0.1, 0.05, 0.0]])))[0]
@@ -166,7 +166,7 @@ def test_a_highlight_adds_the_same_to_ink_and_white() -> None:
 @given(seed=st.integers(0, 2**32), gain=st.floats(0.3, 2.0))
 def test_drawn_light_keeps_to_its_settings(seed: int, gain: float) -> None:
     shadow, dirt, glare = Shadow(stripes=2), Dirt(stains=5), Glare()
-    field = LightField.drawn(shadow, dirt, glare, gain, np.random.default_rng(seed))
+    field = PlateLight.drawn(shadow, dirt, glare, gain, np.random.default_rng(seed))
     assert field.light_left == 0.45
     assert len(field.shades) == 3
     for shade in field.shades:

@@ -77,7 +77,7 @@ def test_proposed_codes_are_the_farthest_of_all() -> None:
     width_deg = 2.0 * ring(0).dot_half_angle_deg
     candidates = code_design._candidates(3, width_deg, 5.0)
     everything = [ring(*code, name=str(i)) for i, code in enumerate(candidates)]
-    own = np.array([dots_apart_turned(one) for one in everything])
+    own = np.array([dots_apart_turned(code) for code in everything])
     proposed = named(propose_codes(ring(0), 1, 3))
     assert least_apart(proposed) == pytest.approx(own.max(), abs=1e-3)
     apart = np.stack(
@@ -126,7 +126,7 @@ def test_codes_that_could_be_confused_are_refused(new: Ring, words: str) -> None
 
 
 def test_codes_that_are_proposed_pass() -> None:
-    targets = [Target(one) for one in named(propose_codes(ring(0), 8, 3))]
+    targets = [Target(proposal) for proposal in named(propose_codes(ring(0), 8, 3))]
     check_new_codes(targets, [])
     for first, second in itertools.combinations(targets, 2):
         assert dots_apart(first.ring, second.ring) >= LEAST_DISTANCE
@@ -141,13 +141,13 @@ def test_too_many_codes_are_refused() -> None:
 def test_many_proposed_codes_pass_too(count: int, dots: int) -> None:
     """Codes that differ by two dots may coincide if all their dots are off by half a dot."""
     proposed = named(propose_codes(ring(0), count, dots))
-    check_new_codes([Target(one) for one in proposed], [])
+    check_new_codes([Target(proposal) for proposal in proposed], [])
 
 
 def test_fifty_codes_of_four_dots_fit_on_a_coarse_grid() -> None:
     codes, least = code_design._farthest_codes(ring(0), 50, 4, [], 12.0, 40)
     assert least >= LEAST_DISTANCE
-    check_new_codes([Target(one) for one in named(codes)], [])
+    check_new_codes([Target(proposal) for proposal in named(codes)], [])
 
 
 @given(st.integers(2, 6), st.floats(0.0, 360.0), st.floats(0.0, 11.5), st.integers(0, 10**6))

@@ -100,7 +100,7 @@ def _scales(
 def blur_on_plate(
     pose: Pose, ray: FloatArray, covariance: tuple[float, float, float], sd_m: float
 ) -> FloatArray:
-    """Return how an image's blur is spread over the plate's directions.
+    """Return an image's blur on the plate: its covariance (3,) xx, xy, yy, in units of sd_m².
 
     Parameters
     ----------
@@ -110,11 +110,6 @@ def blur_on_plate(
         Of the blur: xx, yy, xy [px²].
     sd_m : float
         Largest standard deviation that it may have on the plate.
-
-    Returns
-    -------
-    (3,) array
-        Its covariance there, xx, xy, yy, in units of sd_m².
     """
     a, b, c, d = _scales(pose.rotation, pose.translation_m, ray)
     xx, yy, xy = covariance

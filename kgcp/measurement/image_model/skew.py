@@ -24,7 +24,9 @@ def skew_rows(
     covariance: tuple[float, float, float],
     incidence: EdgeIncidence,
 ) -> FloatArray:
-    """Return the derivatives (4, n) of the white share by the third cumulants of the point spread.
+    """Return the derivatives (4, n) of the white share by the point spread's third cumulants.
+
+    Their order is xxx, xxy, xyy, yyy [1/px³].
 
     Parameters
     ----------
@@ -34,11 +36,6 @@ def skew_rows(
         As of a window.
     covariance : (3,) tuple
         Of the blur: xx, yy, xy [px²].
-
-    Returns
-    -------
-    (4, n) array
-        By xxx, xxy, xyy, yyy [1/px³].
     """
     views, rows = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((SKEW_ROWS, rays.shape[1]))
     meet_plate(pose, rays, views)

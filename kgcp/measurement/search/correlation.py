@@ -18,12 +18,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import BoolArray, FloatArray
-
-SingleArray = npt.NDArray[np.float32]
+from kgcp.geometry.arrays import BoolArray, FloatArray, SingleArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

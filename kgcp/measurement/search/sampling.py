@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray, SingleArray
 from kgcp.geometry.conic import Ellipse
 
 FAINTEST_SLOPE = 0.25  # of an edge, in grey values per pixel: less is rounding
@@ -28,18 +28,9 @@ def sample_grey(grey: GreyArray, points: npt.NDArray[np.floating]) -> FloatArray
 def sample_ellipses(
     grey: GreyArray, outlines: Sequence[Ellipse], factors: FloatArray, circle: FloatArray
 ) -> FloatArray:
-    """Sample a frame on outlines enlarged by some factors, as `sample_grey`.
+    """Sample a frame on n outlines enlarged by factors (m,), as `sample_grey`: (n, m, k).
 
-    Parameters
-    ----------
-    grey : (height, width) array
-    factors : (m,) array
-    circle : (k, 2) array
-        Points of the unit circle, of which `Ellipse.points` makes those of the ellipse.
-
-    Returns
-    -------
-    (n, m, k) array
+    `circle` (k, 2) has the points of the unit circle that become those of the ellipses.
     """
     shape = len(outlines), len(factors), len(circle)
     if not outlines:
@@ -68,7 +59,7 @@ def _place_points(
     angle_rad: float,
     factors: FloatArray,
     circle: FloatArray,
-    points: npt.NDArray[np.float32],
+    points: SingleArray,
 ) -> None:
     """Fill in points (m, k, 2) on ellipses about one centre."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)

@@ -10,12 +10,12 @@ import numpy as np
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
-from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, SingleArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.correlation import Bank, SingleArray, bank_of, correlate
+from kgcp.measurement.search.correlation import Bank, bank_of, correlate
 from kgcp.measurement.search.sampling import sample_ellipses, sample_grey
 from kgcp.measurement.search.templates import (
     ANGLES,
@@ -260,17 +260,9 @@ def _compare(
 
 
 def visible_angles(patch: FloatArray, ring: Ring) -> BoolArray | None:
-    """Return at which angles a ring shows both of its edges.
+    """Return at which angles (angles,) a ring shows both of its edges.
 
-    Parameters
-    ----------
-    patch : (rows, angles) array
-        Grey values at `TEMPLATE_RADII`.
-
-    Returns
-    -------
-    (angles,) array of bool, or None
-        None if nothing is hidden, or too much.
+    None if nothing is hidden, or too much. The patch (rows, angles) is sampled at `TEMPLATE_RADII`.
     """
     plate, outside, disc, inside = edge_rows(ring)
     visible = np.empty(ANGLES, dtype=bool)

@@ -7,8 +7,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.search.correlation import Bank, SingleArray, bank_of
+from kgcp.geometry.arrays import FloatArray, SingleArray
+from kgcp.measurement.search.correlation import Bank, bank_of
 from kgcp.targets.layout import Ring
 
 # Tuning of the templates. The benchmark is `benchmarks.search.hard_frames`; docs/method.md,

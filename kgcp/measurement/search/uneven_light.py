@@ -21,7 +21,8 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
     """Return a polar patch as it would be if ink and plate had the same levels at all angles.
 
     They are read on either side of both edges, smoothed around the ring, and between the edges
-    taken to change evenly: so much smoother than a code's dots that they cannot make one.
+    taken to change evenly: so much smoother than a code's dots that they cannot make one. None if
+    the levels are even, or if a part does not look like a ring.
 
     Parameters
     ----------
@@ -29,11 +30,6 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
         Sampled at `SAMPLED_RADII`.
     shift : int
         Of the template that fits best.
-
-    Returns
-    -------
-    (rows + 2 shifts, angles) array, or None
-        None if the levels are even, or if a part does not look like a ring.
     """
     plate, outside, disc, inside = (row + shift for row in edge_rows(ring))
     white_out, white_in = (_around(patch[r], 0.5, _HALF_PLATE) for r in (plate, disc))

@@ -112,7 +112,7 @@ class DaskCluster(Executor):
 
     def _gone(self, what: str) -> KgcpError:
         return KgcpError(
-            f"{self._name}: the scheduler {what}; when it has workers, the same command goes on"
+            f"{self._name}: the scheduler {what}; once it has workers, the same command resumes"
         )
 
 
@@ -183,8 +183,8 @@ def _connect(scheduler: str, stack: ExitStack) -> Client:
             stack.callback(_close, client)
     except Exception as error:  # any server may answer, and anything is raised
         raise KgcpError(
-            f"scheduler {scheduler}: cannot be reached ({error}); see that it runs, and that this"
-            " machine may connect to it"
+            f"scheduler {scheduler}: cannot be reached ({error}); check that it runs and that this"
+            " machine can connect to it"
         ) from error
     return client
 

@@ -187,7 +187,7 @@ class Journal:
         """Return the result of a key that was there."""
         result = self.get(key)
         if result is None:
-            raise KgcpError(f"{self._path}: is damaged; begin anew", option="restart")
+            raise KgcpError(f"{self._path}: is damaged; start over", option="restart")
         return result
 
     def add(self, key: str, result: FrameResult) -> None:
@@ -249,8 +249,8 @@ class Journal:
             yield
         except OSError as error:
             raise KgcpError(
-                f"{self._path}: {error.strerror}; when that is put right, the same command goes on"
-                " from what is kept there"
+                f"{self._path}: {error.strerror}; fix this, and the same command resumes from"
+                " what is kept there"
             ) from error
         finally:
             self.seconds += time.monotonic() - began_s

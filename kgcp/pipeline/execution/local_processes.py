@@ -101,7 +101,7 @@ class WorkerProcess:
                 self._connection = own
                 return own
         raise KgcpError(
-            "processes end as soon as they are started; free memory, or work in this one",
+            "worker processes end as soon as they start; free memory, or work without them",
             option="jobs 0",
         )
 

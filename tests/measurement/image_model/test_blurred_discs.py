@@ -92,7 +92,7 @@ def along_and_across(disc: Disc, u: FloatArray, v: FloatArray) -> tuple[FloatArr
 
 
 def by_chords(disc: Disc, x: FloatArray, y: FloatArray, count: int) -> FloatArray:
-    """Level of a disc by so many chords along its streak, or along the radius without one."""
+    """Level of a disc by chords along its streak, or along the radius without one."""
     streak = np.broadcast_to([[disc.streak_x], [disc.streak_y]], (2, len(x)))
     smears = bool(disc.streak_x or disc.streak_y)
     length = np.hypot(*streak) if smears else np.hypot(x, y)

@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.measurement.search.outlines import find_outlines, find_seeds, non_max_suppression
 from kgcp.measurement.search.pyramid import build_pyramid, factor_of
 
-SUPER = 8  # drawn so many times as large
+SUPER = 8  # factor by which the drawing is larger
 BLACK, WHITE = 40.0, 190.0
 
 

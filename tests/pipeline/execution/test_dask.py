@@ -1,4 +1,4 @@
-"""Dask's workers instead of a pool: the same bytes, whoever dies."""
+"""Dask's workers instead of a pool: the same bytes, whatever dies."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_a_scheduler_that_is_of_no_use_is_a_line(monkeypatch: pytest.MonkeyPatch
             pass
     with (
         LocalCluster(n_workers=0, processes=False, dashboard_address=ANY_PORT) as empty,
-        pytest.raises(KgcpError, match=r"has had no workers for 0 s; when it has workers"),
+        pytest.raises(KgcpError, match=r"has had no workers for 0 s; once it has workers"),
         connected(empty.scheduler_address, 60.0, ()),
     ):
         pass

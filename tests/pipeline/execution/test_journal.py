@@ -248,7 +248,7 @@ def test_a_line_that_was_cut_spoils_no_other(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["made-by", "never"])
 def test_a_result_that_cannot_be_read_again_is_an_error(key: str, tmp_path: Path) -> None:
-    text = r"journal: is damaged; begin anew"
+    text = r"journal: is damaged; start over"
     with open_journal(tmp_path) as journal, pytest.raises(KgcpError, match=text) as caught:
         journal.read(key)
     assert caught.value.on_command_line().endswith(" (--restart)")
@@ -271,7 +271,7 @@ def test_a_full_disk_is_a_line_and_the_journal_stays(tmp_path: Path) -> None:
     )
     with run(program, tmp_path) as other:
         told, _ = other.communicate()
-    assert "journal: No space left on device; when that is put right" in told
+    assert "journal: No space left on device; fix this" in told
     assert keys(tmp_path) == ["key-0"]
 
 

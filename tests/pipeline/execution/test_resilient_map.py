@@ -130,13 +130,13 @@ def test_a_signal_waits_for_the_end_of_a_call_in_this_process() -> None:
 
 def test_processes_that_cannot_start_are_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kgcp.pipeline.execution.local_processes._serve", end_process)
-    text = "end as soon as they are started; free memory"
+    text = "end as soon as they start; free memory"
     with pool(1) as executor, pytest.raises(KgcpError, match=text) as caught:
         list(resilient_map(abs, (1, 2), executor, 1))
     assert caught.value.on_command_line().endswith(" (--jobs 0)")
 
 
-def test_who_stops_listening_waits_for_nobody(tmp_path: Path) -> None:
+def test_a_map_that_is_closed_early_does_not_wait(tmp_path: Path) -> None:
     start_s = time.monotonic()
 
     def stop() -> Iterator[int]:

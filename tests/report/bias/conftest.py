@@ -59,7 +59,7 @@ def study() -> Study:
     def made(
         *compared: Comparison, attitudes_agree: bool = True, method: Method = Method.MODEL
     ) -> BiasStudy:
-        measured = tuple(one for one in compared if one.attempt.sighting is not None)
+        measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
         return BiasStudy(method, measured, compared, attitudes_agree, ("lost.jpg",), ())
 
     return made

@@ -63,12 +63,12 @@ def again(flight: Flight, frame: str, method: Method) -> list[Reexposed]:
 
 def test_other_grey_values_do_not_move_the_model(flight: Flight) -> None:
     found = again(flight, "frame_0005.jpg", Method.MODEL)
-    assert tuple(one.gain for one in found) == GAINS
-    for one in found:
-        assert one.row == 3
-        assert one.change_percent is not None
-        assert one.sd_percent is not None
-        assert abs(one.change_percent) < 3.0 * one.sd_percent < 0.1
+    assert tuple(result.gain for result in found) == GAINS
+    for result in found:
+        assert result.row == 3
+        assert result.change_percent is not None
+        assert result.sd_percent is not None
+        assert abs(result.change_percent) < 3.0 * result.sd_percent < 0.1
     darker, brighter = found
     assert darker.saturated == 0.0
     assert brighter.saturated is not None

@@ -232,10 +232,10 @@ def test_without_times_deviations_or_poses_there_is_a_page_too(
     rng = np.random.default_rng(1)
     compared = []
     for distance in rng.uniform(10.0, 100.0, 30):
-        one = compare(distance, rng.normal(0.0, 0.05), sds=None, iso=rng.choice([100.0, 200.0]))
-        assert one.attempt.sighting is not None
-        bare = replace(one.attempt.sighting, time_s=None, pose=None)
-        compared.append(replace(one, attempt=replace(one.attempt, time_s=None, sighting=bare)))
+        pair = compare(distance, rng.normal(0.0, 0.05), sds=None, iso=rng.choice([100.0, 200.0]))
+        assert pair.attempt.sighting is not None
+        bare = replace(pair.attempt.sighting, time_s=None, pose=None)
+        compared.append(replace(pair, attempt=replace(pair.attempt, time_s=None, sighting=bare)))
     of_sample(study(*compared)).write_report(tmp_path, reexpose=0)
     summary = json.loads((tmp_path / "bias_summary.json").read_text(encoding="utf-8"))
     assert summary["standardised"] is None

@@ -51,7 +51,7 @@ def fly(compare: Compare, study: Study) -> Fly:
 
 def texts(numbers: BiasNumbers, grade: Grade | None = None) -> str:
     findings = assess(numbers).findings
-    return "\n".join(one.text for one in findings if grade in {None, one.grade})
+    return "\n".join(finding.text for finding in findings if grade in {None, finding.grade})
 
 
 def test_numbers_are_those_of_the_study(compare: Compare, study: Study) -> None:
@@ -184,7 +184,7 @@ def test_an_influence_of_exposure_is_named(compare: Compare, study: Study) -> No
     numbers = bias_numbers(
         study(*(compare(d, e, white=w) for d, e, w in zip(distances, errors, white, strict=True)))
     )
-    assert [one.quantity.name for one in numbers.influences] == ["white"]
+    assert [influence.quantity.name for influence in numbers.influences] == ["white"]
     slope = numbers.influences[0].residual
     assert slope is not None
     assert slope.probability < 1e-6
