@@ -64,7 +64,7 @@ def make_flight(folder: Path, frames: int, jobs: int, *, absent_share: float = 0
     write_simulated_flight(plan_flight(settings, 3), folder, jobs=jobs, on_frame=lambda: None)
     (folder / "reference.csv").unlink()  # it names the first pass alone
     names = sorted(path.name for path in (folder / "frames").iterdir())
-    times = read_times(folder / "frames.csv", names)
+    times = read_times(folder / "frames.csv", names).time_s
     lines = ["frame,time"]
     for number in range(frames):
         name, turn = names[number % len(names)], number // len(names)

@@ -122,8 +122,8 @@ def detect_flight(
     with stopwatch.stage("preparation"):
         frames = frames_below(frames_folder)
         data = FlightData(flight, frames)
-        times = data.frame_times
-        priors = priors_of_frames(flight, data, frames, times)
+        times = data.frame_times.time_s
+        priors = priors_of_frames(flight, data, frames)
         inputs = [
             FrameInput(frame, times.get(frame), known, flight.may_use_exif_times)
             for frame, known in zip(frames, priors, strict=True)
@@ -162,7 +162,7 @@ def detect_flight(
                 sheet.clear()
             with stopwatch.stage("table"):
                 rows = _rows(run, predictions, builder)
-                about = detections_provenance(flight, settings, run.frame_sizes, times)
+                about = detections_provenance(flight, settings, run.frame_sizes, data.frame_times)
                 write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
                 with stopwatch.stage("overlay"):

@@ -18,7 +18,6 @@ from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.frame_times import read_times
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
@@ -120,9 +119,10 @@ class FlightInputs:
             return {
                 header.frame: header.time_s for header in self.headers if header.time_s is not None
             }
-        file, frames = flight.times_file, set(self.frames)
-        times = self._read(lambda: read_times(file, self.frames, flight.times_format)) or {}
-        return {frame: time_s for frame, time_s in times.items() if frame in frames}
+        frames, times = set(self.frames), self._read(lambda: self.data.frame_times)
+        if times is None:
+            return {}
+        return {frame: time_s for frame, time_s in times.time_s.items() if frame in frames}
 
     @cached_property
     def trajectory(self) -> Trajectory | None:

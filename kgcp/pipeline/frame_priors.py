@@ -9,7 +9,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
-from kgcp.georef.scene_rotation import rotations_between_frames
+from kgcp.georef.scene_rotation import combine, rotations_between_frames
 from kgcp.georef.target_positions import TargetPosition, Vehicle
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -19,9 +19,7 @@ from kgcp.targets.layout import Target
 Priors = Mapping[str, PlatePrior]
 
 
-def priors_of_frames(
-    flight: Flight, data: FlightData, frames: Sequence[str], times: Mapping[str, float]
-) -> list[Priors]:
+def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[Priors]:
     """Return for each frame what is known of its targets, by their names.
 
     Detecting needs neither reference poses nor a trajectory: where the files cannot be used,
@@ -30,14 +28,19 @@ def priors_of_frames(
     Raises
     ------
     KgcpError
-        If flight.toml says that the plate is level and the reference poses cannot be read.
+        If flight.toml says that the plate is level and the reference poses cannot be read, or as
+        `FlightData.frame_times`.
     """
+    times = data.frame_times.time_s
     time_s = [times.get(frame) for frame in frames]
     moving = [target for target in flight.targets if target.position_m is None]
     normals = _normals(flight, data, frames, time_s, moving)
     by_target = {target.name: normals for target in moving}
     rotations = {
-        target.name: _rotations(flight, data, frames, time_s, target) for target in flight.targets
+        target.name: _with_rates(
+            flight, data, frames, _rotations(flight, data, frames, time_s, target)
+        )
+        for target in flight.targets
     }
     unknown: list[NormalPrior | None] = [None] * len(frames)
     priors: list[Priors] = []
@@ -73,6 +76,24 @@ def _normals(
         return [None] * len(frames)
     attitudes = CameraAttitudes(poses, flight.plumb_sd_deg)
     return normal_priors(frames, time_s, attitudes, vehicle, level_sd_deg)
+
+
+def _with_rates(
+    flight: Flight,
+    data: FlightData,
+    frames: Sequence[str],
+    by_frames_around: Mapping[int, SceneRotation],
+) -> dict[int, SceneRotation]:
+    """Add what the times file says of the camera's rates to what the frames around say."""
+    rotations = dict(by_frames_around)
+    if flight.camera.readout_s:
+        unknown = SceneRotation.unknown(flight.camera)
+        for row, frame in enumerate(frames):
+            rate = data.frame_times.rotation.get(frame)
+            if rate is not None:
+                velocity = np.array(rate.velocity_rad_s)
+                rotations[row] = combine(velocity, rate.sd_rad_s, rotations.get(row, unknown))
+    return rotations
 
 
 def _rotations(

@@ -10,7 +10,6 @@ import pytest
 
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
-from kgcp.io.formats.frame_times import read_times
 from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
 from kgcp.pipeline.frame_priors import priors_of_frames
 
@@ -19,9 +18,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_flight"
 
 def priors(flight: Flight) -> dict[str, dict[str, PlatePrior]]:
     frames = sorted(path.name for path in flight.frames_folder.iterdir())
-    assert flight.times_file is not None
-    times = read_times(flight.times_file, frames, flight.times_format)
-    known = priors_of_frames(flight, FlightData(flight, frames), frames, times)
+    known = priors_of_frames(flight, FlightData(flight, frames), frames)
     return {frame: dict(each) for frame, each in zip(frames, known, strict=True)}
 
 
@@ -61,3 +58,25 @@ def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: fl
     assert len(sds) == len(known)
     assert (sds <= sd_deg_s).all()
     assert (sds < sd_deg_s).sum() > len(known) // 2
+
+
+def test_rates_beside_the_times_are_the_camera_s(tmp_path: Path) -> None:
+    flight = read_flight(SAMPLE)
+    assert flight.times_file is not None
+    head, *rows = flight.times_file.read_text(encoding="utf-8").splitlines()
+    rates = ",rate_x_deg_s,rate_y_deg_s,rate_z_deg_s,sd_rate_deg_s"
+    times = tmp_path / "frames.csv"
+    times.write_text("\n".join([head + rates, *(f"{row},3,-2,1,0.01" for row in rows)]), "utf-8")
+    camera = replace(flight.camera, readout_s=0.02)
+    flight = replace(flight, camera=camera, times_file=times)
+    for each in priors(flight).values():
+        for prior in each.values():
+            assert prior.rotation is not None
+            rate_deg_s = np.degrees(prior.rotation.velocity_rad_s)
+            assert rate_deg_s == pytest.approx((-3.0, 2.0, -1.0), rel=0.01)
+            assert np.degrees(prior.rotation.sd_rad_s) == pytest.approx(0.01, rel=0.01)
+    assert all(
+        prior.rotation is None
+        for each in priors(replace(flight, camera=replace(camera, readout_s=0.0))).values()
+        for prior in each.values()
+    )

@@ -71,7 +71,7 @@ def test_the_folder_is_a_flight(flight: tuple[FlightPlan, Path]) -> None:
         assert ring.outer_diameter_m == pytest.approx(printed.outer_diameter_m, abs=1e-12)
         assert ring.dot_diameter_m == pytest.approx(printed.dot_diameter_m, abs=1e-12)
     names = list_frames(read.frames_folder)
-    times = read_times(read.times_file, ())
+    times = read_times(read.times_file, ()).time_s
     assert_allclose([times[name] for name in names], plan.recorded_times_s, atol=1e-6)
     poses = read_reference_poses(read.reference.file)
     assert poses.frames == tuple(names)

@@ -10,7 +10,7 @@ from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.frame_times import read_times
+from kgcp.io.formats.frame_times import FrameTimes, read_times
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.settings import VehicleSettings
@@ -51,8 +51,8 @@ class FlightData:
         return self._flight.crs is not None and is_placed
 
     @cached_property
-    def frame_times(self) -> dict[str, float]:
-        """What the times file says, Unix UTC [s], also of frames that are not there; else empty.
+    def frame_times(self) -> FrameTimes:
+        """What the times file says, also of frames that are not there; without one, nothing.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class FlightData:
         """
         flight = self._flight
         if flight.times_file is None:
-            return {}
+            return FrameTimes({})
         return read_times(flight.times_file, self._frames, flight.times_format)
 
     @cached_property

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.io.files.csv_columns import CsvColumns, read_csv_columns
 from kgcp.io.files.gps_time import clock_from_week, unix_from_gps, unwrap_week
 from kgcp.io.files.safe_read import read_lines
 from kgcp.io.files.sniff import ForeignFile
@@ -18,15 +19,35 @@ from kgcp.io.files.time_text import is_in_calendar, parse_time
 from kgcp.io.formats.frame_names import likely_difference
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution, read_solution
+from kgcp.measurement.plate_prior import SceneRotation
+
+_RATES = ("rate_x_deg_s", "rate_y_deg_s", "rate_z_deg_s")
+_SD_RATE, _SD_RATE_DEG_S = "sd_rate_deg_s", 1.0
 
 # Number, GPS seconds of the week, [week]; positions and their deviations follow.
 _MARK = re.compile(r"(\d{1,9})\s+(\d{1,9}(?:\.\d*)?)\s+\[\s*(\d{1,9})\s*\](?:\s|$)")
 _LAST_NUMBER = re.compile(r"(.*?)(\d+)\D*")
 
 
-def read_times(
-    path: Path, frames: Sequence[str], times_format: str | None = None
-) -> dict[str, float]:
+@dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """What a times file says of frames, by their names.
+
+    Entries that belong to no frame stand under what they are called in the file.
+
+    Attributes
+    ----------
+    time_s : mapping of str to float
+        Unix UTC [s].
+    rotation : mapping of str to SceneRotation
+        Of the scene at that time: the camera's rates about its axes, turned round.
+    """
+
+    time_s: Mapping[str, float]
+    rotation: Mapping[str, SceneRotation] = field(default_factory=dict)
+
+
+def read_times(path: Path, frames: Sequence[str], times_format: str | None = None) -> FrameTimes:
     """Read the times of frames, in one of the `FORMATS` of docs/conventions.md.
 
     Parameters
@@ -36,12 +57,6 @@ def read_times(
     times_format : str or None
         Name of the format; None: the content tells.
 
-    Returns
-    -------
-    dict of float
-        Unix seconds (UTC) by frame; entries that belong to no frame by what they are called in
-        the file.
-
     Raises
     ------
     KgcpError
@@ -49,17 +64,19 @@ def read_times(
     """
     file = ForeignFile(path, "[frames] times")
     times = FORMATS.reader(file, times_format)(file, frames)
-    if not all(map(is_in_calendar, times.values())):
+    if not all(map(is_in_calendar, times.time_s.values())):
         raise file.error("GPS week out of range", "give the file of this flight")
     return times
 
 
-def _read_csv(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
+def _read_csv(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
     """Return the columns frame and time; times are mid-exposure, in the notations of `parse_time`.
+
+    The camera's rates may stand beside them.
 
     Frames are named as `kgcp.io.images.frames.list_frames` does.
     """
-    columns = read_csv_columns(file.path, ("frame", "time"), (), (), file.toml_key)
+    columns = read_csv_columns(file.path, ("frame", "time"), (), (*_RATES, _SD_RATE), file.toml_key)
     times = {}
     rows = zip(columns.lines, columns.frames(), columns.texts["time"], strict=True)
     for line, frame, text in rows:
@@ -69,7 +86,27 @@ def _read_csv(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
             raise KgcpError(f"{file.path}, line {line}: {error}") from None
     if times and frames and times.keys().isdisjoint(frames):
         raise _no_common_name(file, [*times], frames)
-    return times
+    return FrameTimes(times, dict(zip(times, _rotations(columns), strict=False)))
+
+
+def _rotations(columns: CsvColumns) -> list[SceneRotation]:
+    """Return the rotation of the scene in every row; nothing if the file has no rates."""
+    if not set(_RATES) & set(columns.names):
+        return []
+    absent = [name for name in _RATES if name not in columns.names]
+    if absent:
+        raise KgcpError(
+            f"{columns.path}, line 1: has no {', '.join(absent)}; give the rates about all three of"
+            " the camera's axes, or none"
+        )
+    sds = columns.deviations((_SD_RATE,))
+    sd_rad_s = np.radians(np.full(len(columns.lines), _SD_RATE_DEG_S) if sds is None else sds[:, 0])
+    return [
+        SceneRotation((-x, -y, -z), sd)
+        for (x, y, z), sd in zip(
+            np.radians(columns.block(_RATES)).tolist(), sd_rad_s.tolist(), strict=True
+        )
+    ]
 
 
 def _no_common_name(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) -> KgcpError:
@@ -86,7 +123,7 @@ def _looks_like_marks(file: ForeignFile) -> bool:
     return _MARK.match(file.head.decode("utf-8-sig", errors="replace").lstrip()) is not None
 
 
-def _read_marks(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
+def _read_marks(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
     """Return the times of DJI's marks by frame: a mark's number is the last one in a frame's name.
 
     Their positions are the antenna's, and the offsets to the sensor beside it (north, east and
@@ -121,7 +158,7 @@ def _read_marks(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
 
 def _join_by_number(
     file: ForeignFile, marks: dict[int, float], frames: Sequence[str]
-) -> dict[str, float]:
+) -> FrameTimes:
     times = {}
     owners: dict[int, tuple[str, str]] = {}
     for frame in frames:
@@ -144,10 +181,10 @@ def _join_by_number(
             "give the marks of this flight, or frames.csv",
         )
     spare = {str(number): time for number, time in marks.items() if number not in owners}
-    return {**spare, **times}
+    return FrameTimes({**spare, **times})
 
 
-def _read_events(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
+def _read_events(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
     """Return the times of RTKLIB's events by frame, in their order: events have no names."""
     solution = read_solution(file)
     if len(solution.time_s) != len(frames):
@@ -161,10 +198,10 @@ def _read_events(file: ForeignFile, frames: Sequence[str]) -> dict[str, float]:
     if backwards.size:
         where = f"line {solution.lines[int(backwards[0]) + 1]}"
         raise file.error_at(where, "its event is not later than the one before", "sort them")
-    return dict(zip(frames, solution.time_s.tolist(), strict=True))
+    return FrameTimes(dict(zip(frames, solution.time_s.tolist(), strict=True)))
 
 
-FORMATS: Registry[Callable[[ForeignFile, Sequence[str]], dict[str, float]]] = Registry(
+FORMATS: Registry[Callable[[ForeignFile, Sequence[str]], FrameTimes]] = Registry(
     "a file of frame times",
     "give a CSV file with the columns frame and time",
     {

@@ -14,7 +14,7 @@ import platform
 import resource
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, astuple, fields
 from pathlib import Path
 
 import cv2
@@ -31,6 +31,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.tables.columns import SCHEMA_VERSION
 from kgcp.measurement.records import TimeSource
 from kgcp.settings import DetectSettings
@@ -49,7 +50,7 @@ def detections_provenance(
     flight: Flight,
     settings: DetectSettings,
     frame_sizes: Mapping[str, int | None],
-    times: Mapping[str, float],
+    times: FrameTimes,
 ) -> dict[str, str]:
     """Return the metadata of a table of detections.
 
@@ -57,8 +58,8 @@ def detections_provenance(
     ----------
     frame_sizes : mapping of str to int
         Bytes of the file of every frame; None: missing.
-    times : mapping of str to float
-        What the times file says, Unix UTC [s]; entries of no frame are passed over.
+    times : FrameTimes
+        Entries of no frame are passed over.
     """
     values = detection_inputs(flight)
     by_part: dict[str, dict[str, object]] = defaultdict(dict)
@@ -174,11 +175,20 @@ def _target_table(target: Target, ring: Ring) -> dict[str, object]:
 
 
 def digested_times(
-    flight: Flight, frames: Iterable[str], times: Mapping[str, float]
-) -> list[tuple[str, object]]:
-    """Return what is known of each frame's time before it is read: microseconds, or who tells."""
+    flight: Flight, frames: Iterable[str], times: FrameTimes
+) -> list[tuple[object, ...]]:
+    """Return what is known of each frame's time before it is read: microseconds, or who tells.
+
+    With a rolling shutter, how fast the camera turns at that time is known, too.
+    """
     otherwise = TimeSource.EXIF if flight.may_use_exif_times else TimeSource.NONE
-    return [(frame, round(1e6 * times[frame]) if frame in times else otherwise) for frame in frames]
+    rotations = times.rotation if flight.camera.readout_s else {}
+    digested: list[tuple[object, ...]] = []
+    for frame in frames:
+        time_s, rotation = times.time_s.get(frame), rotations.get(frame)
+        known = (frame, otherwise if time_s is None else round(1e6 * time_s))
+        digested.append(known if rotation is None else (*known, astuple(rotation)))
+    return digested
 
 
 def _part_of(key: str) -> str:

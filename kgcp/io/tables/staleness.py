@@ -136,7 +136,9 @@ def _changed_times(
     if digest(digested_times(flight, names, times)) == digests.get("times"):
         return
     then_s = _unix_s(frames["time"])
-    now_s = np.array([times.get(name, np.nan) for name in names]) + _to_middle_s(frames, flight)
+    now_s = np.array([times.time_s.get(name, np.nan) for name in names]) + _to_middle_s(
+        frames, flight
+    )
     if flight.may_use_exif_times:
         is_exif = (frames["time_source"] == TimeSource.EXIF.value).to_numpy()
         now_s = np.where(np.isnan(now_s) & is_exif, then_s, now_s)

@@ -49,7 +49,7 @@ def places(folder: Path, keys: str) -> tuple[FloatArray, FloatArray]:
     shutil.copy(SAMPLE / "frames.csv", folder)
     shutil.copy(SAMPLE / "vehicle.csv", folder)
     target_positions = FlightData(read_flight(folder), ()).target_positions
-    times = list(read_times(SAMPLE / "frames.csv", []).values())
+    times = list(read_times(SAMPLE / "frames.csv", []).time_s.values())
     found = [
         p
         for p in target_positions.positions(["A"] * len(times), times)

@@ -3,6 +3,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -35,7 +36,7 @@ def recognised(path: Path) -> str:
 
 
 def test_marks_are_gps_times_joined_by_number(tmp_path: Path) -> None:
-    times = read_times(write(tmp_path, *MARKS), FRAMES)
+    times = read_times(write(tmp_path, *MARKS), FRAMES).time_s
     assert times == {
         FRAMES[0]: pytest.approx(THIRD_S - 2.0, abs=1e-6),
         FRAMES[1]: pytest.approx(THIRD_S - 1.088877, abs=1e-6),
@@ -54,14 +55,14 @@ def test_marks_are_gps_times_joined_by_number(tmp_path: Path) -> None:
     ],
 )
 def test_the_last_number_of_a_name_is_the_mark_s(tmp_path: Path, names: tuple[str, str]) -> None:
-    times = read_times(write(tmp_path, *MARKS), names)
+    times = read_times(write(tmp_path, *MARKS), names).time_s
     assert times[names[1]] == pytest.approx(THIRD_S, abs=1e-6)
     assert times.keys() == {*names, "2"}  # a mark of no frame is called by its number
 
 
 def test_lenses_of_one_trigger_share_a_mark(tmp_path: Path) -> None:
     names = ("DJI_20230601_0003_W.JPG", "DJI_20230601_0003_Z.JPG", "overview.JPG")
-    times = read_times(write(tmp_path, *MARKS), names)
+    times = read_times(write(tmp_path, *MARKS), names).time_s
     assert times[names[0]] == times[names[1]] == pytest.approx(THIRD_S, abs=1e-6)
     assert names[2] not in times
 
@@ -77,7 +78,7 @@ def test_frames_of_two_flights_cannot_share_marks(tmp_path: Path, names: tuple[s
 @pytest.mark.parametrize("week", ["2265", "2264"])  # counted on, or not
 def test_marks_go_over_saturday_midnight(tmp_path: Path, week: str) -> None:
     path = write(tmp_path, f"1\t604799.5\t[2264]{TAIL}", f"2\t0.5\t[{week}]{TAIL}")
-    times = read_times(path, FRAMES[:2])
+    times = read_times(path, FRAMES[:2]).time_s
     assert times[FRAMES[1]] - times[FRAMES[0]] == pytest.approx(1.0, abs=1e-6)
     assert times[FRAMES[1]] == datetime(2023, 6, 3, 23, 59, 42, 500000, tzinfo=UTC).timestamp()
 
@@ -108,7 +109,7 @@ EVENTS = tuple(f"2023/06/01 15:12:{50 + k}.{k}00  {CELLS}" for k in (1, 2, 3))
 
 def test_events_belong_to_the_frames_in_their_order(tmp_path: Path) -> None:
     path = write(tmp_path, *HEADER, *EVENTS, name="rover_events.pos")
-    times = read_times(path, ("x.jpg", "y.jpg", "z.jpg"))
+    times = read_times(path, ("x.jpg", "y.jpg", "z.jpg")).time_s
     base = datetime(2023, 6, 1, 15, 12, 32, tzinfo=UTC).timestamp()  # 18 s behind GPS
     assert times == {
         name: pytest.approx(base + second, abs=1e-6)
@@ -129,7 +130,7 @@ def test_a_lost_event_leaves_no_guess(tmp_path: Path) -> None:
 def test_formats_are_recognised_or_named(tmp_path: Path) -> None:
     table = write(tmp_path, "frame,time", "a.jpg,2.5", name="frames.csv")
     assert recognised(table) == "csv"
-    assert read_times(table, ["a.jpg"]) == {"a.jpg": 2.5}
+    assert read_times(table, ["a.jpg"]).time_s == {"a.jpg": 2.5}
     marks = write(tmp_path, *MARKS, name="times.txt")
     assert recognised(marks) == "mrk"
     assert recognised(write(tmp_path, *HEADER, name="e.txt")) == "rtklib"
@@ -157,7 +158,7 @@ def test_written_marks_read_back(tmp_path: Path, seconds: list[int]) -> None:
         for number, micro in enumerate(seconds, start=1)
     ]
     frames = [f"DJI_{number:04d}.JPG" for number in range(1, len(seconds) + 1)]
-    times = read_times(write(tmp_path, *lines), frames)
+    times = read_times(write(tmp_path, *lines), frames).time_s
     week_s = datetime(2023, 5, 28, tzinfo=UTC).timestamp() - 18.0
     for frame, micro in zip(frames, seconds, strict=True):
         assert times[frame] == pytest.approx(week_s + micro * 1e-6, abs=1e-6)
@@ -172,7 +173,7 @@ def test_a_table_has_both_notations_and_may_have_more_columns(tmp_path: Path) ->
         '"b,c\\d.jpg","x, y",2.25',
         name="frames.csv",
     )
-    assert read_times(path, ()) == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
+    assert read_times(path, ()).time_s == {"a.jpg": 1.5, "b,c/d.jpg": 2.25}
 
 
 @pytest.mark.parametrize(
@@ -197,3 +198,22 @@ def test_a_bad_table_is_an_error_with_its_line(
     with pytest.raises(KgcpError, match=words) as caught:
         read_times(path, ())
     assert "\n" not in str(caught.value)
+
+
+RATES = "frame,time,rate_x_deg_s,rate_y_deg_s,rate_z_deg_s"
+
+
+def test_a_table_may_have_the_camera_s_rates(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_text(f"{RATES}\na.jpg,2026-06-16T08:15:05Z,10,-4,0.5\n", encoding="utf-8")
+    (rotation,) = read_times(path, ("a.jpg",)).rotation.values()
+    assert np.degrees(rotation.velocity_rad_s) == pytest.approx((-10.0, 4.0, -0.5))
+    assert np.degrees(rotation.sd_rad_s) == pytest.approx(1.0)
+
+
+def test_rates_are_those_about_three_axes(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    header = RATES.removesuffix(",rate_z_deg_s")
+    path.write_text(f"{header}\na.jpg,2026-06-16T08:15:05Z,10,-4\n", encoding="utf-8")
+    with pytest.raises(KgcpError, match="line 1: has no rate_z_deg_s; give the rates about all"):
+        read_times(path, ("a.jpg",))
