@@ -30,8 +30,10 @@ lint: $(VENV)/.develops ## check style and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(VENV)/.develops ## check the type annotations
+types: $(VENV)/.develops ## check the type annotations, also as Windows and macOS read them
 	$(BIN)/mypy
+	$(BIN)/mypy --platform win32 kgcp
+	$(BIN)/mypy --platform darwin kgcp
 
 format: $(VENV)/.develops ## bring the code into the project's format
 	$(BIN)/ruff check --fix .

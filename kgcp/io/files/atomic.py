@@ -30,7 +30,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink()  # of a run that was killed, or a link to another place
     try:
         yield temporary
-        with temporary.open("rb") as written:
+        with temporary.open("r+b") as written:  # Windows flushes only what may be written
             os.fsync(written.fileno())
         temporary.replace(path)
     except BaseException:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from kgcp.errors import KgcpError
+from kgcp.io.files.portable import file_of
 from kgcp.io.images.frames import frames_among, list_frames
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 def at_hand(folder: Path | StoredFolder, name: str) -> Iterator[Path]:
     """Have a file of a folder as one that can be opened, until the block ends.
 
-    An object's content is in memory, and nowhere on a disk.
+    On Linux, an object's content is in memory and nowhere on a disk.
 
     Raises
     ------
@@ -264,15 +264,8 @@ def at_hand(folder: Path | StoredFolder, name: str) -> Iterator[Path]:
     if isinstance(folder, Path):
         yield folder / name
         return
-    content = (folder / name).read()
-    descriptor = os.memfd_create("frame")
-    try:
-        with os.fdopen(descriptor, "wb", closefd=False) as stream:
-            stream.write(content)
-        del content
-        yield Path(f"/proc/self/fd/{descriptor}")
-    finally:
-        os.close(descriptor)
+    with file_of((folder / name).read()) as path:
+        yield path
 
 
 @cache

@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import platform
-import resource
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, astuple, fields
@@ -29,6 +28,7 @@ from kgcp import __version__
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.portable import peak_memory_mb
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
@@ -40,7 +40,6 @@ from kgcp.targets.layout import Ring, Target
 TARGET_TABLE = "[[target]]"
 """What the keys of targets begin with, among those that detections depend on."""
 
-_KB_PER_MB = 1024.0
 _SCALE_DIGITS = 12  # of a replica, which is kept as diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
@@ -241,14 +240,10 @@ def write_run_record(path: Path, record: Mapping[str, object]) -> None:
     KgcpError
         If it cannot be written.
     """
-    # The kernel counts for a process also what its parent had when it was started.
-    peaks = {"parent": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
     whole = {
         **record,
         "versions": versions(),
         "host": {"cores": os.cpu_count(), "system": platform.platform()},
-        "peak_memory_mb": {
-            name: resource.getrusage(who).ru_maxrss / _KB_PER_MB for name, who in peaks.items()
-        },
+        "peak_memory_mb": peak_memory_mb(),
     }
     write_bytes(path, f"{json.dumps(whole, indent=1)}\n".encode())

@@ -14,7 +14,6 @@ files to delete), and has no checksums.
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -33,6 +32,7 @@ from typing import Any, Self
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.io.files.portable import OPEN_FLAGS, lock
 from kgcp.measurement import records
 from kgcp.measurement.records import Considered, FrameResult, Miss, TimeSource
 
@@ -140,6 +140,7 @@ class Journal:
         self._due_s = time.monotonic() + _SHORTEST_S
         self.seconds = 0.0
         self.changes: tuple[str, ...] = ()
+        self._is_left = False
         self._writer = _locked(path)
         with self._access():
             self._reader = path.open("rb")
@@ -170,6 +171,8 @@ class Journal:
         finally:
             self._reader.close()
             self._writer.close()
+            if self._is_left:
+                self._path.unlink(missing_ok=True)
 
     def __iter__(self) -> Iterator[str]:
         """Yield the keys of all results."""
@@ -208,7 +211,12 @@ class Journal:
     def remove(self) -> None:
         """Delete it: the output is there."""
         with self._access():
-            self._path.unlink()  # before the lock on it goes
+            try:
+                self._path.unlink()  # before the lock on it goes
+            except PermissionError:
+                if os.name != "nt":
+                    raise
+                self._is_left = True  # Windows keeps what is open
 
     def _append(self, key: str, text: str) -> None:
         body = f"{key} {text}\n".encode()
@@ -266,12 +274,12 @@ def _locked(path: Path) -> FileIO:
         if path.is_symlink():
             raise OSError(errno.ELOOP, "is a link; delete it")
         while True:
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            flags = os.O_RDWR | os.O_CREAT | OPEN_FLAGS
             with ExitStack() as stack:
                 file = stack.enter_context(FileIO(os.open(path, flags, 0o644), "r+"))
                 if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                     raise OSError(errno.EINVAL, "is not a file; delete it")
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file.fileno())
                 # Whoever had it may have deleted it between the two steps of opening and locking.
                 if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
                     stack.pop_all()

@@ -15,7 +15,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from typing import Any
 
 from kgcp.errors import KgcpError
@@ -24,6 +24,7 @@ from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
 _SPAWN = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
+_Connection = Any  # of multiprocessing: `Connection`, or `PipeConnection` on Windows
 _STARTS = 3  # of a process, before it counts as impossible
 _LONGEST_WAIT_S = 1e6  # that the kernel can be asked for
 
@@ -42,7 +43,7 @@ class WorkerProcess:
         self._lock = threading.Lock()  # of starting and killing, which two threads may do
         self._is_over = False
         self._process: multiprocessing.process.BaseProcess | None = None
-        self._connection: Connection[Any, Any] | None = None
+        self._connection: _Connection | None = None
         self._function: Callable[..., Any] | None = None  # what the process has been sent
 
     def call(self, function: Callable[..., Any], /, *args: Any) -> Any:  # noqa: ANN401 - those of any function
@@ -68,7 +69,7 @@ class WorkerProcess:
         self._is_over = True
         self._kill()
 
-    def _answer(self, connection: Connection[Any, Any], limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
+    def _answer(self, connection: _Connection, limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
         try:
             connection.send((limit_s is None, sent))
             if connection.poll(limit_s):
@@ -83,7 +84,7 @@ class WorkerProcess:
             raise error
         return result
 
-    def _start(self) -> Connection[Any, Any]:
+    def _start(self) -> _Connection:
         for _ in range(_STARTS):
             own, other = _SPAWN.Pipe()
             try:
@@ -114,7 +115,7 @@ class WorkerProcess:
                 process.join()
 
 
-def _serve(connection: Connection[Any, Any]) -> None:
+def _serve(connection: _Connection) -> None:
     """Make calls until the parent closes the pipe, or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 _STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
+def _block_interrupts() -> Callable[[], object]:
+    """Block SIGINT in this thread and in processes that it starts; return what undoes that.
+
+    Windows has no masks: there a process that is started gets Ctrl-C, too, and ignores it itself.
+    """
+    set_mask: Any = getattr(signal, "pthread_sigmask", None)
+    if set_mask is None:
+        return lambda: None
+    block, restore = (getattr(signal, name) for name in ("SIG_BLOCK", "SIG_SETMASK"))
+    mask = set_mask(block, {signal.SIGINT})
+    return lambda: set_mask(restore, mask)
 
 
 @contextmanager
@@ -25,7 +38,7 @@ def defer_interrupts() -> Iterator[None]:
         return
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    unblock = _block_interrupts()
     try:
         for stop in _STOPS:
             handlers[stop] = signal.signal(stop, lambda number, _: came.append(number))
@@ -33,6 +46,6 @@ def defer_interrupts() -> Iterator[None]:
     finally:
         for stop, handler in handlers.items():
             signal.signal(stop, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        unblock()
         for number in came:
             signal.raise_signal(number)

@@ -1,0 +1,87 @@
+"""What Windows does in another way than Linux and macOS, each behind one function.
+
+The modules of either system are imported by their names, so that a type checker for the other one
+does not look into them.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+OPEN_FLAGS: int = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"))
+"""For `os.open`, as far as the system has them: no links, not for child processes, no new lines."""
+_BEYOND = 1 << 40  # byte that Windows locks: those that are written stay readable
+_BYTES_PER_KB = 1024
+
+
+def _module(name: str) -> Any:  # noqa: ANN401 - a module of one system, with its own attributes
+    """Return a module of the standard library; None where the system has none of this name."""
+    try:
+        return import_module(name)
+    except ModuleNotFoundError:
+        return None
+
+
+def lock(descriptor: int) -> None:
+    """Lock an open file against other processes; the lock ends with the process or the file.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process has it.
+    """
+    fcntl = _module("fcntl")
+    if fcntl is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return
+    msvcrt = _module("msvcrt")
+    position = os.lseek(descriptor, 0, os.SEEK_CUR)
+    os.lseek(descriptor, _BEYOND, os.SEEK_SET)
+    try:
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    except OSError as error:
+        raise BlockingIOError(errno.EAGAIN, error.strerror) from error
+    finally:
+        os.lseek(descriptor, position, os.SEEK_SET)
+
+
+def peak_memory_mb() -> dict[str, float]:
+    """Return the largest memory [MB] of this process and of one that it has waited for.
+
+    It is empty where the system does not say. The kernel counts for a process also what its parent
+    had when it was started.
+    """
+    resource = _module("resource")
+    if resource is None:
+        return {}
+    who = {"parent": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
+    # macOS counts bytes, Linux kilobytes
+    unit = _BYTES_PER_KB**2 if sys.platform == "darwin" else _BYTES_PER_KB
+    return {name: resource.getrusage(each).ru_maxrss / unit for name, each in who.items()}
+
+
+@contextmanager
+def file_of(content: bytes) -> Iterator[Path]:
+    """Have bytes as a file until the block ends: in memory on Linux, else in a temporary folder."""
+    create: Any = getattr(os, "memfd_create", None)
+    if create is None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "frame"
+            path.write_bytes(content)
+            yield path
+        return
+    descriptor = create("frame")
+    try:
+        with os.fdopen(descriptor, "wb", closefd=False) as stream:
+            stream.write(content)
+        yield Path(f"/proc/self/fd/{descriptor}")
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,115 @@
+"""The commands where the modules and calls of POSIX are missing, as on Windows."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kgcp.io.tables.detections import read_detections
+
+ROOT = Path(__file__).parents[2]
+FRAMES = 3
+# Python imports this at its start, in the program and in the processes that it starts.
+AS_ON_WINDOWS = """
+import errno, fcntl, os, signal, subprocess, sys, types  # subprocess asks for msvcrt, too
+
+def locking(descriptor, mode, count):
+    assert (mode, count) == (2, 1)
+    assert os.lseek(descriptor, 0, os.SEEK_CUR) > 1 << 30
+    try:
+        fcntl_.flock(descriptor, fcntl_.LOCK_EX | fcntl_.LOCK_NB)
+    except BlockingIOError:
+        raise PermissionError(errno.EACCES, "Permission denied") from None
+
+fcntl_ = fcntl
+sys.modules["msvcrt"] = types.SimpleNamespace(LK_NBLCK=2, locking=locking)
+for name in ("fcntl", "resource"):
+    sys.modules[name] = None
+for module, name in ((os, "memfd_create"), (os, "O_NOFOLLOW"), (os, "O_CLOEXEC"),
+                     (signal, "pthread_sigmask"), (signal, "SIGALRM"), (signal, "SIG_BLOCK")):
+    if hasattr(module, name):
+        delattr(module, name)
+"""
+
+
+@pytest.fixture
+def windows(tmp_path: Path) -> dict[str, str]:
+    """The environment of a process that lacks what Windows lacks."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(AS_ON_WINDOWS, encoding="utf-8")
+    paths = os.pathsep.join((str(tmp_path / "site"), str(ROOT)))
+    return {**os.environ, "PYTHONPATH": paths}
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """The first frames of the sample flight."""
+    folder = tmp_path / "flight"
+    shutil.copytree(ROOT / "sample_flight", folder, ignore=shutil.ignore_patterns("frames", "kgcp"))
+    (folder / "frames").mkdir()
+    for frame in sorted((ROOT / "sample_flight" / "frames").iterdir())[:FRAMES]:
+        shutil.copy(frame, folder / "frames")
+    return folder
+
+
+def kgcp(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        (sys.executable, "-m", "kgcp", *arguments),
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_table_is_the_same(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "there"
+    for environment, folder in ((windows, out), (dict(os.environ), tmp_path / "here")):
+        run = kgcp(environment, "detect", str(flight), "--out", str(folder), "--jobs", "2")
+        assert run.returncode == 0, run.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["detections.parquet", "run.json"]
+    assert json.loads((out / "run.json").read_text("utf-8"))["peak_memory_mb"] == {}
+    there, here = (
+        read_detections(tmp_path / name / "detections.parquet") for name in ("there", "here")
+    )
+    assert len(there) == FRAMES
+    assert there.equals(here)
+
+
+def test_export_works(windows: dict[str, str], flight: Path) -> None:
+    assert kgcp(windows, "detect", str(flight), "--jobs", "0").returncode == 0
+    run = kgcp(windows, "export-gcp", str(flight), "--format", "csv")
+    assert run.returncode == 0, run.stderr
+    assert (flight / "kgcp" / "kgcps.parquet").exists()
+
+
+def test_two_at_once_are_told(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+    holder = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from kgcp.pipeline.execution.journal import Journal\n"
+        "with Journal(Path(sys.argv[1]), {}, is_new=False):\n"
+        "    print('held', flush=True)\n"
+        "    sys.stdin.readline()\n"
+    )
+    out = tmp_path / "out"
+    with subprocess.Popen(
+        (sys.executable, "-c", holder, str(out / ".detections.journal")),
+        env=windows,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout.readline() == "held\n"
+        run = kgcp(windows, "detect", str(flight), "--out", str(out), "--jobs", "0")
+        process.stdin.write("\n")
+    assert run.returncode == 1
+    assert "another kgcp is writing here" in run.stderr
