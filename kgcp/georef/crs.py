@@ -152,17 +152,10 @@ def wgs84_from_map(crs: str, positions: Sequence[FloatArray], where: str) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class AreaOfUse:
-    """Where a CRS is meant to be used.
+    """Where a CRS is meant to be used."""
 
-    Attributes
-    ----------
-    name : str
-        Of the region, as PROJ's database has it.
-    west_deg, south_deg, east_deg, north_deg : float
-        Its bounds; west is larger than east where it holds the antimeridian.
-    """
-
-    name: str
+    name: str  # of the region, as PROJ's database has it
+    # its bounds; west is larger than east where it holds the antimeridian
     west_deg: float
     south_deg: float
     east_deg: float
