@@ -157,6 +157,8 @@ def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Cons
     curves = tuple(contours_px(job.camera, target, ring.pose))
     view = RingView(ring.centre_px, appearance.radius_px, curves, residual_image)
     share = None if residual_image is None else 100.0 * residual_image.edge_noise
+    if residual_image is not None and residual_image.white is not None:
+        note = f"uneven light: white from {np.nanmin(residual_image.white):.0%} of its largest"
     return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
 
 

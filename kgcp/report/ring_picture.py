@@ -30,6 +30,7 @@ _PARTS = 4  # bits of a pixel that lines are drawn to
 _FITTED, _DROPPED, _CENTRE = (255, 170, 0), (0, 159, 230), (0, 94, 213)
 _DARKER, _BRIGHTER = np.array([178.0, 114.0, 0.0]), np.array([0.0, 94.0, 213.0])
 _NOTHING = (226, 226, 226)
+_OFF_PLATE = (120, 90, 60)
 
 _Picture = npt.NDArray[np.uint8]
 
@@ -46,7 +47,10 @@ class RingView:
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """One ring as JPEG, twice as wide as high: contours on the left, residuals on the right."""
+    """One ring as JPEG, twice as wide as high: contours on the left, residuals on the right.
+
+    In uneven light `picture` has a third square: the level of white that was fitted.
+    """
 
     picture: bytes
     thumbnail: bytes
@@ -94,10 +98,13 @@ def draw_ring(grey: GreyArray, view: RingView) -> Pictures:
     plain = _stretched(cut.of(grey, math.nan))
     beside = plain if view.residual_image is None else _coloured(view.residual_image, cut)
     picture, thumbnail = (
-        _encoded(np.hstack((_with_contours(_sized(plain, size), cut, view), _sized(beside, size))))
+        np.hstack((_with_contours(_sized(plain, size), cut, view), _sized(beside, size)))
         for size in (PICTURE_PX, THUMBNAIL_PX)
     )
-    return Pictures(picture, thumbnail)
+    if view.residual_image is not None and view.residual_image.white is not None:
+        white = _moved(view.residual_image, cut).of(view.residual_image.white, math.nan)
+        picture = np.hstack((picture, _sized(_lit(white), PICTURE_PX)))
+    return Pictures(_encoded(picture), _encoded(thumbnail))
 
 
 def draw_closeup(grey: GreyArray, view: RingView) -> tuple[bytes, tuple[FloatArray, ...]]:
@@ -126,9 +133,21 @@ def _stretched(cut: FloatArray) -> _Picture:
     return picture
 
 
+def _moved(residual_image: ResidualImage, cut: _Cut) -> _Cut:
+    """Return the same square in the residuals' own pixels."""
+    return _Cut(cut.x0 - residual_image.x0, cut.y0 - residual_image.y0, cut.side)
+
+
+def _lit(white: FloatArray) -> _Picture:
+    """Return the level of white, from none to its largest, as grey; a plain tone off the plate."""
+    level = np.nan_to_num(255.0 * np.clip(white, 0.0, 1.0))
+    picture = np.repeat(np.rint(level).astype(np.uint8)[:, :, None], 3, axis=2)
+    picture[np.isnan(white)] = _OFF_PLATE
+    return picture
+
+
 def _coloured(residual_image: ResidualImage, cut: _Cut) -> _Picture:
-    moved = _Cut(cut.x0 - residual_image.x0, cut.y0 - residual_image.y0, cut.side)
-    share = moved.of(residual_image.share, math.nan)
+    share = _moved(residual_image, cut).of(residual_image.share, math.nan)
     strength = np.nan_to_num(np.minimum(np.abs(share) / FULL_SCALE, 1.0))[:, :, None]
     ink = np.where(share[:, :, None] > 0.0, _BRIGHTER, _DARKER)
     picture = np.rint(255.0 + strength * (ink - 255.0)).astype(np.uint8)

@@ -16,6 +16,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.adjustment.residual_image import residual_image_of
 from kgcp.measurement.frame import examine
 from kgcp.measurement.records import InitialPose, Measurement, Miss
 from kgcp.settings import DetectSettings
@@ -163,3 +164,17 @@ def test_a_plate_half_in_shade_is_found(photograph: Photograph) -> None:
     (seen,) = examine(grey, LENS, (TARGET_PLATE.target,), DetectSettings()).outcomes
     assert isinstance(seen, Measurement)
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=1e-3)
+
+
+def test_the_light_that_was_fitted_can_be_seen(photograph: Photograph) -> None:
+    rng = np.random.default_rng(22)
+    pose, field = some_pose(rng), shadow_edge(rng)
+    target = TARGET_PLATE.target
+    even = residual_image_of(photograph(LENS, pose, rng, gain=0.65), LENS, target, pose, None)
+    assert even.white is None
+    grey = photograph(LENS, pose, rng, gain=0.65, field=field)
+    uneven = residual_image_of(grey, LENS, target, pose, None)
+    assert uneven.white is not None
+    assert np.nanmin(uneven.white) == pytest.approx(0.5, abs=0.06)
+    assert np.array_equal(np.isnan(uneven.white), np.isnan(uneven.share))
+    assert np.nanmedian(np.abs(uneven.share)) < 0.03

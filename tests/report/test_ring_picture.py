@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -92,3 +94,18 @@ def test_rings_of_any_size_and_place_can_be_drawn(
     pictures = draw_ring(frame(dtype), view)
     assert decoded(pictures.thumbnail).shape == (THUMBNAIL_PX, 2 * THUMBNAIL_PX, 3)
     assert pictures == draw_ring(frame(dtype), view), "the same bytes each time"
+
+
+def test_uneven_light_has_a_third_part() -> None:
+    left = residuals(0.0)
+    white = np.full((31, 31), np.nan)
+    white[5:26, 5:16], white[5:26, 16:26] = 1.0, 0.4
+    pictures = draw_ring(frame(), RingView(CENTRE, RADIUS, (), replace(left, white=white)))
+    picture = decoded(pictures.picture)
+    assert picture.shape == (PICTURE_PX, 3 * PICTURE_PX, 3)
+    third = picture[PICTURE_PX // 2, 2 * PICTURE_PX :, 0]
+    lit, shaded = third[int(0.45 * PICTURE_PX)], third[int(0.6 * PICTURE_PX)]
+    assert lit == pytest.approx(255, abs=6)
+    assert shaded == pytest.approx(0.4 * 255, abs=6)
+    thumbnail = decoded(pictures.thumbnail)
+    assert thumbnail.shape == (THUMBNAIL_PX, 2 * THUMBNAIL_PX, 3)

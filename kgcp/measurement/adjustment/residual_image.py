@@ -10,15 +10,18 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import edge_noise
+from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.fit_target import fit_problem_of
 from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import whole_plate
+from kgcp.measurement.adjustment.random_levels import asks_for_levels
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.photometry import plateau_levels
 from kgcp.measurement.image_model.plate import circles_of
+from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 from kgcp.targets.layout import Target
 
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 97)
@@ -38,12 +41,16 @@ class ResidualImage:
         Model less grey value; NaN off the ring and its border, as far as that is plate.
     edge_noise : float
         Their median size near edges, without what lies hidden.
+    white : (height, width) array or None
+        Where the light is uneven, the level of white that was fitted, in shares of its largest
+        value on the plate; NaN where `share` is.
     """
 
     x0: int
     y0: int
     share: FloatArray
     edge_noise: float
+    white: FloatArray | None = None
 
 
 def residual_image_of(
@@ -51,7 +58,8 @@ def residual_image_of(
 ) -> ResidualImage:
     """Return what the image of a target at this pose leaves of the grey values.
 
-    Blur and light are adjusted, the pose is not, whoever measured it.
+    Blur and light are adjusted, the pose is not, whoever measured it. Uneven light is that of a
+    fit in which the pose is free.
 
     Parameters
     ----------
@@ -74,19 +82,37 @@ def residual_image_of(
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
-    light = fit.parameters.light
-    sample = whole_plate(problem, pose, fit.parameters.blur, light)
+    if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and asks_for_levels(fit):
+        best = fit_in_any_light(problem, pose, start.blur).best
+        fit = best if best.parameters.field is not None else fit
+    parameters = fit.parameters.at(pose)
+    light = parameters.light
+    sample = whole_plate(problem, pose, parameters.blur, light)
     black, white = plateau_levels(light, problem.response)
     limits = problem.censoring
-    levels = np.clip(predict(sample, fit.parameters).levels, limits.low, limits.high)
+    levels = np.clip(predict(sample, parameters).levels, limits.low, limits.high)
     window = problem.window
     share = np.full(window.width * window.height, np.nan)
     share[sample.index] = (levels - np.clip(sample.levels, limits.low, limits.high)) / (
         min(white, limits.high) - black
     )
     shape = (window.height, window.width)
-    of_pixels = np.kron(share.reshape(shape), np.ones((binning, binning)))
-    return ResidualImage(binning * window.x0, binning * window.y0, of_pixels, edge_noise(fit))
+    white_share = None
+    if parameters.field is not None:
+        white_share = np.full(len(share), np.nan)
+        white_share[sample.index] = 1.0 + parameters.field.added(window.pixels(sample.index))[1]
+        white_share /= np.nanmax(white_share)
+
+    def of_pixels(values: FloatArray) -> FloatArray:
+        return np.asarray(np.kron(values.reshape(shape), np.ones((binning, binning))))
+
+    return ResidualImage(
+        x0=binning * window.x0,
+        y0=binning * window.y0,
+        share=of_pixels(share),
+        edge_noise=edge_noise(fit),
+        white=None if white_share is None else of_pixels(white_share),
+    )
 
 
 def contours_px(camera: Camera, target: Target, pose: Pose) -> FloatArray:
