@@ -29,7 +29,7 @@ from kgcp.measurement.adjustment.solver import adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, decoded
 from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
@@ -108,7 +108,7 @@ def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) 
     """Let the levels vary from those seen on ink and plate, and from a shadow."""
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
-    black, white = plateaus.extremes
+    black, white = decoded(np.array(plateaus.extremes), problem.response).tolist()
     light = replace(first.light, black=black, white=white)
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
@@ -120,11 +120,14 @@ def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -
     edge = step_across(problem, plateaus)
     if edge is None:
         return []
-    black, white = plateaus.typical
     if edge[4] > 0.0:  # beyond is the shade: the tone curve is that of the lit side
         edge = np.array((edge[0] + math.pi, -edge[1], edge[2], -edge[3], -edge[4]))
-    light = replace(first.light, black=black - 0.5 * edge[3], white=white - 0.5 * edge[4])
-    edge[3:] /= light.white - light.black
+    lit, shaded = (
+        decoded(np.array(plateaus.typical) + half * edge[3:], problem.response)
+        for half in (-0.5, 0.5)
+    )
+    light = replace(first.light, black=float(lit[0]), white=float(lit[1]))
+    edge[3:] = (shaded - lit) / (light.white - light.black)
     edged = Parameters.of(first.pose, first.blur, light)
     return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
 

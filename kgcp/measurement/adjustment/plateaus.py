@@ -12,7 +12,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.light_field import INK, PLATE, LightField
-from kgcp.measurement.image_model.photometry import Light
+from kgcp.measurement.image_model.photometry import Light, decoded
 from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_plate
 
 # Tuning, by the flights `light` of `benchmarks.accuracy.evaluate`; lengths in radii, light in
@@ -168,7 +168,8 @@ def field_of(
     y = np.clip(spacing * (np.arange(rows) - 0.5) - 0.5, 0, window.height - 1)
     at = (np.rint(y).astype(int)[:, None] * window.width + np.rint(x).astype(int)).ravel()
     values = np.zeros_like(field.values)
-    levels = plateaus.levels[:, at] - np.array([[light.black], [light.white]])
+    seen = decoded(plateaus.levels[:, at], problem.response)
+    levels = seen - np.array([[light.black], [light.white]])
     values[:, -len(at) :] = levels / (light.white - light.black)
     return replace(field, values=values)
 

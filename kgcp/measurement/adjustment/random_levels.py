@@ -63,7 +63,7 @@ _PLATEAU_PIXELS = 1200
 _LEAST_CONTRAST = 0.05
 # Mean square of the residuals' sums over cells, of what independent residuals make it: above, the
 # levels vary. Frames in even light have about 1.
-_ASKS = 2.5
+_ASKS = 1.9
 _ENOUGH_POWER = 0.05  # of the cell that tells most
 
 

@@ -74,7 +74,7 @@ def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
 
     They are the light's own levels, but for a camera with a known encoding.
     """
-    if response is not Response.SRGB:
+    if response is Response.LINEAR:
         return light.black, light.white
     black, white = srgb_encoded(np.array([light.black, light.white])).tolist()
     return black, white
@@ -82,17 +82,17 @@ def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
 
 def encoded(level: FloatArray, response: Response) -> FloatArray:
     """Return grey values from the light of a camera with a known response."""
-    return srgb_encoded(level) if response is Response.SRGB else level
+    return srgb_encoded(level) if response is not Response.LINEAR else level
 
 
 def decoded(level: FloatArray, response: Response) -> FloatArray:
     """Return the light that gives grey values, of a camera with a known response."""
-    return srgb_decoded(level) if response is Response.SRGB else level
+    return srgb_decoded(level) if response is not Response.LINEAR else level
 
 
 def light_of_levels(black: float, white: float, response: Response) -> Light:
     """Return the light that gives these grey values of ink and plate."""
-    if response is Response.SRGB:
+    if response is not Response.LINEAR:
         black, white = (float(level) for level in srgb_decoded(np.array([black, white])))
     return Light(black, white)
 
@@ -160,7 +160,7 @@ class PhotometricModel:
     ) -> None:
         """Sharpen the derivatives by what is added to ink and to plate."""
         ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
-        if self.response is Response.SRGB:
+        if self.response is not Response.LINEAR:
             ink *= srgb_slope(toned(added[0], light.values))
             plate *= srgb_slope(toned(1.0 + added[1], light.values))
         by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
@@ -193,7 +193,7 @@ class PhotometricModel:
             value,
             jacobian,
         )
-        if self.response is Response.SRGB:
+        if self.response is not Response.LINEAR:
             jacobian *= srgb_slope(value)
             value = encoded(value, self.response)
         if self.mask is None:
@@ -226,7 +226,7 @@ class PhotometricModel:
             for row in _SKEW:
                 jacobian[row] += light.sharpening * mask.detail(jacobian[row], 0.0, 0.0)
         others = (1.0, 1.0)
-        if self.response is Response.SRGB:
+        if self.response is not Response.LINEAR:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
         mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
