@@ -84,109 +84,141 @@ class Status(StrEnum):
 class Reason(StrEnum):
     """Why a target was not measured: the word of the `reason` column.
 
-    Every member carries the status it leads to and a sentence for the documentation.
+    Every member carries the status it leads to, a sentence for the documentation, and what its
+    user can do.
     """
 
     status: Status
     description: str
+    remedy: str
 
-    def __new__(cls, word: str, status: Status, description: str) -> Self:
+    def __new__(cls, word: str, status: Status, description: str, remedy: str) -> Self:
         """Make a member whose value is the word alone."""
         member = str.__new__(cls, word)
         member._value_ = word
         member.status = status
         member.description = description
+        member.remedy = remedy
         return member
+
+    @classmethod
+    def of(cls, word: str) -> Reason:
+        """Return the member of a word of the `reason` column."""
+        return next(member for member in cls if member.value == word)
 
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
         "no dark ring with dots between bright disc and plate, other targets' apart",
+        "none needed if the target is not in the frame; else see the contact sheet",
     )
     CODE_MISMATCH = (
         "code_mismatch",
         Status.NOT_FOUND,
         "rings were found, but none carries this target's code",
+        "none needed for other round objects; if it is the target, correct code_deg",
+    )
+    OUT_OF_VIEW = (
+        "out_of_view",
+        Status.NOT_FOUND,
+        "other frames or the reference poses predict the target outside the frame",
+        "none needed",
     )
     CUT = (
         "cut",
         Status.REJECTED,
         "too much of the target is outside the frame",
+        "keep the target away from the border, or print a replica inside",
     )
     OTHER_CODE = (
         "other_code",
         Status.REJECTED,
         "a ring of this target's geometry, but with dots that are not this code's",
+        "correct code_deg in flight.toml, or clean the dots",
     )
     TOO_SMALL = (
         "too_small",
         Status.REJECTED,
         "a ring like this target's, but with less than the smallest radius across",
+        "fly lower, use a larger target or search for smaller rings",
     )
     TOO_BLURRED = (
         "too_blurred",
         Status.REJECTED,
         "a ring like this target's, but blur has left too little of its dots",
+        "expose for a shorter time, fly slower, focus",
     )
     CLIPPED = (
         "clipped",
         Status.REJECTED,
         "a ring like this target's, but its white is burnt out and its edges have moved",
+        "expose less",
     )
     HIDDEN = (
         "hidden",
         Status.REJECTED,
         "a ring like this target's, but too little of its outer edge is seen",
+        "keep the plate clear of shadows, antennas and people",
     )
     NO_INNER_CIRCLE = (
         "no_inner_circle",
         Status.REJECTED,
         "the code matches, but the edge of the ring's inner circle is not found",
+        "look at the picture in the contact sheet",
     )
     EDGES_LOST = (
         "edges_lost",
         Status.REJECTED,
         "too few sub-pixel edge points are left on one of the circles",
+        "look at the picture in the contact sheet",
     )
     POOR_ELLIPSE = (
         "poor_ellipse",
         Status.REJECTED,
         "the edge points of a circle do not lie on an ellipse",
+        "look at the picture in the contact sheet",
     )
     IMPOSSIBLE_GEOMETRY = (
         "impossible_geometry",
         Status.REJECTED,
         "the two ellipses cannot be images of this target's concentric circles",
+        "look at the picture in the contact sheet",
     )
     NO_CONTRAST = (
         "no_contrast",
         Status.REJECTED,
         "ink is not darker than the plate: too dark, burnt out or too blurred",
+        "expose for the plate; look at the picture in the contact sheet",
     )
     POOR_FIT = (
         "poor_fit",
         Status.REJECTED,
         "the grey values do not fit the image of this target",
+        "look at the picture in the contact sheet; use a matt print and a flat plate",
     )
     DECODE_FAILED = (
         "decode_failed",
         Status.UNREADABLE,
         "the file is not an image, or is damaged",
+        "copy the files again",
     )
     WRONG_SIZE = (
         "wrong_size",
         Status.UNREADABLE,
         "the frame's size is not the camera's",
+        "give flight.toml the size and calibration of these frames, or the right frames",
     )
     WORKER_DIED = (
         "worker_died",
         Status.UNREADABLE,
         "the process that examined the frame died twice: memory ran out, or a decoder crashed",
+        "use fewer processes, and look at the file",
     )
     TIMED_OUT = (
         "timed_out",
         Status.UNREADABLE,
         "the frame took longer than it may, also alone",
+        "look at the file, or allow more time",
     )
 
 

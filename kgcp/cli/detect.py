@@ -10,6 +10,7 @@ import click
 
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import flight_place_argument, json_option, out_place_option
+from kgcp.errors import KgcpError
 from kgcp.settings import DetectSettings, Method
 
 if TYPE_CHECKING:
@@ -178,3 +179,5 @@ def command(
     report(summary, workspace.named(summary.table), overlay, seconds, log, as_json=as_json)
     if is_profiled:
         report_stages(summary)
+    if summary.problem is not None:
+        raise KgcpError(summary.problem)

@@ -169,7 +169,10 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
     )
     speed = f" ({frames_per_s:.1f}/s)" if frames_per_s else ""  # all were kept from before
     lines = [f"{counted(summary.frames, 'frame')} in {seconds:.1f} s{speed}: {counts}"]
-    lines += [f"  {count:6d} {reason}" for reason, count in summary.reasons.items()]
+    lines += [
+        f"  {count:6d} {reason}{_about(reason, summary)}"
+        for reason, count in summary.reasons.items()
+    ]
     if summary.guided:
         lines.append(f"{summary.guided} of them measured in the second pass")
     if summary.guide_problem is not None:
@@ -183,6 +186,15 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
             " cannot tell their two poses apart: give [camera] plumb_sd_deg"
         )
     click.echo("\n".join(lines), err=True)
+
+
+def _about(reason: str, summary: DetectionSummary) -> str:
+    """Return the commonest detail of a reason, and what to do about it."""
+    from kgcp.errors import Reason
+
+    detail = summary.details.get(reason)
+    mostly = "mostly " if summary.reasons[reason] > 1 else ""
+    return "" if detail is None else f": {mostly}{detail}; {Reason.of(reason).remedy}"
 
 
 def _about_times(summary: DetectionSummary) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,10 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.records import Considered
+from kgcp.measurement.search.dot_reading import describe_dots, read_dots
 from kgcp.measurement.search.template_match import CODE_LIKE, match_templates, polar_patch
 from kgcp.measurement.search.templates import SAMPLED_RADII
-from kgcp.targets.layout import Ring
+from kgcp.targets.layout import Ring, Target
 
 # Shares from which on something is the reason why a target was not measured. They only choose the
 # word of a miss: the sets of `benchmarks.search.hard_frames` are named for these words.
@@ -26,9 +28,48 @@ _SEEN, _EDGE_STEP = (
 _BURNT = 0.9  # of the pixels on disc and plate
 _INK, _PLATE, _HALF_BAND = 0.9, 1.1, 0.04  # circles either side of the outer edge, of its radius
 _DISC = 0.8  # of the inner radius
+_WRONG_CODE = {Reason.OTHER_CODE, Reason.CODE_MISMATCH}
+_CONCENTRIC, _SAME_SCALE = 0.3, 0.2  # of a replica's radius; relative
 
 
-def explain(grey: GreyArray, ring: Ring, candidate: Considered, min_radius_px: float) -> Considered:
+def ring_to_explain(target: Target, considered: Sequence[Considered]) -> Considered:
+    """Return the candidate whose failure explains a miss: the best, or the main ring around it.
+
+    A candidate that carried the code is better than any that did not, whatever their scores. But
+    if a replica carries its code and the main ring around it does not, the latter has failed.
+
+    Parameters
+    ----------
+    considered : sequence of Considered
+        At least one.
+    """
+    best = max(considered, key=lambda candidate: (candidate.is_match, candidate.score))
+    around = (
+        candidate
+        for candidate in considered
+        if candidate.ring == target.ring.name
+        and candidate.score >= CODE_LIKE
+        and any(
+            _encloses(candidate.outline, best.outline, target, ring) for ring in target.replicas
+        )
+    )
+    return max(around, key=lambda candidate: candidate.score, default=best)
+
+
+def _encloses(outer: Ellipse, inner: Ellipse, target: Target, replica: Ring) -> bool:
+    """Tell whether two outlines lie as a target's main ring and its replica do."""
+    scale = replica.outer_diameter_m / target.ring.outer_diameter_m
+    offset_px = float(np.linalg.norm(outer.centre - inner.centre))
+    return offset_px < _CONCENTRIC * inner.a and abs(scale * outer.a / inner.a - 1.0) < _SAME_SCALE
+
+
+def explain(
+    grey: GreyArray,
+    target: Target,
+    candidate: Considered,
+    min_radius_px: float,
+    targets: Sequence[Target] = (),
+) -> Considered:
     """Give a dropped candidate the reason that lies in the image, where one is plain to see.
 
     A ring that is hardly like the target keeps its reason: it is something else, and how it is
@@ -36,23 +77,32 @@ def explain(grey: GreyArray, ring: Ring, candidate: Considered, min_radius_px: f
 
     Parameters
     ----------
-    ring : Ring
-        What it was compared with.
+    target : Target
+        One of whose rings it was compared with.
     candidate : Considered
         Dropped by one of the tests.
     min_radius_px : float
         Smallest radius that is looked for [px].
+    targets : sequence of Target
+        All of the flight, whose code the ring may carry instead.
     """
     outline = candidate.outline
+    ring = next(ring for ring in target.rings if ring.name == candidate.ring)
     at = f"ring at ({outline.x:.0f}, {outline.y:.0f}), radius {outline.mean_radius:.1f} px"
     reason = candidate.reason
     finding = None
     if candidate.is_match or candidate.score >= CODE_LIKE:
         finding = _plain_cause(grey, ring, outline, min_radius_px)
+    cause = None
     if finding is not None:
         reason, cause = finding
-        at = f"{at}, {cause}"
-    detail = f"{at}: {candidate.detail}" if candidate.detail else at
+    elif reason in _WRONG_CODE and candidate.score >= CODE_LIKE:
+        cause = describe_dots(read_dots(grey, outline, ring), ring, target, targets)
+    detail = at if cause is None else f"{at}, {cause}"
+    if candidate.detail:
+        detail = (
+            f"{detail}: {candidate.detail}" if cause is None else f"{detail} ({candidate.detail})"
+        )
     return replace(candidate, reason=reason, detail=detail)
 
 

@@ -15,7 +15,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.closed_form.chain import measure_ring
 from kgcp.measurement.closed_form.circles import paper_outlines
-from kgcp.measurement.diagnosis import explain
+from kgcp.measurement.diagnosis import explain, ring_to_explain
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Considered, Measurement, Miss, Outcome
 from kgcp.measurement.search.candidates import Candidate, find_code, find_dotted, find_rings
@@ -98,7 +98,7 @@ def examine(
             for candidate in trial.considered
             if not any(rival.covers(candidate.outline) for rival in rivals)
         ]
-        outcomes += own or (miss_of(grey, trial.target, free, settings),)
+        outcomes += own or (miss_of(grey, trial.target, free, settings, targets),)
         considered += trial.considered
     return Examination(tuple(outcomes), tuple(considered))
 
@@ -213,17 +213,23 @@ def _check_plate(
 
 
 def miss_of(
-    grey: GreyArray, target: Target, considered: Sequence[Considered], settings: DetectSettings
+    grey: GreyArray,
+    target: Target,
+    considered: Sequence[Considered],
+    settings: DetectSettings,
+    targets: Sequence[Target] = (),
 ) -> Miss:
     """Return why a target was not measured: the reason of its best candidate.
 
-    A candidate that carried the code is better than any that did not, whatever their scores.
+    Parameters
+    ----------
+    targets : sequence of Target
+        All that may be seen, whose code the candidate may carry instead.
     """
     if not considered:
         return Miss(target.name, Reason.NO_CANDIDATE)
-    best = max(considered, key=lambda candidate: (candidate.is_match, candidate.score))
-    ring = next(ring for ring in target.rings if ring.name == best.ring)
-    best = explain(grey, ring, best, settings.min_radius_px)
+    best = ring_to_explain(target, considered)
+    best = explain(grey, target, best, settings.min_radius_px, targets)
     outlines = {candidate.outline for candidate in considered}
     reason = best.reason or Reason.CODE_MISMATCH
     return Miss(target.name, reason, best.detail, best.score, len(outlines), best.outline)

@@ -82,6 +82,12 @@ class Prediction:
             and self.radius_px >= _SMALLEST_PX
         )
 
+    def is_outside(self, camera: Camera) -> bool:
+        """Tell whether no part of the ring can be in the frame."""
+        x, y = self.centre_px
+        reach = self.radius_px * math.exp(_SIGMAS * self.sd_log_radius) + _SIGMAS * self.sd_px
+        return bool(max(-x, x - camera.width + 1.0, -y, y - camera.height + 1.0) > reach)
+
     def check(self, observation: Measurement) -> None:
         """Raise `Rejection` (`POOR_FIT`) unless an observation agrees, in place and in radius."""
         off_px = float(np.linalg.norm(observation.centre_px - self.centre_px))

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.remote import StoredFolder, frames_below
@@ -78,6 +79,10 @@ class NoProgress:
 
 _DEFAULT_SETTINGS = DetectSettings()
 _DEFAULT_OPTIONS = RunOptions()
+_NEGATIVE = (
+    "black and white are swapped in the frames or on the plate; give frames that are not negatives,"
+    " or print the ring black on white"
+)
 _STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
 
 
@@ -158,10 +163,14 @@ def detect_flight(
                 with stopwatch.stage("second look"):
                     predictions, guide_problem = predict_missing(flight, data, run.tracks)
                     run.guided_pass(predictions)
+            likely_cause = None
+            if run.tracks.is_readable.any() and not run.tracks.found:
+                with stopwatch.stage("trial of negatives"):
+                    likely_cause = _NEGATIVE if run.is_negative() else None
             if sheet is not None:
                 sheet.clear()
             with stopwatch.stage("table"):
-                rows = _rows(run, predictions, builder)
+                rows = _rows(run, predictions, flight.camera, builder)
                 about = detections_provenance(flight, settings, run.frame_sizes, data.frame_times)
                 write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
@@ -170,6 +179,7 @@ def detect_flight(
         is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
         summary = builder.summary(
             table=table,
+            likely_cause=likely_cause,
             kept=run.kept,
             frames_without_attitude=sum(
                 all(prior.normal is None for prior in frame_input.priors.values())
@@ -218,8 +228,12 @@ def _making(job: DetectionJob) -> dict[str, str]:
 
 
 def _rows(
-    run: DetectionRun, predictions: Mapping[int, Mapping[str, Prediction]], builder: SummaryBuilder
+    run: DetectionRun,
+    predictions: Mapping[int, Mapping[str, Prediction]],
+    camera: Camera,
+    builder: SummaryBuilder,
 ) -> Iterator[Row]:
     for row, result in enumerate(run.results()):
-        builder.add(result)
-        yield from detection_rows(with_predictions(result, predictions.get(row, {})))
+        told = with_predictions(result, predictions.get(row, {}), camera)
+        builder.add(told)
+        yield from detection_rows(told)

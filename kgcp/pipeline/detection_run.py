@@ -7,6 +7,7 @@ is expected. What all results depend on is the journal's own business.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,10 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+import numpy as np
+
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.records import FrameResult, is_unreadable
+from kgcp.measurement.records import FrameResult, Miss, is_unreadable
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
@@ -30,10 +33,13 @@ from kgcp.pipeline.frame_task import (
     examine_frame_again,
     kept_frame,
     lost_frame,
+    shows_negative,
 )
 from kgcp.pipeline.guidance import FrameTracks
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
+
+_NEGATIVES = 12  # frames that are tried with black and white swapped
 
 _Result = TypeVar("_Result")
 
@@ -46,6 +52,41 @@ class ProgressListener(Protocol):
 
     def progress(self, stage: str, done: int, total: int, found: int) -> None:
         """Hear how many frames of a stage are done, of how many, and how many show a target."""
+
+
+class FirstSizes:
+    """The sizes of the first frames: all wrong and the same, they are not this camera's.
+
+    Parameters
+    ----------
+    frames : int
+        Of the flight. A short one is looked at to its end.
+
+    Attributes
+    ----------
+    wrong : str or None
+        Size of the first `FRAMES` frames, and that of the camera; None: not all are wrong.
+    """
+
+    FRAMES = 20
+
+    def __init__(self, frames: int) -> None:
+        self._seen = 0 if frames > self.FRAMES else self.FRAMES
+        self._details: set[str] = set()
+        self.wrong: str | None = None
+
+    def add(self, result: FrameResult) -> None:
+        """Take what the next frame was."""
+        if self._seen >= self.FRAMES:
+            return
+        self._seen += 1
+        first = result.outcomes[0]
+        is_wrong = isinstance(first, Miss) and first.reason is Reason.WRONG_SIZE
+        self._details.add(first.detail if is_wrong and isinstance(first, Miss) else "")
+        if len(self._details) > 1 or "" in self._details:
+            self._seen = self.FRAMES
+        elif self._seen == self.FRAMES:
+            (self.wrong,) = self._details
 
 
 class DetectionRun:
@@ -90,14 +131,22 @@ class DetectionRun:
         self.kept = 0
 
     def first_pass(self) -> None:
-        """Look at all frames that the journal has not."""
+        """Look at all frames that the journal has not.
+
+        Raises
+        ------
+        KgcpError
+            If the first frames all have one size, which is not the camera's, or frames vanish.
+        """
         todo = []
+        sizes = FirstSizes(len(self._keys))
         for row, key in enumerate(self._keys):
             kept = self._journal.get(key)
             if kept is None:
                 todo.append(row)
             else:
                 self.tracks.add(row, kept)
+                sizes.add(kept)
         self.kept = len(self._keys) - len(todo)
         self._tell_what_is_kept(todo)
         self._begin("first look", self.kept, len(self._keys))
@@ -111,6 +160,12 @@ class DetectionRun:
                 else:
                     self._require_frame(result)
                     self._keep(row, result)
+                    sizes.add(result)
+                    if sizes.wrong is not None:
+                        raise KgcpError(
+                            f"{self._job.frames_folder}: the first {FirstSizes.FRAMES} frames are"
+                            f" all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"
+                        )
 
     def guided_pass(self, predictions: Mapping[int, Mapping[str, Prediction]]) -> None:
         """Look again at the readable frames in which a missing target must be visible.
@@ -151,6 +206,14 @@ class DetectionRun:
                 else:
                     self._keys[row] = keys[row]
                     self._keep(row, result)
+
+    def is_negative(self) -> bool:
+        """Tell whether a target is measured in some frames if black and white are swapped."""
+        readable = np.flatnonzero(self.tracks.is_readable)
+        some = readable[:: math.ceil(len(readable) / _NEGATIVES) or 1]
+        inputs = (self._inputs[row] for row in some)
+        with closing(self._pool.map(partial(shows_negative, self._job), inputs)) as results:
+            return any(result is True for _, result in results)
 
     def results(self) -> Iterator[FrameResult]:
         """Yield the last result of every frame, in the frames' order."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
@@ -168,6 +170,19 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
     return replace(guided_input.first, outcomes=outcomes, dropped=dropped)
 
 
+@single_threaded()
+def shows_negative(job: DetectionJob, frame_input: FrameInput) -> bool:
+    """Tell whether a target is measured in a frame whose black and white are swapped."""
+    try:
+        with at_hand(job.frames_folder, frame_input.frame) as path:
+            grey = read_grey(path, job.camera)
+    except Rejection:
+        return False
+    negative = np.iinfo(grey.dtype).max - grey
+    examination = examine(negative, job.camera, job.targets, job.settings, frame_input.priors)
+    return any(isinstance(outcome, Measurement) for outcome in examination.outcomes)
+
+
 def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> FrameResult:
     """Return the result of a frame that cannot be examined without the end of the process."""
     outcomes = tuple(Miss(target.name, reason) for target in job.targets)
@@ -207,7 +222,9 @@ def _merged(
     instead: dict[str, Outcome] = {}
     for target in missed:
         there = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
-        known = miss_of(grey, target, there, job.settings) if there else first[target.name]
+        known = (
+            miss_of(grey, target, there, job.settings, job.targets) if there else first[target.name]
+        )
         instead[target.name] = known
     for name in first.keys() & found.keys():
         instead[name] = _with_common_uncertainty(job, found[name])

@@ -8,13 +8,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from kgcp.errors import KgcpError
+from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.camera import Camera
 from kgcp.georef.prediction import Track, predict_position, reference_states, state_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.targets.layout import Target
+
+# What a ring that is not the target's may be dropped for.
+_NO_TARGET = {
+    *(Reason.NO_CANDIDATE, Reason.CODE_MISMATCH, Reason.OTHER_CODE, Reason.TOO_SMALL),
+    *(Reason.TOO_BLURRED, Reason.CLIPPED, Reason.HIDDEN, Reason.CUT),
+}
 
 
 class FrameTracks:
@@ -89,12 +96,36 @@ def predict_missing(
     return predictions, problem
 
 
-def with_predictions(result: FrameResult, predictions: Mapping[str, Prediction]) -> FrameResult:
-    """Add to the misses where the target must have been."""
+def with_predictions(
+    result: FrameResult, predictions: Mapping[str, Prediction], camera: Camera
+) -> FrameResult:
+    """Add to the misses where the target must have been; outside the frame that is the reason.
+
+    A ring that is in the frame then is something else. One that carried the code and failed later
+    contradicts the prediction, and keeps its reason.
+    """
     outcomes = tuple(
-        replace(one, detail="; ".join(filter(None, (one.detail, str(predictions[one.target])))))
+        _with_prediction(one, predictions[one.target], camera)
         if isinstance(one, Miss) and one.target in predictions and not is_unreadable(one)
         else one
         for one in result.outcomes
     )
     return replace(result, outcomes=outcomes)
+
+
+def is_out_of_view(reason: Reason, prediction: Prediction, camera: Camera) -> bool:
+    """Tell whether a target is outside the frame, and a ring in the frame is something else.
+
+    Parameters
+    ----------
+    reason : Reason
+        Of the miss, by the frame itself.
+    """
+    return prediction.is_outside(camera) and reason in _NO_TARGET
+
+
+def _with_prediction(miss: Miss, prediction: Prediction, camera: Camera) -> Miss:
+    if is_out_of_view(miss.reason, prediction, camera):
+        detail = f"{prediction}, outside the frame"
+        return replace(miss, reason=Reason.OUT_OF_VIEW, detail=detail, outline=None)
+    return replace(miss, detail="; ".join(filter(None, (miss.detail, str(prediction)))))

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from kgcp.errors import Rejection, Status
+from kgcp.errors import Reason, Rejection, Status
 from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
 from kgcp.measurement.adjustment.residual_image import contours_px, residual_image_of
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Considered, FrameResult, Measurement, Miss, Outcome
+from kgcp.measurement.search.template_match import match_templates, polar_patch
 from kgcp.pipeline.detection_run import DetectionRun
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.frame_task import DetectionJob
+from kgcp.pipeline.guidance import is_out_of_view
 from kgcp.quality.number_text import minus
 from kgcp.report.contact_sheet import DROPPED, Card, ContactSheet
 from kgcp.report.ring_picture import Pictures, RingView, draw_ring
+from kgcp.targets.layout import Target
 
 _LOSSES = {
     TaskFailure.CRASHED: "the process that drew it ended twice",
@@ -29,6 +34,7 @@ _LOSSES = {
 }
 _MISSES = {Status.NOT_FOUND.value, Status.REJECTED.value}
 _TURN = np.linspace(0.0, 2.0 * np.pi, 97)
+_CIRCLE = np.stack((np.cos(_TURN), np.sin(_TURN)), axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +93,8 @@ def draw_overlay(
         lost += sum(sketch.is_lost for sketch in sketches)
         cards[row] = []
         for place, sketch in enumerate(sketches):
-            card = _with_prediction(sketch.card, predictions.get(row, {}))
-            if sketch.pictures is not None:
+            card = _with_prediction(sketch.card, predictions.get(row, {}), job.camera)
+            if sketch.pictures is not None and card.reason != Reason.OUT_OF_VIEW:
                 stem = f"{row + 1:06d}-{place}"
                 sheet.add(stem, sketch.pictures)
                 card = replace(card, stem=stem)
@@ -97,11 +103,23 @@ def draw_overlay(
     return lost
 
 
-def _with_prediction(card: Card, predictions: Mapping[str, Prediction]) -> Card:
+def _with_prediction(card: Card, predictions: Mapping[str, Prediction], camera: Camera) -> Card:
     """Add to the card of a miss where its target must have been."""
     if card.target not in predictions or card.status not in _MISSES:
         return card
-    return replace(card, text=_joined(card.text, str(predictions[card.target])))
+    prediction = predictions[card.target]
+    if is_out_of_view(Reason.of(card.reason), prediction, camera):
+        word = Reason.OUT_OF_VIEW.value
+        return Card(
+            frame=card.frame,
+            target=card.target,
+            instance=0,
+            status=Reason.OUT_OF_VIEW.status.value,
+            reason=word,
+            headline=word,
+            text=f"{prediction}, outside the frame",
+        )
+    return replace(card, text=_joined(card.text, str(prediction)))
 
 
 def sketch_frame(job: DetectionJob, result: FrameResult) -> list[Sketch]:
@@ -144,10 +162,12 @@ def _lost(result: FrameResult, why: str) -> list[Sketch]:
 
 
 def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
-    if not isinstance(ring, Measurement):
-        pictures = None if ring.outline is None else draw_ring(grey, _outlined(ring.outline))
-        return Sketch(_card(frame, ring), pictures)
     target = next(target for target in job.targets if target.name == ring.target)
+    if not isinstance(ring, Measurement):
+        pictures = None
+        if ring.outline is not None:
+            pictures = draw_ring(grey, _dropped_view(grey, ring.outline, target))
+        return Sketch(_card(frame, ring), pictures)
     appearance = ring.appearance
     note, residual_image = "", None
     try:
@@ -162,8 +182,17 @@ def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Cons
     return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
 
 
-def _outlined(outline: Ellipse) -> RingView:
-    return RingView(outline.centre, outline.a, (outline.points(_TURN),))
+def _dropped_view(grey: GreyArray, outline: Ellipse, target: Target) -> RingView:
+    """Show a ring that was dropped, with the dots of the target's ring that it resembles most."""
+    patch = polar_patch(grey, outline)
+    matches = [(match_templates(patch, ring, outline.mean_radius), ring) for ring in target.rings]
+    best, ring = max(matches, key=lambda pair: pair[0].score)
+    turn = math.radians(best.lag_deg)
+    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    plate_m = ring.dot_centres_m()[:, None] + 0.5 * ring.dot_diameter_m * _CIRCLE
+    unit = plate_m @ rotation.T / (0.5 * ring.outer_diameter_m)
+    dots = tuple(outline.centre + points @ outline.stretch.T for points in unit)
+    return RingView(outline.centre, outline.a, (outline.points(_TURN),), expected=dots)
 
 
 def _card(

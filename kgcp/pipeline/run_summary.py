@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +14,10 @@ from kgcp.errors import Reason, Status
 from kgcp.io.formats.frame_names import likely_difference
 from kgcp.measurement.records import FrameResult, Miss, TimeSource
 
+_KEPT_DETAILS = 1000  # per reason: numbers differ from frame to frame
+_PLACE = re.compile(r"ring at \([^)]*\), radius [\d.]+ px(, |: |$)")
+_NUMBERS_OF_TEST = re.compile(r" \([^()]*\)$")
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _COMPARED = 1000  # names that differ, in search of two that resemble each other
 
 
@@ -30,6 +35,10 @@ class DetectionSummary:
         Rows per status.
     reasons : dict of int
         Rows per reason, most frequent first.
+    details : dict of str
+        What is behind a reason in most of its rows, where something is.
+    likely_cause : str or None
+        Why nothing was measured, where a trial has told.
     frames_without_time : int
         Frames that neither the times file nor EXIF gives a time.
     frames_not_in_times_file : int
@@ -59,6 +68,8 @@ class DetectionSummary:
     frames: int
     status: Mapping[str, int]
     reasons: Mapping[str, int]
+    details: Mapping[str, str]
+    likely_cause: str | None
     frames_without_time: int
     frames_not_in_times_file: int
     times_without_frame: int
@@ -70,6 +81,18 @@ class DetectionSummary:
     not_drawn: int
     guide_problem: str | None
     stages_s: Mapping[str, float]
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with a run that has measured nothing, in one line with the remedy."""
+        if self.status[Status.MEASURED.value]:
+            return None
+        text = f"no target was measured in any of {self.frames} frames"
+        if self.likely_cause is not None:
+            return f"{text}: {self.likely_cause}"
+        reason, count = next(iter(self.reasons.items()))
+        detail = f" ({self.details[reason]})" if reason in self.details else ""
+        return f"{text}: {count} {reason}{detail}; {Reason.of(reason).remedy}"
 
     def numbers(self) -> dict[str, object]:
         """Return all but the table, by name, for JSON."""
@@ -114,6 +137,7 @@ class SummaryBuilder:
         self._not_named: list[str] = []
         self._status: Counter[Status] = Counter()
         self._reasons: Counter[Reason] = Counter()
+        self._details: dict[Reason, Counter[str]] = defaultdict(Counter)
         self._from_exif: Counter[bool] = Counter()  # by whether the time has no fraction
 
     def add(self, result: FrameResult) -> None:
@@ -130,14 +154,21 @@ class SummaryBuilder:
             if isinstance(outcome, Miss):
                 self._reasons[outcome.reason] += 1
                 self._status[outcome.reason.status] += 1
+                self._count_detail(outcome)
             else:
                 self._status[Status.MEASURED] += 1
                 self._guided += outcome.is_guided
+
+    def _count_detail(self, miss: Miss) -> None:
+        counts, text = self._details[miss.reason], _without_place(miss.detail)
+        if text and (text in counts or len(counts) < _KEPT_DETAILS):
+            counts[text] += 1
 
     def summary(
         self,
         *,
         table: Path,
+        likely_cause: str | None,
         kept: int,
         frames_without_attitude: int,
         not_drawn: int,
@@ -151,6 +182,12 @@ class SummaryBuilder:
             frames=self._frames,
             status={kind.value: self._status[kind] for kind in Status},
             reasons={reason.value: count for reason, count in self._reasons.most_common()},
+            details={
+                reason.value: _commonest(counts)
+                for reason, counts in self._details.items()
+                if counts and reason is not Reason.OUT_OF_VIEW
+            },
+            likely_cause=likely_cause,
             frames_without_time=self._without_time,
             frames_not_in_times_file=len(self._not_named),
             times_without_frame=len(unused),
@@ -163,6 +200,21 @@ class SummaryBuilder:
             guide_problem=guide_problem,
             stages_s=dict(stages_s),
         )
+
+
+def _without_place(detail: str) -> str:
+    """Return what a detail says that may be the same in other frames."""
+    text = _PLACE.sub("", detail.partition("; expected by ")[0])
+    return _NUMBERS_OF_TEST.sub("", text)
+
+
+def _commonest(details: Counter[str]) -> str:
+    """Return the commonest detail, of those that differ in their numbers alone."""
+    kinds: Counter[str] = Counter()
+    for text, count in details.items():
+        kinds[_NUMBER.sub("#", text)] += count
+    kind = kinds.most_common(1)[0][0]
+    return next(text for text, _ in details.most_common() if _NUMBER.sub("#", text) == kind)
 
 
 def _name_difference(names: Sequence[str], frames: Sequence[str]) -> str | None:

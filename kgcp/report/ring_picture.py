@@ -43,6 +43,7 @@ class RingView:
     radius_px: float  # of its outer edge [px]
     curves: Sequence[FloatArray]  # contours, fitted or of the outline that was dropped [px]
     residual_image: ResidualImage | None = None  # what the fit leaves; None: there is no fit
+    expected: Sequence[FloatArray] = ()  # dots that a dropped ring should have [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +169,7 @@ def _with_contours(picture: _Picture, cut: _Cut, view: RingView) -> _Picture:
     colour = _DROPPED if view.residual_image is None else _FITTED
     arm = np.array([0.03 * cut.side, 0.0])
     cross = [view.centre_px + np.array([-tip, tip]) for tip in (arm, arm[::-1])]
-    for lines, ink in ((view.curves, colour), (cross, _CENTRE)):
+    for lines, ink in ((view.curves, colour), (view.expected, _FITTED), (cross, _CENTRE)):
         for line in lines:
             points = np.rint((cut.placed(line, len(picture)) - 0.5) * 2**_PARTS).astype(np.int32)
             cv2.polylines(picture, [points], isClosed=False, color=ink, thickness=1,

@@ -68,7 +68,8 @@ def test_bad_frames_are_rows_among_the_good_ones(flight: Path) -> None:
     (frames / "zero.png").touch()
     assert cv2.imwrite(str(frames / "tiny.png"), np.zeros((1, 1), np.uint8))
     result = run("detect", str(flight), "--jobs", "0", "--json")
-    assert result.exit_code == 0
+    assert result.exit_code == 1, "nothing was measured"
+    assert "no target was measured in any of 7 frames: 3 " in result.stderr.splitlines()[-1]
     summary = json.loads(result.stdout)
     assert summary["frames"] == 7
     status = summary["status"]
@@ -96,3 +97,44 @@ def test_an_empty_frames_folder_is_a_line(flight: Path) -> None:
 @pytest.mark.parametrize("command", ["export-gcp", "bias-report"])
 def test_a_command_before_detect_is_a_line(flight: Path, command: str) -> None:
     assert "run 'kgcp detect'" in one_line_of_error(run(command, str(flight)))
+
+
+def sized(flight: Path, count: int, *sizes: tuple[int, int]) -> None:
+    """Let the flight have so many frames, of sizes that take turns."""
+    for frame in (flight / "frames").iterdir():
+        frame.unlink()
+    for number in range(count):
+        width, height = sizes[number % len(sizes)]
+        image = np.full((height, width), 90, np.uint8)
+        assert cv2.imwrite(str(flight / "frames" / f"{number:03d}.png"), image)
+
+
+def test_frames_of_another_size_end_the_run_early(flight: Path) -> None:
+    sized(flight, 30, (640, 400))
+    line = one_line_of_error(run("detect", str(flight), "--jobs", "0"))
+    assert (
+        "frames: the first 20 frames are all 640 x 400 px, the camera has 320 x 200; give"
+        " flight.toml the size and calibration of these frames"
+    ) in line
+    assert not (flight / "kgcp" / "detections.parquet").exists()
+    line = one_line_of_error(run("detect", str(flight), "--jobs", "0"))
+    assert "the first 20 frames are all 640 x 400 px" in line, "also of a run that is resumed"
+
+
+@pytest.mark.parametrize(
+    ("count", "sizes", "rows"),
+    [
+        (12, [(640, 400)], 12),
+        (30, [(640, 400), (400, 640)], 30),
+        (30, [(WIDTH, HEIGHT), (9, 9)], 15),
+    ],
+)
+def test_other_flights_are_looked_at_to_their_end(
+    flight: Path, count: int, sizes: list[tuple[int, int]], rows: int
+) -> None:
+    sized(flight, count, *sizes)
+    result = run("detect", str(flight), "--jobs", "0")
+    assert f"no target was measured in any of {count} frames: {rows} " in one_line_of_error(result)
+    assert f"{rows} wrong_size: mostly " in result.stderr
+    table = pq.read_table(flight / "kgcp" / "detections.parquet").to_pydict()
+    assert table["reason"].count("wrong_size") == rows

@@ -54,6 +54,7 @@ def test_a_speed_is_told_of_frames_that_were_worked_on(
 ) -> None:
     summary = SummaryBuilder({}).summary(
         table=tmp_path,
+        likely_cause=None,
         kept=kept,
         frames_without_attitude=0,
         not_drawn=0,

@@ -96,7 +96,7 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     done = events[-1]["done"]
     assert 1 <= done < FRAMES
     result = run(flight, tmp_path)
-    assert result.exit_code == 0
+    assert result.exit_code == 1, "there is no target to measure"
     assert f"results of {done} of {FRAMES} frames are kept, 0 have" in result.stderr
     assert f"{FRAMES} frames in" in result.stderr
 
@@ -123,9 +123,11 @@ def test_a_run_started_with_sigint_ignored_stops_at_sigterm_alone(
 
 def test_what_is_said_can_be_chosen(short_flight: Path, tmp_path: Path) -> None:
     quiet = run(short_flight, tmp_path / "a", "--quiet")
-    assert (quiet.exit_code, quiet.output) == (0, "")
+    assert quiet.exit_code == 1
+    assert quiet.output.startswith("kgcp: error: no target was measured in any of 4 frames: ")
+    assert quiet.output.count("\n") == 1
     told = run(short_flight, tmp_path / "b", "--log-json", "--restart", "--json")
-    events = [json.loads(line) for line in told.stderr.splitlines()]
+    events = [json.loads(line) for line in told.stderr.splitlines()[:-1]]
     assert [event["event"] for event in events[-2:]] == ["progress", "summary"]
     assert events[-1]["reasons"] == json.loads(told.stdout)["reasons"]
     profiled = run(short_flight, tmp_path / "c", "--profile")

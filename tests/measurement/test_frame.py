@@ -143,9 +143,10 @@ def test_the_replica_on_another_plate_is_not_this_target(
     frame = draw_frame((other_plate(target), place_plate((240.0, 180.0), 90.0)))
     (outcome,) = measure_frame(frame, camera, (target,), SETTINGS)
     assert isinstance(outcome, Miss)
-    assert outcome.reason is Reason.CODE_MISMATCH
-    assert outcome.score is not None
-    assert outcome.score > 0.9
+    assert outcome.reason is Reason.OTHER_CODE
+    assert outcome.outline is not None
+    assert outcome.outline.a == pytest.approx(90.0, rel=0.02), "the main ring has failed"
+    assert "flight.toml has 0, 43, 78, 180 for A" in outcome.detail
 
 
 def test_an_empty_frame_has_no_candidate(

@@ -190,7 +190,7 @@ def test_the_best_ring_of_a_miss_is_shown_once(flight: Path) -> None:
         Considered("A", "A-inner", outline, 0.4, is_match=False, reason=Reason.CODE_MISMATCH)
         for outline in (Ellipse(20.0, 30.0, 6.0, 5.0, 0.1), Ellipse(80.0, 60.0, 9.0, 8.0, 0.1))
     )
-    job = DetectionJob(flight / "frames", CAMERA, None, (), DetectSettings())
+    job = DetectionJob(flight / "frames", CAMERA, None, (TARGET_PLATE.target,), DetectSettings())
     result = FrameResult(EMPTY, None, ExposureSettings(), (miss,), None, dropped)
     first, second = sketch_frame(job, result)
     assert (first.card.status, first.card.reason) == ("rejected", "cut")
@@ -225,3 +225,14 @@ def test_where_a_missing_target_must_be_is_said(tmp_path: Path) -> None:
     predictions = {0: {"A": Prediction(np.array([20.0, 30.0]), 2.0, 6.0, 0.04, "its neighbours")}}
     draw_overlay(sheet, "<b>Süd</b>", cast("DetectionRun", _OneLost()), job, predictions)
     assert "expected by its neighbours at (20, 30) ± 2.0 px" in cards(tmp_path / "sheet")[0]
+
+
+def test_a_target_outside_the_frame_has_no_picture_of_another_ring(tmp_path: Path) -> None:
+    sheet = ContactSheet(tmp_path / "sheet")
+    job = DetectionJob(tmp_path, CAMERA, None, (), DetectSettings())
+    predictions = {0: {"A": Prediction(np.array([-90.0, 30.0]), 2.0, 6.0, 0.04, "the reference")}}
+    draw_overlay(sheet, "<b>Süd</b>", cast("DetectionRun", _OneLost()), job, predictions)
+    (card,) = cards(tmp_path / "sheet")
+    assert "out_of_view" in card
+    assert "expected by the reference at (-90, 30) ± 2.0 px" in card
+    assert "ring at" not in card

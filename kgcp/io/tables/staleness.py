@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -31,6 +32,7 @@ _SAME_TIME_S = 2e-6  # tables hold microseconds
 _SAME_SHIFT_S = 1e-3  # spread of differences that are called one shift
 _LONGEST_VALUE = 40  # characters of a value that is shown
 _MOST_SHOWN = 6  # changes that are named one by one
+_CAMERA_KEYS = {f"[camera] {field.name}" for field in fields(Camera)}  # every table has them
 
 
 def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
@@ -99,7 +101,8 @@ def _changed_keys(then: Mapping[str, object], now: Mapping[str, object]) -> Iter
     kept = {target for target in targets_then if target in targets_now}
     for key in (*now, *(key for key in then if key not in now)):
         is_of_both = not key.startswith(TARGET_TABLE) or _target(key) in kept
-        if is_of_both and then.get(key) != now.get(key):
+        is_of_later_version = key in _CAMERA_KEYS and key not in then
+        if is_of_both and not is_of_later_version and then.get(key) != now.get(key):
             yield f"{key}{_from_to(then.get(key), now.get(key))}"
 
 
