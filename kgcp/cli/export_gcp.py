@@ -64,6 +64,14 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     default=None,
     help="CRS of the points, for example EPSG:25832.  [default: the flight's]",
 )
+@click.option(
+    "--mark-floor-px",
+    metavar="PX",
+    type=click.FloatRange(0.0, 100.0),
+    default=0.1,
+    show_default=True,
+    help="Least standard deviation of an image point in the files of other programs [px].",
+)
 @selection_options
 @detections_option
 @json_option
@@ -72,6 +80,7 @@ def command(
     out: Path | StoredFolder | None,
     formats: tuple[str, ...],
     crs: str | None,
+    mark_floor_px: float,
     detections: Path | None,
     *,
     as_json: bool,
@@ -98,14 +107,14 @@ def command(
         source = detections or workspace.out / DETECTIONS
         made = make_gcps(the_flight, source, selection=Selection(**selection), crs=crs)
         written = write_gcps(made, workspace.out)
-        more, left_out = _export(made, formats, workspace.out)
+        more, left_out = _export(made, formats, workspace.out, mark_floor_px)
         written += more
         older = not_renewed(workspace.out, written)
     _report(made, written, left_out, older, workspace.named, as_json=as_json)
 
 
 def _export(
-    made: GcpSet, formats: tuple[str, ...], folder: Path
+    made: GcpSet, formats: tuple[str, ...], folder: Path, mark_floor_px: float
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the named formats; with `all`, every format that can hold the points.
 
@@ -117,7 +126,7 @@ def _export(
     written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):
         try:
-            written += export_gcps(made, (name,), folder)
+            written += export_gcps(made, (name,), folder, mark_floor_px=mark_floor_px)
         except KgcpError as error:
             if name in formats:
                 raise

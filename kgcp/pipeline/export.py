@@ -17,6 +17,7 @@ from kgcp.georef.selection import Selection, explain_none_left, select
 from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.weights import MARK_FLOOR_PX
 from kgcp.io.exporters.write import export
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
@@ -146,7 +147,11 @@ def make_gcps(
 
 @single_threaded()
 def export_gcps(
-    gcp_set: GcpSet, formats: Sequence[str] = DEFAULT_FORMATS, folder: Path | str | None = None
+    gcp_set: GcpSet,
+    formats: Sequence[str] = DEFAULT_FORMATS,
+    folder: Path | str | None = None,
+    *,
+    mark_floor_px: float = MARK_FLOOR_PX,
 ) -> list[Path]:
     """Write the files of some formats, and return their paths.
 
@@ -158,6 +163,8 @@ def export_gcps(
         Names as in `kgcp export-gcp --list-formats`.
     folder : Path, optional
         Of the files; by default the flight's results folder.
+    mark_floor_px : float
+        Least standard deviation of a mark in the files of packages [px].
 
     Raises
     ------
@@ -169,7 +176,13 @@ def export_gcps(
     if unknown:
         raise KgcpError(f"format {unknown[0]!r}: is unknown; give one of {', '.join(FORMATS)}")
     folder = results_folder(gcp_set.flight.folder) if folder is None else Path(folder)
-    points = MapPoints(gcp_set.crs, gcp_set.gcps, gcp_set.flight.camera, gcp_set.camera_priors)
+    points = MapPoints(
+        gcp_set.crs,
+        gcp_set.gcps,
+        gcp_set.flight.camera,
+        gcp_set.camera_priors,
+        mark_floor_px,
+    )
     return [path for name in dict.fromkeys(formats) for path in export(points, name, folder)]
 
 

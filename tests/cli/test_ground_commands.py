@@ -226,6 +226,17 @@ def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder
     assert '"my%20f_0.jpg"' in (flight.out / "opf/camera_list.json").read_text(encoding="utf-8")
 
 
+def test_marks_of_packages_have_a_floor_and_the_table_has_not(flight: FlightFolder) -> None:
+    for options, accuracy in ((), 0.1), (("--mark-floor-px", "0.3"), 0.3):
+        assert flight.run("export-gcp", "--format", "pix4d", *options).exit_code == 0
+        with (flight.out / "pix4d/marks.csv").open(encoding="utf-8") as stream:
+            assert {float(row[4]) for row in csv.reader(stream)} == {accuracy}
+    table = read_table(flight.out / "kgcps.parquet", GCP_COLUMNS)
+    assert set(table["sd_x_px"]) == {0.03}
+    assert set(table["sd_distance_m"]) == {0.01}
+    assert flight.run("export-gcp", "--mark-floor-px", "-1").exit_code == 2
+
+
 def test_files_of_an_earlier_export_are_mentioned(flight: FlightFolder) -> None:
     flight.run("export-gcp", "--format", "odm", "--format", "micmac")
     result = flight.run("export-gcp", "--format", "csv", "--min-spacing", "30", "--json")

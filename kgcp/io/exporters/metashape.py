@@ -26,7 +26,7 @@ from kgcp.io.exporters.points import (
     labels,
     pixel,
 )
-from kgcp.io.exporters.shared import focal_length_note, xml_text
+from kgcp.io.exporters.shared import focal_length_note, marks_note, xml_text
 
 _FOLDER = "metashape"
 _HOWTO = """\
@@ -48,8 +48,10 @@ need it taken off:
    Reference > Settings). They are weak; import it only where the photos' own reference is worse.
 
 Optimise the cameras afterwards. Metashape has one accuracy for all marker projections (Reference >
-Settings, marker accuracy): {mark_px} px is the RMS of these. It ignores correlations, and
-the errors that all distances share (sd_common_distance_m in kgcps.csv).
+Settings, marker accuracy, by default 0.5 px): set it to {mark_px} px, the RMS of these. Every scale
+bar has the weight of its own accuracy. Metashape ignores correlations.
+
+{marks}
 
 {focal_length}"""
 
@@ -70,6 +72,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
             crs=points.crs,
             heights=points.heights,
             mark_px=_rms_mark_px(points.gcps),
+            marks=marks_note(points),
             focal_length=focal_length_note(points.controls),
         ),
         "markers.csv": _markers(points, label),

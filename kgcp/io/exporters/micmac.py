@@ -22,7 +22,7 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
-from kgcp.io.exporters.shared import add_text, xml_text
+from kgcp.io.exporters.shared import add_text, marks_note, xml_text
 
 _FOLDER = "micmac"
 _HOWTO = """\
@@ -32,7 +32,8 @@ MicMac v1 (mm3d)
 
 gcps.xml has the points with the standard deviations of their three coordinates (Incertitude),
 marks.xml their image points with pointing precision in pixels (PrecPointe); the factors 1 and 1 of
-Campari scale both. Pixel (0, 0) is the centre of the top-left pixel.
+Campari multiply both, and their inverse squares are the weights. Pixel (0, 0) is the centre of the
+top-left pixel.
 
 GCPBascule needs points that are seen in two or more images, which moving points are not: bring
 the block into the frame by camera positions (CenterBascule) or by classic points first. All that
@@ -40,6 +41,8 @@ goes into one adjustment must be in the same frame:
 
 {frame}
 MicMac v1 ignores distances and correlations. Points kept for checking are not in the files.
+
+{marks}
 """
 
 
@@ -56,7 +59,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
     texts = {
         "gcps.xml": _gcps(points, label),
         "marks.xml": _marks(points, label),
-        "HOWTO.txt": _HOWTO.format(frame=describe_frame(points)),
+        "HOWTO.txt": _HOWTO.format(frame=describe_frame(points), marks=marks_note(points)),
     }
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 

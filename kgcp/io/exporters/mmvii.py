@@ -27,7 +27,7 @@ from kgcp.io.exporters.points import (
     pixel,
     upper,
 )
-from kgcp.io.exporters.shared import add_text, focal_length_note, xml_text
+from kgcp.io.exporters.shared import add_text, focal_length_note, marks_note, xml_text
 
 _FOLDER = "mmvii"
 _DISTANCE = 3
@@ -46,9 +46,10 @@ frame all this is, which the distances ask for. Pixel (0, 0) is the centre of th
 The block must be in the points' frame before:
 
 {frame}
-MMVII reads the covariances, and of the points uses the three standard deviations. It does not
-know of errors that all distances share (sd_common_distance_m in kgcps.csv). Points kept for
-checking are not in the files.
+MMVII weighs marks by their covariances, distances by their standard deviations, and points by their
+three standard deviations. Points kept for checking are not in the files.
+
+{marks}
 
 {focal_length}"""
 
@@ -66,7 +67,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
     names = image_names((point.frame for point in points.gcps), _FOLDER, r'\s*"')
     texts = {
         "HOWTO.txt": _HOWTO.format(
-            frame=describe_frame(points), focal_length=focal_length_note(points.controls)
+            frame=describe_frame(points),
+            marks=marks_note(points),
+            focal_length=focal_length_note(points.controls),
         ),
         "MesGCP-kgcp.xml": _gcps(points, label),
         "CurSysCo.xml": _system(points),

@@ -27,6 +27,7 @@ from kgcp.io.exporters.points import (
     known_cov,
     largest_sd,
 )
+from kgcp.io.exporters.shared import marks_note
 
 _FOLDER = "opf"
 _CODE = re.compile(r"[A-Za-z]+:\d+(\+([A-Za-z]+:)?\d+)?")
@@ -41,8 +42,10 @@ project.opf names the two files beside it:
                               with three standard deviations each; their marks with accuracies
                               [px]; points kept for checking have is_checkpoint.
 
-OPF holds no correlations. Its scale constraints join two control points and no cameras: the
-distances find no place in it.
+Programs weigh marks by their accuracies and points by their sigmas. OPF holds no correlations. Its
+scale constraints join two control points and no cameras: the distances find no place in it.
+
+{marks}
 """
 
 
@@ -70,7 +73,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
     }
     texts = {f"{name}.json": json.dumps(part, indent=1) + "\n" for name, part in parts.items()}
     texts["project.opf"] = _project(texts)
-    texts["HOWTO.txt"] = _HOWTO.format(crs=points.crs, heights=points.heights)
+    texts["HOWTO.txt"] = _HOWTO.format(
+        crs=points.crs, heights=points.heights, marks=marks_note(points)
+    )
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 
 

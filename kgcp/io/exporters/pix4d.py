@@ -22,6 +22,7 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
+from kgcp.io.exporters.shared import marks_note
 
 _FOLDER = "pix4d"
 _HOWTO = """\
@@ -36,8 +37,11 @@ PIX4Dmatic, PIX4Dmapper
    folder that holds the images, zoom level off.
 
 Pix4D takes one horizontal accuracy, which here is that of the worst direction, and a vertical one.
-It ignores correlations and distances. Whether it uses points with a mark in a single image is not
-documented for this route; OPF (--format opf) is the better one for PIX4Dmatic.
+Every mark has the weight of its own accuracy. Pix4D ignores correlations and distances. Whether it
+uses points with a mark in a single image is not documented for this route; OPF (--format opf) is
+the better one for PIX4Dmatic.
+
+{marks}
 """
 
 
@@ -53,7 +57,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
     checks = [point for point in points.gcps if point.is_checkpoint]
     order = "latitude or northing" if points.is_north_first else "longitude or easting"
     texts = {
-        "HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights, order=order),
+        "HOWTO.txt": _HOWTO.format(
+            crs=points.crs, heights=points.heights, order=order, marks=marks_note(points)
+        ),
         "gcps.csv": _points(points, points.controls),
         "marks.csv": _marks(points),
     }

@@ -18,6 +18,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
 from kgcp.georef.gcp import Gcp
+from kgcp.io.exporters.weights import MARK_FLOOR_PX
 
 Cell = TypeVar("Cell", str, float)
 
@@ -39,12 +40,15 @@ class MapPoints:
         Of the points and the priors.
     priors : tuple of CameraPrior
         Of the frames for which there is one.
+    mark_floor_px : float
+        Least standard deviation of a mark for packages [px]; `kgcp.io.exporters.weights`.
     """
 
     crs: str
     gcps: tuple[Gcp, ...]
     camera: Camera
     priors: tuple[CameraPrior, ...] = ()
+    mark_floor_px: float = MARK_FLOOR_PX
 
     @property
     def parsed_crs(self) -> CRS:

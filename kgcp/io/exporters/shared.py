@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
 from kgcp.georef.gcp import Gcp
+from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.weights import ASSUMED_SHARE, distance_share
 from kgcp.io.files.time_text import format_time
 from kgcp.io.tables.columns import ColumnType
 from kgcp.io.tables.gcps import GCP_COLUMNS
@@ -24,10 +26,10 @@ _NOTE = """\
 Distances and the focal length: kgcp measures with the calibration of flight.toml. If its focal
 length is wrong by 0.1 %, all distances are wrong by 0.1 %, 8 cm at 80 m, and so with the printed
 diameter. {known}
-The accuracies are those of single distances, without this common error. So leave the calibration
-free in the adjustment. Where the focal length is not known far better than single distances,
-enlarge their accuracies to sqrt(accuracy^2 + (share x distance)^2). If the adjusted focal length
-is another one, put the new calibration into flight.toml and begin again with kgcp detect.
+The package has no place for an error that all distances share: their accuracies here are
+sqrt(measured^2 + (share x distance)^2). kgcps.csv has the measured ones. Leave the calibration free
+in the adjustment. If the adjusted focal length is another one, put the new calibration into
+flight.toml and begin again with kgcp detect.
 """
 
 
@@ -39,18 +41,25 @@ def attributes(point: Gcp) -> dict[str, object]:
 
 def focal_length_note(gcps: Iterable[Gcp]) -> str:
     """Return lines for a HOWTO: how distances hang on the focal length, and how much in these."""
-    shares = [
-        point.sd_common_distance_m / point.distance_m
-        for point in gcps
-        if point.sd_common_distance_m is not None
-    ]
+    shares = [distance_share(point) for point in gcps if point.sd_common_distance_m]
     if not shares:
-        return _NOTE.format(
-            known="How well they are known, flight.toml does not say (sd_fx, sd_outer_diameter_m)."
+        known = (
+            "How well they are known, flight.toml does not say (sd_fx, sd_outer_diameter_m): a\n"
+            f"share of {100.0 * ASSUMED_SHARE:.2g} % is assumed."
         )
-    percent = 100.0 * max(shares)
-    return _NOTE.format(
-        known=f"By flight.toml (sd_fx, sd_outer_diameter_m) the share is {percent:.2g} % here."
+    else:
+        percent = 100.0 * max(shares)
+        known = f"By flight.toml (sd_fx, sd_outer_diameter_m) the share is {percent:.2g} % here."
+    return _NOTE.format(known=known)
+
+
+def marks_note(points: MapPoints) -> str:
+    """Return lines for a HOWTO: that marks are not given the weight they were measured with."""
+    return (
+        f"Marks: no standard deviation is below {points.mark_floor_px:g} px (kgcp export-gcp"
+        " --mark-floor-px). They are\nmeasured better (kgcps.csv), but no calibration is that good"
+        " everywhere, and with thousandths of\na pixel each would weigh as much as thousands of"
+        " tie points."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -23,6 +24,7 @@ from kgcp.io.exporters import (
 )
 from kgcp.io.exporters.formats import FORMATS
 from kgcp.io.exporters.points import MapPoints
+from kgcp.io.exporters.weights import with_floors
 from kgcp.io.files.atomic import write_all
 
 _WRITERS: Mapping[str, ModuleType] = {
@@ -41,8 +43,13 @@ _WRITERS: Mapping[str, ModuleType] = {
 }
 
 
+_AS_MEASURED = {"csv", "geojson", "geopackage"}  # formats for people, who weigh for themselves
+
+
 def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
     """Write the files of one format; return their paths.
+
+    Packages get accuracies with floors, see `kgcp.io.exporters.weights`.
 
     Raises
     ------
@@ -51,6 +58,8 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
     """
     if not points.gcps:
         raise KgcpError(f"{name}: no points left after selection; select less strictly")
+    if name not in _AS_MEASURED:
+        points = replace(points, gcps=with_floors(points.gcps, points.mark_floor_px))
     files: Mapping[str, str | bytes] = _WRITERS[name].files(points)
     contents = {
         folder / file_name: content.encode("utf-8") if isinstance(content, str) else content

@@ -134,7 +134,7 @@ def test_points_images_and_cameras_fit_together_again(make_points: Factory) -> N
 def test_packages_that_take_distances_are_told_what_these_hang_on(
     points: MapPoints, tmp_path: Path, name: str
 ) -> None:
-    """1.23 cm of 79 m are 0.016 % of the distance; unknown, where flight.toml says nothing."""
+    """1.23 cm of 79 m are 0.016 % of the distance; assumed, where flight.toml says nothing."""
     silent = tuple(replace(point, sd_common_distance_m=None) for point in points.gcps)
     for some, words in (
         (points, "the share is 0.016 % here"),
@@ -143,7 +143,7 @@ def test_packages_that_take_distances_are_told_what_these_hang_on(
         (how_to,) = [path for path in export(some, name, tmp_path) if path.name == "HOWTO.txt"]
         text = " ".join(how_to.read_text(encoding="utf-8").split())
         assert "wrong by 0.1 %, all distances are wrong by 0.1 %" in text
-        assert "leave the calibration free" in text
+        assert "Leave the calibration free" in text
         assert words in text
 
 

@@ -1,0 +1,53 @@
+"""Accuracies that an adjustment can use: floors for marks, common errors for distances.
+
+A ring of 50 px is measured to a thousandth of a pixel. No calibration is that good all over the
+image: a mark with such a weight would have that of ten thousand tie points and bend the block
+around it. Likewise a distance is as good as calibration and print, which are wrong alike in all
+frames; packages have no place for a common error, and take it as one of each distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.georef.gcp import Gcp
+
+MARK_FLOOR_PX = 0.1
+"""Default of the least standard deviation of a mark [px]: what good calibrations leave."""
+
+ASSUMED_SHARE = 3e-4
+"""Standard deviation of all distances together, relative, where flight.toml states none."""
+
+
+def distance_share(point: Gcp) -> float:
+    """Return the relative standard deviation of calibration and print in a point's distance."""
+    if not point.sd_common_distance_m:
+        return ASSUMED_SHARE
+    return point.sd_common_distance_m / point.distance_m
+
+
+def with_floors(gcps: Sequence[Gcp], mark_floor_px: float) -> tuple[Gcp, ...]:
+    """Return points with accuracies for a package: what is unknown stays unknown.
+
+    Parameters
+    ----------
+    mark_floor_px : float
+        Least standard deviation of a mark, in any direction [px]. The directions of its
+        covariance stay.
+    """
+    return tuple(_with_floors(point, mark_floor_px) for point in gcps)
+
+
+def _with_floors(point: Gcp, mark_floor_px: float) -> Gcp:
+    cov, sd_m = point.centre_cov_px2, point.sd_distance_m
+    if cov is not None:
+        variances, axes = np.linalg.eigh(cov)
+        if variances[0] < mark_floor_px**2:
+            cov = (axes * np.maximum(variances, mark_floor_px**2)) @ axes.T
+    if sd_m is not None:
+        sd_m = math.hypot(sd_m, distance_share(point) * point.distance_m)
+    return replace(point, centre_cov_px2=cov, sd_distance_m=sd_m)
