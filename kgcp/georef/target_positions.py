@@ -13,6 +13,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import attitude_axes, covariance_along
+from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import (
     ENU_FROM_NED,
@@ -25,10 +26,6 @@ from kgcp.georef.trajectory import (
 )
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
-
-_DAY_S = 86400.0
-_TWO_WEEKS_S = 14 * _DAY_S  # longer than any seconds of the week, with a flight over its end
-_GPS_EPOCH_S = 315_964_800  # 1980-01-06 as Unix seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +241,7 @@ def _moving_positions(
 
 def _no_overlap(vehicle: Vehicle, time_s: FloatArray) -> str:
     covered, gap_s = vehicle.motion.time_s, vehicle.motion.max_gap_s
-    remedy = _gps_remedy(float(time_s.min()), float(covered[0])) or (
+    remedy = gps_count_remedy(float(time_s.min()), float(covered[0])) or (
         "correct [vehicle] time_offset_s in flight.toml (GPS time is 18 s ahead of UTC) or give the"
         " trajectory of this flight"
     )
@@ -254,31 +251,6 @@ def _no_overlap(vehicle: Vehicle, time_s: FloatArray) -> str:
         f" {vehicle.settings.time_offset_s:g}, trajectory {_utc(covered[0])} to"
         f" {_utc(covered[-1])} without gaps over {gap_s:g} s; {remedy}"
     )
-
-
-def _gps_remedy(frames_s: float, trajectory_s: float) -> str | None:
-    """Return what to do about times that count from the start of a GPS week, or of GPS itself."""
-    if 0.0 <= trajectory_s < _TWO_WEEKS_S <= frames_s:
-        return (
-            "the trajectory's times are seconds of a GPS week: give [vehicle] date ="
-            f' {_utc(frames_s)[:10]}, the day of its first epoch, and time_system = "gps" in'
-            " flight.toml"
-        )
-    if 0.0 <= frames_s < _TWO_WEEKS_S <= trajectory_s:
-        return (
-            "the frames' times are seconds of a GPS week: write them as UTC,"
-            f" {_utc(trajectory_s)}, and run 'kgcp detect' again"
-        )
-    for whose, behind_s in (
-        ("trajectory's", frames_s - trajectory_s),
-        ("frames'", trajectory_s - frames_s),
-    ):
-        if abs(behind_s - _GPS_EPOCH_S) < _DAY_S:
-            return (
-                f"the {whose} times count from 1980-01-06, as GPS does: add {_GPS_EPOCH_S} s, and"
-                " take off the leap seconds (18 since 2017), to make them Unix seconds"
-            )
-    return None
 
 
 def _utc(unix_s: float) -> str:

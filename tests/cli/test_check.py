@@ -116,7 +116,7 @@ def test_a_slip_is_named_with_its_remedy(
 def test_detect_prints_the_doubts_before_it_measures(flight: Path, tmp_path: Path) -> None:
     (flight / "frames").unlink()
     (flight / "frames").mkdir()
-    shutil.copy(SAMPLE / "frames" / "frame_0020.jpg", flight / "frames")
+    shutil.copy(SAMPLE / "frames" / "frame_0015.jpg", flight / "frames")
     change(flight, "flight.toml", "-1.95", "1.95")
     arguments = ["detect", str(flight), "--jobs", "0", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)

@@ -24,6 +24,8 @@ def corrections(flight: Path, old: str, new: str) -> tuple[Corrections, list[str
     assert right.count(old) == 1
     toml.write_text(right.replace(old, new), encoding="utf-8")
     try:
+        if "readout_s" in new:  # part of what is measured
+            detect_flight(read_flight(flight), options=RunOptions(jobs=0))
         result = CliRunner().invoke(main, ["export-gcp", str(flight), "--format", "csv", "--json"])
     finally:
         toml.write_text(right, encoding="utf-8")

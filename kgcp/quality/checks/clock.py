@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 _WEEK_S = 604_800.0
@@ -77,6 +78,9 @@ def check_overlap(
         f"{count} of {len(times)} frames with a time lie outside the trajectory (frames"
         f" {time_span(frame_s)}{offset}; trajectory {time_span(trajectory_s)})"
     )
+    remedy = gps_count_remedy(float(times.min()), first)
+    if remedy is not None:
+        return (grave(Cause.CLOCK, sentence, remedy, figures),)
     for shift_s, words in clock_shifts_s():
         if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
             return (
@@ -101,23 +105,22 @@ def check_overlap(
                 {**figures, "shift_s": days * _DAY_S},
             ),
         )
+    return (_unexplained(sentence, outside, figures),)
+
+
+def _unexplained(sentence: str, outside: float, figures: Mapping[str, float]) -> Doubt:
     if outside < 0.5:
-        return (
-            mild(
-                Cause.NO_OVERLAP,
-                sentence,
-                "give the whole trajectory if those frames show the target",
-                figures,
-            ),
-        )
-    return (
-        grave(
+        return mild(
             Cause.NO_OVERLAP,
             sentence,
-            "give the trajectory of this flight, or correct [vehicle] time_offset_s and"
-            " time_system",
+            "give the whole trajectory if those frames show the target",
             figures,
-        ),
+        )
+    return grave(
+        Cause.NO_OVERLAP,
+        sentence,
+        "give the trajectory of this flight, or correct [vehicle] time_offset_s and time_system",
+        figures,
     )
 
 

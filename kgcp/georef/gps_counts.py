@@ -1,0 +1,41 @@
+"""Times that do not count from 1970: seconds of a GPS week, and seconds of GPS since 1980."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+_DAY_S = 86400.0
+_TWO_WEEKS_S = 14 * _DAY_S  # longer than any seconds of the week, with a flight over its end
+_GPS_EPOCH_S = 315_964_800  # 1980-01-06 as Unix seconds
+
+
+def gps_count_remedy(frames_s: float, trajectory_s: float) -> str | None:
+    """Return what to do about times that count from the start of a GPS week, or of GPS itself.
+
+    Both arguments are the first of their kind, taken for Unix seconds. None: they count from 1970.
+    """
+    if 0.0 <= trajectory_s < _TWO_WEEKS_S <= frames_s:
+        return (
+            "the trajectory's times are seconds of a GPS week: give [vehicle] date ="
+            f' {_date(frames_s):%Y-%m-%d}, the day of its first epoch, and time_system = "gps" in'
+            " flight.toml"
+        )
+    if 0.0 <= frames_s < _TWO_WEEKS_S <= trajectory_s:
+        return (
+            "the frames' times are seconds of a GPS week: write them as UTC,"
+            f" {_date(trajectory_s):%Y-%m-%dT%H:%M:%SZ}, and run 'kgcp detect' again"
+        )
+    for whose, behind_s in (
+        ("trajectory's", frames_s - trajectory_s),
+        ("frames'", trajectory_s - frames_s),
+    ):
+        if abs(behind_s - _GPS_EPOCH_S) < _DAY_S:
+            return (
+                f"the {whose} times count from 1980-01-06, as GPS does: add {_GPS_EPOCH_S} s, and"
+                " take off the leap seconds (18 since 2017), to make them Unix seconds"
+            )
+    return None
+
+
+def _date(unix_s: float) -> datetime:
+    return datetime.fromtimestamp(unix_s, UTC)
