@@ -192,9 +192,11 @@ def _about(reason: str, summary: DetectionSummary) -> str:
     """Return the commonest detail of a reason, and what to do about it."""
     from kgcp.errors import Reason
 
-    detail = summary.details.get(reason)
+    remedy = Reason.of(reason).remedy
+    if reason not in summary.details:
+        return "" if remedy == Reason.OUT_OF_VIEW.remedy else f": {remedy}"
     mostly = "mostly " if summary.reasons[reason] > 1 else ""
-    return "" if detail is None else f": {mostly}{detail}; {Reason.of(reason).remedy}"
+    return f": {mostly}{summary.details[reason]}; {remedy}"
 
 
 def _about_times(summary: DetectionSummary) -> Iterator[str]:

@@ -16,6 +16,7 @@ from kgcp.measurement.records import FrameResult, Miss, TimeSource
 
 _KEPT_DETAILS = 1000  # per reason: numbers differ from frame to frame
 _PLACE = re.compile(r"ring at \([^)]*\), radius [\d.]+ px(, |: |$)")
+_PREDICTION = re.compile(r"(^|; )expected by .*")
 _NUMBERS_OF_TEST = re.compile(r" \([^()]*\)$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _COMPARED = 1000  # names that differ, in search of two that resemble each other
@@ -204,7 +205,7 @@ class SummaryBuilder:
 
 def _without_place(detail: str) -> str:
     """Return what a detail says that may be the same in other frames."""
-    text = _PLACE.sub("", detail.partition("; expected by ")[0])
+    text = _PLACE.sub("", _PREDICTION.sub("", detail))
     return _NUMBERS_OF_TEST.sub("", text)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from kgcp.cli.detect_log import log_to_stderr, report
+from kgcp.errors import Reason
+from kgcp.measurement.records import ExposureSettings, FrameResult, Miss
 from kgcp.pipeline.run_summary import SummaryBuilder
 
 
@@ -64,3 +66,53 @@ def test_a_speed_is_told_of_frames_that_were_worked_on(
     with log_to_stderr(is_quiet=False, as_json=False) as log:
         report(replace(summary, frames=1), "table", None, 2.0, log, as_json=False)
     assert f"1 frame in 2.0 s{speed}: 0 measured" in capsys.readouterr().err
+
+
+def test_each_reason_has_its_commonest_detail_and_a_remedy(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    builder = SummaryBuilder({})
+    for number, (reason, detail) in enumerate(
+        (
+            (
+                Reason.TOO_SMALL,
+                "ring at (10, 20), radius 5.4 px, 5.4 px of 6 px across (score 0.9)",
+            ),
+            (
+                Reason.TOO_SMALL,
+                "ring at (30, 40), radius 5.2 px, 5.2 px of 6 px across (score 0.8)",
+            ),
+            (Reason.TOO_SMALL, "ring at (50, 60), radius 5.2 px, 5.2 px of 6 px across"),
+            (Reason.OTHER_CODE, "ring at (9, 9), radius 30.0 px, dots at 0, 43 deg (score 0.9)"),
+            (
+                Reason.NO_CANDIDATE,
+                "expected by its neighbours at (1, 2) ± 0.5 px, radius 9 px ± 4%",
+            ),
+            (
+                Reason.OUT_OF_VIEW,
+                "expected by the reference at (-9, 2) ± 0.5 px, outside the frame",
+            ),
+        )
+    ):
+        miss = Miss("A", reason, detail)
+        builder.add(FrameResult(f"{number}.jpg", None, ExposureSettings(), (miss,)))
+    summary = builder.summary(
+        table=tmp_path,
+        likely_cause=None,
+        kept=0,
+        frames_without_attitude=0,
+        not_drawn=0,
+        guide_problem=None,
+        stages_s={},
+    )
+    assert summary.problem == (
+        "no target was measured in any of 6 frames: 3 too_small (5.2 px of 6 px across); fly lower,"
+        " use a larger target or search for smaller rings"
+    )
+    with log_to_stderr(is_quiet=False, as_json=False) as log:
+        report(summary, "table", None, 2.0, log, as_json=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert "       3 too_small: mostly 5.2 px of 6 px across; fly lower," in "\n".join(lines)
+    assert any(line.startswith("       1 other_code: dots at 0, 43 deg; correct") for line in lines)
+    assert any(line.startswith("       1 no_candidate: none needed if") for line in lines)
+    assert "       1 out_of_view" in lines
