@@ -214,8 +214,6 @@ def _report_consistency(found: Consistency) -> None:
         f" {along:.3f} m along, {across:.3f} m across, {up:.3f} m up (RMS), {outliers} outliers",
         err=True,
     )
-    for line in _advice(found):
-        click.echo(f"warning: {line}", err=True)
 
 
 def _advice(found: Consistency | None) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -175,6 +176,7 @@ class AreaOfUse:
         return max(beside, above)
 
 
+@lru_cache(maxsize=8)
 def area_of_use(crs: str) -> AreaOfUse | None:
     """Return where a CRS is meant to be used; None: PROJ does not know.
 
@@ -192,6 +194,7 @@ def area_of_use(crs: str) -> AreaOfUse | None:
     return AreaOfUse(area.name, area.west, area.south, area.east, area.north)
 
 
+@lru_cache(maxsize=8)
 def is_geographic(crs: str) -> bool:
     """Tell whether the coordinates are longitude and latitude.
 
@@ -213,18 +216,26 @@ def longitude_latitude(crs: str, xy: FloatArray) -> FloatArray:
     KgcpError
         If pyproj cannot read the CRS.
     """
-    parsed = parse_crs(crs)
-    flat = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
-    geodetic = flat.geodetic_crs
-    if geodetic is None:
+    transformer = _to_longitude_latitude(crs)
+    if transformer is None:
         return np.full(xy.shape, np.nan)
-    transformer = Transformer.from_crs(flat, geodetic.to_2d(), always_xy=True)
     x, y = xy.T
     columns = np.column_stack(transformer.transform(x, y))
     columns[~np.isfinite(columns).all(axis=1)] = np.nan
     return columns
 
 
+@lru_cache(maxsize=8)
+def _to_longitude_latitude(crs: str) -> Transformer | None:
+    parsed = parse_crs(crs)
+    flat = parsed.sub_crs_list[0] if parsed.is_compound else parsed.to_2d()
+    geodetic = flat.geodetic_crs
+    if geodetic is None:
+        return None
+    return Transformer.from_crs(flat, geodetic.to_2d(), always_xy=True)
+
+
+@lru_cache(maxsize=8)
 def geoid_height_m(longitude_deg: float, latitude_deg: float) -> float | None:
     """Return the height of the EGM2008 or EGM96 geoid above WGS 84; None: no grid is installed."""
     for model in ("EPSG:3855", "EPSG:5773"):

@@ -15,15 +15,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import attitude_axes, covariance_along
 from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.georef.trajectory import (
-    ENU_FROM_NED,
-    Coverage,
-    Motion,
-    States,
-    Trajectory,
-    body_to_ned,
-    roll_pitch_heading_deg,
-)
+from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
 from kgcp.targets.layout import Target
 
@@ -72,21 +64,6 @@ class Vehicle:
             cov_position_m2=trajectory.cov_position_m2,
         )
         return cls(motion, settings, local_frame)
-
-    def attitude_deg(self, frame_from_body: FloatArray, position_m: FloatArray) -> FloatArray:
-        """Return roll, pitch, heading (n, 3) [deg] of attitudes (n, 3, 3) at ENU points (n, 3).
-
-        They are those of the trajectory's file: against the local level and true north.
-        """
-        frame_from_ned = self.local_frame.level_rotations(position_m) @ ENU_FROM_NED
-        body_in_ned = np.swapaxes(frame_from_ned, 1, 2) @ frame_from_body
-        return roll_pitch_heading_deg(body_in_ned)
-
-    def with_attitude(self, attitude_deg: FloatArray, position_m: FloatArray) -> FloatArray:
-        """Return the body axes (n, 3, 3) of such angles (n, 3); undoes `attitude_deg`."""
-        frame_from_ned = self.local_frame.level_rotations(position_m) @ ENU_FROM_NED
-        axes: FloatArray = frame_from_ned @ body_to_ned(*attitude_deg.T)
-        return axes
 
     def coverage(self, time_s: FloatArray) -> list[Coverage]:
         """Return for frame times (n,) whether the trajectory covers them."""

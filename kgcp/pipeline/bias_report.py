@@ -26,10 +26,12 @@ from kgcp.io.tables.provenance import derived_provenance
 from kgcp.measurement.image_model.window import contour_px
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.flight_inputs import SAMPLED_FRAMES, FlightInputs, naming_causes
+from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
+from kgcp.quality.checks.measured import measured_doubts
+from kgcp.quality.consistency import study_consistency
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -195,10 +197,9 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
     settings = read_settings(table)
-    frames = [attempt.frame for attempt in attempts]
-    data = FlightData(flight, frames)
-    doubts = FlightInputs.of(flight, frames, most_headers=SAMPLED_FRAMES, data=data).plausibility
-    with naming_causes(doubts):
+    data = FlightData(flight, [attempt.frame for attempt in attempts])
+    inputs = FlightInputs.detected(flight, data, attempts)
+    with naming_causes(inputs.plausibility):
         study = study_bias(
             attempts,
             data.reference_poses,
@@ -207,6 +208,17 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
             flight.targets,
             settings.method,
         )
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    poses, positions = data.reference_poses, data.target_positions
+    doubts = measured_doubts(
+        inputs.plausibility,
+        sightings,
+        positions,
+        poses,
+        flight.camera,
+        inputs.headers,
+        study_consistency(sightings, positions, poses, flight.camera),
+    )
     provenance = derived_provenance(flight, table, {}, has_reference=True)
     return FlightBias(flight, settings, study, provenance, doubts)
 

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.georef.prediction import reference_states
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.pipeline.execution.threads import single_threaded
@@ -227,43 +225,18 @@ def _reference_text(inputs: FlightInputs) -> str:
 
 def _expected_text(inputs: FlightInputs) -> str:
     """Return distances and radii: by the reference, or at a typical distance."""
-    camera = inputs.flight.camera
-    states = _expected_states(inputs)
-    target = inputs.flight.targets[0]
+    camera, target = inputs.flight.camera, inputs.flight.targets[0]
     scale = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
-    if states is None:
+    if inputs.expected_radii_px is None:
         least = DetectSettings().min_radius_px
         return (
             f"{target.name} has a radius of {scale / _TYPICAL_M:.0f} px at {_TYPICAL_M:g} m;"
             f" it is found to some {scale / least:.0f} m ({least:g} px)"
         )
-    margin = np.exp(states[:, 2])[:, None]
-    size = np.array([camera.width, camera.height])
-    inside = np.all((states[:, :2] >= margin) & (states[:, :2] <= size - 1 - margin), axis=1)
-    if not inside.any():
+    if not len(inputs.expected_radii_px):
         return f"{target.name} is in no frame, by the reference poses"
-    radii = np.exp(states[inside, 2])
+    large, small = inputs.expected_radii_px.max(), inputs.expected_radii_px.min()
     return (
-        f"{target.name} in {int(inside.sum())} frames, {scale / radii.max():.1f} …"
-        f" {scale / radii.min():.1f} m away, radius {radii.max():.0f} … {radii.min():.0f} px"
+        f"{target.name} in {len(inputs.expected_radii_px)} frames, {scale / large:.1f} …"
+        f" {scale / small:.1f} m away, radius {large:.0f} … {small:.0f} px"
     )
-
-
-def _expected_states(inputs: FlightInputs) -> FloatArray | None:
-    """Return the states (n, 3) that reference poses give the first target; None: not known."""
-    positions, poses = inputs.target_positions, inputs.reference_poses
-    if positions is None or poses is None:
-        return None
-    try:
-        states = reference_states(
-            inputs.frames,
-            [inputs.times_s.get(frame) for frame in inputs.frames],
-            inputs.flight.targets[0],
-            poses,
-            positions,
-            inputs.flight.camera,
-        )
-    except KgcpError:  # no time, or outside the trajectory: that is a doubt
-        return None
-    with np.errstate(invalid="ignore"):
-        return states[np.isfinite(states).all(axis=1)]

@@ -27,9 +27,10 @@ from kgcp.io.tables.gcps import GCP_COLUMNS, gcp_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.flight_inputs import SAMPLED_FRAMES, FlightInputs, naming_causes
+from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.checks.doubt import Doubt
+from kgcp.quality.checks.measured import measured_doubts
 from kgcp.quality.consistency import Consistency, study_consistency
 
 _DEFAULT_SELECTION = Selection()
@@ -110,20 +111,28 @@ def make_gcps(
             f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
-    frames = sorted({attempt.frame for attempt in attempts})
-    data = FlightData(flight, frames)
-    doubts = FlightInputs.of(flight, frames, most_headers=SAMPLED_FRAMES, data=data).plausibility
-    with naming_causes(doubts):
+    data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
+    inputs = FlightInputs.detected(flight, data, attempts)
+    with naming_causes(inputs.plausibility):
         target_positions = data.target_positions
         placed, absent = build_gcps(sightings, target_positions, flight.camera)
     local_frame = target_positions.local_frame
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     if placed and not gcps:
         raise KgcpError(explain_none_left(placed, unwanted, selection))
+    poses = data.reference_poses if data.has_reference else None
     consistency = None
-    if data.has_reference:
-        poses = data.reference_poses
+    if poses is not None:
         consistency = study_consistency(sightings, target_positions, poses, flight.camera)
+    doubts = measured_doubts(
+        inputs.plausibility,
+        sightings,
+        target_positions,
+        poses,
+        flight.camera,
+        inputs.headers,
+        consistency,
+    )
     if crs is not None and gcps:
         transform = CrsTransform.to(crs, local_frame, np.asarray(gcps[0].position_map))
         gcps, local_frame = transform_gcps(gcps, transform), transform.target

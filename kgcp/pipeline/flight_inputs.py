@@ -14,6 +14,8 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.crs import longitude_latitude
+from kgcp.georef.prediction import reference_states
+from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.data import FlightData
@@ -22,14 +24,14 @@ from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.camera_position import check_camera_position
-from kgcp.quality.checks.clock import check_exif_times, check_overlap
+from kgcp.quality.checks.clock import check_completeness, check_exif_times, check_overlap
 from kgcp.quality.checks.course import Course, check_attitude, course_of
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
 from kgcp.quality.checks.place import check_place
 from kgcp.quality.checks.plate import check_targets
-from kgcp.quality.checks.reference import check_reference
+from kgcp.quality.checks.reference import check_reference, check_visibility
 
 SAMPLED_FRAMES = 100
 """Headers that are read where a command has other work to do."""
@@ -71,12 +73,15 @@ class FlightInputs:
         All of them, sorted.
     headers : tuple of FrameHeader
         Of all frames, or of some, evenly spaced.
+    detected_s : mapping of str to float, or None
+        Times that the frames had when targets were detected in them [s]; None: not detected yet.
     """
 
     flight: Flight
     data: FlightData
     frames: tuple[str, ...]
     headers: tuple[FrameHeader, ...]
+    detected_s: Mapping[str, float] | None = None
 
     @classmethod
     def of(
@@ -86,7 +91,6 @@ class FlightInputs:
         folder: StoredFolder | None = None,
         *,
         most_headers: int | None = None,
-        data: FlightData | None = None,
     ) -> FlightInputs:
         """Read the headers of a flight's frames.
 
@@ -96,15 +100,25 @@ class FlightInputs:
             Where the frames are, if not in the flight's folder.
         most_headers : int, optional
             How many headers to read; by default all.
-        data : FlightData, optional
-            If it is at hand already.
         """
         return cls(
             flight,
-            data or FlightData(flight, frames),
+            FlightData(flight, frames),
             tuple(frames),
             read_headers(flight, frames, folder, most_headers),
         )
+
+    @classmethod
+    def detected(
+        cls, flight: Flight, data: FlightData, attempts: Sequence[Attempt]
+    ) -> FlightInputs:
+        """Take frames and times from detections, and read some headers."""
+        frames = sorted({attempt.frame for attempt in attempts})
+        times_s = {
+            attempt.frame: attempt.time_s for attempt in attempts if attempt.time_s is not None
+        }
+        headers = read_headers(flight, frames, most=SAMPLED_FRAMES)
+        return cls(flight, data, tuple(frames), headers, times_s)
 
     @cached_property
     def problems(self) -> list[Doubt]:
@@ -113,8 +127,10 @@ class FlightInputs:
 
     @cached_property
     def times_s(self) -> Mapping[str, float]:
-        """Times of frames [s], by the times file; without one those of the headers."""
+        """Times of frames [s]: those of the detections, of the times file, or of the headers."""
         flight = self.flight
+        if self.detected_s is not None:
+            return self.detected_s
         if flight.times_file is None:
             return {
                 header.frame: header.time_s for header in self.headers if header.time_s is not None
@@ -155,6 +171,33 @@ class FlightInputs:
         return course_of(positions.vehicle, trajectory.attitude_deg)
 
     @cached_property
+    def expected_radii_px(self) -> FloatArray | None:
+        """Radii (n,) of the first target in the frames that reference poses put it into [px].
+
+        None: not known, since poses, times or places are missing.
+        """
+        positions, poses = self.target_positions, self.reference_poses
+        if positions is None or poses is None:
+            return None
+        camera = self.flight.camera
+        try:
+            states = reference_states(
+                self.frames,
+                [self.times_s.get(frame) for frame in self.frames],
+                self.flight.targets[0],
+                poses,
+                positions,
+                camera,
+            )
+        except KgcpError:  # no time, or outside the trajectory: that is a doubt
+            return None
+        states = states[np.isfinite(states).all(axis=1)]
+        radius = np.exp(states[:, 2])
+        last = np.array([camera.width, camera.height]) - 1 - radius[:, None]
+        centre = states[:, :2]
+        return radius[np.all((centre >= radius[:, None]) & (centre <= last), axis=1)]
+
+    @cached_property
     def plausibility(self) -> tuple[Doubt, ...]:
         """What does not fit, grave doubts first; without what cannot be read."""
         flight = self.flight
@@ -167,16 +210,19 @@ class FlightInputs:
         ]
         if flight.vehicle is not None:
             found += check_lever_arm(flight.vehicle.settings)
-        if self.target_positions is not None:
+        if self.target_positions is not None and not _is_lost(found):
             found += check_attitude(self.course)
             if self.reference_poses is not None:
                 found += check_reference(self.reference_poses, self.target_positions)
+        poses = self.reference_poses
+        if poses is not None and not any(doubt.is_grave for doubt in found):
+            found += check_visibility(poses.frames, self.frames, self.expected_radii_px)
         return ranked(found)
 
     def doubts(self) -> tuple[Doubt, ...]:
         """Return what does not fit or cannot be read, grave doubts first."""
         found = self.plausibility
-        if any(doubt.code in _OF_PLACES for doubt in found):
+        if _is_lost(found):
             return found  # what cannot be read then is the consequence
         return ranked((*self.problems, *found))
 
@@ -214,6 +260,10 @@ class FlightInputs:
             offset_s = self.flight.vehicle.settings.time_offset_s
             frame_s = np.array([times[frame] for frame in sorted(times)])
             found += check_overlap(frame_s, self.trajectory.time_s, offset_s)
+        if self.flight.vehicle is not None:
+            is_by_header = self.detected_s is None and self.flight.times_file is None
+            asked = [header.frame for header in self.headers] if is_by_header else self.frames
+            found += check_completeness(asked, times)
         if self.flight.times_file is not None:
             both = [
                 (times[header.frame], header.time_s)
@@ -232,6 +282,11 @@ class FlightInputs:
             if doubt.sentence not in {problem.sentence for problem in self.problems}:
                 self.problems.append(doubt)
             return None
+
+
+def _is_lost(doubts: Sequence[Doubt]) -> bool:
+    """Tell whether places are not where they seem to be, so that nothing about them means much."""
+    return any(doubt.code in _OF_PLACES for doubt in doubts)
 
 
 def missing_files(flight: Flight) -> tuple[Doubt, ...]:

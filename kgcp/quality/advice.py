@@ -10,8 +10,7 @@ from kgcp.quality.consistency import Consistency
 from kgcp.quality.corrections import Correction
 from kgcp.quality.number_text import amount
 
-_UNEXPLAINED = 3.0  # χ² over its degrees of freedom: disagreement without a single culprit
-_FARTHEST_M = 100.0  # what a second and some metres of lever arm make of a vehicle's place
+_EXPLAINED = 2.0  # χ² over its degrees of freedom that corrections may leave
 _AXES = {"forward": 0, "right": 1, "down": 2}
 
 
@@ -19,30 +18,42 @@ def advice(consistency: Consistency) -> tuple[str, ...]:
     """Return one line per correction that is due; none where all is well.
 
     A correction is due where it is more than chance, and more than what flight.toml itself calls
-    uncertain. Where maps or clocks do not belong together, corrections mean nothing.
+    uncertain. It is offered only if the corrections together explain the disagreement; otherwise
+    they mean nothing, and the line says so.
     """
-    distance_m = math.hypot(*rms_m(consistency))
-    strange = [
+    if is_explained(consistency):
+        return tuple(remedy for _, remedy in corrections(consistency))
+    along, across, up = rms_m(consistency)
+    left = math.sqrt(consistency.estimate.variance_factor)
+    line = (
+        f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across and {up:.3f} m up"
+        " (RMS), which no correction of lever arm, time, readout or boresight explains:"
+        f" {left:.1f} times what the standard deviations say would be left"
+    )
+    return (line,)
+
+
+def is_explained(consistency: Consistency) -> bool:
+    """Tell whether the corrections, if any are due, explain the disagreement."""
+    due = [one for one in consistency.estimate.corrections if one.is_significant]
+    is_credible = all(correction.is_credible for correction in due)
+    return is_credible and consistency.estimate.variance_factor <= _EXPLAINED
+
+
+def corrections(consistency: Consistency) -> tuple[tuple[str, str], ...]:
+    """Return what differs, and the remedy, for each correction that is due."""
+    due = [
         correction
-        for correction in consistency.estimate.corrections
-        if correction.is_significant and not correction.is_credible
-    ]
-    if strange or distance_m > _FARTHEST_M:
-        return (_mismatch(distance_m),)
-    lines = [
-        _line(correction)
         for correction in consistency.estimate.corrections
         if correction.is_significant
         and abs(correction.value or 0.0) > consistency.stated_sd.get(correction.name, 0.0)
     ]
-    factor = consistency.estimate.variance_factor
-    if factor > _UNEXPLAINED:
-        lines.append(
-            f"vehicle and camera disagree {math.sqrt(factor):.1f} times as much as their standard"
-            " deviations say, whatever is corrected: look at consistency.parquet for when, and"
-            " check sd_x … of trajectory and reference poses"
-        )
-    return tuple(lines)
+    along, across, up = rms_m(consistency)
+    sentence = (
+        f"vehicle and camera differ by {along:.3f} m along, {across:.3f} m across, {up:.3f} m up"
+        " (RMS)"
+    )
+    return tuple((sentence, _line(correction)) for correction in due)
 
 
 def rms_m(consistency: Consistency) -> tuple[float, float, float]:
@@ -56,14 +67,6 @@ def rms_m(consistency: Consistency) -> tuple[float, float, float]:
     )
     along, across, up = np.sqrt(np.mean(kept**2, axis=0)).tolist()
     return along, across, up
-
-
-def _mismatch(distance_m: float) -> str:
-    return (
-        f"vehicle and camera put the target {distance_m:.0f} m apart, which no correction explains:"
-        " check in flight.toml that [vehicle] crs and [reference] crs are those of the files, and"
-        " that all times are of one clock (GPS time is 18 s ahead of UTC: [vehicle] time_system)"
-    )
 
 
 def _line(correction: Correction) -> str:

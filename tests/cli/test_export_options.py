@@ -135,7 +135,8 @@ def _export(folder: Path, *options: str) -> Result:
 def test_the_summary_says_what_to_change_and_heeding_it_ends_it(folder: Path) -> None:
     result = _export(folder, "--json")
     (line,) = json.loads(result.stdout)["advice"]
-    assert f"warning: {line}" in result.stderr
+    assert "kgcp: doubt: vehicle and camera differ by 0.303 m along, " in result.stderr
+    assert f"; {line}\n" in result.stderr
     value = float(line.split()[1])
     assert line.startswith("add 0.02")
     assert "to [vehicle] time_offset_s in flight.toml" in line

@@ -18,6 +18,9 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import ENU_FROM_NED, Trajectory, body_to_ned
 from kgcp.quality.advice import advice
+from kgcp.quality.checks.causes import causes_of
+from kgcp.quality.checks.doubt import Cause, Doubt
+from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.consistency import Consistency, study_consistency
 from kgcp.quality.corrections import UNKNOWNS
 from kgcp.settings import VehicleSettings
@@ -84,6 +87,14 @@ class Flight:
         return found
 
     def study_if_enough(self, camera: Camera = _CAMERA) -> Consistency | None:
+        return study_consistency(*self.inputs(), camera)
+
+    def causes(self) -> tuple[Doubt, ...]:
+        encounters = Encounters.of(*self.inputs(), _CAMERA)
+        assert encounters is not None
+        return causes_of(encounters)
+
+    def inputs(self) -> tuple[list[Sighting], TargetPositions, ReferencePoses]:
         rng = np.random.default_rng(self.seed)
         time_s = _LEAD_S + 1.5 * np.arange(self.frames, dtype=np.float64)
         names = tuple(f"f{index:04d}.jpg" for index in range(self.frames))
@@ -107,7 +118,7 @@ class Flight:
             replace(one, time_s=float(t) - self.time_offset_s)
             for one, t in zip(sightings, time_s, strict=True)
         ]
-        return study_consistency(late, target_positions, poses, camera)
+        return late, target_positions, poses
 
     def _seen(
         self, time_s: FloatArray, enu_from_camera: FloatArray, rng: np.random.Generator
@@ -274,10 +285,29 @@ def test_what_flight_toml_itself_calls_uncertain_needs_no_correction() -> None:
 
 def test_clocks_that_do_not_belong_together_are_named_instead_of_corrections() -> None:
     """Three seconds at 15 m/s are more than anybody's time_offset_s is wrong by."""
-    (line,) = advice(Flight(time_offset_s=-3.0, seed=1).study())
-    assert re.search(r"put the target \d+ m apart, which no correction explains", line)
-    assert "GPS time is 18 s ahead of UTC" in line
-    assert "crs" in line
+    flight = Flight(time_offset_s=-3.0, seed=1)
+    (line,) = advice(flight.study())
+    assert re.search(r"differ by \d+\.\d+ m along, .* which no correction of lever arm", line)
+    (doubt,) = flight.causes()
+    assert doubt.code is Cause.CLOCK
+    assert re.search(r"\(frames (3|3\.00\d*|2\.99\d*) s late\)", doubt.sentence)
+
+
+def test_a_correct_flight_has_no_cause_to_look_for() -> None:
+    for seed in range(3):
+        assert Flight(seed=seed).causes() == ()
+        assert Flight(seed=seed, has_sds=False).causes() == ()
+
+
+def test_a_lever_arm_of_the_wrong_sign_is_told_from_one_of_the_wrong_length() -> None:
+    right = VehicleSettings(lever_arm_m=(*_LEVER[:2].tolist(), -float(_LEVER[2])))
+    (doubt,) = Flight(seed=2, settings=right).causes()
+    assert doubt.code is Cause.LEVER_ARM
+    assert "the sign of lever_arm_m (down)" in doubt.sentence
+    other = VehicleSettings(lever_arm_m=(*_LEVER[:2].tolist(), float(_LEVER[2]) - 30.0))
+    (doubt,) = Flight(seed=2, settings=other).causes()
+    assert doubt.code is Cause.LEVER_ARM
+    assert "seems to be 30.0" in doubt.sentence
 
 
 def test_a_known_readout_is_taken_into_account() -> None:

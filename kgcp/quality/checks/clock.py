@@ -18,6 +18,7 @@ GPS_MINUS_UTC_S, TAI_MINUS_UTC_S = 18.0, 37.0
 _LEAP_TOLERANCE_S = 1.2  # EXIF has whole seconds
 _HOUR_TOLERANCE_S = 60.0
 _STEADY_S = 2.0
+_SAME_SHARE = 0.02  # of the interval between frames
 _MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
 _UNIX_1990_S = 631_152_000.0
 
@@ -124,6 +125,18 @@ def _unexplained(sentence: str, outside: float, figures: Mapping[str, float]) ->
     )
 
 
+def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> tuple[Doubt, ...]:
+    """Tell frames without a time: the vehicle's place in them is not known."""
+    untimed = [frame for frame in frames if frame not in times_s]
+    if not untimed:
+        return ()
+    figures = {"frames_without_time": float(len(untimed)), "frames": float(len(frames))}
+    sentence = f"{len(untimed)} of {len(frames)} frames have no time, such as {untimed[0]}"
+    remedy = "give [frames] times with one line per frame, named as below the frames folder"
+    doubt = grave if len(untimed) == len(frames) else mild
+    return (doubt(Cause.NO_TIMES, sentence, remedy, figures),)
+
+
 def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> tuple[Doubt, ...]:
     """Compare the times of frames with those that their EXIF has, both Unix UTC [s], in pairs.
 
@@ -145,6 +158,18 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> tuple
                 {"spread_s": spread},
             ),
         )
+    interval = float(np.median(np.abs(np.diff(exif_s))))
+    for step, word in ((1, "next"), (-1, "previous")):
+        moved = np.roll(np.asarray(exif_s), -step)[1:-1] - np.asarray(times_s)[1:-1]
+        if abs(middle) > 0.5 * interval and np.median(np.abs(moved)) < _SAME_SHARE * interval:
+            return (
+                mild(
+                    Cause.FRAME_ORDER,
+                    f"the frames' times are those that the EXIF of the {word} frame has",
+                    "check that every line of the times file has the time of the frame it names",
+                    {"difference_s": middle},
+                ),
+            )
     likely = [
         words
         for shift_s, words in clock_shifts_s()

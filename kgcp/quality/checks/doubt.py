@@ -65,12 +65,15 @@ class Cause(StrEnum):
     HEIGHTS = "heights", "heights are of another kind: above the geoid, or above ground"
     CLOCK = "clock", "times are of another clock: leap seconds, hours, days or GPS weeks"
     NO_OVERLAP = "no_overlap", "frames and trajectory are not of the same time"
+    NO_TIMES = "no_times", "frames have no time"
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
     REFERENCE = "reference", "reference poses are of another place, or turned"
     CAMERA_POSITION = (
         "camera_position",
         "the frames' own GPS position or altitude is not near the vehicle",
     )
+    SINGLE_FRAMES = "single_frames", "single frames disagree where the others agree"
+    CORRECTION = "correction", "a small correction of flight.toml explains a disagreement"
     UNEXPLAINED = "unexplained", "vehicle and camera disagree, and no single cause explains it"
 
 
@@ -119,5 +122,5 @@ def mild(
 
 def ranked(doubts: Iterable[Doubt]) -> tuple[Doubt, ...]:
     """Return doubts with the grave ones first, else in their order, and each only once."""
-    once = {(doubt.code, doubt.sentence): doubt for doubt in doubts}
+    once = {(doubt.code, doubt.sentence, doubt.remedy): doubt for doubt in doubts}
     return tuple(sorted(once.values(), key=lambda doubt: not doubt.is_grave))

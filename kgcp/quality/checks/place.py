@@ -36,7 +36,7 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> tuple[Doubt, 
     x, y = xy.tolist()
     longitude, latitude = longitude_latitude(crs, xy[None])[0].tolist()
     figures = {"x": x, "y": y, "longitude_deg": longitude, "latitude_deg": latitude}
-    sentence = f"{where} at x = {x:.9g}, y = {y:.9g} lies {_spot(longitude, latitude)}"
+    sentence = f"{where}: x = {x:.9g}, y = {y:.9g} is {_spot(longitude, latitude)}"
     if area is not None and not area.is_world:
         sentence += f", {outside:.0f}° outside the area of {crs} ({_short(area.name)})"
     guess = (_angular_guess if is_angular else _projected_guess)(area, crs, xy)

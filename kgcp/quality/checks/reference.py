@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -34,6 +34,38 @@ def check_reference(poses: ReferencePoses, target_positions: TargetPositions) ->
                 "give both in heights of one kind: ellipsoidal ones, or a compound crs that names"
                 " the geoid; [reference] crs and [vehicle] crs may differ",
                 {"camera_above_vehicle_m": above_m},
+            ),
+        )
+    return ()
+
+
+def check_visibility(
+    posed: Sequence[str], frames: Sequence[str], expected_radii_px: FloatArray | None
+) -> tuple[Doubt, ...]:
+    """Tell poses that belong to no frame, or that see the target in none.
+
+    Parameters
+    ----------
+    posed : sequence of str
+        Names of the frames that have a pose.
+    expected_radii_px : (n,) array or None
+        Of the target in the frames that should show it; None: not known.
+    """
+    if posed and not set(posed) & set(frames):
+        return (
+            grave(
+                Cause.REFERENCE,
+                f"the reference poses name none of the frames: {posed[0]!r}, but the frames are"
+                f" named like {frames[0]!r}",
+                "name the poses as the frames, relative to the frames folder",
+            ),
+        )
+    if expected_radii_px is not None and not len(expected_radii_px):
+        return (
+            grave(
+                Cause.REFERENCE,
+                "by reference poses and trajectory the target is in no frame",
+                "check unit, order and signs of omega, phi, kappa, and the times of the frames",
             ),
         )
     return ()

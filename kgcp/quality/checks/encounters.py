@@ -1,0 +1,265 @@
+"""Frames in which a target's place is known twice: by its vehicle, and by camera and reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPositions, Vehicle
+from kgcp.georef.trajectory import (
+    ENU_FROM_NED,
+    Motion,
+    body_to_ned,
+    roll_pitch_heading_deg,
+)
+
+MIN_ENCOUNTERS = 5
+_MOST_ENCOUNTERS = 80  # more tell nothing new about slips, which are the same in all frames
+_RUN = 10  # consecutive frames, since times may be those of the next frame
+_FLOOR_M = 0.01  # of what states no standard deviation, and of models
+_MEDIAN_CHI2 = 2.366  # of three coordinates
+_WIDEST_GAP = 4.0  # of the usual intervals of a trajectory
+_HELD_SHARE = 0.6  # of the encounters that a trial must have inside the trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Encounters:
+    """What is known in n frames of a moving target, as if some inputs were other ones.
+
+    Attributes
+    ----------
+    vehicle : Vehicle
+    camera : Camera
+    time_s : (n,) array
+        Of the target's row, by the trajectory's clock, ascending [s].
+    position_m : (n, 3) array
+        Trajectory point in the ENU frame [m]; NaN: not covered.
+    attitude_deg : (n, 3) array
+        Roll, pitch, heading [deg].
+    lever_arm_m : (3,) array
+        In body axes [m].
+    pixel : (n, 2) array
+        Measured centres [px].
+    in_camera_m : (n, 3) array
+        Measured centres in the camera frame [m].
+    camera_from_plate : (n, 3, 3) array
+        Measured attitude of the plate.
+    centre_m : (n, 3) array
+        Reference projection centres in the ENU frame [m].
+    enu_from_camera : (n, 3, 3) array
+    opk_deg : (n, 3) array
+        Reference attitude as the file has it.
+    variance_m2 : (n,) array
+        Of either coordinate of the difference of both places, by all stated standard
+        deviations, at least 1 cm² [m²].
+    frame_from_ned : (n, 3, 3) array
+        North, east, down where the vehicle was, in the ENU frame, as columns; the same for all
+        times that are tried.
+    """
+
+    vehicle: Vehicle
+    camera: Camera
+    time_s: FloatArray
+    position_m: FloatArray
+    attitude_deg: FloatArray
+    lever_arm_m: FloatArray
+    pixel: FloatArray
+    in_camera_m: FloatArray
+    camera_from_plate: FloatArray
+    centre_m: FloatArray
+    enu_from_camera: FloatArray
+    opk_deg: FloatArray
+    variance_m2: FloatArray
+    frame_from_ned: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        sightings: Sequence[Sighting],
+        target_positions: TargetPositions,
+        poses: ReferencePoses,
+        camera: Camera,
+    ) -> Encounters | None:
+        """Collect the frames, thinned if there are many; None where too few tell."""
+        vehicle = target_positions.vehicle
+        rows = {frame: row for row, frame in enumerate(poses.frames)}
+        posed = [
+            (row_s, sighting, sighting.pose, rows[sighting.frame])
+            for sighting in sightings
+            if not sighting.instance
+            and sighting.pose is not None
+            and sighting.target not in target_positions.static
+            and sighting.frame in rows
+            and (row_s := sighting.row_time_s(camera)) is not None
+        ]
+        if vehicle is None or len(posed) < MIN_ENCOUNTERS:
+            return None
+        posed.sort(key=lambda one: (one[0], one[1].frame))
+        posed = [posed[index] for index in _thinned(len(posed))]
+        orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+        row = [one[3] for one in posed]
+        time_s = np.array([one[0] for one in posed]) + vehicle.settings.time_offset_s
+        draft = cls(
+            vehicle=vehicle,
+            camera=camera,
+            time_s=time_s,
+            position_m=np.empty((0, 3)),
+            attitude_deg=np.empty((0, 3)),
+            lever_arm_m=np.array(vehicle.settings.lever_arm_m),
+            pixel=np.array([one[1].centre_px for one in posed]),
+            in_camera_m=np.array([one[2].translation_m for one in posed]),
+            camera_from_plate=np.array([one[2].rotation for one in posed]),
+            centre_m=orientations.centre_m[row],
+            enu_from_camera=orientations.enu_from_camera[row],
+            opk_deg=poses.opk_deg[row],
+            variance_m2=_variance_m2([one[1] for one in posed], vehicle, poses, row),
+            frame_from_ned=np.broadcast_to(ENU_FROM_NED, (len(row), 3, 3)),
+        )
+        place = draft.at(time_s).position_m
+        place[~np.isfinite(place).all(axis=1)] = vehicle.motion.position_m[0]
+        level = target_positions.local_frame.level_rotations(place)
+        return replace(draft, frame_from_ned=level @ ENU_FROM_NED).at(time_s)
+
+    def at(self, time_s: FloatArray) -> Encounters:
+        """Return the encounters with the vehicle as it was at other times (n,) [s]."""
+        position, body = _states(self.vehicle.motion, time_s)
+        attitude = roll_pitch_heading_deg(np.swapaxes(self.frame_from_ned, 1, 2) @ body)
+        return replace(self, time_s=time_s, position_m=position, attitude_deg=attitude)
+
+    def is_covered(self, time_s: FloatArray) -> bool:
+        """Tell whether enough of other times (n,) lie between the trajectory's ends."""
+        first, last = self.vehicle.motion.time_s[[0, -1]]
+        return bool(np.mean((time_s >= first) & (time_s <= last)) >= _HELD_SHARE)
+
+    @property
+    def frame_from_body(self) -> FloatArray:
+        """Body axes in the ENU frame (n, 3, 3), as columns."""
+        axes: FloatArray = self.frame_from_ned @ body_to_ned(*self.attitude_deg.T)
+        return axes
+
+    def seen_by(self, other: Encounters) -> Encounters:
+        """Return the vehicle of these with camera and reference of other encounters."""
+        return replace(
+            self,
+            camera=other.camera,
+            in_camera_m=other.in_camera_m,
+            centre_m=other.centre_m,
+            enu_from_camera=other.enu_from_camera,
+        )
+
+    @property
+    def by_vehicle_m(self) -> FloatArray:
+        """Place of the target by the vehicle (n, 3), in the ENU frame [m]."""
+        return np.asarray(self.position_m + self.frame_from_body @ self.lever_arm_m)
+
+    @property
+    def by_camera_m(self) -> FloatArray:
+        """Place of the target by camera and reference (n, 3), in the ENU frame [m]."""
+        sight = np.einsum("nij,nj->ni", self.enu_from_camera, self.in_camera_m)
+        return np.asarray(self.centre_m + sight)
+
+    @property
+    def offset_m(self) -> FloatArray:
+        """Place by the vehicle minus place by the camera (n, 3), in the ENU frame [m]."""
+        return np.asarray(self.by_vehicle_m - self.by_camera_m)
+
+    @property
+    def misfit(self) -> float:
+        """Median square of the offsets over their variance: 1 where these are right."""
+        return misfit_of(self.offset_m, self.variance_m2)
+
+    @property
+    def apart_m(self) -> float:
+        """Median length of the offsets [m]."""
+        length = np.linalg.norm(self.offset_m, axis=1)
+        return float(np.nanmedian(length)) if np.isfinite(length).any() else np.inf
+
+
+def _thinned(count: int) -> list[int]:
+    """Return which of many encounters to take: runs of neighbours, evenly spaced."""
+    if count <= _MOST_ENCOUNTERS:
+        return [*range(count)]
+    starts = np.linspace(0, count - _RUN, _MOST_ENCOUNTERS // _RUN).astype(int)
+    return (starts[:, None] + np.arange(_RUN)).ravel().tolist()
+
+
+def misfit_of(offset_m: FloatArray, variance_m2: FloatArray) -> float:
+    """Return the misfit of offsets (n, 3); infinite where too few are known."""
+    square = np.sum(offset_m**2, axis=1) / variance_m2
+    known = np.isfinite(square)
+    if np.count_nonzero(known) < max(MIN_ENCOUNTERS, _HELD_SHARE * len(square)):
+        return np.inf
+    return float(np.median(square[known])) / _MEDIAN_CHI2
+
+
+def _variance_m2(
+    sightings: Sequence[Sighting], vehicle: Vehicle, poses: ReferencePoses, row: list[int]
+) -> FloatArray:
+    """Return variances (n,) [m²]: all errors as if they pointed in any direction."""
+    settings, motion = vehicle.settings, vehicle.motion
+    distance = np.array([sighting.distance_m for sighting in sightings])
+    total = np.full(len(sightings), _FLOOR_M**2)
+    for sds in (
+        [sighting.sd_distance_m or 0.0 for sighting in sightings],
+        [sighting.sd_common_distance_m or 0.0 for sighting in sightings],
+    ):
+        total += np.square(sds)
+    total += max(settings.sd_lever_arm_m) ** 2
+    if motion.sd_position_m is not None:
+        total += float(np.median(motion.sd_position_m.max(axis=1))) ** 2
+    if poses.sd_position_m is not None:
+        total += poses.sd_position_m[row].max(axis=1) ** 2
+    if poses.sd_angle_deg is not None:
+        total += (np.radians(poses.sd_angle_deg[row]) * distance) ** 2
+    way = np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1).sum()
+    speed = float(way) / float(motion.time_s[-1] - motion.time_s[0])
+    return total + (settings.sd_time_s * speed) ** 2
+
+
+def _states(motion: Motion, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return positions (n, 3) and body axes (n, 3, 3) at times (n,); NaN where not covered.
+
+    A cubic through the four nearest samples: slips are tried at many times, for which splines
+    through a whole trajectory would take seconds each.
+    """
+    time_s = np.nan_to_num(time_s, nan=motion.time_s[0] - 1.0)  # not known is not covered
+    left = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, None)
+    left = np.clip(left, 0, len(motion.time_s) - 2)
+    position = _cubic(motion, left, time_s)
+    step = motion.time_s[left + 1] - motion.time_s[left]
+    share = np.clip((time_s - motion.time_s[left]) / step, 0.0, 1.0)
+    start = Rotation.from_matrix(motion.frame_from_body[left])
+    end = Rotation.from_matrix(motion.frame_from_body[left + 1])
+    turn = (end * start.inv()).as_rotvec()
+    body = (Rotation.from_rotvec(share[:, None] * turn) * start).as_matrix()
+    outside = (time_s < motion.time_s[0]) | (time_s > motion.time_s[-1])
+    outside |= step > _WIDEST_GAP * _usual_step(motion)
+    position[outside] = np.nan
+    return position, body
+
+
+def _usual_step(motion: Motion) -> float:
+    few = motion.time_s[:: max(1, len(motion.time_s) // 1000)]
+    return float(np.median(np.diff(few))) / max(1, len(motion.time_s) // 1000)
+
+
+def _cubic(motion: Motion, left: IndexArray, time_s: FloatArray) -> FloatArray:
+    """Return Lagrange's polynomials (n, 3) through four samples about each time (n,)."""
+    count = min(4, len(motion.time_s))
+    first = np.clip(left - 1, 0, len(motion.time_s) - count)
+    nodes = first[:, None] + np.arange(count)
+    at = motion.time_s[nodes] - time_s[:, None]
+    weights = np.ones_like(at)
+    for row in range(count):
+        for other in range(count):
+            if other != row:
+                weights[:, row] *= -at[:, other] / (at[:, row] - at[:, other])
+    return np.asarray(np.einsum("nk,nki->ni", weights, motion.position_m[nodes]))

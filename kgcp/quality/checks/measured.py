@@ -1,0 +1,83 @@
+"""The checks that need measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPositions
+from kgcp.quality.advice import corrections, is_explained
+from kgcp.quality.checks.camera_position import check_altitude
+from kgcp.quality.checks.causes import MISFIT, causes_of
+from kgcp.quality.checks.doubt import Cause, Doubt, mild, ranked
+from kgcp.quality.checks.encounters import Encounters
+from kgcp.quality.checks.frame_header import FrameHeader
+from kgcp.quality.checks.mount import check_mount
+from kgcp.quality.checks.patterns import check_lone_frames, unexplained
+from kgcp.quality.consistency import Consistency
+
+
+def measured_doubts(
+    plausibility: Sequence[Doubt],
+    sightings: Sequence[Sighting],
+    target_positions: TargetPositions,
+    poses: ReferencePoses | None,
+    camera: Camera,
+    headers: Sequence[FrameHeader],
+    consistency: Consistency | None,
+) -> tuple[Doubt, ...]:
+    """Return all doubts, grave ones first: those before measuring, and what measurements tell.
+
+    Parameters
+    ----------
+    plausibility : sequence of Doubt
+        What did not fit before anything was measured.
+    headers : sequence of FrameHeader
+        Of some frames.
+    consistency : Consistency or None
+        Of the same sightings and poses.
+    """
+    doubts = [*plausibility, *_of_altitude(sightings, headers)]
+    # Where an input cannot be right, all that follows from it disagrees.
+    if poses is not None and not any(doubt.is_grave for doubt in plausibility):
+        encounters = Encounters.of(sightings, target_positions, poses, camera)
+        if encounters is not None:
+            doubts += _of_encounters(encounters, consistency)
+    return ranked(doubts)
+
+
+def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> list[Doubt]:
+    is_correctable = consistency is not None and is_explained(consistency)
+    causes = causes_of(encounters, is_correctable=is_correctable)
+    if causes:
+        return [*causes]
+    doubts = [*check_mount(encounters), *check_lone_frames(encounters)]
+    if consistency is not None and is_correctable:
+        doubts += [
+            mild(Cause.CORRECTION, sentence, remedy)
+            for sentence, remedy in corrections(consistency)
+        ]
+    elif encounters.misfit > MISFIT:
+        doubts.append(unexplained(encounters))
+    return doubts
+
+
+def _of_altitude(
+    sightings: Sequence[Sighting], headers: Sequence[FrameHeader]
+) -> tuple[Doubt, ...]:
+    altitudes = {
+        header.frame: header.altitude_m for header in headers if header.altitude_m is not None
+    }
+    pairs = [
+        (altitudes[sighting.frame], float(sighting.pose.normal @ sighting.pose.translation_m))
+        for sighting in sightings
+        if sighting.frame in altitudes and sighting.pose is not None
+    ]
+    if not pairs:
+        return ()
+    altitude_m, height_m = np.array(pairs).T
+    return check_altitude(altitude_m, np.abs(height_m))

@@ -1,0 +1,52 @@
+"""The direction in which the plate is mounted: by image and reference against the vehicle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.georef.camera_priors import body_from_plate
+from kgcp.quality.checks.doubt import Cause, Doubt, mild
+from kgcp.quality.checks.encounters import Encounters
+
+_LARGEST_DEG = 8.0
+_STEADY_DEG = 8.0
+_RIGHT_ANGLE_DEG = 5.0  # closer to a multiple of 90°, that is what is meant
+
+
+def check_mount(encounters: Encounters) -> tuple[Doubt, ...]:
+    """Compare the plate's direction with that of the vehicle and `mount_deg`."""
+    mount_deg = encounters.vehicle.settings.mount_deg
+    off = _plate_turns_deg(encounters, mount_deg)
+    off = off[np.isfinite(off)]
+    if not len(off):
+        return ()
+    turns = np.exp(1j * np.radians(off))
+    middle = math.degrees(float(np.angle(turns.mean())))
+    spread = float(np.median(np.abs((off - middle + 180.0) % 360.0 - 180.0)))
+    if abs(middle) < _LARGEST_DEG or spread > _STEADY_DEG:
+        return ()
+    seen = (mount_deg + middle + 180.0) % 360.0 - 180.0
+    nearest = 90.0 * round(seen / 90.0)
+    told = nearest if abs(seen - nearest) < _RIGHT_ANGLE_DEG else round(seen, 1)
+    return (
+        mild(
+            Cause.MOUNT,
+            f"by images and reference poses the plate is turned by {seen:.1f}° ± {spread:.1f}° on"
+            f" the vehicle, but mount_deg is {mount_deg:g}",
+            f"set [vehicle] mount_deg = {told:g}, unless headings are wrong",
+            {"mount_deg": seen, "spread_deg": spread},
+        ),
+    )
+
+
+def _plate_turns_deg(encounters: Encounters, mount_deg: float) -> FloatArray:
+    """Return by how much the plate is turned about its normal from what is said (n,) [deg]."""
+    by_image = encounters.enu_from_camera @ encounters.camera_from_plate
+    by_vehicle = encounters.frame_from_body @ body_from_plate(mount_deg)
+    turn = np.swapaxes(by_vehicle, 1, 2) @ by_image
+    angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    angle[~np.isfinite(encounters.position_m).all(axis=1)] = np.nan
+    return np.asarray(np.degrees(angle))

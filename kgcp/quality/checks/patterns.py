@@ -1,0 +1,137 @@
+"""The pattern of a disagreement that no slip explains: what it grows with, and what that means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.quality.checks.doubt import Cause, Doubt, mild
+from kgcp.quality.checks.encounters import Encounters
+
+_SHOWN_SHARE = 0.2  # of the squared offsets that a pattern must explain to be named
+_PER_NUMBER = 0.02  # of the share that another number must explain to be preferred
+_FAR = 25.0  # squared offset over its median, beyond which a frame stands alone
+_LONE_M = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """A part of the disagreement.
+
+    Attributes
+    ----------
+    share : float
+        Of the squared offsets that it explains.
+    numbers : int
+        How many are fitted.
+    words : str
+        What it looks like, with its amount.
+    causes : str
+        What makes such a pattern.
+    """
+
+    share: float
+    numbers: int
+    words: str
+    causes: str
+
+
+def patterns(encounters: Encounters) -> tuple[Pattern, ...]:
+    """Return the patterns that explain most, best first.
+
+    Each is fitted alone, by least squares of the offsets that are known.
+    """
+    offset = encounters.offset_m
+    known = np.isfinite(offset).all(axis=1)
+    offset = offset[known]
+    if not len(offset):
+        return ()
+    sight = np.einsum("nij,nj->ni", encounters.enu_from_camera, encounters.in_camera_m)[known]
+    body = encounters.frame_from_body[known]
+    track = _velocity(encounters)[known]
+    camera = encounters.camera
+    middle = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)])
+    radial = (encounters.pixel[known] - middle) / middle[0]
+    growth = np.sum(radial**2, axis=1)
+    in_image = np.column_stack((radial * growth[:, None], np.zeros(len(radial))))
+    in_image *= encounters.in_camera_m[known][:, 2:3]
+    outward = np.einsum("nij,nj->ni", encounters.enu_from_camera[known], in_image)
+    up = np.broadcast_to(np.eye(3)[2], offset.shape)[:, :, None]
+    every = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
+    trials = (
+        ("up and down only, by {0:.2f} m", up, "heights of another kind, or lever_arm_m[2]"),
+        (
+            "in proportion to the distance, by {0:.2%} of it",
+            sight[:, :, None],
+            "diameters in [[target]], or fx and fy",
+        ),
+        ("along the track, by {0:.3f} s", track[:, :, None], "clocks, or lever_arm_m[0]"),
+        ("constant in the vehicle's axes, by {norm:.2f} m", body, "lever_arm_m"),
+        ("constant on the ground, by {norm:.2f} m", every, "datum, or the base station"),
+        (
+            "growing towards the corners of the frame",
+            outward[:, :, None],
+            "k1, k2 …, or cx and cy",
+        ),
+    )
+    named = [_fitted(offset, design, words, causes) for words, design, causes in trials]
+    likely = [pattern for pattern in named if pattern.share > _SHOWN_SHARE]
+    return tuple(sorted(likely, key=lambda pattern: _PER_NUMBER * pattern.numbers - pattern.share))
+
+
+def unexplained(encounters: Encounters) -> Doubt:
+    """Return the doubt about a disagreement that neither slip nor correction explains."""
+    found = patterns(encounters)[:2]
+    parts = [f"{pattern.share:.0%} of it {pattern.words} ({pattern.causes})" for pattern in found]
+    pattern = f": {', or '.join(parts)}" if parts else ", without a pattern"
+    return mild(
+        Cause.UNEXPLAINED,
+        f"vehicle and camera put the target {encounters.apart_m:.2f} m apart (median),"
+        f" {np.sqrt(encounters.misfit):.1f} times as much as their standard deviations say, which"
+        f" no single cause explains{pattern}",
+        "look at consistency.parquet for when; check times, trajectory, reference poses and their"
+        " standard deviations",
+        {"apart_m": encounters.apart_m, "misfit": encounters.misfit},
+    )
+
+
+def check_lone_frames(encounters: Encounters) -> tuple[Doubt, ...]:
+    """Tell single frames that disagree where the others agree."""
+    square = np.sum(encounters.offset_m**2, axis=1)
+    known = np.isfinite(square)
+    if not known.any():
+        return ()
+    limit = max(_LONE_M**2, _FAR * float(np.median(square[known])))
+    far = known & (square > limit) & (square > _FAR * encounters.variance_m2)
+    count, total = int(np.count_nonzero(far)), int(np.count_nonzero(known))
+    if not count or 2 * count >= total:
+        return ()
+    worst = float(np.sqrt(square[far].max()))
+    return (
+        mild(
+            Cause.SINGLE_FRAMES,
+            f"in {count} of {total} frames vehicle and camera put the target up to {worst:.1f} m"
+            f" apart, in the others {encounters.apart_m:.2f} m (median)",
+            "check the times of these frames and their reference poses: consistency.parquet names"
+            " them as outliers",
+            {"frames": float(count), "worst_m": worst},
+        ),
+    )
+
+
+def _fitted(offset: FloatArray, design: FloatArray, words: str, causes: str) -> Pattern:
+    columns = design.reshape(-1, design.shape[2])
+    values, *_ = np.linalg.lstsq(columns, offset.ravel(), rcond=None)
+    left = np.sum((offset.ravel() - columns @ values) ** 2) / max(np.sum(offset**2), 1e-12)
+    amount = words.format(abs(float(values[0])), norm=float(np.linalg.norm(values)))
+    return Pattern(1.0 - float(left), columns.shape[1], amount, causes)
+
+
+def _velocity(encounters: Encounters) -> FloatArray:
+    """Return the vehicle's velocity (n, 3) at the encounters [m/s]."""
+    step_s = 0.25
+    after = encounters.at(encounters.time_s + step_s).position_m
+    before = encounters.at(encounters.time_s - step_s).position_m
+    return np.nan_to_num((after - before) / (2.0 * step_s))

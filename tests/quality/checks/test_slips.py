@@ -1,0 +1,157 @@
+"""The pieces of the search for causes that the corpus of wrong flights does not look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import read_flight
+from kgcp.io.tables.detections import read_attempts
+from kgcp.quality.checks.causes import causes_of
+from kgcp.quality.checks.encounters import Encounters, misfit_of
+from kgcp.quality.checks.mount import check_mount
+from kgcp.quality.checks.patterns import check_lone_frames, patterns, unexplained
+from kgcp.quality.checks.slips import remeasured, slips
+from tests.wrong_flights.flights import CAMERA, changed, flight
+
+
+@pytest.fixture(scope="module")
+def encounters(tmp_path_factory: pytest.TempPathFactory) -> Encounters:
+    """Those of the sample flight, without any slip."""
+    return of(tmp_path_factory.mktemp("right") / "flight", CAMERA)
+
+
+def of(folder: Path, camera: Mapping[str, float]) -> Encounters:
+    replace(flight(), camera=camera).write(folder)
+    read = read_flight(folder)
+    attempts = read_attempts(folder / "kgcp" / "detections.parquet", read)
+    data = FlightData(read, [attempt.frame for attempt in attempts])
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    found = Encounters.of(sightings, data.target_positions, data.reference_poses, read.camera)
+    assert found is not None
+    return found
+
+
+def test_a_correct_flight_fits_and_needs_no_cause(encounters: Encounters) -> None:
+    assert 0.1 < encounters.misfit < 2.0
+    assert causes_of(encounters) == ()
+    assert check_mount(encounters) == ()
+    assert check_lone_frames(encounters) == ()
+
+
+def test_cubics_between_samples_are_those_of_the_motion(encounters: Encounters) -> None:
+    times = encounters.time_s + 0.0123
+    states = encounters.vehicle.motion.states(times)
+    moved = encounters.at(times)
+    assert np.abs(moved.position_m - states.position_m).max() < 0.005
+    assert np.abs(moved.frame_from_body - states.frame_from_body).max() < 1e-4
+
+
+def test_times_outside_the_trajectory_have_no_place(encounters: Encounters) -> None:
+    early = encounters.at(encounters.time_s - 20.0)
+    outside = early.time_s < encounters.vehicle.motion.time_s[0]
+    assert 0 < np.count_nonzero(outside) < len(outside)
+    assert (np.isnan(early.position_m).all(axis=1) == outside).all()
+    assert not encounters.is_covered(encounters.time_s - 40.0)
+    assert encounters.at(encounters.time_s - 40.0).misfit == np.inf
+
+
+def test_the_misfit_is_one_where_variances_are_right() -> None:
+    rng = np.random.default_rng(1)
+    offsets = rng.standard_normal((20_000, 3)) * 0.3
+    assert misfit_of(offsets, np.full(20_000, 0.09)) == pytest.approx(1.0, abs=0.03)
+    assert misfit_of(offsets[:4], np.full(4, 0.09)) == np.inf
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        changed(CAMERA, k1=0.081, k2=-0.064),
+        changed(CAMERA, fx=1950.0, fy=1948.0),
+        changed(CAMERA, cx=620.0, cy=430.0),
+    ],
+)
+def test_another_camera_measures_what_it_would_have_measured(
+    encounters: Encounters, camera: dict[str, float], tmp_path: Path
+) -> None:
+    """Measured with a wrong camera and again with the right one: as if it had never been wrong."""
+    wrong = of(tmp_path / "flight", camera)
+    assert wrong.apart_m > 0.1
+    again = remeasured(wrong, encounters.camera)
+    distance = np.linalg.norm(encounters.in_camera_m, axis=1)
+    off = np.linalg.norm(again.in_camera_m - encounters.in_camera_m, axis=1) / distance
+    assert np.median(off) < 5e-4
+    assert off.max() < 3e-3
+
+
+def test_every_slip_moves_something_and_says_what_to_do(encounters: Encounters) -> None:
+    named = [*slips(encounters)]
+    assert len({slip.words for slip in named}) == len(named) > 30
+    for slip in named:
+        with np.errstate(all="ignore"):
+            undone = slip.undone(encounters)
+        assert undone.misfit > encounters.misfit
+        assert slip.remedy
+
+
+def moved(encounters: Encounters, shift: FloatArray) -> Encounters:
+    return replace(encounters, centre_m=encounters.centre_m - shift)
+
+
+@pytest.mark.parametrize(
+    ("shift", "words"),
+    [
+        (lambda _: np.array([0.0, 0.0, 1.3]), "up and down only, by 1.32 m"),
+        (
+            lambda one: 0.02 * np.einsum("nij,nj->ni", one.enu_from_camera, one.in_camera_m),
+            "in proportion to the distance, by 1.98%",
+        ),
+        (
+            lambda one: 2.0 * (one.at(one.time_s + 0.25).position_m - one.position_m),
+            "along the track, by 0.50",
+        ),
+        (
+            lambda one: one.frame_from_body @ np.array([0.0, 0.7, 0.0]),
+            "constant in the vehicle's axes, by 0.7",
+        ),
+        (lambda _: np.array([0.8, -0.6, 0.0]), "constant on the ground, by 0.99 m"),
+    ],
+)
+def test_the_pattern_of_a_disagreement_is_told(
+    encounters: Encounters, shift: object, words: str
+) -> None:
+    assert callable(shift)
+    found = patterns(moved(encounters, shift(encounters)))
+    assert found[0].share > 0.9
+    names = [pattern.words for pattern in found if pattern.share > found[0].share - 0.05]
+    assert any(name.startswith(words) for name in names), found
+
+
+def test_what_has_no_pattern_is_said_so(encounters: Encounters) -> None:
+    noise = np.random.default_rng(5).standard_normal(encounters.centre_m.shape)
+    doubt = unexplained(moved(encounters, noise))
+    assert "which no single cause explains" in doubt.sentence
+    assert causes_of(moved(encounters, noise)) == ()
+
+
+def test_a_lone_frame_is_counted(encounters: Encounters) -> None:
+    shift = np.zeros_like(encounters.centre_m)
+    shift[4, 0] = 3.0
+    (doubt,) = check_lone_frames(moved(encounters, shift))
+    assert doubt.figures["frames"] == 1.0
+    assert "up to 3.0 m apart" in doubt.sentence
+
+
+def test_a_mount_between_right_angles_is_named_as_seen(encounters: Encounters) -> None:
+    settings = replace(encounters.vehicle.settings, mount_deg=33.0)
+    (doubt,) = check_mount(
+        replace(encounters, vehicle=replace(encounters.vehicle, settings=settings))
+    )
+    assert "set [vehicle] mount_deg = 0, unless headings are wrong" in doubt.remedy
+    assert doubt.figures["mount_deg"] == pytest.approx(0.0, abs=2.0)

@@ -1,0 +1,127 @@
+"""Wrong flights: the cause is named first, none is silent, and correct ones raise no doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.io.flight.flight import read_flight
+from kgcp.pipeline.check import check_flight
+from kgcp.pipeline.export import make_gcps
+from kgcp.quality.checks.doubt import Cause, Doubt
+from tests.wrong_flights.flights import Flight, drone_pictures, flight, without_reference
+from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE
+
+SHARED = Path("/work/shared/flights")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a user is told.
+
+    Attributes
+    ----------
+    doubts : tuple of Doubt
+        Of `check`, and of `export-gcp` where `check` has none.
+    error : str
+        Of `export-gcp`, if it fails.
+    """
+
+    doubts: tuple[Doubt, ...]
+    error: str = ""
+
+    @property
+    def first(self) -> Cause | None:
+        return self.doubts[0].code if self.doubts else None
+
+
+def verdict(one: Flight, folder: Path) -> Verdict:
+    """Run a flight through `check` and, if that has no doubt, `export-gcp`."""
+    one.write(folder)
+    the_flight = read_flight(folder)
+    checked = check_flight(the_flight).doubts
+    if any(doubt.is_grave for doubt in checked):
+        return Verdict(checked)
+    try:
+        made = make_gcps(the_flight)
+    except KgcpError as error:
+        return Verdict(checked, str(error))
+    assert [*made.doubts][: len(checked)] == [*checked] or made.doubts[0].is_grave
+    return Verdict(checked or made.doubts)
+
+
+@cache
+def wrong() -> dict[str, tuple[Flight, tuple[Cause, ...]]]:
+    """All flights with one slip, and the causes of which one must be named first."""
+
+    def all_of_them() -> Iterator[tuple[str, Flight, tuple[Cause, ...]]]:
+        for name, slip in ANYWAY.items():
+            yield name, slip.make(flight()), slip.causes
+            yield f"{name}, no reference", slip.make(without_reference(flight())), slip.causes
+        for name, slip in WITH_REFERENCE.items():
+            yield name, slip.make(flight()), slip.causes
+        for name, slip in WITHOUT_REFERENCE.items():
+            yield name, slip.make(without_reference(flight())), slip.causes
+
+    return {name: (one, causes) for name, one, causes in all_of_them()}
+
+
+def test_there_are_many_slips() -> None:
+    assert len(wrong()) >= 100
+    assert len({cause for _, causes in wrong().values() for cause in causes}) >= 20
+
+
+@pytest.mark.parametrize("name", [*wrong()])
+def test_the_cause_is_named_first(name: str, tmp_path: Path) -> None:
+    one, causes = wrong()[name]
+    told = verdict(one, tmp_path / "flight")
+    assert told.first in causes, told
+    assert told.doubts[0].remedy
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_of_two_slips_at_least_one_is_named_first(first: str, second: str, tmp_path: Path) -> None:
+    both = {**ANYWAY, **WITH_REFERENCE}
+    one = both[second].make(both[first].make(flight()))
+    told = verdict(one, tmp_path / "flight")
+    assert told.first in (*both[first].causes, *both[second].causes), told
+
+
+CORRECT = {
+    "Munich": flight(),
+    "Munich, drone": replace(flight(), pictures=drone_pictures()),
+    "Munich, degrees": flight("EPSG:4258", (11.5491, 48.1509, 545.5)),
+    "Munich, neighbouring zone": flight("EPSG:25833", (242000.0, 5338000.0, 545.5)),
+    "Bern": flight("EPSG:2056", (2600000.0, 1200000.0, 600.0)),
+    "London": flight("EPSG:27700", (530000.0, 180000.0, 60.0)),
+    "Melbourne": flight("EPSG:28355", (320000.0, 5812000.0, 30.0)),
+    "Santiago": flight("EPSG:32719", (350000.0, 6300000.0, 560.0)),
+    "Nairobi": flight("EPSG:4326", (36.8, -1.3, 1650.0)),
+    "Fiji": flight("EPSG:32760", (650000.0, 7990000.0, 80.0)),
+    "Raleigh, feet": flight("EPSG:2264", (2100000.0, 740000.0, 90.0)),
+    "Tokyo": flight("EPSG:6677", (-7000.0, -35000.0, 70.0)),
+    "Svalbard": flight("EPSG:25833", (515000.0, 8680000.0, 50.0)),
+    "Kiruna, web": flight("EPSG:3857", (2250000.0, 10450000.0, 430.0)),
+}
+
+
+@pytest.mark.parametrize("place", CORRECT)
+@pytest.mark.parametrize("has_reference", [True, False])
+def test_correct_flights_raise_no_doubt(place: str, tmp_path: Path, *, has_reference: bool) -> None:
+    one = CORRECT[place] if has_reference else without_reference(CORRECT[place])
+    assert verdict(one, tmp_path / "flight") == Verdict(())
+
+
+@pytest.mark.parametrize(
+    "name", ["machine_vision", "exposure_sweep", "consumer", "blurred", "real_ground"]
+)
+def test_the_shared_flights_raise_no_doubt(name: str) -> None:
+    folder = SHARED / name / "flight"
+    if not folder.is_dir():
+        pytest.skip("needs the shared test flights")
+    assert check_flight(read_flight(folder)).doubts == ()
