@@ -14,6 +14,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.noise import find_censoring
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
 from kgcp.measurement.records import InitialPose
@@ -136,7 +137,7 @@ def imaging_of() -> Callable[..., FitProblem]:
             centre_px=camera.project(pose.translation_m),
             focal_px=camera.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
-            response=camera.response,
+            tone=Tone.of(camera.response),
             sharpening_px=0.0 if camera.response is Response.LINEAR else 1.2,
         )
 

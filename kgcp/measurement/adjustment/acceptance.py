@@ -29,7 +29,7 @@ _DOTS_PER_MISSING = 4  # one dot in so many may be dirty
 
 def edge_noise(fit: TargetFit) -> float:
     """Return the residuals near edges, of the contrast; above 1 where nothing makes sense."""
-    black, white = plateau_levels(fit.parameters.light, fit.sample.problem.response)
+    black, white = plateau_levels(fit.parameters.light, fit.sample.problem.tone)
     residual = median_at_edges(fit.sd, fit.prediction.share, 0.2, 0.8, math.nan)
     return residual / (white - black) if residual > 0.0 and white > black else _NO_SENSE
 
@@ -119,7 +119,7 @@ def _light_around_code_circle(fit: TargetFit, ring: Ring) -> FloatArray:
     0, which says nothing, where too few pixels are seen.
     """
     sample, clip = fit.sample, fit.sample.censoring.high
-    black, white = plateau_levels(fit.parameters.light, sample.problem.response)
+    black, white = plateau_levels(fit.parameters.light, sample.problem.tone)
     lack = sample.levels - np.minimum(fit.prediction.levels, clip)
     lack = lack / max(min(white, clip) - black, sample.problem.window.levels_per_count)
     code_m, dot_m = 0.5 * ring.code_diameter_m, 0.5 * ring.dot_diameter_m

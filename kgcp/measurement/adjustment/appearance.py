@@ -19,7 +19,7 @@ from kgcp.targets.layout import Target
 def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
     """Return levels, clipping, blur and edge displacement of a fitted target."""
     problem = fit.sample.problem
-    black, white = plateau_levels(fit.parameters.light, problem.response)
+    black, white = plateau_levels(fit.parameters.light, problem.tone)
     x, y = fit.prediction.points_m
     inside = x * x + y * y < problem.outer_radius_m**2
     binning, clipped = problem.window.binning, fit.sample.clipped
@@ -45,6 +45,6 @@ def _edge_shift_px(fit: TargetFit) -> float:
     clipped; the true one is where half the light comes from either side.
     """
     light, problem = fit.parameters.light, fit.sample.problem
-    black, white = plateau_levels(light, problem.response)
-    crossing = share_at(0.5 * (black + min(white, problem.censoring.high)), light, problem.response)
+    black, white = plateau_levels(light, problem.tone)
+    crossing = share_at(0.5 * (black + min(white, problem.censoring.high)), light, problem.tone)
     return float(-fit.parameters.blur.mean_sd_px * ndtri(min(max(crossing, 1e-3), 1.0 - 1e-3)))

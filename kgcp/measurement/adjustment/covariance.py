@@ -20,12 +20,12 @@ from scipy.special import ndtri
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import cross_matrix
-from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.noise import median_at_edges
-from kgcp.measurement.image_model.photometry import plateau_levels, share_at
+from kgcp.measurement.image_model.photometry import Tone, plateau_levels, share_at
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.records import Uncertainty
 
@@ -135,13 +135,13 @@ def _common_displacement_px(fit: TargetFit) -> float:
     of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
     """
     problem = fit.sample.problem
-    is_plain = problem.window.binning == 1 or problem.response is Response.LINEAR
+    is_plain = problem.window.binning == 1 or problem.tone is Tone.LINEAR
     floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / problem.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction)
     excess = noise.sd**2 - noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
-    black, white = plateau_levels(fit.parameters.light, problem.response)
+    black, white = plateau_levels(fit.parameters.light, problem.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
     return max(floor_px, _COMMON_SHARE * math.sqrt(at_edges) / slope_per_px)
 
@@ -149,8 +149,8 @@ def _common_displacement_px(fit: TargetFit) -> float:
 def _clipped_reach_px(fit: TargetFit) -> float:
     """Return how far the middle of a straight edge is within what is clipped [px]."""
     light, problem = fit.parameters.light, fit.sample.problem
-    burnt = share_at(problem.censoring.high, light, problem.response)
-    sunk = share_at(problem.censoring.low, light, problem.response)
+    burnt = share_at(problem.censoring.high, light, problem.tone)
+    sunk = share_at(problem.censoring.low, light, problem.tone)
     hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
     return float(fit.parameters.blur.mean_sd_px * ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
 

@@ -108,7 +108,7 @@ def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) 
     """Let the levels vary from those seen on ink and plate, and from a shadow."""
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
-    black, white = decoded(np.array(plateaus.extremes), problem.response).tolist()
+    black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
     light = replace(first.light, black=black, white=white)
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
@@ -123,8 +123,7 @@ def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -
     if edge[4] > 0.0:  # beyond is the shade: the tone curve is that of the lit side
         edge = np.array((edge[0] + math.pi, -edge[1], edge[2], -edge[3], -edge[4]))
     lit, shaded = (
-        decoded(np.array(plateaus.typical) + half * edge[3:], problem.response)
-        for half in (-0.5, 0.5)
+        decoded(np.array(plateaus.typical) + half * edge[3:], problem.tone) for half in (-0.5, 0.5)
     )
     light = replace(first.light, black=float(lit[0]), white=float(lit[1]))
     edge[3:] = (shaded - lit) / (light.white - light.black)

@@ -20,7 +20,7 @@ from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_
 from kgcp.measurement.adjustment.appearance import appearance_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
-from kgcp.measurement.adjustment.problem import FitProblem, apparent_response
+from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.two_poses import (
     TwoPoses,
     advantage,
@@ -140,7 +140,7 @@ def fit_problem_of(
             centre_px=centre_px,
             focal_px=seen.mean_focal_px,
             censoring=find_censoring(window.levels, window.levels_per_count),
-            response=apparent_response(camera.response, window),
+            tone=apparent_tone(camera.response, window),
             sharpening_px=0.0 if is_plain else _SHARPENING_PX,
             shutter=shutter,
         )

@@ -114,7 +114,7 @@ def first_levels(problem: FitProblem, pose: Pose) -> Light:
     )
     if not white - black >= 4.0 * window.levels_per_count:
         raise Rejection(Reason.NO_CONTRAST, f"ink {black:.3f}, plate {white:.3f}")
-    return light_of_levels(black, white, problem.response)
+    return light_of_levels(black, white, problem.tone)
 
 
 def _uneven(step: int, width: int) -> int:
@@ -159,7 +159,7 @@ def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> Boo
     The pose may be off by `slack_px`.
     """
     problem, blur, unblurred, scale = seen.problem, seen.blur, seen.unblurred, seen.metres_per_px
-    black, white = plateau_levels(light, problem.response)
+    black, white = plateau_levels(light, problem.tone)
     foreign = np.empty(len(unblurred.rho_m), dtype=np.bool_)
     if not _mark_foreign(
         *(problem.window.smooth, unblurred.points_m, unblurred.rho_m, seen.spread, black, white),
@@ -232,7 +232,7 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     other = np.zeros(len(unblurred.rho_m), dtype=np.bool_)
     if problem.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
         return other
-    black, white = plateau_levels(light, problem.response)
+    black, white = plateau_levels(light, problem.tone)
     contrast, scale = min(white, 1.0) - black, seen.metres_per_px
     found, tested = _mark_other(
         *(

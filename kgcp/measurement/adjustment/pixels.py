@@ -222,11 +222,11 @@ def _photometric_model(
     problem, window = seen.problem, seen.problem.window
     offsets = (window.pixels(index) - problem.centre_px[:, None]) / problem.outer_radius_px
     if problem.sharpening_px == 0.0 or light is None:
-        return PhotometricModel(offsets, problem.response, None)
+        return PhotometricModel(offsets, problem.tone, None)
     is_small = problem.outer_radius_px < _SMALL_PX
     shown = _shown(seen, pose, light, index) if is_small else seen.unblurred.share
     mask = unsharp_mask((window.height, window.width), index, shown, problem.sharpening_px)
-    return PhotometricModel(offsets, problem.response, mask)
+    return PhotometricModel(offsets, problem.tone, mask)
 
 
 def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
@@ -243,8 +243,8 @@ def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> Floa
     )
     incidence = find_edge_incidence(points_m, scale, problem.circles, seen.blur, seen.spread)
     share = white_level(pose.matrix, rays, seen.blur.vector, incidence).value
-    even = PhotometricModel(np.zeros((2, len(others))), problem.response, None)
-    black, white = plateau_levels(light, problem.response)
+    even = PhotometricModel(np.zeros((2, len(others))), problem.tone, None)
+    black, white = plateau_levels(light, problem.tone)
     shown[others] = (even.levels(share, light) - black) / (white - black)
     return shown
 

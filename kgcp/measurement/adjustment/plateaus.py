@@ -168,7 +168,7 @@ def field_of(
     y = np.clip(spacing * (np.arange(rows) - 0.5) - 0.5, 0, window.height - 1)
     at = (np.rint(y).astype(int)[:, None] * window.width + np.rint(x).astype(int)).ravel()
     values = np.zeros_like(field.values)
-    seen = decoded(plateaus.levels[:, at], problem.response)
+    seen = decoded(plateaus.levels[:, at], problem.tone)
     levels = seen - np.array([[light.black], [light.white]])
     values[:, -len(at) :] = levels / (light.white - light.black)
     return replace(field, values=values)

@@ -9,6 +9,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.noise import Censoring
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import Circles
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import Window
@@ -36,7 +37,7 @@ class FitProblem:
         Mean principal distance.
     censoring : Censoring
         Of the whole window.
-    response : Response
+    tone : Tone
     sharpening_px : float
         σ of the unsharp mask to be modelled [px]; 0: none.
     shutter : RollingShutter or None
@@ -54,7 +55,7 @@ class FitProblem:
     centre_px: FloatArray
     focal_px: float
     censoring: Censoring
-    response: Response
+    tone: Tone
     sharpening_px: float
     shutter: RollingShutter | None = None
     visible: BoolArray | None = None
@@ -65,13 +66,13 @@ class FitProblem:
         return None if self.sharpening_px else _FEW_PIXELS
 
 
-def apparent_response(response: Response, window: Window) -> Response:
+def apparent_tone(response: Response, window: Window) -> Tone:
     """Return how the grey values of a window follow light.
 
     In means of grey values, tone curves, sharpening and clipping leave of an edge within a bin how
-    far they displace it; the parameters of an unknown response take that.
+    far they displace it; the tone's parameters take that.
     """
     if window.clipped is None:
-        return response
+        return Tone.of(response)
     is_clipped = float(np.mean(window.clipped)) > _CLIPPED
-    return Response.LINEAR if response is Response.LINEAR and not is_clipped else Response.UNKNOWN
+    return Tone.LINEAR if response is Response.LINEAR and not is_clipped else Tone.OF_BINS

@@ -63,7 +63,7 @@ _PLATEAU_PIXELS = 1200
 _LEAST_CONTRAST = 0.05
 # Mean square of the residuals' sums over cells, of what independent residuals make it: above, the
 # levels vary. Frames in even light have about 1.
-_ASKS = 1.9
+_ASKS, _ASKS_OF_BINS = 1.9, 2.5
 _ENOUGH_POWER = 0.05  # of the cell that tells most
 
 
@@ -101,7 +101,8 @@ def excess_of_cells(fit: TargetFit) -> float:
 
 def asks_for_levels(fit: TargetFit) -> bool:
     """Tell whether residuals go together over the cells of the finest grid."""
-    return excess_of_cells(fit) > _ASKS
+    is_binned = fit.sample.problem.window.binning > 1
+    return excess_of_cells(fit) > (_ASKS_OF_BINS if is_binned else _ASKS)
 
 
 def fit_levels(
@@ -165,10 +166,8 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
         return problem
     added = field.added(window.pixels(np.arange(len(window.levels))))
     light = parameters.light
-    black, white = plateau_levels(light, problem.response)
-    ink, plate = (
-        encoded(toned(x, light.values), problem.response) for x in (added[0], 1.0 + added[1])
-    )
+    black, white = plateau_levels(light, problem.tone)
+    ink, plate = (encoded(toned(x, light.values), problem.tone) for x in (added[0], 1.0 + added[1]))
     contrast = np.maximum(plate - ink, _LEAST_CONTRAST * (white - black))
     smooth = black + (window.smooth - ink) * (white - black) / contrast
     return replace(problem, window=replace(window, smooth=smooth))

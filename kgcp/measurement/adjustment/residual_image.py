@@ -88,7 +88,7 @@ def residual_image_of(
     parameters = fit.parameters.at(pose)
     light = parameters.light
     sample = whole_plate(problem, pose, parameters.blur, light)
-    black, white = plateau_levels(light, problem.response)
+    black, white = plateau_levels(light, problem.tone)
     limits = problem.censoring
     levels = np.clip(predict(sample, parameters).levels, limits.low, limits.high)
     window = problem.window

@@ -7,13 +7,12 @@ from functools import cache
 
 import numpy as np
 
-from kgcp.geometry.camera import Response
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone
 
 _MANY_PIXELS_RADIUS_PX = 40.0  # from there on, few pixels first save more than to choose them costs
 _SHORTEST_STREAK_PX = 2.0  # below, a streak looks like a Gaussian
@@ -33,12 +32,12 @@ _WHITE, _WHITE_SD = 1.0, 0.4  # burnt plates of unknown tone: lest white and ton
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]
-_OF_RESPONSE = {
-    Response.LINEAR: [],
-    Response.SRGB: [Param.SHARPENING],
-    Response.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
+_OF_TONE = {
+    Tone.LINEAR: [],
+    Tone.SRGB: [Param.SHARPENING],
+    Tone.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
+    Tone.OF_BINS: [Param.TONE_1],  # how far edges are displaced; their shape is that of the bins
 }
-_OF_BINS = [Param.TONE_1]  # how far edges are displaced; their shape is that of the bins
 
 
 def adjust_with_streak(problem: FitProblem, start: Parameters, *, moves: bool = True) -> TargetFit:
@@ -58,20 +57,16 @@ def adjust_with_streak(problem: FitProblem, start: Parameters, *, moves: bool = 
 
 def unknowns_of(problem: FitProblem, *, has_streak: bool, moves: bool = True) -> Unknowns:
     """Return which parameters are free, with weak priors on what one frame hardly tells."""
-    is_binned = problem.window.binning > 1
-    return _unknowns(problem.response, is_binned=is_binned, has_streak=has_streak, moves=moves)
+    return _unknowns(problem.tone, has_streak=has_streak, moves=moves)
 
 
 @cache
-def _unknowns(response: Response, *, is_binned: bool, has_streak: bool, moves: bool) -> Unknowns:
-    of_response = _OF_RESPONSE[response]
-    if is_binned and of_response:
-        of_response = _OF_BINS
-    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *of_response]
+def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
+    free = [*_ALWAYS, *(_STREAK if has_streak else _GAUSSIAN), *_OF_TONE[tone]]
     mean, precision = np.zeros(PARAM_COUNT), np.zeros(PARAM_COUNT)
     for param, sd in _PRIOR_SD.items():
         precision[param] = sd**-2 if param in free else 0.0
-    if response is Response.UNKNOWN:
+    if tone.is_shaped:
         mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
     estimated = np.array(sorted(free)[0 if moves else 6 :])
     return Unknowns(estimated, mean, precision, precision[estimated])

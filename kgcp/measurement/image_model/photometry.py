@@ -1,15 +1,16 @@
 """From white share to grey value: levels, tone, a lit gradient, in-camera sharpening.
 
-grey = sharpen(tone(black + (white − black) · share) · (1 + slope · offset)): the tone curve of an
-unknown response is a monotone function of the share between ink and plate, here with three shape
-parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve as in cameras.
-Together they are what displaces apparent edges: δ is a consequence here, not a parameter.
+grey = sharpen(sRGB((black + (white − black) · tone(share)) · (1 + slope · offset))): an unknown
+response departs from sRGB's curve, which nearly all cameras follow, by a function of the share
+between ink and plate that has three parameters; sharpening is an unsharp mask on the pixel grid,
+after the tone curve as in cameras. Together they are what displaces apparent edges: δ is a
+consequence here, not a parameter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum, auto
 
 import numpy as np
 
@@ -18,6 +19,30 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
 from kgcp.measurement.image_model.sharpening import Mask
+
+
+class Tone(Enum):
+    """What is known of the curve between light and grey value, and what is free."""
+
+    LINEAR = auto()
+    SRGB = auto()
+    UNKNOWN = auto()  # sRGB, of light that three parameters shape: usual cameras are near it
+    OF_BINS = auto()  # a straight line that they shape: bins leave of a curve what displaces edges
+
+    @staticmethod
+    def of(response: Response) -> Tone:
+        """Return the tone of pixels of a camera."""
+        return Tone[response.name]
+
+    @property
+    def is_srgb(self) -> bool:
+        """Whether sRGB's curve is applied last."""
+        return self in {Tone.SRGB, Tone.UNKNOWN}
+
+    @property
+    def is_shaped(self) -> bool:
+        """Whether the tone parameters take part."""
+        return self in {Tone.UNKNOWN, Tone.OF_BINS}
 
 
 class Param(IntEnum):
@@ -69,30 +94,30 @@ class Light:
         return (*levels, self.tone_1, self.tone_2, self.tone_3, self.sharpening)
 
 
-def plateau_levels(light: Light, response: Response) -> tuple[float, float]:
+def plateau_levels(light: Light, tone: Tone) -> tuple[float, float]:
     """Return the grey values of ink and plate before clipping.
 
-    They are the light's own levels, but for a camera with a known encoding.
+    Without sRGB's curve they are the light's own levels.
     """
-    if response is Response.LINEAR:
+    if not tone.is_srgb:
         return light.black, light.white
     black, white = srgb_encoded(np.array([light.black, light.white])).tolist()
     return black, white
 
 
-def encoded(level: FloatArray, response: Response) -> FloatArray:
-    """Return grey values from the light of a camera with a known response."""
-    return srgb_encoded(level) if response is not Response.LINEAR else level
+def encoded(level: FloatArray, tone: Tone) -> FloatArray:
+    """Return grey values from light, by sRGB's curve or a straight line."""
+    return srgb_encoded(level) if tone.is_srgb else level
 
 
-def decoded(level: FloatArray, response: Response) -> FloatArray:
-    """Return the light that gives grey values, of a camera with a known response."""
-    return srgb_decoded(level) if response is not Response.LINEAR else level
+def decoded(level: FloatArray, tone: Tone) -> FloatArray:
+    """Return the light that gives grey values, by sRGB's curve or a straight line."""
+    return srgb_decoded(level) if tone.is_srgb else level
 
 
-def light_of_levels(black: float, white: float, response: Response) -> Light:
+def light_of_levels(black: float, white: float, tone: Tone) -> Light:
     """Return the light that gives these grey values of ink and plate."""
-    if response is not Response.LINEAR:
+    if tone.is_srgb:
         black, white = (float(level) for level in srgb_decoded(np.array([black, white])))
     return Light(black, white)
 
@@ -133,7 +158,7 @@ class PhotometricModel:
 
     offsets: FloatArray  # (2, n): from the target's centre, in ring radii
     # `linear` and `srgb` are applied as known; `unknown` uses the tone parameters
-    response: Response
+    tone: Tone
     mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
 
     def levels(
@@ -145,7 +170,7 @@ class PhotometricModel:
         """
         value = np.empty(len(share))
         _expose(share, self.offsets, light.values, self._added(added), value)
-        value = encoded(value, self.response)
+        value = encoded(value, self.tone)
         if self.mask is None:
             return value
         return value + light.sharpening * self._detail(self.mask, value, light, added)
@@ -153,14 +178,14 @@ class PhotometricModel:
     def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the levels of ink and of plate at all pixels, where the light is uneven."""
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
-        return encoded(ink, self.response), encoded(plate, self.response)
+        return encoded(ink, self.tone), encoded(plate, self.tone)
 
     def _sharpen_levels(
         self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray
     ) -> None:
         """Sharpen the derivatives by what is added to ink and to plate."""
         ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
-        if self.response is not Response.LINEAR:
+        if self.tone.is_srgb:
             ink *= srgb_slope(toned(added[0], light.values))
             plate *= srgb_slope(toned(1.0 + added[1], light.values))
         by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
@@ -182,7 +207,7 @@ class PhotometricModel:
         has_skew = len(share.jacobian) > GEOMETRY_ROWS
         rows = PARAM_COUNT if has_skew or added is not None else PLAIN_COUNT
         jacobian = np.empty((rows + (0 if added is None else 2), len(value)))
-        has_tone = self.response is Response.UNKNOWN
+        has_tone = self.tone.is_shaped
         _expose_with_slopes(
             share.value,
             share.jacobian,
@@ -193,9 +218,9 @@ class PhotometricModel:
             value,
             jacobian,
         )
-        if self.response is not Response.LINEAR:
+        if self.tone.is_srgb:
             jacobian *= srgb_slope(value)
-            value = encoded(value, self.response)
+            value = encoded(value, self.tone)
         if self.mask is None:
             return value, jacobian
         if added is not None:
@@ -213,28 +238,28 @@ class PhotometricModel:
         Where no edge is near there is no blur, and over the mask the light's gradient is flat.
         """
         if added is None:
-            return mask.detail(value, *plateau_levels(light, self.response))
+            return mask.detail(value, *plateau_levels(light, self.tone))
         ink, plate = self.local_levels(light, added)
         return mask.detail(value, ink, plate)
 
     def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
         """Sharpen the rows of a Jacobian."""
-        rows = [*_FILTERED, *(_TONE_ROWS if self.response is Response.UNKNOWN else [])]
+        rows = [*_FILTERED, *(_TONE_ROWS if self.tone.is_shaped else [])]
         if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
             rows += _STREAK_ROWS
         if len(jacobian) > PLAIN_COUNT and jacobian[Param.SKEW_XXX].any():
             for row in _SKEW:
                 jacobian[row] += light.sharpening * mask.detail(jacobian[row], 0.0, 0.0)
         others = (1.0, 1.0)
-        if self.response is not Response.LINEAR:
+        if self.tone.is_srgb:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
         mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
 
 
-def share_at(level: float, light: Light, response: Response) -> float:
+def share_at(level: float, light: Light, tone: Tone) -> float:
     """Return the white share at which a grey value is reached, 0…1; without a gradient of light."""
-    return _share_at(float(decoded(np.array(level), response)), light.values)
+    return _share_at(float(decoded(np.array(level), tone)), light.values)
 
 
 @inlined

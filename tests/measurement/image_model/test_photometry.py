@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kgcp.geometry.camera import Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.blur import Blur
@@ -21,6 +20,8 @@ from kgcp.measurement.image_model.photometry import (
     Light,
     Param,
     PhotometricModel,
+    Tone,
+    plateau_levels,
     srgb_encoded,
 )
 from kgcp.measurement.image_model.sharpening import unsharp_mask
@@ -30,24 +31,24 @@ STEP = 1e-6
 LIGHT = Light(0.06, 0.8, 0.04, -0.03, tone_1=0.35, tone_2=-0.2, sharpening=0.5)
 LINEAR = replace(LIGHT, tone_1=0.0, tone_2=0.0, sharpening=0.0)
 CASES = [
-    (Response.LINEAR, 0.0, LINEAR),
-    (Response.SRGB, 0.0, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
-    (Response.SRGB, SHARPENING_PX, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
-    (Response.UNKNOWN, 0.0, LIGHT),
-    (Response.UNKNOWN, SHARPENING_PX, LIGHT),
+    (Tone.LINEAR, 0.0, LINEAR),
+    (Tone.SRGB, 0.0, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
+    (Tone.SRGB, SHARPENING_PX, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
+    (Tone.UNKNOWN, 0.0, LIGHT),
+    (Tone.UNKNOWN, SHARPENING_PX, LIGHT),
 ]
 
 
-def make_imager(response: Response, sharpening_px: float) -> PhotometricModel:
+def make_imager(tone: Tone, sharpening_px: float) -> PhotometricModel:
     """Two pixels of three are modelled; the others are ink or plate."""
     rng = np.random.default_rng(8)
     index = np.sort(rng.permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT * 2 // 3])
     offsets = np.stack((index % WIDTH / WIDTH - 0.5, index // WIDTH / HEIGHT - 0.5))
     if sharpening_px == 0.0:
-        return PhotometricModel(offsets, response, None)
+        return PhotometricModel(offsets, tone, None)
     plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, sharpening_px)
-    return PhotometricModel(offsets, response, mask)
+    return PhotometricModel(offsets, tone, mask)
 
 
 def make_share(photometry: PhotometricModel) -> WhiteShare:
@@ -56,22 +57,22 @@ def make_share(photometry: PhotometricModel) -> WhiteShare:
     return WhiteShare(np.zeros((2, count)), rng.random(count), rng.normal(size=(11, count)))
 
 
-@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+@pytest.mark.parametrize(("tone", "sharpening_px", "light"), CASES)
 def test_levels_are_the_same_with_and_without_derivatives(
-    response: Response, sharpening_px: float, light: Light
+    tone: Tone, sharpening_px: float, light: Light
 ) -> None:
-    photometry = make_imager(response, sharpening_px)
+    photometry = make_imager(tone, sharpening_px)
     share = make_share(photometry)
     levels, jacobian = photometry.linearised(share, light)
     np.testing.assert_allclose(levels, photometry.levels(share.value, light), atol=1e-14)
     assert jacobian.shape == (PLAIN_COUNT, len(levels))
 
 
-@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+@pytest.mark.parametrize(("tone", "sharpening_px", "light"), CASES)
 def test_geometric_rows_of_the_jacobian_are_derivatives(
-    response: Response, sharpening_px: float, light: Light
+    tone: Tone, sharpening_px: float, light: Light
 ) -> None:
-    photometry = make_imager(response, sharpening_px)
+    photometry = make_imager(tone, sharpening_px)
     share = make_share(photometry)
     _, jacobian = photometry.linearised(share, light)
     for row in range(11):
@@ -84,24 +85,24 @@ def test_geometric_rows_of_the_jacobian_are_derivatives(
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Light)])
-@pytest.mark.parametrize(("response", "sharpening_px", "light"), CASES)
+@pytest.mark.parametrize(("tone", "sharpening_px", "light"), CASES)
 def test_photometric_rows_of_the_jacobian_are_derivatives(
-    response: Response,
+    tone: Tone,
     sharpening_px: float,
     light: Light,
     name: str,
 ) -> None:
-    photometry = make_imager(response, sharpening_px)
+    photometry = make_imager(tone, sharpening_px)
     share = make_share(photometry)
     _, jacobian = photometry.linearised(share, light)
     # a gradient over a whole ring is flat over the mask: its rows leave sharpening out
-    seen = make_imager(response, 0.0) if name.startswith("slope") else photometry
+    seen = make_imager(tone, 0.0) if name.startswith("slope") else photometry
     high, low = (
         seen.levels(share.value, replace(light, **{name: getattr(light, name) + sign * STEP}))
         for sign in (1.0, -1.0)
     )
     expected = (high - low) / (2.0 * STEP)
-    if name.startswith("tone") and response is not Response.UNKNOWN:
+    if name.startswith("tone") and tone is not Tone.UNKNOWN:
         expected = np.zeros_like(high)  # the curve is known: none to be estimated
     np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, atol=1e-7)
 
@@ -114,23 +115,25 @@ def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> N
     share = rng.random(len(index))
     plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
     even = np.zeros((2, len(index)))
-    plain = np.where(plateau > 0.5, LIGHT.white, LIGHT.black)
-    plain[index] = PhotometricModel(even, Response.UNKNOWN, None).levels(share, LIGHT)
+    black, white = plateau_levels(LIGHT, Tone.UNKNOWN)
+    plain = np.where(plateau > 0.5, white, black)
+    plain[index] = PhotometricModel(even, Tone.UNKNOWN, None).levels(share, LIGHT)
     smooth = cv2.GaussianBlur(
         plain.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
     ).ravel()
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
-    sharp = PhotometricModel(even, Response.UNKNOWN, mask).levels(share, LIGHT)
+    sharp = PhotometricModel(even, Tone.UNKNOWN, mask).levels(share, LIGHT)
     expected = (plain + LIGHT.sharpening * (plain - smooth))[index]
     np.testing.assert_allclose(sharp, expected, atol=1e-12)
 
 
 def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
-    photometry = make_imager(Response.UNKNOWN, 0.0)
+    photometry = make_imager(Tone.UNKNOWN, 0.0)
     count = photometry.offsets.shape[1]
     even = replace(LIGHT, slope_x=0.0, slope_y=0.0)
-    np.testing.assert_allclose(photometry.levels(np.zeros(count), even), even.black)
-    np.testing.assert_allclose(photometry.levels(np.ones(count), even), even.white)
+    black, white = plateau_levels(even, Tone.UNKNOWN)
+    np.testing.assert_allclose(photometry.levels(np.zeros(count), even), black)
+    np.testing.assert_allclose(photometry.levels(np.ones(count), even), white)
 
 
 @given(st.floats(0.0, 1.0))
