@@ -57,6 +57,10 @@ def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> Non
     assert re.match(r"\d+\.\d{3} m ± \d+\.\d mm \[", lines[0])
     assert (tmp_path / "results" / "bias_report.html").exists()
     assert (tmp_path / "results" / "gcp_list.txt").exists()
+    flight = kgcp.read_flight(ROOT / "sample_flight")
+    table = tmp_path / "results" / "detections.parquet"
+    assert kgcp.make_gcps(flight, table).doubts == ()
+    assert kgcp.bias_study(flight, table).doubts == ()
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ _STORED_FRAMES = 5
 _PLACES = 1000  # of a trajectory that are compared with the frames' own
 
 _OF_PLACES = frozenset({Cause.AXES_SWAPPED, Cause.ANGLE_UNIT, Cause.CRS})
+_OF_TIMES = frozenset({Cause.CLOCK, Cause.FRAME_ORDER})
 _CAUSES_OF_ERRORS = _OF_PLACES | {Cause.CLOCK, Cause.NO_OVERLAP, Cause.CAMERA_POSITION}
 
 _Input = TypeVar("_Input")
@@ -215,7 +216,8 @@ class FlightInputs:
             if self.reference_poses is not None:
                 found += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses
-        if poses is not None and not any(doubt.is_grave for doubt in found):
+        is_doubted = any(doubt.is_grave or doubt.code in _OF_TIMES for doubt in found)
+        if poses is not None and not is_doubted:
             found += check_visibility(poses.frames, self.frames, self.expected_radii_px)
         return ranked(found)
 

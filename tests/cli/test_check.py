@@ -54,6 +54,8 @@ def test_the_page_of_a_correct_flight(flight: Path) -> None:
         assert words in page
     assert max(map(len, result.stdout.splitlines())) <= 100
     assert not (flight / "kgcp").exists()
+    stored = CliRunner().invoke(main, ["check", f"file://{flight}"], catch_exceptions=False)
+    assert stored.stdout == result.stdout
 
 
 def test_json_has_facts_and_doubts(flight: Path) -> None:

@@ -154,7 +154,7 @@ def _height_words(encounters: Encounters, up_m: float) -> tuple[str, str]:
         words += f", as much as geoid and ellipsoid there ({geoid_m:.1f} m)"
         return f"{words}: heights in {low} seem to be above the geoid", _ONE_KIND
     if abs(up_m) > _LEAST_GEOID_M:
-        return f"{words}; a geoid lies up to 107 m from the ellipsoid, in Europe 20 … 60", _ONE_KIND
+        return f"{words}; geoids lie up to 107 m from the ellipsoid, 15 … 65 m in Europe", _ONE_KIND
     return words, _OTHER_HEIGHTS
 
 

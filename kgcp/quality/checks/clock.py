@@ -20,7 +20,7 @@ _HOUR_TOLERANCE_S = 60.0
 _STEADY_S = 2.0
 _SAME_SHARE = 0.02  # of the interval between frames
 _MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
-_UNIX_1990_S = 631_152_000.0
+_MOSTLY = 0.5
 
 
 def clock_shifts_s() -> list[tuple[float, str]]:
@@ -70,6 +70,7 @@ def check_overlap(
     first, last = float(trajectory_s[0]), float(trajectory_s[-1])
     times = frame_s + time_offset_s
     outside = float(np.mean((times < first) | (times > last)))
+    doubt = grave if outside > _MOSTLY else mild  # a logger may have been started late
     if outside <= _MOST_OUTSIDE:
         return ()
     count = round(outside * len(times))
@@ -85,7 +86,7 @@ def check_overlap(
     for shift_s, words in clock_shifts_s():
         if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
             return (
-                grave(
+                doubt(
                     Cause.CLOCK,
                     f"{sentence}: {words}; {_shifted(shift_s)} all would lie inside",
                     "give [vehicle] time_system, correct the times file, or set [vehicle]"
@@ -106,23 +107,10 @@ def check_overlap(
                 {**figures, "shift_s": days * _DAY_S},
             ),
         )
-    return (_unexplained(sentence, outside, figures),)
-
-
-def _unexplained(sentence: str, outside: float, figures: Mapping[str, float]) -> Doubt:
-    if outside < 0.5:
-        return mild(
-            Cause.NO_OVERLAP,
-            sentence,
-            "give the whole trajectory if those frames show the target",
-            figures,
-        )
-    return grave(
-        Cause.NO_OVERLAP,
-        sentence,
-        "give the trajectory of this flight, or correct [vehicle] time_offset_s and time_system",
-        figures,
-    )
+    remedy = "give the trajectory of this flight, or correct [vehicle] time_offset_s, time_system"
+    nothing = grave(Cause.NO_OVERLAP, sentence, remedy, figures)
+    # of those partly inside: blocks are flown for longer than vehicles drive
+    return (nothing,) if outside == 1.0 else ()
 
 
 def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> tuple[Doubt, ...]:

@@ -15,6 +15,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 _SMALL_FRAME_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal that equivalents refer to
 _FOCAL_TOLERANCE = 1.25  # equivalents are rounded, by width or diagonal, and of cropped video, too
 _SIZE_TOLERANCE = 1.1
+_FOCUSED = 1.03  # what focusing makes of a focal length in EXIF
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,15 +91,20 @@ def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt,
 
 
 def _check_cameras(headers: Sequence[FrameHeader]) -> tuple[Doubt, ...]:
+    zooms = _zooms_mm(headers)
     cameras = Counter(
-        (header.camera, header.focal_mm)
+        (header.camera, None if header.focal_mm is None else zooms[header.focal_mm])
         for header in headers
         if header.camera or header.focal_mm is not None
     )
     if len(cameras) < 2:
         return ()
     (first, _), (second, count) = cameras.most_common(2)
-    name = next(header.frame for header in headers if (header.camera, header.focal_mm) == second)
+    name = next(
+        header.frame
+        for header in headers
+        if (header.camera, None if header.focal_mm is None else zooms[header.focal_mm]) == second
+    )
     return (
         grave(
             Cause.TWO_CAMERAS,
@@ -108,6 +114,17 @@ def _check_cameras(headers: Sequence[FrameHeader]) -> tuple[Doubt, ...]:
             {"cameras": float(len(cameras)), "frames": float(count)},
         ),
     )
+
+
+def _zooms_mm(headers: Sequence[FrameHeader]) -> dict[float, float]:
+    """Return, for each focal length, the smallest of those that are the same but for focusing."""
+    zooms: dict[float, float] = {}
+    first = 0.0
+    for focal_mm in sorted({header.focal_mm for header in headers if header.focal_mm is not None}):
+        if focal_mm > _FOCUSED * first:
+            first = focal_mm
+        zooms[focal_mm] = first
+    return zooms
 
 
 def _named(camera: tuple[str, float | None]) -> str:
@@ -143,4 +160,4 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> tuple
                     figures,
                 ),
             )
-    return (grave(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures),)
+    return (mild(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures),)

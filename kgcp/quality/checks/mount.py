@@ -10,6 +10,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.camera_priors import body_from_plate
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.quality.checks.encounters import Encounters
+from kgcp.quality.number_text import minus
 
 _LARGEST_DEG = 8.0
 _STEADY_DEG = 8.0
@@ -34,8 +35,8 @@ def check_mount(encounters: Encounters) -> tuple[Doubt, ...]:
     return (
         mild(
             Cause.MOUNT,
-            f"by images and reference poses the plate is turned by {seen:.1f}° ± {spread:.1f}° on"
-            f" the vehicle, but mount_deg is {mount_deg:g}",
+            f"by images and reference poses the plate is turned by {minus(f'{seen:.1f}')}° ±"
+            f" {spread:.1f}° on the vehicle, but mount_deg is {mount_deg:g}",
             f"set [vehicle] mount_deg = {told:g}, unless headings are wrong",
             {"mount_deg": seen, "spread_deg": spread},
         ),

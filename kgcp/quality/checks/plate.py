@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
 from kgcp.targets.layout import Target
 
-_LARGEST_M, _SMALLEST_M = 5.0, 0.02
+_LARGEST_M, _SMALLEST_M = 8.0, 0.02
 _UNITS = (("inches", 0.0254), ("feet", 0.3048), ("centimetres", 0.01), ("millimetres", 0.001))
 _USUAL_M = 0.15, 3.0
 

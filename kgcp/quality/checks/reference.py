@@ -12,7 +12,8 @@ from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.target_positions import TargetPositions, Vehicle
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
 
-_FAR_M = 3000.0  # from a camera to the vehicle that it shows
+_FAR_M = 6000.0  # from the nearest camera to the vehicle, higher than aircraft take photographs
+_FEW = 1000  # epochs of a trajectory that tell its height
 
 
 def check_reference(poses: ReferencePoses, target_positions: TargetPositions) -> tuple[Doubt, ...]:
@@ -24,8 +25,10 @@ def check_reference(poses: ReferencePoses, target_positions: TargetPositions) ->
     off_m = _distance(poses.position_map, vehicle, ground)
     if off_m > _FAR_M:
         return (_far(poses, vehicle, ground, off_m),)
-    cameras = vehicle.local_frame.enu_from_map(poses.position_map)
-    above_m = float(np.median(cameras[:, 2]) - np.median(ground[:, 2]))
+    frame = vehicle.local_frame
+    cameras = frame.geodetic_deg(frame.enu_from_map(poses.position_map))
+    road = frame.geodetic_deg(ground[:: max(1, len(ground) // _FEW)])
+    above_m = float(np.median(cameras[:, 2]) - np.median(road[:, 2]))
     if above_m < 0.0:
         return (
             grave(
@@ -73,7 +76,7 @@ def check_visibility(
 
 def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: float) -> Doubt:
     figures = {"distance_m": off_m}
-    sentence = f"reference poses and trajectory are {off_m / 1000.0:.4g} km apart (medians)"
+    sentence = f"reference poses and trajectory are {off_m / 1000.0:.4g} km apart at least"
     swapped_poses = poses.position_map[:, [1, 0, 2]]
     if _distance(swapped_poses, vehicle, ground) < _FAR_M:
         return grave(
@@ -117,13 +120,11 @@ _UNITS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
 
 
 def _distance(position_map: FloatArray, vehicle: Vehicle, ground: FloatArray) -> float:
-    """Return the horizontal distance [m] of places from the ground (medians), less its extent."""
+    """Return how far the nearest place is from the box that the vehicle has driven in [m]."""
     try:
         cameras = vehicle.local_frame.enu_from_map(position_map)
     except KgcpError:
         return np.inf
-    middle = 0.5 * (ground[:, :2].min(axis=0) + ground[:, :2].max(axis=0))
-    extent = 0.5 * float(np.linalg.norm(np.ptp(ground[:, :2], axis=0)))
-    vertical = float(abs(np.median(cameras[:, 2]) - np.median(ground[:, 2])))
-    flat = float(np.linalg.norm(np.median(cameras[:, :2], axis=0) - middle))
-    return max(0.0, flat - extent, vertical - _FAR_M)
+    low, high = ground.min(axis=0), ground.max(axis=0)
+    beyond = np.maximum(np.maximum(low - cameras, cameras - high), 0.0)
+    return float(np.linalg.norm(beyond, axis=1).min())

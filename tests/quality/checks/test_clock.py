@@ -37,7 +37,7 @@ def test_frames_within_the_trajectory_raise_no_doubt() -> None:
 )
 def test_the_shift_that_fits_is_named(ahead_s: float, words: str) -> None:
     (doubt,) = check_overlap(FRAMES_S + ahead_s, TRAJECTORY_S, 0.0)
-    assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, True)
+    assert (doubt.code, doubt.is_grave) == (Cause.CLOCK, abs(ahead_s) > 20.0)
     assert words in doubt.sentence
     assert doubt.figures["shift_s"] == pytest.approx(-ahead_s)
 
@@ -46,9 +46,8 @@ def test_frames_of_another_drive_are_told() -> None:
     (doubt,) = check_overlap(FRAMES_S + 500.0, TRAJECTORY_S, 0.0)
     assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, True)
     assert "24 of 24 frames" in doubt.sentence
-    long = START_S + 5.0 + 1.5 * np.arange(40.0)
-    (doubt,) = check_overlap(long, TRAJECTORY_S, 0.0)
-    assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, False)
+    long = START_S + 5.0 + 1.5 * np.arange(-100.0, 100.0)
+    assert check_overlap(long, TRAJECTORY_S, 0.0) == ()  # the vehicle drove for a part of it
 
 
 @pytest.mark.parametrize(

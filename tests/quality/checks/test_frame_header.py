@@ -44,6 +44,8 @@ def test_two_cameras_and_two_zooms_are_named() -> None:
     (doubt,) = check_frames([*DJI, *others], CAMERA)
     assert doubt.code is Cause.TWO_CAMERAS
     assert "1 of SONY ILCE-7RM4 with 3.61 mm, such as b.jpg" in doubt.sentence
+    focused = [replace(DJI[0], frame="c.jpg", focal_mm=3.65)]
+    assert check_frames([*DJI, *focused], CAMERA) == ()
     zoomed = [replace(DJI[0], frame="c.jpg", focal_mm=7.2)]
     assert [one.code for one in check_frames([*DJI, *zoomed], CAMERA)] == [Cause.TWO_CAMERAS]
 
