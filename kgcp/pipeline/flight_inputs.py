@@ -41,7 +41,7 @@ _PLACES = 1000  # of a trajectory that are compared with the frames' own
 
 _OF_PLACES = frozenset({Cause.AXES_SWAPPED, Cause.ANGLE_UNIT, Cause.CRS})
 _OF_TIMES = frozenset({Cause.CLOCK, Cause.FRAME_ORDER})
-_CAUSES_OF_ERRORS = _OF_PLACES | {Cause.CLOCK, Cause.NO_OVERLAP, Cause.CAMERA_POSITION}
+_CAUSES_OF_ERRORS = _OF_PLACES | {Cause.CLOCK, Cause.CAMERA_POSITION}
 
 _Input = TypeVar("_Input")
 

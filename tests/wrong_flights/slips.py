@@ -187,6 +187,10 @@ ANYWAY: Mapping[str, Slip] = {
     "frames a day late": _slip(_late(86_400.0), Cause.CLOCK),
     "trajectory a GPS week early": _slip(_late_vehicle(-_WEEK_S), Cause.CLOCK),
     "trajectory 1024 weeks early": _slip(_late_vehicle(-1024 * _WEEK_S), Cause.CLOCK),
+    "trajectory in seconds of the GPS week": _slip(
+        lambda one: replace(one, vehicle_s=one.vehicle_s % _WEEK_S), Cause.CLOCK
+    ),
+    "trajectory in seconds since 1980": _slip(_late_vehicle(-315_964_782.0), Cause.CLOCK),
     "trajectory in local time": _slip(_late_vehicle(7200.0), Cause.CLOCK),
     "trajectory of another drive": _slip(_late_vehicle(1000.0), Cause.NO_OVERLAP),
     "times of a fortnight later": _slip(_late(2 * _WEEK_S), Cause.CLOCK),

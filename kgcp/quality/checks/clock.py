@@ -65,11 +65,9 @@ def check_overlap(
 
     Both in Unix UTC [s]; `time_offset_s` is that of flight.toml.
     """
-    if not len(frame_s):
-        return ()
     first, last = float(trajectory_s[0]), float(trajectory_s[-1])
     times = frame_s + time_offset_s
-    outside = float(np.mean((times < first) | (times > last)))
+    outside = float(np.mean((times < first) | (times > last))) if len(times) else 0.0
     doubt = grave if outside > _MOSTLY else mild  # a logger may have been started late
     if outside <= _MOST_OUTSIDE:
         return ()
