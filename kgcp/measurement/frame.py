@@ -33,19 +33,12 @@ _MOST_TURNED_DEG = 8.0  # the main ring's heading against the replica's
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What one frame says about all targets.
+    """What one frame says about all targets."""
 
-    Attributes
-    ----------
-    outcomes : tuple of Outcome
-        In the order of the targets; of each either its plates as observations, instance 0, 1, …
-        in order of score, or one Miss with the reason of its best candidate.
-    considered : tuple of Considered
-        All rings that were compared with a target's.
-    """
-
+    # in the order of the targets; of each either its plates as observations, instance 0, 1, … in
+    # order of score, or one Miss with the reason of its best candidate
     outcomes: tuple[Outcome, ...]
-    considered: tuple[Considered, ...]
+    considered: tuple[Considered, ...]  # all rings that were compared with a target's
 
 
 @dataclass(frozen=True, slots=True)

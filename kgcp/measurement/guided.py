@@ -35,27 +35,13 @@ _TRIES = 4  # per ring, the best candidates
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where a target must be in a frame, and how large, with deviations.
+    """Where a target must be in a frame, and how large, with deviations."""
 
-    Attributes
-    ----------
-    centre_px : (2,) array
-        Projected centre [px].
-    sd_px : float
-        Standard deviation of either coordinate [px].
-    radius_px : float
-        Of the main ring [px].
-    sd_log_radius : float
-        Standard deviation of its logarithm.
-    source : str
-        What it was made from, as one word.
-    """
-
-    centre_px: FloatArray
-    sd_px: float
-    radius_px: float
-    sd_log_radius: float
-    source: str
+    centre_px: FloatArray  # (2,): projected centre [px]
+    sd_px: float  # standard deviation of either coordinate [px]
+    radius_px: float  # of the main ring [px]
+    sd_log_radius: float  # standard deviation of its logarithm
+    source: str  # what it was made from, as one word
 
     def __str__(self) -> str:
         """Text for the detail of a row."""

@@ -23,18 +23,11 @@ _BELIEVED_CHI2 = 25.0  # 5 σ: beyond, what is known of the attitudes is wrong, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalPrior:
-    """Where the plate's normal should point.
+    """Where the plate's normal should point."""
 
-    Attributes
-    ----------
-    direction_camera : (3,) array
-        Unit vector in the camera frame, into the plate: downwards for a level plate.
-    sd_deg : float
-        Standard deviation of the normal about either axis square to it [deg].
-    """
-
+    # (3,): unit vector in the camera frame, into the plate: downwards for a level plate
     direction_camera: FloatArray
-    sd_deg: float
+    sd_deg: float  # standard deviation of the normal about either axis square to it [deg]
 
     def chi2(self, pose: Pose, rotation_cov: FloatArray) -> float:
         """Return how far the normal of a measured pose is from the expected one, as χ² (2 dof).
@@ -68,20 +61,13 @@ class NormalPrior:
 
 @dataclass(frozen=True, slots=True)
 class SceneRotation:
-    """How the scene turns about the camera while a rolling shutter reads it.
+    """How the scene turns about the camera while a rolling shutter reads it."""
 
-    Attributes
-    ----------
-    velocity_rad_s : tuple of float
-        Ω about the camera's axes x right, y down, z forward: a point X moves by Ω × X. It is the
-        camera's own rotation, turned round, and for the part of a moving plate or of a camera
-        that flies by, the turn of the line of sight.
-    sd_rad_s : float
-        Standard deviation of each of the three.
-    """
-
+    # Ω about the camera's axes x right, y down, z forward: a point X moves by Ω × X. It is the
+    # camera's own rotation, turned round, and for the part of a moving plate or of a camera that
+    # flies by, the turn of the line of sight.
     velocity_rad_s: tuple[float, float, float]
-    sd_rad_s: float
+    sd_rad_s: float  # standard deviation of each of the three
 
     @classmethod
     def unknown(cls, camera: Camera) -> Self:
@@ -91,15 +77,9 @@ class SceneRotation:
 
 @dataclass(frozen=True, slots=True)
 class PlatePrior:
-    """What is known of one target in one frame before it is measured.
+    """What is known of one target in one frame before it is measured."""
 
-    Attributes
-    ----------
-    normal : NormalPrior or None
-        Where its normal points; it helps to choose between the two poses.
-    rotation : SceneRotation or None
-        None: nothing more than what `SceneRotation.unknown` says.
-    """
-
+    # where its normal points; it helps to choose between the two poses
     normal: NormalPrior | None = None
+    # None: nothing more than what `SceneRotation.unknown` says
     rotation: SceneRotation | None = None

@@ -103,30 +103,15 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPose:
-    """What the adjustment starts from: the outline that the search has followed, as a pose.
+    """What the adjustment starts from: the outline that the search has followed, as a pose."""
 
-    Attributes
-    ----------
-    ring : str
-        Name of the ring, the target's own or a replica.
-    score : float
-        Normalised cross-correlation of the code.
-    pose : Pose
-        Target → camera; good to a per cent or two.
-    radius_px : float
-        Semi-major axis of the main ring's outer ellipse [px].
-    edge_shift_px : float
-        δ: displacement of the edges towards the dark side, from both circles [px].
-    blur_px : float
-        Edge spread σ [px].
-    """
-
-    ring: str
-    score: float
-    pose: Pose
-    radius_px: float
+    ring: str  # name of the ring, the target's own or a replica
+    score: float  # normalised cross-correlation of the code
+    pose: Pose  # target → camera; good to a per cent or two
+    radius_px: float  # semi-major axis of the main ring's outer ellipse [px]
+    # δ: displacement of the edges towards the dark side, from both circles [px]
     edge_shift_px: float
-    blur_px: float
+    blur_px: float  # edge spread σ [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

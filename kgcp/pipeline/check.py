@@ -29,21 +29,11 @@ _TYPICAL_M = 50.0  # a distance to name, where no reference tells any
 
 @dataclass(frozen=True, slots=True)
 class FlightCheck:
-    """What a dry run has found.
+    """What a dry run has found."""
 
-    Attributes
-    ----------
-    name : str
-        Of the flight.
-    facts : mapping of str to str
-        What there is, and what follows from it, by its heading.
-    doubts : tuple of Doubt
-        What does not fit, grave doubts first.
-    """
-
-    name: str
-    facts: Mapping[str, str]
-    doubts: tuple[Doubt, ...]
+    name: str  # of the flight
+    facts: Mapping[str, str]  # what there is, and what follows from it, by its heading
+    doubts: tuple[Doubt, ...]  # what does not fit, grave doubts first
 
     @property
     def is_grave(self) -> bool:

@@ -66,22 +66,13 @@ def naming_causes(doubts: Sequence[Doubt]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class FlightInputs:
-    """The records of a flight, each read when it is first needed, or why it cannot be.
-
-    Attributes
-    ----------
-    frames : tuple of str
-        All of them, sorted.
-    headers : tuple of FrameHeader
-        Of all frames, or of some, evenly spaced.
-    detected_s : mapping of str to float, or None
-        Times that the frames had when targets were detected in them [s]; None: not detected yet.
-    """
+    """The records of a flight, each read when it is first needed, or why it cannot be."""
 
     flight: Flight
     data: FlightData
-    frames: tuple[str, ...]
-    headers: tuple[FrameHeader, ...]
+    frames: tuple[str, ...]  # all of them, sorted
+    headers: tuple[FrameHeader, ...]  # of all frames, or of some, evenly spaced
+    # times that the frames had when targets were detected in them [s]; None: not detected yet
     detected_s: Mapping[str, float] | None = None
 
     @classmethod

@@ -40,58 +40,35 @@ _MOST_DROPPED = 24  # rings per frame that are kept to be shown: a texture may h
 
 @dataclass(frozen=True, slots=True)
 class DetectionJob:
-    """What a worker needs to know to examine any frame of a flight.
-
-    Attributes
-    ----------
-    keeps_dropped : bool
-        Whether the results name the rings that were compared with a target's and dropped.
-    """
+    """What a worker needs to know to examine any frame of a flight."""
 
     frames_folder: Path | StoredFolder
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
     targets: tuple[Target, ...]
     settings: DetectSettings
+    # whether the results name the rings that were compared with a target's and dropped
     keeps_dropped: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class FrameInput:
-    """What a worker needs to know about one frame.
+    """What a worker needs to know about one frame."""
 
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    time_s : float or None
-        From the times file, of the camera's `time_reference`, Unix UTC [s]; None: it has none.
-    priors : mapping of str to PlatePrior
-        What is known of its targets, by their names.
-    may_use_exif_time : bool
-        Whether EXIF gives the time if the times file does not.
-    """
-
-    frame: str
+    frame: str  # path relative to the frames folder
+    # from the times file, of the camera's `time_reference`, Unix UTC [s]; None: it has none
     time_s: float | None
-    priors: Mapping[str, PlatePrior]
-    may_use_exif_time: bool = True
+    priors: Mapping[str, PlatePrior]  # what is known of its targets, by their names
+    may_use_exif_time: bool = True  # whether EXIF gives the time if the times file does not
 
 
 @dataclass(frozen=True, slots=True)
 class GuidedInput:
-    """A frame that is to be looked at again.
-
-    Attributes
-    ----------
-    first : FrameResult
-        Of the first look.
-    predictions : mapping of str to Prediction
-        By the name of the target, which must be visible; those that are looked for.
-    """
+    """A frame that is to be looked at again."""
 
     input: FrameInput
-    first: FrameResult
+    first: FrameResult  # of the first look
+    # by the name of the target, which must be visible; those that are looked for
     predictions: Mapping[str, Prediction]
 
 

@@ -39,21 +39,12 @@ _CIRCLE = np.stack((np.cos(_TURN), np.sin(_TURN)), axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """One card of the sheet, to be written.
+    """One card of the sheet, to be written."""
 
-    Attributes
-    ----------
-    card : Card
-        Without the name of a picture.
-    pictures : Pictures or None
-        None: nothing says where a ring is, or the frame could not be read again.
-    is_lost : bool
-        Whether there should be pictures.
-    """
-
-    card: Card
+    card: Card  # without the name of a picture
+    # None: nothing says where a ring is, or the frame could not be read again
     pictures: Pictures | None = None
-    is_lost: bool = False
+    is_lost: bool = False  # whether there should be pictures
 
 
 def draw_overlay(

@@ -53,20 +53,11 @@ def results_folder(flight: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """Folders of this machine, and what they stand for.
+    """Folders of this machine, and what they stand for."""
 
-    Attributes
-    ----------
-    flight : Path
-        Has flight.toml and what that names, but for the frames of a stored flight.
-    out : Path
-        Takes the results.
-    stored_flight, stored_out : StoredFolder or None
-        What `flight` and `out` stand for; None: they are what the user named.
-    """
-
-    flight: Path
-    out: Path
+    flight: Path  # has flight.toml and what that names, but for the frames of a stored flight
+    out: Path  # takes the results
+    # what `flight` and `out` stand for; None: they are what the user named
     stored_flight: StoredFolder | None
     stored_out: StoredFolder | None
 

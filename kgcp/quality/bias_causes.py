@@ -25,24 +25,16 @@ _CURVED = "edge_curvature_px2"
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One cause, as far as residuals show it.
+    """One cause, as far as residuals show it."""
 
-    Attributes
-    ----------
-    name : str
-        `scale`, `offset_m`, `edge_curvature_px2`, or a column of the exposure.
-    value, sd : float
-        Estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of
-        `edge_curvature_px2` displacement of the edge times its radius [px²], of the others
-        displacement of the edge in pixels per unit.
-    probability : float
-        Of a value as large by chance (Student's t, both sides), by Holm's correction for the
-        number of terms.
-    """
-
-    name: str
+    name: str  # `scale`, `offset_m`, `edge_curvature_px2`, or a column of the exposure
+    # estimate and standard deviation: of `scale` relative, of `offset_m` in metres, of
+    # `edge_curvature_px2` displacement of the edge times its radius [px²], of the others
+    # displacement of the edge in pixels per unit
     value: float
     sd: float
+    # of a value as large by chance (Student's t, both sides), by Holm's correction for the number
+    # of terms
     probability: float
 
     @property
@@ -53,41 +45,23 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """Residual = scale · distance + offset + what displaced edges do.
+    """Residual = scale · distance + offset + what displaced edges do."""
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        `scale` first.
-    tangled : tuple of str
-        Quantities that vary, but so much like others that they cannot be told from them.
-    count : int
-        Residuals that took part.
-    used, outlier : (n,) array of bool
-        Rows that have all quantities; those of them that fit nothing and were left out.
-    scatter : float
-        Of the residuals over their stated standard deviations; 1 where these are true.
-    correlation_s : float
-        As in `RegressionFit`.
-    exposure_share : float
-        Of the variance that scale and offset leave, what the terms of exposure explain,
-        corrected for their number; 0 without any.
-    exposure_probability : float or None
-        Of as large a share by chance (F test); None without such terms.
-    systematic_m : (n,) array
-        What all terms but those of exposure make [m].
-    """
-
-    terms: tuple[Term, ...]
+    terms: tuple[Term, ...]  # `scale` first
+    # quantities that vary, but so much like others that they cannot be told from them
     tangled: tuple[str, ...]
-    count: int
+    count: int  # residuals that took part
+    # (n,): rows that have all quantities; those of them that fit nothing and were left out
     used: BoolArray
     outlier: BoolArray
-    scatter: float
-    correlation_s: float
+    scatter: float  # of the residuals over their stated standard deviations; 1 where these are true
+    correlation_s: float  # as in `RegressionFit`
+    # of the variance that scale and offset leave, what the terms of exposure explain, corrected for
+    # their number; 0 without any
     exposure_share: float
+    # of as large a share by chance (F test); None without such terms
     exposure_probability: float | None
-    systematic_m: FloatArray
+    systematic_m: FloatArray  # (n,): what all terms but those of exposure make [m]
 
     def term(self, name: str) -> Term | None:
         """Return the term of a name."""

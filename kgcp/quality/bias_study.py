@@ -22,21 +22,12 @@ from kgcp.targets.layout import Target
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSds:
-    """Standard deviations of a reference distance, by where they come from.
+    """Standard deviations of a reference distance, by where they come from."""
 
-    Attributes
-    ----------
-    pose_m : float
-        Of the camera's reference position, taken as independent from frame to frame [m].
-    place_m : float
-        Of the trajectory, attitude included: an error that lasts for a while [m].
-    common_m : float
-        Of lever arm and synchronisation, or of a static target's position: one error in all
-        frames [m].
-    """
-
+    # of the camera's reference position, taken as independent from frame to frame [m]
     pose_m: float
-    place_m: float
+    place_m: float  # of the trajectory, attitude included: an error that lasts for a while [m]
+    # of lever arm and synchronisation, or of a static target's position [m]: one error in all frames
     common_m: float
 
     @property
@@ -69,26 +60,17 @@ class ReferenceSds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """One attempt against the reference.
-
-    Attributes
-    ----------
-    camera_m, place_m : (3,) array
-        Reference projection centre, and the target's place at that time, in the ENU frame [m].
-    sds : ReferenceSds or None
-        Of the distance between the two; None where trajectory or poses have none.
-    expected_px : (2,) array
-        Where the reference pose puts the centre in the raw image [px]; NaN behind the camera.
-    expected_radius_px : float
-        Outer radius that the main ring has there [px].
-    """
+    """One attempt against the reference."""
 
     attempt: Attempt
+    # (3,): reference projection centre, and the target's place at that time, in the ENU frame [m]
     camera_m: FloatArray
     place_m: FloatArray
+    # of the distance between the two; None where trajectory or poses have none
     sds: ReferenceSds | None
+    # (2,): where the reference pose puts the centre in the raw image [px]; NaN behind the camera
     expected_px: FloatArray
-    expected_radius_px: float
+    expected_radius_px: float  # outer radius that the main ring has there [px]
 
     @property
     def reference_distance_m(self) -> float:
@@ -127,29 +109,17 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class BiasStudy:
-    """All that could be compared.
-
-    Attributes
-    ----------
-    measured : tuple of Comparison
-        With a residual, in the frames' order.
-    expected_visible : tuple of Comparison
-        Frames in which the target must be wholly visible, measured or not.
-    attitudes_agree : bool
-        Whether most measured centres lie where the reference attitudes put them. If not, nothing
-        is called misplaced, and every frame with a pose counts as one that shows it.
-    frames_without_pose : tuple of str
-        Frames that the reference does not name.
-    absences : tuple of NoPosition
-        Of the frames whose target cannot be placed.
-    """
+    """All that could be compared."""
 
     method: Method
-    measured: tuple[Comparison, ...]
+    measured: tuple[Comparison, ...]  # with a residual, in the frames' order
+    # frames in which the target must be wholly visible, measured or not
     expected_visible: tuple[Comparison, ...]
+    # whether most measured centres lie where the reference attitudes put them. If not, nothing is
+    # called misplaced, and every frame with a pose counts as one that shows it.
     attitudes_agree: bool
-    frames_without_pose: tuple[str, ...]
-    absences: tuple[NoPosition, ...]
+    frames_without_pose: tuple[str, ...]  # frames that the reference does not name
+    absences: tuple[NoPosition, ...]  # of the frames whose target cannot be placed
 
     def trusts(self, pair: Comparison) -> bool:
         """Whether a comparison holds a measurement, and one of this target."""
@@ -277,21 +247,11 @@ def _compare(
 
 @dataclass(frozen=True, slots=True)
 class EdgeDistances:
-    """Distances of one target by its edges.
+    """Distances of one target by its edges."""
 
-    Attributes
-    ----------
-    one_m : float
-        As the outer edge alone gives it, displaced by exposure as it is [m].
-    two_m : float
-        With both edges, whose common displacement drops out [m].
-    one_px : float
-        Radius of the displaced outer edge [px].
-    """
-
-    one_m: float
-    two_m: float
-    one_px: float
+    one_m: float  # as the outer edge alone gives it, displaced by exposure as it is [m]
+    two_m: float  # with both edges, whose common displacement drops out [m]
+    one_px: float  # radius of the displaced outer edge [px]
 
 
 def edge_distances(pair: Comparison, method: Method) -> EdgeDistances | None:

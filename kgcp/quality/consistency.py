@@ -26,52 +26,29 @@ _FLOOR_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Discrepancy:
-    """Between the two places of a target in one frame.
+    """Between the two places of a target in one frame."""
 
-    Attributes
-    ----------
-    frame, target : str
-        As in the sighting.
-    time_s : float
-        When the target's row was exposed, by the trajectory's clock, Unix UTC [s].
-    offset_m : (3,) array
-        By the vehicle minus by the camera: along the track, across it to the right, up [m].
-    cov_m2 : (3, 3) array
-        By all stated standard deviations but those that all frames share [m²].
-    residual_m : (3,) array
-        What the corrections leave of the offset [m].
-    is_outlier : bool
-        Whether it fits no correction and was left out.
-    """
-
+    # as in the sighting
     frame: str
     target: str
-    time_s: float
+    time_s: float  # when the target's row was exposed, by the trajectory's clock, Unix UTC [s]
+    # (3,): by the vehicle minus by the camera: along the track, across it to the right, up [m]
     offset_m: FloatArray
+    # (3, 3): by all stated standard deviations but those that all frames share [m²]
     cov_m2: FloatArray
-    residual_m: FloatArray
-    is_outlier: bool
+    residual_m: FloatArray  # (3,): what the corrections leave of the offset [m]
+    is_outlier: bool  # whether it fits no correction and was left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consistency:
-    """How well vehicle and camera agree.
+    """How well vehicle and camera agree."""
 
-    Attributes
-    ----------
-    discrepancies : tuple of Discrepancy
-        Ascending in time.
-    estimate : Estimate
-        Corrections that explain them.
-    correlation_s : float
-        Over which the trajectory's errors seem to fade: the likeliest of a few times [s].
-    stated_sd : mapping of str to float
-        How well flight.toml says that unknowns are known, by their names and in their units.
-    """
-
-    discrepancies: tuple[Discrepancy, ...]
-    estimate: Estimate
+    discrepancies: tuple[Discrepancy, ...]  # ascending in time
+    estimate: Estimate  # corrections that explain them
+    # over which the trajectory's errors seem to fade: the likeliest of a few times [s]
     correlation_s: float
+    # how well flight.toml says that unknowns are known, by their names and in their units
     stated_sd: Mapping[str, float]
 
 

@@ -25,56 +25,32 @@ _NEIGHBOUR_S = 5.0  # over which a camera's velocity shows in its positions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """One frame in which the target's place is known twice.
-
-    Attributes
-    ----------
-    pose : Pose
-        Of the sighting, target → camera.
-    time_s : float
-        When the target's row was exposed, by the frames' clock, Unix UTC [s].
-    position : TargetPosition
-        By the vehicle.
-    row : int
-        Of the reference pose.
-    """
+    """One frame in which the target's place is known twice."""
 
     sighting: Sighting
-    pose: Pose
-    time_s: float
-    position: TargetPosition
+    pose: Pose  # of the sighting, target → camera
+    time_s: float  # when the target's row was exposed, by the frames' clock, Unix UTC [s]
+    position: TargetPosition  # by the vehicle
     vehicle_state: VehicleState
-    row: int
+    row: int  # of the reference pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """Discrepancies of n meetings in ENU axes, and everything that they are made of.
+    """Discrepancies of n meetings in ENU axes, and everything that they are made of."""
 
-    Attributes
-    ----------
-    offset : (n, 3) array
-        Place by the vehicle minus place by the camera [m].
-    design : (n, 3, 8) array
-        What one unit of each of the `UNKNOWNS`, as a correction, adds to it.
-    fading, white : (n, 3, 3) array
-        Covariance by the trajectory, and by all that is independent from frame to frame [m²].
-    common : (n, 3) array
-        What one standard deviation of calibration and diameter, by way of the distance, adds to
-        it [m].
-    has_sds : bool
-        Whether trajectory and reference poses have standard deviations.
-    track : (n, 3, 3) array
-        Along the track, across it to the right and up, as rows.
-    """
-
-    offset: FloatArray
+    offset: FloatArray  # (n, 3): place by the vehicle minus place by the camera [m]
+    # (n, 3, 8): what one unit of each of the `UNKNOWNS`, as a correction, adds to it
     design: FloatArray
+    # (n, 3, 3): covariance by the trajectory, and by all that is independent from frame to frame
+    # [m²]
     fading: FloatArray
     white: FloatArray
+    # (n, 3): what one standard deviation of calibration and diameter, by way of the distance, adds
+    # to it [m]
     common: FloatArray
-    has_sds: bool
-    track: FloatArray
+    has_sds: bool  # whether trajectory and reference poses have standard deviations
+    track: FloatArray  # (n, 3, 3): along the track, across it to the right and up, as rows
 
     @classmethod
     def of(

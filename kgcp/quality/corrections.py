@@ -17,22 +17,13 @@ _SIGNIFICANT = 0.001
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """One thing that may be wrong in the same way in all frames.
+    """One thing that may be wrong in the same way in all frames."""
 
-    Attributes
-    ----------
-    name : str
-        With the unit of its value.
-    limit : float
-        Beyond belief, in the unit of the adjustment; an unknown whose standard deviation alone is
-        larger is not determined.
-    factor : float
-        From the unit of the adjustment to that of the name.
-    """
-
-    name: str
+    name: str  # with the unit of its value
+    # beyond belief, in the unit of the adjustment; an unknown whose standard deviation alone is
+    # larger is not determined
     limit: float
-    factor: float = 1.0
+    factor: float = 1.0  # from the unit of the adjustment to that of the name
 
 
 UNKNOWNS = (
@@ -52,27 +43,17 @@ UNKNOWN_LIMITS: FloatArray = np.array([unknown.limit for unknown in UNKNOWNS])
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What to add to one setting, and how sure that is.
+    """What to add to one setting, and how sure that is."""
 
-    Attributes
-    ----------
-    name : str
-        Of the unknown, with its unit.
-    value, sd : float or None
-        Estimate and standard deviation; None: not determined by this flight.
-    probability : float or None
-        Of an estimate as large by chance, where nothing is wrong (Student's t, both sides).
-    tangled_with : tuple of str
-        Unknowns that look alike in this flight: the estimate holds if they are right.
-    is_credible : bool
-        Whether the estimate is within the unknown's limit; beyond, something else is wrong.
-    """
-
-    name: str
+    name: str  # of the unknown, with its unit
+    # estimate and standard deviation; None: not determined by this flight
     value: float | None
     sd: float | None
+    # of an estimate as large by chance, where nothing is wrong (Student's t, both sides)
     probability: float | None
+    # unknowns that look alike in this flight: the estimate holds if they are right
     tangled_with: tuple[str, ...]
+    # whether the estimate is within the unknown's limit; beyond, something else is wrong
     is_credible: bool
 
     @property
@@ -83,26 +64,14 @@ class Correction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Corrections, and the residuals' size without and with them.
+    """Corrections, and the residuals' size without and with them."""
 
-    Attributes
-    ----------
-    corrections : tuple of Correction
-        In the order of `UNKNOWNS`.
-    values : (8,) array
-        In the units of the adjustment; 0 where not estimated.
-    chi2_before, chi2_after : float
-        Sum of squares without and with the corrections, by the stated standard
-        deviations.
-    degrees_of_freedom : int
-        Of `chi2_after`.
-    """
-
-    corrections: tuple[Correction, ...]
-    values: FloatArray
+    corrections: tuple[Correction, ...]  # in the order of `UNKNOWNS`
+    values: FloatArray  # (8,): in the units of the adjustment; 0 where not estimated
+    # sum of squares without and with the corrections, by the stated standard deviations
     chi2_before: float
     chi2_after: float
-    degrees_of_freedom: int
+    degrees_of_freedom: int  # of `chi2_after`
 
     @property
     def variance_factor(self) -> float:

@@ -20,26 +20,13 @@ _UNSTATED_WHITE_M, _UNSTATED_LASTING_M = 0.005, 0.01
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One thing that an exposure may act by.
+    """One thing that an exposure may act by."""
 
-    Attributes
-    ----------
-    name : str
-        Of the column.
-    label : str
-        What it is, with its unit.
-    per : str
-        Of what one unit is called in the regression.
-    is_log : bool
-        Whether factors count, not differences: then the unit is a factor of two.
-    is_absolute : bool
-        Whether 0 means that nothing is displaced; of others only changes can be told.
-    """
-
-    name: str
-    label: str
-    per: str
-    is_log: bool = False
+    name: str  # of the column
+    label: str  # what it is, with its unit
+    per: str  # of what one unit is called in the regression
+    is_log: bool = False  # whether factors count, not differences: then the unit is a factor of two
+    # whether 0 means that nothing is displaced; of others only changes can be told
     is_absolute: bool = False
 
     def measure(self, values: FloatArray) -> FloatArray:
@@ -66,24 +53,14 @@ QUANTITIES = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistanceResiduals:
-    """Residuals of n distances, with all that may explain them, in the order of time.
+    """Residuals of n distances, with all that may explain them, in the order of time."""
 
-    Attributes
-    ----------
-    distance_m, radius_px : (n,) array
-        Reference distance, and the radius in the image that gave the measured one.
-    residual_m : (n,) array
-        Measured minus reference distance.
-    errors : ErrorModel
-        Of the residuals, in m².
-    exposure : mapping of str to (n,) array
-        The columns of `QUANTITIES` by name; NaN where a frame has none.
-    """
-
+    # (n,): reference distance, and the radius in the image that gave the measured one
     distance_m: FloatArray
     radius_px: FloatArray
-    residual_m: FloatArray
-    errors: ErrorModel
+    residual_m: FloatArray  # (n,): measured minus reference distance
+    errors: ErrorModel  # of the residuals, in m²
+    # the columns of `QUANTITIES` by name; NaN where a frame has none
     exposure: dict[str, FloatArray]
 
     @classmethod

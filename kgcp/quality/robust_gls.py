@@ -27,21 +27,11 @@ _ALIKE_SHARE = 0.3  # of the largest component of the weakest eigenvector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
-    """What is known beforehand about the errors of n observations, in the order of time.
+    """What is known beforehand about the errors of n observations, in the order of time."""
 
-    Attributes
-    ----------
-    white : (n,) or (n, d, d) array
-        Variances of what is independent from one to the next.
-    lasting : (n,) or (n, d, d) array
-        Variances of what lasts for a while; 0: nothing does.
-    time_s : (n,) array
-        Ascending [s].
-    """
-
-    white: FloatArray
-    lasting: FloatArray
-    time_s: FloatArray
+    white: FloatArray  # (n,): variances of what is independent from one to the next
+    lasting: FloatArray  # (n,): variances of what lasts for a while; 0: nothing does
+    time_s: FloatArray  # (n,): ascending [s]
 
     @property
     def total(self) -> FloatArray:
@@ -55,32 +45,17 @@ class ErrorModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegressionFit:
-    """Result of one least squares fit.
+    """Result of one least squares fit."""
 
-    Attributes
-    ----------
-    values : (p,) array
-    cov : (p, p) array
-        Their covariance, scaled by the scatter of the residuals.
-    outlier : (n,) array of bool
-        Observations that took no part, since they fit nothing.
-    freedom : int
-        Degrees of freedom.
-    correlation_s : float
-        Over which lasting errors fade, the likeliest of a few times; 0: none are evident [s].
-    chi2 : float
-        Weighted sum of squares of the residuals.
-    products : (p + 1, p + 1) array
-        Weighted products of the columns, each of unit length, and of the observations: enough for
-        any part of the model.
-    """
-
-    values: FloatArray
-    cov: FloatArray
-    outlier: BoolArray
-    freedom: int
+    values: FloatArray  # (p,)
+    cov: FloatArray  # (p, p): their covariance, scaled by the scatter of the residuals
+    outlier: BoolArray  # (n,): observations that took no part, since they fit nothing
+    freedom: int  # degrees of freedom
+    # over which lasting errors fade, the likeliest of a few times; 0: none are evident [s]
     correlation_s: float
-    chi2: float
+    chi2: float  # weighted sum of squares of the residuals
+    # (p + 1, p + 1): weighted products of the columns, each of unit length, and of the
+    # observations: enough for any part of the model
     products: FloatArray
 
     @property

@@ -19,21 +19,12 @@ _MIN_COUNT = 6
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean, standard deviation and root mean square of `count` values.
+    """Mean, standard deviation and root mean square of `count` values."""
 
-    Attributes
-    ----------
-    count : int
-        At least 1.
-    mean, rms : float
-        In the values' unit.
-    sd : float or None
-        Of one value, with count − 1; None for a single value.
-    """
-
-    count: int
+    count: int  # at least 1
+    # in the values' unit
     mean: float
-    sd: float | None
+    sd: float | None  # of one value, with count − 1; None for a single value
     rms: float
 
     @classmethod
@@ -51,15 +42,10 @@ class Spread:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingStatistics:
-    """Mean and standard deviation in a window that moves along x (the paper's Figure 9).
+    """Mean and standard deviation in a window that moves along x (the paper's Figure 9)."""
 
-    Attributes
-    ----------
-    centre, mean, sd : (n,) array
-        Window centres, and the values' statistics in each; NaN where a window holds fewer than
-        three values.
-    """
-
+    # (n,): window centres, and the values' statistics in each; NaN where a window holds fewer than
+    # three values
     centre: FloatArray
     mean: FloatArray
     sd: FloatArray
@@ -101,29 +87,17 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slope:
-    """A line y = height + value · (x − middle).
+    """A line y = height + value · (x − middle)."""
 
-    Attributes
-    ----------
-    count : int
-        Points that took part; those far off the line did not.
-    middle, height, value : float
-    sd_height, sd_value : float
-        Standard deviations, by the scatter about the line.
-    probability : float
-        Of as large a slope by chance.
-    share : float
-        Of the variance of y what the line explains, corrected for its one parameter.
-    """
-
-    count: int
+    count: int  # points that took part; those far off the line did not
     middle: float
     height: float
     value: float
+    # standard deviations, by the scatter about the line
     sd_height: float
     sd_value: float
-    probability: float
-    share: float
+    probability: float  # of as large a slope by chance
+    share: float  # of the variance of y what the line explains, corrected for its one parameter
 
     def line(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the line at x (n,) and its standard deviation."""

@@ -9,14 +9,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """One format of the command line.
+    """One format of the command line."""
 
-    Attributes
-    ----------
-    files : tuple of str
-        What it writes, below the results' folder; in brackets: only where there is something.
-    """
-
+    # what it writes, below the results' folder; in brackets: only where there is something
     files: tuple[str, ...]
     description: str
 

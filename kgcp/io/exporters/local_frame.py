@@ -22,22 +22,12 @@ _ROUND_MAP, _ROUND_DEGREES, _ROUND_HEIGHT = 100.0, 0.001, 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalPoints:
-    """The points of a `MapPoints` in its local frame.
-
-    Attributes
-    ----------
-    origin_map : (3,) array
-        The frame's origin in the map.
-    position_m : (n, 3) array
-        East, north, up of the points, in their order [m].
-    enu_from_map : (n, 3, 3) array
-        From the map's axes at each point to east, north, up.
-    """
+    """The points of a `MapPoints` in its local frame."""
 
     local_frame: LocalFrame
-    origin_map: FloatArray
-    position_m: FloatArray
-    enu_from_map: FloatArray
+    origin_map: FloatArray  # (3,): the frame's origin in the map
+    position_m: FloatArray  # (n, 3): east, north, up of the points, in their order [m]
+    enu_from_map: FloatArray  # (n, 3, 3): from the map's axes at each point to east, north, up
 
     def cov_m2(self, index: int, cov_map: FloatArray) -> FloatArray:
         """Turn the covariance (3, 3) of a point from the map's axes to east, north, up."""
@@ -74,20 +64,13 @@ def local_cameras(points: MapPoints) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The local frame's origin as PROJ takes it.
+    """The local frame's origin as PROJ takes it."""
 
-    Attributes
-    ----------
-    longitude, latitude, height : str
-        In degrees and metres above the ellipsoid.
-    ellipsoid : str
-        PROJ's parameters of its size.
-    """
-
+    # in degrees and metres above the ellipsoid
     longitude: str
     latitude: str
     height: str
-    ellipsoid: str
+    ellipsoid: str  # PROJ's parameters of its size
 
 
 def origin_of(points: MapPoints) -> Origin:

@@ -32,22 +32,13 @@ CORNER_PX = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPoints:
-    """KGCPs, the map of their coordinates and the camera that saw them.
+    """KGCPs, the map of their coordinates and the camera that saw them."""
 
-    Attributes
-    ----------
-    crs : str
-        Of the points and the priors.
-    priors : tuple of CameraPrior
-        Of the frames for which there is one.
-    mark_floor_px : float
-        Least standard deviation of a mark for packages [px]; `kgcp.io.exporters.weights`.
-    """
-
-    crs: str
+    crs: str  # of the points and the priors
     gcps: tuple[Gcp, ...]
     camera: Camera
-    priors: tuple[CameraPrior, ...] = ()
+    priors: tuple[CameraPrior, ...] = ()  # of the frames for which there is one
+    # least standard deviation of a mark for packages [px]; `kgcp.io.exporters.weights`
     mark_floor_px: float = MARK_FLOOR_PX
 
     @property

@@ -24,25 +24,13 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvColumns:
-    """The wanted columns of one file, row by row.
-
-    Attributes
-    ----------
-    lines : tuple of int
-        Line of each row in the file, from 1.
-    texts : mapping of tuples
-        The text columns by name.
-    names : tuple of str
-        Names of the number columns that the file has.
-    numbers : (n, len(names)) array
-        Their values, all finite.
-    """
+    """The wanted columns of one file, row by row."""
 
     path: Path
-    lines: tuple[int, ...]
-    texts: Mapping[str, tuple[str, ...]]
-    names: tuple[str, ...]
-    numbers: FloatArray
+    lines: tuple[int, ...]  # line of each row in the file, from 1
+    texts: Mapping[str, tuple[str, ...]]  # the text columns by name
+    names: tuple[str, ...]  # names of the number columns that the file has
+    numbers: FloatArray  # (n, len(names): their values, all finite
 
     def frames(self) -> tuple[str, ...]:
         """Return the column frame with `/` between folders.

@@ -26,16 +26,10 @@ _HEAD = 4096
 
 @dataclass(frozen=True, eq=False)
 class ForeignFile:
-    """A file whose format its content tells; each part is read when it is first asked for.
-
-    Attributes
-    ----------
-    toml_key : str
-        Where flight.toml names it, for messages.
-    """
+    """A file whose format its content tells; each part is read when it is first asked for."""
 
     path: Path
-    toml_key: str
+    toml_key: str  # where flight.toml names it, for messages
 
     @cached_property
     def head(self) -> bytes:
@@ -124,16 +118,10 @@ class ForeignFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JsonObject:
-    """An object of a JSON file that knows its place.
-
-    Attributes
-    ----------
-    where : str
-        Its place in the file, for messages.
-    """
+    """An object of a JSON file that knows its place."""
 
     file: ForeignFile
-    where: str
+    where: str  # its place in the file, for messages
     values: Mapping[str, object]
 
     @classmethod

@@ -40,15 +40,9 @@ _LONG_KEY = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The camera's poses from an adjustment.
+    """The camera's poses from an adjustment."""
 
-    Attributes
-    ----------
-    file : Path
-        It is not looked for until a command needs it.
-    """
-
-    file: Path
+    file: Path  # it is not looked for until a command needs it
     options: OrientationFileOptions
 
 

@@ -22,16 +22,10 @@ _LEVER_ARM = "[forward, right, down] in metres from the trajectory point to the 
 
 @dataclass(frozen=True, slots=True)
 class VehicleTable:
-    """The [vehicle] table of flight.toml.
-
-    Attributes
-    ----------
-    trajectory_file : Path
-        It is not looked for until a command needs it.
-    """
+    """The [vehicle] table of flight.toml."""
 
     settings: VehicleSettings
-    trajectory_file: Path
+    trajectory_file: Path  # it is not looked for until a command needs it
     options: TrajectoryFileOptions
 
 

@@ -34,16 +34,10 @@ class FrameTimes:
     """What a times file says of frames, by their names.
 
     Entries that belong to no frame stand under what they are called in the file.
-
-    Attributes
-    ----------
-    time_s : mapping of str to float
-        Unix UTC [s].
-    rotation : mapping of str to SceneRotation
-        Of the scene at that time: the camera's rates about its axes, turned round.
     """
 
-    time_s: Mapping[str, float]
+    time_s: Mapping[str, float]  # Unix UTC [s]
+    # of the scene at that time: the camera's rates about its axes, turned round
     rotation: Mapping[str, SceneRotation] = field(default_factory=dict)
 
 

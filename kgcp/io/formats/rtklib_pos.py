@@ -25,24 +25,14 @@ _SEXAGESIMAL = "d'\""  # degrees, minutes, seconds in three cells
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The rows of a solution file.
-
-    Attributes
-    ----------
-    lines : tuple of int
-        Line of each row in the file, from 1.
-    time_s : (n,) array
-        Unix time, UTC [s].
-    columns : mapping of (n,) arrays
-        By the header's names without units, angles in degrees: `latitude`, `x-ecef`, `sdn`, ….
-    datum, heights : str
-        From the header, `WGS84` and `ellipsoidal`; empty where it has neither.
-    """
+    """The rows of a solution file."""
 
     path: Path
-    lines: tuple[int, ...]
-    time_s: FloatArray
+    lines: tuple[int, ...]  # line of each row in the file, from 1
+    time_s: FloatArray  # (n,): Unix time, UTC [s]
+    # by the header's names without units, angles in degrees: `latitude`, `x-ecef`, `sdn`, …
     columns: Mapping[str, FloatArray]
+    # from the header, `WGS84` and `ellipsoidal`; empty where it has neither
     datum: str
     heights: str
 

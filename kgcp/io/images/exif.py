@@ -29,15 +29,9 @@ _RELATIVE_ALTITUDE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """Exposure and time of one frame; None where the tag is absent or makes no sense.
+    """Exposure and time of one frame; None where the tag is absent or makes no sense."""
 
-    Attributes
-    ----------
-    time_s : float or None
-        Unix seconds (UTC) of DateTimeOriginal: when the camera says it took the frame.
-    exposure : ExposureSettings
-    """
-
+    # Unix seconds (UTC) of DateTimeOriginal: when the camera says it took the frame
     time_s: float | None = None
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
 

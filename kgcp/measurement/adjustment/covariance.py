@@ -46,18 +46,11 @@ _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCovariance:
-    """Covariance of a pose.
+    """Covariance of a pose."""
 
-    Attributes
-    ----------
-    pose_cov : (6, 6) array
-        Translation [m] and rotation vector [rad], left perturbation in the camera frame.
-    inflation : float
-        Mean ratio of these variances to those of independent residuals.
-    """
-
+    # (6, 6): translation [m] and rotation vector [rad], left perturbation in the camera frame
     pose_cov: FloatArray
-    inflation: float
+    inflation: float  # mean ratio of these variances to those of independent residuals
 
 
 def pose_covariance(fit: TargetFit) -> PoseCovariance:

@@ -32,39 +32,21 @@ class AtKnots(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelEquations:
-    """The equations of one linearisation, the levels eliminated.
+    """The equations of one linearisation, the levels eliminated."""
 
-    Attributes
-    ----------
-    scaled : (p, n) array
-        Jacobian by all else, in units of the noise.
-    normal : (p, p) array
-        N, priors included.
-    at_knots : AtKnots
-    by_level : (2, n) array
-        Derivatives by the levels of ink and of plate, in units of the noise.
-    count : int
-        Of the knots.
-    used : (q,) array of int
-        The values that some pixel depends on: of ink at all knots, then of plate.
-    root : (q, q) array
-        Lower Cholesky factor of C.
-    mixed, projected : (p, q) array
-        B, and B C⁻¹.
-    precision : (q,) array
-        Of the levels' prior.
-    """
-
-    scaled: FloatArray
-    normal: FloatArray
+    scaled: FloatArray  # (p, n): Jacobian by all else, in units of the noise
+    normal: FloatArray  # (p, p): n, priors included
     at_knots: AtKnots
+    # (2, n): derivatives by the levels of ink and of plate, in units of the noise
     by_level: FloatArray
-    count: int
+    count: int  # of the knots
+    # (q,): the values that some pixel depends on: of ink at all knots, then of plate
     used: IndexArray
-    root: FloatArray
+    root: FloatArray  # (q, q): lower Cholesky factor of C
+    # (p, q): b, and B C⁻¹
     mixed: FloatArray
     projected: FloatArray
-    precision: FloatArray
+    precision: FloatArray  # (q,): of the levels' prior
 
     def gradient_of_levels(self, score: FloatArray, values: FloatArray) -> FloatArray:
         """Return the gradient (q,) by the levels, at their `values` (2, k)."""

@@ -47,24 +47,13 @@ _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPlate:
-    """A window under an approximate pose, blur and light.
-
-    Attributes
-    ----------
-    problem : FitProblem
-    metres_per_px : float
-        Largest length on the plate that a pixel spans.
-    blur : Blur
-    spread : (3,) array
-        By `blur_on_plate`.
-    unblurred : UnblurredPlate
-        Under every pixel, with small discs and edges in reach by `see_plate`.
-    """
+    """A window under an approximate pose, blur and light."""
 
     problem: FitProblem
-    metres_per_px: float
+    metres_per_px: float  # largest length on the plate that a pixel spans
     blur: Blur
-    spread: FloatArray
+    spread: FloatArray  # (3,): by `blur_on_plate`
+    # under every pixel, with small discs and edges in reach by `see_plate`
     unblurred: UnblurredPlate
 
     def dilated(self, pixels: BoolArray, kernel: GreyArray) -> BoolArray:

@@ -21,22 +21,13 @@ _DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
-    """Which parameters are estimated, and what is known of them beforehand.
+    """Which parameters are estimated, and what is known of them beforehand."""
 
-    Attributes
-    ----------
-    free : (p,) array of int
-        Estimated parameters, by `Param`.
-    mean, precision : (23,) array
-        Independent normal priors on the nuisance parameters; precision 0: none.
-    free_precision : (p,) array
-        Of the estimated parameters.
-    """
-
-    free: IndexArray
+    free: IndexArray  # (p,): estimated parameters, by `Param`
+    # (23,): independent normal priors on the nuisance parameters; precision 0: none
     mean: FloatArray
     precision: FloatArray
-    free_precision: FloatArray
+    free_precision: FloatArray  # (p,): of the estimated parameters
 
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""

@@ -23,21 +23,11 @@ _MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """A pose, a blur and a light, as the numbers that the adjustment works with.
+    """A pose, a blur and a light, as the numbers that the adjustment works with."""
 
-    Attributes
-    ----------
-    matrix : (3, 4) array
-        Of the pose: rotation and translation [m], target → camera.
-    vector : (23,) array
-        All others in the order of `Param`, with zeros for the pose.
-    field : LightField, optional
-        Of light that is not the same everywhere.
-    """
-
-    matrix: FloatArray
-    vector: FloatArray
-    field: LightField | None = None
+    matrix: FloatArray  # (3, 4): of the pose: rotation and translation [m], target → camera
+    vector: FloatArray  # (23,): all others in the order of `Param`, with zeros for the pose
+    field: LightField | None = None  # of light that is not the same everywhere
 
     @staticmethod
     def of(pose: Pose, blur: Blur, light: Light) -> Parameters:

@@ -45,28 +45,13 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """The pixels that take part, chosen for an approximate pose and blur.
-
-    Attributes
-    ----------
-    problem : FitProblem
-    index : (n,) array of int
-        The pixels, in the flattened window.
-    is_thinned : bool
-        There would be more.
-    levels : (n,) array
-    rays : (6, n) array
-        As in `Window`.
-    photometry : PhotometricModel
-    censoring : Censoring
-    incidence : EdgeIncidence
-    """
+    """The pixels that take part, chosen for an approximate pose and blur."""
 
     problem: FitProblem
-    index: IndexArray
-    is_thinned: bool
-    levels: FloatArray
-    rays: FloatArray
+    index: IndexArray  # (n,): the pixels, in the flattened window
+    is_thinned: bool  # there would be more
+    levels: FloatArray  # (n,)
+    rays: FloatArray  # (6, n): as in `Window`
     photometry: PhotometricModel
     censoring: Censoring
     incidence: EdgeIncidence

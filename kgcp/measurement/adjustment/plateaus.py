@@ -35,27 +35,13 @@ _LEAST_BY_INK, _MOST_BY_INK = -0.1, 0.6  # change of ink by that of plate: shade
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plateaus:
-    """Levels of ink and plate all over a window, from where they are seen.
+    """Levels of ink and plate all over a window, from where they are seen."""
 
-    Attributes
-    ----------
-    levels : (2, n) array
-        Of ink and of plate, at every pixel.
-    typical : tuple of two floats
-        Medians.
-    extremes : tuple of two floats
-        The darkest ink and the brightest plate, smoothed.
-    uneven : float
-        How much they vary, of the contrast.
-    flat : tuple of two (m,) arrays of int
-        Pixels of ink and plate clear of edges.
-    """
-
-    levels: FloatArray
-    typical: tuple[float, float]
-    extremes: tuple[float, float]
-    uneven: float
-    flat: tuple[IndexArray, IndexArray]
+    levels: FloatArray  # (2, n): of ink and of plate, at every pixel
+    typical: tuple[float, float]  # medians
+    extremes: tuple[float, float]  # the darkest ink and the brightest plate, smoothed
+    uneven: float  # how much they vary, of the contrast
+    flat: tuple[IndexArray, IndexArray]  # pixels of ink and plate clear of edges
 
     @property
     def is_uneven(self) -> bool:

@@ -20,44 +20,24 @@ _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """A window with a target in it, and what it is seen with.
-
-    Attributes
-    ----------
-    window : Window
-    circles : Circles
-        All circles of the plate.
-    measured_count : int
-        The first so many of them are measured; of the others only what they add there is modelled.
-    outer_radius_m, outer_radius_px : float
-        Of the ring that is measured.
-    centre_px : (2,) array
-        Approximate, raw image.
-    focal_px : float
-        Mean principal distance.
-    censoring : Censoring
-        Of the whole window.
-    tone : Tone
-    sharpening_px : float
-        σ of the unsharp mask to be modelled [px]; 0: none.
-    shutter : RollingShutter or None
-        What is known of the rotation is taken out of the window's rays; None: a global shutter.
-    visible : (m,) array of bool, or None
-        Where the target is seen, in equal steps about its normal from its +x axis on; None:
-        everywhere, as far as the search knows.
-    """
+    """A window with a target in it, and what it is seen with."""
 
     window: Window
-    circles: Circles
+    circles: Circles  # all circles of the plate
+    # the first so many of them are measured; of the others only what they add there is modelled
     measured_count: int
+    # of the ring that is measured
     outer_radius_m: float
     outer_radius_px: float
-    centre_px: FloatArray
-    focal_px: float
-    censoring: Censoring
+    centre_px: FloatArray  # (2,): approximate, raw image
+    focal_px: float  # mean principal distance
+    censoring: Censoring  # of the whole window
     tone: Tone
-    sharpening_px: float
+    sharpening_px: float  # σ of the unsharp mask to be modelled [px]; 0: none
+    # what is known of the rotation is taken out of the window's rays; None: a global shutter
     shutter: RollingShutter | None = None
+    # (m,): where the target is seen, in equal steps about its normal from its +x axis on; None:
+    # everywhere, as far as the search knows
     visible: BoolArray | None = None
 
     @property

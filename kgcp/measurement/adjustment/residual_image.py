@@ -31,25 +31,17 @@ _USUAL_BLUR_PX = 0.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualImage:
-    """Residuals around one target, in shares of the contrast between plate and ink.
+    """Residuals around one target, in shares of the contrast between plate and ink."""
 
-    Attributes
-    ----------
-    x0, y0 : int
-        The first pixel's place in the frame [px].
-    share : (height, width) array
-        Model less grey value; NaN off the ring and its border, as far as that is plate.
-    edge_noise : float
-        Their median size near edges, without what lies hidden.
-    white : (height, width) array or None
-        Where the light is uneven, the level of white that was fitted, in shares of its largest
-        value on the plate; NaN where `share` is.
-    """
-
+    # the first pixel's place in the frame [px]
     x0: int
     y0: int
+    # (height, width): model less grey value; NaN off the ring and its border, as far as that is
+    # plate
     share: FloatArray
-    edge_noise: float
+    edge_noise: float  # their median size near edges, without what lies hidden
+    # (height, width): where the light is uneven, the level of white that was fitted, in shares of
+    # its largest value on the plate; NaN where `share` is
     white: FloatArray | None = None
 
 

@@ -39,51 +39,25 @@ _MAX_DAMPING = 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedImage:
-    """A sample under given parameters.
+    """A sample under given parameters."""
 
-    Attributes
-    ----------
-    points_m : (2, n) array
-        Where the pixels' rays meet the plate.
-    share : (n,) array
-        White share.
-    levels : (n,) array
-        Grey values before clipping.
-    """
-
-    points_m: FloatArray
-    share: FloatArray
-    levels: FloatArray
+    points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
+    share: FloatArray  # (n,): white share
+    levels: FloatArray  # (n,): grey values before clipping
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetFit:
-    """The state of an adjustment.
-
-    Attributes
-    ----------
-    sample : Sample
-    parameters : Parameters
-    prediction : PredictedImage
-    jacobian : (19, n), (23, n) or (25, n) array
-        As of `PhotometricModel.linearised`.
-    sd : (n,) array
-        Noise of every pixel, as level.
-    misfit : Misfit
-        Without the priors.
-    unknowns : Unknowns
-    varied : LevelEquations or None
-        Of levels that vary; None: the light is even.
-    """
+    """The state of an adjustment."""
 
     sample: Sample
     parameters: Parameters
     prediction: PredictedImage
-    jacobian: FloatArray
-    sd: FloatArray
-    misfit: Misfit
+    jacobian: FloatArray  # (19, n): as of `PhotometricModel.linearised`
+    sd: FloatArray  # (n,): noise of every pixel, as level
+    misfit: Misfit  # without the priors
     unknowns: Unknowns
-    varied: LevelEquations | None = None
+    varied: LevelEquations | None = None  # of levels that vary; None: the light is even
 
     @property
     def scaled_jacobian(self) -> FloatArray:

@@ -35,18 +35,12 @@ _HOPELESS, _UNLIKELY = 200.0, 40.0  # of log-likelihood: so bad a mirrored pose 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoPoses:
-    """The two poses of a circle, adjusted.
+    """The two poses of a circle, adjusted."""
 
-    Attributes
-    ----------
-    best, other : TargetFit
-        The better and the worse one, on the same pixels with the same noise.
-    even : TargetFit, optional
-        The better one before levels were let vary, which may hide a dot; None if they do not vary.
-    """
-
+    # the better and the worse one, on the same pixels with the same noise
     best: TargetFit
     other: TargetFit
+    # the better one before levels were let vary, which may hide a dot; None if they do not vary
     even: TargetFit | None = None
 
 

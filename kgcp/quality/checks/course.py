@@ -24,18 +24,10 @@ _MOST_EPOCHS = 20_000  # more tell nothing new
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """A vehicle while it moves, at n epochs.
+    """A vehicle while it moves, at n epochs."""
 
-    Attributes
-    ----------
-    course_deg : (n,) array
-        Direction of motion, clockwise from true north [deg].
-    attitude_deg : (n, 3) array
-        Roll, pitch, heading as the trajectory has them [deg].
-    """
-
-    course_deg: FloatArray
-    attitude_deg: FloatArray
+    course_deg: FloatArray  # (n,): direction of motion, clockwise from true north [deg]
+    attitude_deg: FloatArray  # (n, 3): roll, pitch, heading as the trajectory has them [deg]
 
     @property
     def median_off_deg(self) -> float:

@@ -79,22 +79,13 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """One thing that does not fit.
-
-    Attributes
-    ----------
-    sentence : str
-        What does not fit, with figures.
-    remedy : str
-        What to do, beginning with a verb.
-    figures : mapping of str to float
-        The numbers behind it, with their units in their names.
-    """
+    """One thing that does not fit."""
 
     code: Cause
     severity: Severity
-    sentence: str
-    remedy: str
+    sentence: str  # what does not fit, with figures
+    remedy: str  # what to do, beginning with a verb
+    # the numbers behind it, with their units in their names
     figures: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -32,52 +32,25 @@ _HELD_SHARE = 0.6  # of the encounters that a trial must have inside the traject
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Encounters:
-    """What is known in n frames of a moving target, as if some inputs were other ones.
-
-    Attributes
-    ----------
-    vehicle : Vehicle
-    camera : Camera
-    time_s : (n,) array
-        Of the target's row, by the trajectory's clock, ascending [s].
-    position_m : (n, 3) array
-        Trajectory point in the ENU frame [m]; NaN: not covered.
-    attitude_deg : (n, 3) array
-        Roll, pitch, heading [deg].
-    lever_arm_m : (3,) array
-        In body axes [m].
-    pixel : (n, 2) array
-        Measured centres [px].
-    in_camera_m : (n, 3) array
-        Measured centres in the camera frame [m].
-    camera_from_plate : (n, 3, 3) array
-        Measured attitude of the plate.
-    centre_m : (n, 3) array
-        Reference projection centres in the ENU frame [m].
-    enu_from_camera : (n, 3, 3) array
-    opk_deg : (n, 3) array
-        Reference attitude as the file has it.
-    variance_m2 : (n,) array
-        Of either coordinate of the difference of both places, by all stated standard
-        deviations, at least 1 cm² [m²].
-    frame_from_ned : (n, 3, 3) array
-        North, east, down where the vehicle was, in the ENU frame, as columns; the same for all
-        times that are tried.
-    """
+    """What is known in n frames of a moving target, as if some inputs were other ones."""
 
     vehicle: Vehicle
     camera: Camera
-    time_s: FloatArray
-    position_m: FloatArray
-    attitude_deg: FloatArray
-    lever_arm_m: FloatArray
-    pixel: FloatArray
-    in_camera_m: FloatArray
-    camera_from_plate: FloatArray
-    centre_m: FloatArray
-    enu_from_camera: FloatArray
-    opk_deg: FloatArray
+    time_s: FloatArray  # (n,): of the target's row, by the trajectory's clock, ascending [s]
+    position_m: FloatArray  # (n, 3): trajectory point in the ENU frame [m]; NaN: not covered
+    attitude_deg: FloatArray  # (n, 3): roll, pitch, heading [deg]
+    lever_arm_m: FloatArray  # (3,): in body axes [m]
+    pixel: FloatArray  # (n, 2): measured centres [px]
+    in_camera_m: FloatArray  # (n, 3): measured centres in the camera frame [m]
+    camera_from_plate: FloatArray  # (n, 3, 3): measured attitude of the plate
+    centre_m: FloatArray  # (n, 3): reference projection centres in the ENU frame [m]
+    enu_from_camera: FloatArray  # (n, 3, 3)
+    opk_deg: FloatArray  # (n, 3): reference attitude as the file has it
+    # (n,): of either coordinate of the difference of both places, by all stated standard
+    # deviations, at least 1 cm² [m²]
     variance_m2: FloatArray
+    # (n, 3, 3): north, east, down where the vehicle was, in the ENU frame, as columns; the same for
+    # all times that are tried
     frame_from_ned: FloatArray
 
     @classmethod

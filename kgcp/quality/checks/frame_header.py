@@ -20,35 +20,19 @@ _FOCUSED = 1.03  # what focusing makes of a focal length in EXIF
 
 @dataclass(frozen=True, slots=True)
 class FrameHeader:
-    """What the header of one frame says; None where it says nothing.
+    """What the header of one frame says; None where it says nothing."""
 
-    Attributes
-    ----------
-    frame : str
-        Path relative to the frames folder.
-    size_px : tuple of int or None
-        Width and height.
-    camera : str
-        Maker, model and serial number; empty: not known.
-    focal_mm, focal_35_mm : float or None
-        Focal length, and the one of a small-format camera with the same angle of view.
-    time_s : float or None
-        Unix UTC, as far as the header names its time zone [s].
-    longitude_deg, latitude_deg : float or None
-        Of the camera, WGS 84.
-    altitude_m : float or None
-        Above the take-off point.
-    """
-
-    frame: str
-    size_px: tuple[int, int] | None = None
-    camera: str = ""
+    frame: str  # path relative to the frames folder
+    size_px: tuple[int, int] | None = None  # width and height
+    camera: str = ""  # maker, model and serial number; empty: not known
+    # focal length, and the one of a small-format camera with the same angle of view
     focal_mm: float | None = None
     focal_35_mm: float | None = None
-    time_s: float | None = None
+    time_s: float | None = None  # Unix UTC, as far as the header names its time zone [s]
+    # of the camera, WGS 84
     longitude_deg: float | None = None
     latitude_deg: float | None = None
-    altitude_m: float | None = None
+    altitude_m: float | None = None  # above the take-off point
 
 
 def check_frames(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:

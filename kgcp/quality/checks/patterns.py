@@ -18,24 +18,12 @@ _LONE_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """A part of the disagreement.
+    """A part of the disagreement."""
 
-    Attributes
-    ----------
-    share : float
-        Of the squared offsets that it explains.
-    numbers : int
-        How many are fitted.
-    words : str
-        What it looks like, with its amount.
-    causes : str
-        What makes such a pattern.
-    """
-
-    share: float
-    numbers: int
-    words: str
-    causes: str
+    share: float  # of the squared offsets that it explains
+    numbers: int  # how many are fitted
+    words: str  # what it looks like, with its amount
+    causes: str  # what makes such a pattern
 
 
 def patterns(encounters: Encounters) -> tuple[Pattern, ...]:

@@ -29,24 +29,13 @@ _AXES = ("forward", "right", "down")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slip:
-    """One thing that may have been done wrong.
-
-    Attributes
-    ----------
-    group : str
-        Of two slips of one group, only one can have been made.
-    words : str
-        What seems to be wrong.
-    remedy : str
-        Beginning with a verb.
-    undone : callable
-        Returns the encounters as they would be without the slip.
-    """
+    """One thing that may have been done wrong."""
 
     code: Cause
-    group: str
-    words: str
-    remedy: str
+    group: str  # of two slips of one group, only one can have been made
+    words: str  # what seems to be wrong
+    remedy: str  # beginning with a verb
+    # returns the encounters as they would be without the slip
     undone: Callable[[Encounters], Encounters]
 
     @property
