@@ -27,7 +27,7 @@ class ReferenceSds:
     # of the camera's reference position, taken as independent from frame to frame [m]
     pose_m: float
     place_m: float  # of the trajectory, attitude included: an error that lasts for a while [m]
-    # of lever arm and synchronisation, or of a static target's position [m]: one error in all frames
+    # of lever arm and synchronisation, or of a static target's position [m]: the same in all frames
     common_m: float
 
     @property

@@ -106,6 +106,7 @@ def test_errors_are_as_large_as_reported(
         (Response.SRGB, Sensor(tone=ToneCurve.SRGB), 0.9),
         (Response.SRGB, Sensor(tone=ToneCurve.SRGB), 1.44),
         (Response.UNKNOWN, Sensor(), 0.9),
+        (Response.UNKNOWN, Sensor(tone=ToneCurve.SRGB), 0.9),
         (Response.UNKNOWN, FILM, 0.9),
         (Response.UNKNOWN, FILM, 0.5),
     ],
