@@ -51,7 +51,7 @@ paths = sorted(flight.frames_folder.rglob("*.*"), reverse=True)
 for method in (Method.PAPER, Method.MODEL):
     for path in paths:
         examine(read_grey(path, flight.camera), flight.camera, flight.targets,
-                DetectSettings(method=method), None)
+                DetectSettings(method=method))
 """
 
 
