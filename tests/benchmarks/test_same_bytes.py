@@ -47,5 +47,8 @@ def test_threads_and_jobs_change_no_byte(core: str | None, flight: Path, tmp_pat
     wanted = {"detections.parquet"} if is_other else {"kgcps.parquet", "bias_report.html"}
     assert wanted <= expected.keys()
     for number, other in enumerate(others):
-        hashes = process(flight, tmp_path / str(number), other, only_detects=is_other)
-        assert hashes == expected, other.name
+        only_detects = is_other or other.jobs > 0  # no other command has jobs
+        hashes = process(flight, tmp_path / str(number), other, only_detects=only_detects)
+        assert "detections.parquet" in hashes
+        assert hashes.items() <= expected.items(), other.name
+        assert only_detects or len(hashes) == len(expected)
