@@ -76,8 +76,13 @@ def judge_frame(index: int, shot: Shot, outcomes: Sequence[Outcome]) -> FrameVer
     wanted = len(shot.wanted)
     found = wanted - len(notes.missed) - len(notes.off)
     return FrameVerdict(
-        *(index, wanted, found, len(shot.decoys)),
-        *(tuple(notes.missed), tuple(notes.off), tuple(notes.wrong)),
+        index,
+        wanted,
+        found,
+        len(shot.decoys),
+        tuple(notes.missed),
+        tuple(notes.off),
+        tuple(notes.wrong),
     )
 
 

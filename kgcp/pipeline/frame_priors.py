@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -62,18 +63,19 @@ def _normals(
     time_s: Sequence[float | None],
     moving: Sequence[Target],
 ) -> list[NormalPrior | None]:
-    vehicle: Vehicle | None = None
-    level_sd_deg = None if flight.vehicle is None else flight.vehicle.settings.level_sd_deg
     if not moving or flight.vehicle is None:
         return [None] * len(frames)
+    level_sd_deg = flight.vehicle.settings.level_sd_deg
     try:
         poses = data.reference_poses if data.has_reference else None
-        if poses is not None and data.has_position_of(moving[0]):
-            vehicle = data.target_positions.vehicle
     except KgcpError:
-        if level_sd_deg is not None and data.has_reference:
+        if level_sd_deg is not None:
             raise
         return [None] * len(frames)
+    vehicle: Vehicle | None = None
+    if poses is not None and data.has_position_of(moving[0]):
+        with suppress(KgcpError):  # a plate that is said to be level does without a trajectory
+            vehicle = data.target_positions.vehicle
     attitudes = CameraAttitudes(poses, flight.plumb_sd_deg)
     return normal_priors(frames, time_s, attitudes, vehicle, level_sd_deg)
 

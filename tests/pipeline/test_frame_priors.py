@@ -47,6 +47,19 @@ def test_files_that_cannot_be_read_tell_nothing(tmp_path: Path) -> None:
     assert not any(priors(replace(flight, reference=None)).values())
 
 
+def test_a_plate_that_is_said_to_be_level_does_without_a_trajectory(tmp_path: Path) -> None:
+    flight = read_flight(SAMPLE)
+    assert flight.vehicle is not None
+    bad = tmp_path / "vehicle.csv"
+    bad.write_text("not,a,table\n", encoding="utf-8")
+    vehicle = replace(flight.vehicle, trajectory_file=bad)
+    assert not any(priors(replace(flight, vehicle=vehicle)).values())
+    level = replace(vehicle, settings=replace(vehicle.settings, level_sd_deg=1.5))
+    known = priors(replace(flight, vehicle=level))
+    assert all(prior.normal is not None for each in known.values() for prior in each.values())
+    assert all(known.values())
+
+
 @pytest.mark.parametrize("sd_deg_s", [5.0, 40.0])
 def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: float) -> None:
     flight = read_flight(SAMPLE)

@@ -17,7 +17,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt
 from tests.wrong_flights.flights import Flight, drone_pictures, flight, without_reference
 from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE
 
-SHARED = Path("/work/shared/flights")
+SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "flights"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -80,13 +80,13 @@ def _read_csv(file: ForeignFile, frames: Sequence[str]) -> FrameTimes:
             raise KgcpError(f"{file.path}, line {line}: {error}") from None
     if times and frames and times.keys().isdisjoint(frames):
         raise _no_common_name(file, [*times], frames)
-    return FrameTimes(times, dict(zip(times, _rotations(columns), strict=False)))
+    return FrameTimes(times, _rotations(columns, times))
 
 
-def _rotations(columns: CsvColumns) -> list[SceneRotation]:
-    """Return the rotation of the scene in every row; nothing if the file has no rates."""
+def _rotations(columns: CsvColumns, frames: Iterable[str]) -> dict[str, SceneRotation]:
+    """Return the rotation of the scene by frame; nothing if the file has no rates."""
     if not set(_RATES) & set(columns.names):
-        return []
+        return {}
     absent = [name for name in _RATES if name not in columns.names]
     if absent:
         raise KgcpError(
@@ -95,12 +95,11 @@ def _rotations(columns: CsvColumns) -> list[SceneRotation]:
         )
     sds = columns.deviations((_SD_RATE,))
     sd_rad_s = np.radians(np.full(len(columns.lines), _SD_RATE_DEG_S) if sds is None else sds[:, 0])
-    return [
-        SceneRotation((-x, -y, -z), sd)
-        for (x, y, z), sd in zip(
-            np.radians(columns.block(_RATES)).tolist(), sd_rad_s.tolist(), strict=True
-        )
-    ]
+    rates_rad_s = np.radians(columns.block(_RATES)).tolist()
+    return {
+        frame: SceneRotation((-x, -y, -z), sd)
+        for frame, (x, y, z), sd in zip(frames, rates_rad_s, sd_rad_s.tolist(), strict=True)
+    }
 
 
 def _no_common_name(file: ForeignFile, names: Sequence[str], frames: Sequence[str]) -> KgcpError:

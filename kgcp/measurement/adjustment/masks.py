@@ -151,8 +151,15 @@ def background_mask(seen: SeenPlate, light: Light, slack_px: float = 0.0) -> Boo
     black, white = plateau_levels(light, problem.tone)
     foreign = np.empty(len(unblurred.rho_m), dtype=np.bool_)
     if not _mark_foreign(
-        *(problem.window.smooth, unblurred.points_m, unblurred.rho_m, seen.spread, black, white),
-        *(problem.outer_radius_m, blur.largest_sd_px * scale, slack_px * scale),
+        problem.window.smooth,
+        unblurred.points_m,
+        unblurred.rho_m,
+        seen.spread,
+        black,
+        white,
+        problem.outer_radius_m,
+        blur.largest_sd_px * scale,
+        slack_px * scale,
         foreign,
     ):
         return foreign
@@ -224,15 +231,15 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     black, white = plateau_levels(light, problem.tone)
     contrast, scale = min(white, 1.0) - black, seen.metres_per_px
     found, tested = _mark_other(
-        *(
-            problem.window.smooth,
-            unblurred.share,
-            unblurred.off_edge_m,
-            unblurred.rho_m,
-            black,
-            contrast,
-        ),
-        *(problem.outer_radius_m, slack_px * scale, sd_px * scale),
+        problem.window.smooth,
+        unblurred.share,
+        unblurred.off_edge_m,
+        unblurred.rho_m,
+        black,
+        contrast,
+        problem.outer_radius_m,
+        slack_px * scale,
+        sd_px * scale,
         other,
     )
     if found:

@@ -87,8 +87,15 @@ def gauss_newton_step(
         `POOR_FIT` if the equations cannot be solved.
     """
     damped, gradient = _damped_equations(
-        *(scaled, current.score, normal, damping, parameters.matrix[:, 3]),
-        *(parameters.vector, unknowns.mean, unknowns.precision, unknowns.free),
+        scaled,
+        current.score,
+        normal,
+        damping,
+        parameters.matrix[:, 3],
+        parameters.vector,
+        unknowns.mean,
+        unknowns.precision,
+        unknowns.free,
     )
     _, solution, failure = dposv(damped.T, gradient)  # LAPACK itself: they are small and many
     promised = 0.5 * float(gradient @ solution)

@@ -153,9 +153,13 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArr
     limit = 1.0 + min(_BORDER_RADII, border_px / problem.outer_radius_px)
     index = np.empty(len(unused), dtype=np.intp)
     count = _choose(
-        *(seen.unblurred.rho_m, seen.unblurred.off_measured_m, unused),
-        *((_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale, tail_m),
-        *(_unmeasured_m(seen), limit * problem.outer_radius_m),
+        seen.unblurred.rho_m,
+        seen.unblurred.off_measured_m,
+        unused,
+        (_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale,
+        tail_m,
+        _unmeasured_m(seen),
+        limit * problem.outer_radius_m,
         plateau,
         index,
     )

@@ -10,10 +10,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, added_levels
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, Param
+from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, SKEW_PARAMS
 from kgcp.measurement.image_model.skew import skew_rows
 
-_SKEW = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
 _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
 # have 13 at most, the 14 of light/lens 35 and more.
@@ -22,10 +21,10 @@ _ASKS = 25.0
 
 def asks_for_skew(fit: TargetFit) -> bool:
     """Tell whether third moments would take more of the residuals than chance (score test)."""
-    if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= _SKEW[0]:
+    if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= SKEW_PARAMS[0]:
         return False
     scaled = np.vstack((fit.scaled_jacobian, _by_skew(fit) / fit.sd))
-    precision = np.append(fit.unknowns.free_precision, np.zeros(len(_SKEW)))
+    precision = np.append(fit.unknowns.free_precision, np.zeros(len(SKEW_PARAMS)))
     normal = normal_matrix(scaled, fit.misfit, replace(fit.unknowns, free_precision=precision))
     count = len(fit.unknowns.free)
     score = scaled[count:] @ fit.misfit.score
@@ -43,14 +42,14 @@ def _by_skew(fit: TargetFit) -> FloatArray:
     by_geometry = np.vstack((np.zeros((GEOMETRY_ROWS, rows.shape[1])), rows))
     share = WhiteShare(fit.prediction.points_m, fit.prediction.share, by_geometry)
     added = added_levels(sample, parameters)
-    return sample.photometry.linearised(share, parameters.light, added)[1][_SKEW]
+    return sample.photometry.linearised(share, parameters.light, added)[1][SKEW_PARAMS]
 
 
 def with_skew(unknowns: Unknowns) -> Unknowns:
     """Return the unknowns with the third moments among them."""
-    free = np.append(unknowns.free, _SKEW)
+    free = np.append(unknowns.free, SKEW_PARAMS)
     precision = unknowns.precision.copy()
-    precision[_SKEW] = _SKEW_SD_PX3**-2
+    precision[SKEW_PARAMS] = _SKEW_SD_PX3**-2
     return Unknowns(free, unknowns.mean, precision, precision[free])
 
 

@@ -144,7 +144,7 @@ def srgb_slope(light: FloatArray) -> FloatArray:
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
-_SKEW = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
+SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
 _SHARE_STEPS = 400
 GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
@@ -248,7 +248,7 @@ class PhotometricModel:
         if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
             rows += _STREAK_ROWS
         if len(jacobian) > PLAIN_COUNT and jacobian[Param.SKEW_XXX].any():
-            for row in _SKEW:
+            for row in SKEW_PARAMS:
                 jacobian[row] += light.sharpening * mask.detail(jacobian[row], 0.0, 0.0)
         others = (1.0, 1.0)
         if self.tone.is_srgb:
