@@ -29,7 +29,7 @@ from kgcp.measurement.adjustment.solver import adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, decoded
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone, decoded
 from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
@@ -37,6 +37,30 @@ _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are le
 
 
 def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
+    """Adjust both poses; with an unknown tone over sRGB's curve and over a straight line.
+
+    Three shapes hold curves near either of them. The likelier one is returned; which one it is
+    stands in its fits' problem.
+
+    Raises
+    ------
+    Rejection
+        As `_fit_in_any_light`, if neither leads anywhere.
+    """
+    if problem.tone is not Tone.UNKNOWN:
+        return _fit_in_any_light(problem, pose, blur)
+    fits = []
+    for tone in (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE):
+        try:
+            fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur))
+        except Rejection as rejection:
+            failure = rejection
+    if not fits:
+        raise failure
+    return min(fits, key=lambda both: loss_per_pixel(both.best))
+
+
+def _fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
     """Adjust both poses by the plain model, and by what its residuals ask for beyond it.
 
     Raises

@@ -76,7 +76,7 @@ def measure_by_model(
     problem = replace(problem, visible=visible)
     poses = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
     if prior.normal is not None:
-        poses = choose_by_prior(problem, poses, prior.normal)
+        poses = choose_by_prior(poses.best.sample.problem, poses, prior.normal)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
     if poses.even is not None:

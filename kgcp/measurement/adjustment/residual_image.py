@@ -77,6 +77,7 @@ def residual_image_of(
     if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and asks_for_levels(fit):
         best = fit_in_any_light(problem, pose, start.blur).best
         fit = best if best.parameters.field is not None else fit
+    problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
     parameters = fit.parameters.at(pose)
     light = parameters.light
     sample = whole_plate(problem, pose, parameters.blur, light)

@@ -36,6 +36,7 @@ _OF_TONE = {
     Tone.LINEAR: [],
     Tone.SRGB: [Param.SHARPENING],
     Tone.UNKNOWN: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
+    Tone.UNKNOWN_FROM_LINE: [Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING],
     Tone.OF_BINS: [Param.TONE_1],  # how far edges are displaced; their shape is that of the bins
 }
 

@@ -27,6 +27,7 @@ class Tone(Enum):
     LINEAR = auto()
     SRGB = auto()
     UNKNOWN = auto()  # sRGB, of light that three parameters shape: usual cameras are near it
+    UNKNOWN_FROM_LINE = auto()  # the same over a straight line: some curves are nearer to that
     OF_BINS = auto()  # a straight line that they shape: bins leave of a curve what displaces edges
 
     @staticmethod
@@ -42,7 +43,7 @@ class Tone(Enum):
     @property
     def is_shaped(self) -> bool:
         """Whether the tone parameters take part."""
-        return self in {Tone.UNKNOWN, Tone.OF_BINS}
+        return self in {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE, Tone.OF_BINS}
 
 
 class Param(IntEnum):
