@@ -30,15 +30,16 @@ from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.records import Uncertainty
 
 _ARC_PX = 6.0
+_UNEVEN_ARC_PX = 12.0  # where levels vary: stains leave residuals that go together over their knots
 _ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
 _LEAST_LEFT = 0.25  # of the scatter, after the fit
 _VECTOR = 4  # numbers that the processor takes at once
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
 _TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
-# The variance of plates with a shadow's edge across them, by what residuals show of it: errors of
-# 15 rendered plates (R 13-110 px, 45 % of the light left) were twice as large as residuals say.
-_ACROSS_SHADOW = 3.5
+# The variance where levels vary, by what residuals show of it, with and without a shadow's edge
+# across the plate: the errors of 240 simulated plates (R 14-100 px; shadows, dirt, highlights).
+_ACROSS_SHADOW, _UNDER_UNEVEN_LIGHT = 3.5, 1.4
 _SKEW_SHARE = 0.25  # of what a skew spread displaces: beyond its third moment nothing is known
 _COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
@@ -85,8 +86,8 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
     pose_cov = half @ half.T + shifts @ shifts.T
     field, depth_m = fit.parameters.field, fit.parameters.matrix[2, 3]
-    if field is not None and len(field.edges):
-        pose_cov *= _ACROSS_SHADOW
+    if field is not None:
+        pose_cov *= _ACROSS_SHADOW if len(field.edges) else _UNDER_UNEVEN_LIGHT
     if fit.parameters.has_skew:
         across_m = _skew_displacement_px(fit) * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
@@ -167,7 +168,8 @@ def _nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
     problem = fit.sample.problem
     circles = problem.circles.part(slice(0, problem.measured_count))
     px_per_m = problem.outer_radius_px / problem.outer_radius_m
-    counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / _ARC_PX))
+    arc_px = _ARC_PX if fit.varied is None else _UNEVEN_ARC_PX
+    counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / arc_px))
     return _number_arcs(fit.prediction.points_m, circles.centres_m, circles.radii_m, counts)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -32,6 +33,12 @@ class Unknowns:
     def penalty(self, parameters: Parameters) -> float:
         """Return the priors' part of the negative log-likelihood."""
         return _penalty(parameters.vector, self.mean, self.precision)
+
+    def step_of(self, solution: FloatArray) -> FloatArray:
+        """Return the step (23,) by all parameters, of that by the estimated ones (p,)."""
+        step = np.zeros(PARAM_COUNT)
+        step[self.free] = solution
+        return step
 
 
 def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
@@ -71,39 +78,72 @@ def _normal_matrix(scaled: FloatArray, weight: FloatArray, precision: FloatArray
     return normal
 
 
-def gauss_newton_step(
-    scaled: FloatArray,
-    normal: FloatArray,
-    current: Misfit,
-    parameters: Parameters,
-    unknowns: Unknowns,
-    damping: float,
+class Equations(Protocol):
+    """The normal equations of one linearisation."""
+
+    def proposed(
+        self, current: Misfit, parameters: Parameters, damping: float
+    ) -> tuple[Parameters, float]:
+        """Return the parameters after a damped step, and the gain that the step promises.
+
+        Raises
+        ------
+        Rejection
+            `POOR_FIT` if the equations cannot be solved.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlainEquations:
+    """The equations of pose, blur and light."""
+
+    scaled: FloatArray  # (p, n): Jacobian, in units of the noise
+    normal: FloatArray  # (p, p): priors included
+    unknowns: Unknowns
+
+    @staticmethod
+    def of(
+        jacobian: FloatArray, sd: FloatArray, current: Misfit, unknowns: Unknowns
+    ) -> PlainEquations:
+        """Make the equations of a Jacobian by all parameters, with the noise (n,)."""
+        scaled = scaled_rows(jacobian, unknowns.free, sd)
+        return PlainEquations(scaled, normal_matrix(scaled, current, unknowns), unknowns)
+
+    def proposed(
+        self, current: Misfit, parameters: Parameters, damping: float
+    ) -> tuple[Parameters, float]:
+        """Return the parameters after a damped step, and the gain that the step promises."""
+        unknowns = self.unknowns
+        damped, gradient = _damped_equations(
+            self.scaled,
+            current.score,
+            self.normal,
+            damping,
+            parameters.matrix[:, 3],
+            parameters.vector,
+            unknowns.mean,
+            unknowns.precision,
+            unknowns.free,
+        )
+        solution, promised = solve_damped(damped, gradient)
+        return parameters.moved(unknowns.step_of(solution)), promised
+
+
+def solve_damped(
+    damped: FloatArray, gradient: FloatArray, gain_besides: float = 0.0
 ) -> tuple[FloatArray, float]:
-    """Return a step (23,) and the gain that it promises.
+    """Return the solution of symmetric equations, and the gain that it promises.
 
     Raises
     ------
     Rejection
         `POOR_FIT` if the equations cannot be solved.
     """
-    damped, gradient = _damped_equations(
-        scaled,
-        current.score,
-        normal,
-        damping,
-        parameters.matrix[:, 3],
-        parameters.vector,
-        unknowns.mean,
-        unknowns.precision,
-        unknowns.free,
-    )
     _, solution, failure = dposv(damped.T, gradient)  # LAPACK itself: they are small and many
-    promised = 0.5 * float(gradient @ solution)
+    promised = 0.5 * float(gradient @ solution) + gain_besides
     if failure or not math.isfinite(promised):
         raise Rejection(Reason.POOR_FIT, "singular normal equations")
-    step = np.zeros(PARAM_COUNT)
-    step[unknowns.free] = solution
-    return step, promised
+    return solution, promised
 
 
 @compiled

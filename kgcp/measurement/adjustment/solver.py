@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.level_equations import LevelEquations
 from kgcp.measurement.adjustment.normal_equations import (
+    Equations,
+    PlainEquations,
     Unknowns,
-    gauss_newton_step,
-    normal_matrix,
     scaled_rows,
 )
 from kgcp.measurement.adjustment.parameters import Parameters
@@ -22,6 +23,8 @@ from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, 
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
 from kgcp.measurement.image_model.photometry import Param
 from kgcp.measurement.image_model.skew import skew_rows
+
+EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
 _MAX_ROUNDS = 4
 _EARLY_STEPS, _STEPS = 4, 8
@@ -67,9 +70,7 @@ class TargetFit:
     @property
     def total(self) -> float:
         """Negative log-likelihood with the priors."""
-        field = self.parameters.field
-        of_field = 0.0 if field is None else field.penalty
-        return self.misfit.total + self.unknowns.penalty(self.parameters) + of_field
+        return _total(self.misfit, self.unknowns, self.parameters)
 
 
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
@@ -223,35 +224,36 @@ def minimise(
     steps: int,
     enough: float,
     linear: tuple[PredictedImage, FloatArray] | None = None,
+    large_change: float = _LARGE_CHANGE,
     pauses: bool = False,
+    equations_of: EquationsOf | None = None,
 ) -> TargetFit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
     At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
-    anew only while steps are large, and the normal matrix with it: near the minimum they hardly
-    change, and cost most. With `pauses`, one that is made anew ends it.
+    anew only while steps change the grey values by more than the share `large_change` of the
+    contrast, and the equations with it: near the minimum they hardly change, and cost most. With
+    `pauses`, a Jacobian that is made anew ends it. `equations_of` makes the equations at some
+    parameters; None: those of pose, blur and light.
     """
     damping, light = _DAMPING, parameters.light
     contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
     relative_sd = float(sd.mean()) / contrast
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
-    scaled = scaled_rows(jacobian, unknowns.free, sd)
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
-    total = current.total + unknowns.penalty(parameters)
-    normal = normal_matrix(scaled, current, unknowns)
+    total = _total(current, unknowns, parameters)
+    equations_of = equations_of or _plain_equations_of(sd, unknowns)
+    equations = equations_of(parameters, jacobian, current)
     for number in range(steps):
         while True:
-            step, promised = gauss_newton_step(
-                scaled, normal, current, parameters, unknowns, damping
-            )
-            candidate = parameters.moved(step)
+            candidate, promised = equations.proposed(current, parameters, damping)
             change = relative_sd * math.sqrt(2.0 * promised / len(sd))
-            if change > _LARGE_CHANGE and number < steps - 1:
+            if change > large_change and number < steps - 1:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian
             trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
-            trial_total = trial.total + unknowns.penalty(candidate)
+            trial_total = _total(trial, unknowns, candidate)
             is_better = trial_total <= total + _NEGLIGIBLE
             if is_better or promised < enough or damping > _MAX_DAMPING:
                 break
@@ -262,11 +264,20 @@ def minimise(
         parameters, prediction, current = candidate, attempt, trial
         if attempt_jacobian is not jacobian:
             jacobian = attempt_jacobian
-            scaled = scaled_rows(jacobian, unknowns.free, sd)
             if pauses:
                 break
-            normal = normal_matrix(scaled, current, unknowns)
+            equations = equations_of(parameters, jacobian, current)
         damping = max(0.1 * damping, 1e-9)
         if gain < enough or abs(gain - promised) < _AS_PROMISED:
             break
     return TargetFit(sample, parameters, prediction, jacobian, sd, current, unknowns)
+
+
+def _plain_equations_of(sd: FloatArray, unknowns: Unknowns) -> EquationsOf:
+    return lambda _, jacobian, current: PlainEquations.of(jacobian, sd, current, unknowns)
+
+
+def _total(current: Misfit, unknowns: Unknowns, parameters: Parameters) -> float:
+    """Return the negative log-likelihood with all priors."""
+    of_field = 0.0 if parameters.field is None else parameters.field.penalty
+    return current.total + unknowns.penalty(parameters) + of_field
