@@ -1,0 +1,264 @@
+"""Outlines of all discs and rings of a photograph: contours, edges along rays, ellipses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.ellipse_fit import fit_ellipses
+from kgcp.measurement.discs.blobs import find_blobs
+from kgcp.measurement.discs.edge_points import (
+    DIRECTIONS,
+    RAYS,
+    mark_inliers,
+    sample_edges,
+)
+from kgcp.measurement.discs.records import (
+    DiscOutline,
+    Polarity,
+    ellipse_of_moments,
+)
+
+# Tuning, as in `blobs`.
+_REACHES = (0.45, 0.25, 0.2)  # of the radius that edges are looked for in, pass by pass, …
+_LEAST_REACHES_PX = (2.0, 1.5, 1.5)  # … or so many pixels
+_MOST_REACH_PX = 12.0
+_LIMIT_PX, _LIMIT = 0.5, 0.04  # distance of an edge point that counts: pixels, and of the radius
+_LEAST_INLIERS = 0.8
+_RESIDUAL_PX, _RESIDUAL = 0.3, 0.012  # largest root mean square: pixels, and of the radius
+_LEAST_SEMI_AXIS_PX = 1.5
+_MOST_ASPECT = 4.0
+_LEAST_CONTRAST = 0.03  # of the grey values' range
+_NEAR, _ALIKE = 0.3, 1.25  # centres, of the radius, and ratio of radii of one and the same edge
+_CONCENTRIC = 0.2  # of the larger radius: how far the centre of a hole may be off
+_LARGEST_HOLE = 0.95  # of the radius
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edges:
+    """Ellipses through edge points, for n candidates."""
+
+    ellipses: FloatArray  # (n, 5): centre and symmetric stretch
+    shares: FloatArray  # (n,): of the rays whose edge is on the ellipse
+    residual_px: FloatArray  # (n,)
+    contrast: FloatArray  # (n,): of the grey values' range
+
+
+def find_outlines(grey: GreyArray) -> tuple[DiscOutline, ...]:
+    """Find the edges of all discs, rings and holes in a photograph, of both polarities.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Grey values of 8 or 16 bits, or floats in 0…1.
+
+    Returns
+    -------
+    tuple of DiscOutline
+        From top to bottom and left to right. Each edge of a ring has an outline of its own.
+    """
+    blobs, polarities = find_blobs(grey)
+    return _nested(_follow(grey, blobs, polarities))
+
+
+def follow_outlines(
+    grey: GreyArray, guesses: Sequence[DiscOutline], reach_px: float = 3.0
+) -> tuple[DiscOutline | None, ...]:
+    """Look for edges where they must be; None where there is none.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    guesses : sequence of DiscOutline
+        Such as `DiscOutline.predicted`.
+    reach_px : float
+        How far an edge may be from its guess.
+    """
+    if not guesses:
+        return ()
+    ellipses = np.array([_stretched(each.ellipse) for each in guesses])
+    signs = np.array([_sign(each.polarity) for each in guesses])
+    # a guess may be off by its whole reach, wherever the edge is then nearer to the middle
+    reaches_px = [np.full(len(guesses), reach_px), None, None]
+    found = _edges_of(grey, ellipses, signs, reaches_px)
+    is_disc = _is_disc(found)
+    axes = _semi_axes(found.ellipses)
+    off_px = np.linalg.norm(found.ellipses[:, :2] - ellipses[:, :2], axis=1)
+    off_px = np.maximum(off_px, np.abs(axes - _semi_axes(ellipses)).max(axis=1))
+    return tuple(
+        replace(_outline(found, i, guess.polarity), hole=guess.hole, is_hole=guess.is_hole)
+        if is_disc[i] and off_px[i] <= reach_px
+        else None
+        for i, guess in enumerate(guesses)
+    )
+
+
+def _follow(
+    grey: GreyArray, ellipses: FloatArray, polarities: Sequence[Polarity]
+) -> list[DiscOutline]:
+    """Return outlines of candidates that are ellipses, the best of those that are the same."""
+    if not len(ellipses):
+        return []
+    signs = np.array([_sign(each) for each in polarities])
+    found = _edges_of(grey, ellipses, signs, [None] * len(_REACHES))
+    chosen = _distinct(found, signs, np.flatnonzero(_is_disc(found)))
+    return [_outline(found, i, polarities[i]) for i in chosen]
+
+
+def _sign(polarity: Polarity) -> float:
+    """Return the sign of the slope outwards."""
+    return 1.0 if polarity is Polarity.DARK else -1.0
+
+
+def _is_disc(found: _Edges) -> BoolArray:
+    """Tell which candidates (n,) have the edge of an ellipse."""
+    axes = _semi_axes(found.ellipses)
+    radius = np.sqrt(axes[:, 0] * axes[:, 1])
+    is_disc = found.shares >= _LEAST_INLIERS
+    is_disc &= found.residual_px <= np.hypot(_RESIDUAL_PX, _RESIDUAL * radius)
+    is_disc &= (axes[:, 1] >= _LEAST_SEMI_AXIS_PX) & (axes[:, 0] <= _MOST_ASPECT * axes[:, 1])
+    return np.asarray(is_disc & (found.contrast >= _LEAST_CONTRAST))
+
+
+def _outline(found: _Edges, i: int, polarity: Polarity) -> DiscOutline:
+    contrast, residual_px = float(found.contrast[i]), float(found.residual_px[i])
+    return DiscOutline(_ellipse(found.ellipses[i]), polarity, contrast, residual_px)
+
+
+def _edges_of(
+    grey: GreyArray,
+    ellipses: FloatArray,
+    signs: FloatArray,
+    reaches_px: Sequence[FloatArray | None],
+) -> _Edges:
+    """Fit ellipses to edges, in passes; each starts from the last and looks less far.
+
+    How far [px], is given for each pass, or goes with the radius.
+    """
+    image = np.ascontiguousarray(grey)
+    count = len(ellipses)
+    edges, strengths = np.empty((count, RAYS)), np.empty((count, RAYS))
+    levels = np.empty((count, 2, RAYS))
+    fitted, shares, residual_px = np.zeros((count, 5)), np.zeros(count), np.zeros(count)
+    for reach, least, given_px in zip(_REACHES, _LEAST_REACHES_PX, reaches_px, strict=True):
+        radius = np.sqrt(np.prod(_semi_axes(ellipses), axis=1))
+        reach_px = np.clip(reach * radius, least, _MOST_REACH_PX) if given_px is None else given_px
+        sample_edges(image, ellipses, signs, reach_px, edges, strengths, levels)
+        inlying = strengths > 0.25 * np.median(strengths, axis=1, keepdims=True)
+        # first around the ellipse itself, then twice around what was fitted
+        fit_ellipses(edges, inlying, DIRECTIONS, 2.0, fitted, shares)
+        for limit in (2.0, 1.0):
+            limits_px = limit * np.hypot(_LIMIT_PX, _LIMIT * radius)
+            fitted[shares == 0.0] = (0.0, 0.0, 1.0, 1.0, 0.0)
+            mark_inliers(edges, strengths, ellipses, fitted, limits_px, inlying, residual_px)
+            fit_ellipses(edges, inlying, DIRECTIONS, 2.0, fitted, shares)
+        fitted[shares == 0.0] = (0.0, 0.0, 1.0, 1.0, 0.0)
+        mark_inliers(edges, strengths, ellipses, fitted, limits_px, inlying, residual_px)
+        ellipses = _carried(ellipses, fitted)
+    contrast = _contrast(levels, inlying) / _full_scale(grey)
+    return _Edges(
+        ellipses, np.where(shares > 0.0, inlying.mean(axis=1), 0.0), residual_px, contrast
+    )
+
+
+def _full_scale(grey: GreyArray) -> float:
+    return float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
+
+
+def _contrast(levels: FloatArray, inlying: BoolArray) -> FloatArray:
+    """Return the median difference (n,) of the levels (n, 2, rays) beside edges that count."""
+    steps = np.where(inlying, np.abs(levels[:, 1] - levels[:, 0]), np.nan)
+    steps[~inlying.any(axis=1)] = 0.0
+    return np.asarray(np.nanmedian(steps, axis=1))
+
+
+def _carried(frames: FloatArray, fitted: FloatArray) -> FloatArray:
+    """Return ellipses (n, 5) fitted in the frames of others as centre and symmetric stretch."""
+    x, y, a, b, angle = fitted.T
+    stretch = _matrices(frames)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.stack((np.stack((c, -s), axis=-1), np.stack((s, c), axis=-1)), axis=-2)
+    carried = stretch @ turn * np.stack((a, b), axis=-1)[:, None, :]
+    square = carried @ np.swapaxes(carried, 1, 2)
+    # the symmetric root of a symmetric 2 × 2 matrix, by Cayley and Hamilton
+    area = np.sqrt(np.maximum(np.linalg.det(square), 1e-12))
+    trace = np.sqrt(np.trace(square, axis1=1, axis2=2) + 2.0 * area)
+    root = (square + area[:, None, None] * np.eye(2)) / trace[:, None, None]
+    centre = frames[:, :2] + np.einsum("nij,nj->ni", stretch, np.stack((x, y), axis=-1))
+    return np.column_stack((centre, root[:, 0, 0], root[:, 0, 1], root[:, 1, 1]))
+
+
+def _matrices(ellipses: FloatArray) -> FloatArray:
+    return ellipses[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+
+
+def _semi_axes(ellipses: FloatArray) -> FloatArray:
+    """Return the larger and the smaller semi-axis (n, 2)."""
+    xx, xy, yy = ellipses[:, 2:].T
+    mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    return np.column_stack((mean + half, np.maximum(mean - half, 0.0)))
+
+
+def _stretched(ellipse: Ellipse) -> FloatArray:
+    (xx, xy), (_, yy) = ellipse.stretch.tolist()
+    return np.array((ellipse.x, ellipse.y, xx, xy, yy))
+
+
+def _ellipse(values: FloatArray) -> Ellipse:
+    x, y, xx, xy, yy = values.tolist()
+    square = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
+    return ellipse_of_moments(np.array((x, y, *square)))
+
+
+def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[int]:
+    """Return the candidates, the best of those that follow the same edge, in reading order."""
+    best = sorted(candidates.tolist(), key=lambda i: (found.residual_px[i], i))
+    if not best:
+        return []
+    centres, radius = (
+        found.ellipses[best, :2],
+        found.ellipses[:, 2:].take((0, 2), axis=1).mean(axis=1),
+    )
+    tree, kept, taken = cKDTree(centres), [], np.zeros(len(best), np.bool_)
+    for place, i in enumerate(best):
+        if taken[place]:
+            continue
+        kept.append(i)
+        for other in tree.query_ball_point(centres[place], _NEAR * radius[i]):
+            j = best[other]
+            ratio = radius[j] / radius[i]
+            if signs[j] == signs[i] and 1.0 / _ALIKE < ratio < _ALIKE:
+                taken[other] = True
+    return sorted(kept, key=lambda i: (round(found.ellipses[i, 1]), found.ellipses[i, 0]))
+
+
+def _nested(outlines: list[DiscOutline]) -> tuple[DiscOutline, ...]:
+    """Return the outlines with their holes: concentric edges of the other polarity inside."""
+    if not outlines:
+        return ()
+    centres = np.array([each.ellipse.centre for each in outlines])
+    radii = np.array([each.ellipse.mean_radius for each in outlines])
+    tree, hole_of = cKDTree(centres), {}
+    for i, outline in enumerate(outlines):
+        inside = [
+            j
+            for j in tree.query_ball_point(centres[i], _CONCENTRIC * radii[i])
+            if radii[j] < _LARGEST_HOLE * radii[i]
+            and outlines[j].polarity is outline.polarity.other
+        ]
+        if inside:
+            hole_of[i] = max(inside, key=lambda j: radii[j])
+    holes = set(hole_of.values())
+    return tuple(
+        replace(
+            outline,
+            hole=outlines[hole_of[i]].ellipse if i in hole_of else None,
+            is_hole=i in holes,
+        )
+        for i, outline in enumerate(outlines)
+    )
