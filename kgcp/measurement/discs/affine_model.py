@@ -1,0 +1,176 @@
+"""The image of a disc in the affine form: no camera, an ellipse with five parameters.
+
+With the symmetric stretch M of the ellipse, u = M⁻¹ (p − c) makes the disc the unit circle. The
+blur B of the image is M⁻¹ B M⁻¹ there, so that `blurred_discs.render`, which blurs the circles of a
+coded target, blurs this one. Derivatives go back the same way: when M changes by dM, the disc moves
+past a pixel by M⁻¹ dM u, and the blur changes by −(M⁻¹ dM Σ + Σ dM M⁻¹).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.measurement.image_model.blur import REACH_SIGMAS, Blur
+from kgcp.measurement.image_model.blurred_discs import render
+from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.quadrature import quadrature_for
+from kgcp.measurement.image_model.ray_plate import PLATE_ROWS, SLOPE_ROWS
+
+_VIEW_ROWS = 6
+_SLACK_PX = 1.0  # what the edge may move before the pixels in reach are found anew
+_LEAST_SEMI_AXIS_PX = 0.4
+
+# x, y [px] and the stretch xx, xy, yy [px]
+Geometry = FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscPixels:
+    """n pixels of a photograph, as an edge of a disc divides them."""
+
+    places_px: FloatArray  # (2, n)
+    is_dark: bool  # whether the disc is darker than the ground
+    # (n,): white share of the pixels that the edge does not reach
+    background: FloatArray
+    starts: IndexArray  # (2,): 0, and the number of those that it reaches
+    members: IndexArray  # which these are
+    rule: float  # of integration
+
+    @classmethod
+    def of(
+        cls, places_px: FloatArray, geometry: Geometry, blur: Blur, *, is_dark: bool
+    ) -> DiscPixels:
+        """Find which pixels (2, n) feel the edge."""
+        smallest, _ = semi_axes(geometry)
+        sd_px = blur.largest_sd_px
+        rule = quadrature_for(
+            np.array([smallest / sd_px]), np.array([smallest / sharpest_px(blur)])
+        )
+        reach_px = REACH_SIGMAS * sd_px + _SLACK_PX
+        off_px = distances_px(places_px, geometry)
+        members = np.flatnonzero(np.abs(off_px) <= reach_px)
+        inside = (off_px < -reach_px).astype(np.float64)
+        background = 1.0 - inside if is_dark else inside
+        background[members] = 1.0 if is_dark else 0.0
+        starts = np.array([0, len(members)])
+        return cls(places_px, is_dark, background, starts, members, float(rule[0]))
+
+    def white_share(self, geometry: Geometry, blur: Blur) -> WhiteShare:
+        """Return the share of the brighter level in every pixel, with derivatives.
+
+        They are laid out as those of a plate: rows 0…4 by the geometry, row 5 zero, then by the
+        blur.
+        """
+        views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
+        _meet_disc(geometry, self.places_px, inverse, views)
+        on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
+        on_disc[0] = self.background
+        circle = np.array([[0.0, 0.0, 1.0, -1.0 if self.is_dark else 1.0, self.rule]])
+        render(views, blur.vector, circle, self.starts, self.members, on_disc)
+        slopes = np.empty((SLOPE_ROWS, views.shape[1]))
+        _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
+        return WhiteShare(views[:2], on_disc[0], slopes)
+
+
+def semi_axes(geometry: Geometry) -> tuple[float, float]:
+    """Return the smaller and the larger semi-axis [px]."""
+    _, _, xx, xy, yy = geometry.tolist()
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    return mean - half, mean + half
+
+
+def sharpest_px(blur: Blur) -> float:
+    """Return the standard deviation along the direction of the weakest blur [px]."""
+    xx, yy, xy = blur.total_covariance
+    least = 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+    return math.sqrt(max(least, 1e-6))
+
+
+def limited(geometry: Geometry) -> Geometry:
+    """Return a geometry that is an ellipse, whatever a step has made of it."""
+    smallest, _ = semi_axes(geometry)
+    if smallest >= _LEAST_SEMI_AXIS_PX:
+        return geometry
+    values, axes = np.linalg.eigh(geometry[[2, 3, 3, 4]].reshape(2, 2))
+    matrix = axes * np.maximum(values, _LEAST_SEMI_AXIS_PX) @ axes.T
+    return np.array((*geometry[:2], matrix[0, 0], matrix[0, 1], matrix[1, 1]))
+
+
+def distances_px(places_px: FloatArray, geometry: Geometry) -> FloatArray:
+    """Return how far pixels (2, n) are outside the ellipse, negative inside; first order [px]."""
+    off_px = np.empty(places_px.shape[1])
+    _distances(places_px, geometry, off_px)
+    return off_px
+
+
+@compiled
+def _distances(places_px: FloatArray, geometry: FloatArray, off_px: FloatArray) -> None:
+    determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
+    a, b, d = geometry[4] / determinant, -geometry[3] / determinant, geometry[2] / determinant
+    for i in range(len(off_px)):
+        x, y = places_px[0, i] - geometry[0], places_px[1, i] - geometry[1]
+        u, v = a * x + b * y, b * x + d * y
+        rho = math.sqrt(u * u + v * v)
+        slope_x, slope_y = a * u + b * v, b * u + d * v
+        slope = math.sqrt(slope_x * slope_x + slope_y * slope_y)
+        # at the centre, which has no direction, as far inside as the mean radius
+        off_px[i] = (rho - 1.0) * rho / slope if rho > 1e-6 else -math.sqrt(determinant)
+
+
+@compiled
+def _meet_disc(
+    geometry: FloatArray, places_px: FloatArray, inverse: FloatArray, views: FloatArray
+) -> None:
+    """Fill in the inverse stretch (3,) xx, xy, yy and the first rows of `meet_plate`'s views."""
+    determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
+    inverse[0], inverse[1] = geometry[4] / determinant, -geometry[3] / determinant
+    inverse[2] = geometry[2] / determinant
+    for i in range(places_px.shape[1]):
+        x, y = places_px[0, i] - geometry[0], places_px[1, i] - geometry[1]
+        views[0, i] = inverse[0] * x + inverse[1] * y
+        views[1, i] = inverse[1] * x + inverse[2] * y
+        views[2, i], views[3, i] = inverse[0], inverse[1]
+        views[4, i], views[5, i] = inverse[1], inverse[2]
+
+
+@compiled
+def _carry_slopes(
+    inverse: FloatArray,
+    blur: FloatArray,
+    views: FloatArray,
+    on_disc: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Carry derivatives from the unit circle to the ellipse and to the blur in the image."""
+    a, b, d = inverse[0], inverse[1], inverse[2]
+    side_ax, side_ay = blur[0] * a + blur[2] * b, blur[2] * a + blur[1] * b
+    side_bx, side_by = blur[0] * b + blur[2] * d, blur[2] * b + blur[1] * d
+    sxx, sxy = side_ax * a + side_ay * b, side_ax * b + side_ay * d
+    syy = side_bx * b + side_by * d
+    for i in range(views.shape[1]):
+        t1, t2 = on_disc[1, i], on_disc[2, i]
+        t4, t5, t6 = on_disc[4, i], on_disc[5, i], on_disc[6, i]
+        u, v = views[0, i], views[1, i]
+        slopes[0, i], slopes[1, i] = t1 * a + t2 * b, t1 * b + t2 * d
+        # G = M⁻¹ E with E = xx: [[a, 0], [b, 0]]; yy: [[0, b], [0, d]]; xy: [[b, a], [d, b]]
+        slopes[2, i] = (t1 * a + t2 * b) * u - 2.0 * (
+            t4 * a * sxx + t5 * (a * sxy + b * sxx) + t6 * b * sxy
+        )
+        slopes[4, i] = (t1 * b + t2 * d) * v - 2.0 * (
+            t4 * b * sxy + t5 * (b * syy + d * sxy) + t6 * d * syy
+        )
+        gxx, gxy = b * sxx + a * sxy, b * sxy + a * syy
+        gyx, gyy = d * sxx + b * sxy, d * sxy + b * syy
+        slopes[3, i] = t1 * (b * u + a * v) + t2 * (d * u + b * v)
+        slopes[3, i] -= 2.0 * (t4 * gxx + t5 * (gxy + gyx) + t6 * gyy)
+        slopes[5, i] = 0.0
+        by_xx = (t4 * a + 2.0 * t5 * b) * a + t6 * b * b
+        by_yy = (t4 * b + 2.0 * t5 * d) * b + t6 * d * d
+        slopes[6, i], slopes[7, i] = by_xx + by_yy, by_xx - by_yy
+        slopes[8, i] = 2.0 * (t4 * a * b + t5 * (a * d + b * b) + t6 * b * d)
+        slopes[9, i] = slopes[10, i] = 0.0

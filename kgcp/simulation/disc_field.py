@@ -1,0 +1,190 @@
+"""Photographs of fields of plain discs and rings: exact coverage through the full camera.
+
+Every circle is painted on its own plane by exact coverage of sub-pixels, shaded by the light, and
+spread over pixels; light adds up, so that the circles may touch. Nothing here is shared with the
+model that measures them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D
+from kgcp.geometry.pose import Pose
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
+from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
+
+_SUB_PIXELS_ACROSS = 1200  # of a window
+_FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS = 4, 10  # per pixel and axis
+
+
+@dataclass(frozen=True, slots=True)
+class FieldDisc:
+    """A disc, or a ring, in the frame of its field.
+
+    Attributes
+    ----------
+    position_m : (3,) tuple of float
+        Of its centre [m].
+    diameter_m, inner_diameter_m : float
+        Of the disc, and of a hole in it; 0: none [m].
+    normal : (3,) tuple of float
+        Unit vector square to it; the field's own z axis by default, which points into the board.
+    """
+
+    position_m: tuple[float, float, float]
+    diameter_m: float
+    inner_diameter_m: float = 0.0
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldScene:
+    """A field under its light.
+
+    Attributes
+    ----------
+    discs : tuple of FieldDisc
+    ground, ink : float
+        Radiance of the board and of the discs on it at the frame's middle, 0…1; discs may be
+        brighter than the ground.
+    gradient : (2,) tuple of float
+        Relative change of the light along x and y of the image [1/px].
+    board_m : (4,) tuple of float or None
+        Edges of the board in the field's plane z = 0: x and y of one corner and of the opposite
+        one [m]; None: the ground is everywhere.
+    surround : float
+        Radiance beyond the board.
+    """
+
+    discs: tuple[FieldDisc, ...]
+    ground: float = 0.8
+    ink: float = 0.06
+    gradient: tuple[float, float] = (0.0, 0.0)
+    board_m: tuple[float, float, float, float] | None = None
+    surround: float = 0.3
+
+    def light(self, camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Return the light at columns x (m,) and rows y (n,), relative to the frame's middle."""
+        along_x, along_y = self.gradient
+        off_x, off_y = x_px - 0.5 * (camera.width - 1), y_px - 0.5 * (camera.height - 1)
+        return np.asarray(1.0 + along_x * off_x[None, :] + along_y * off_y[:, None])
+
+
+def photograph(
+    camera: Camera,
+    pose: Pose,
+    scene: FieldScene,
+    optics: Optics,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    gain: float = 1.0,
+) -> GreyArray:
+    """Return a photograph (uint8) of a field.
+
+    Parameters
+    ----------
+    pose : Pose
+        Field → camera.
+    gain : float
+        Exposure relative to the one at which radiance 1 fills the well.
+    """
+    return sensor.expose(field_irradiance(camera, pose, scene, optics), gain, rng)
+
+
+def field_irradiance(camera: Camera, pose: Pose, scene: FieldScene, optics: Optics) -> FloatArray:
+    """Return the light (height, width) of a field in all pixels, without noise.
+
+    What is not wholly in front of the camera is left out.
+    """
+    columns, rows = np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)
+    frame = _board(camera, pose, scene, optics)
+    if frame is None:
+        frame = scene.ground * scene.light(camera, columns, rows)
+    for disc in scene.discs:
+        plane = disc_pose(pose, disc)
+        if plane.translation_m[2] <= 0.5 * disc.diameter_m:
+            continue
+        shapes: list[Region] = [DiscRegion((0.0, 0.0), 0.5 * disc.diameter_m)]
+        if disc.inner_diameter_m > 0.0:
+            shapes.append(DiscRegion((0.0, 0.0), 0.5 * disc.inner_diameter_m))
+        _add(frame, camera, plane, shapes, scene.ink - scene.ground, scene, optics)
+    return frame
+
+
+def disc_pose(pose: Pose, disc: FieldDisc) -> Pose:
+    """Return the pose of a disc's plane, disc → camera, for that of its field."""
+    circle = field_circles(pose, [disc])
+    axes = circle.axes[0]
+    rotation = np.column_stack((axes, np.cross(axes[:, 0], axes[:, 1])))
+    return Pose(rotation, circle.centres_m[0])
+
+
+def field_circles(pose: Pose, discs: Sequence[FieldDisc]) -> Circles3D:
+    """Return the outer circles of discs in the camera frame, for the field's pose."""
+    positions = np.array([disc.position_m for disc in discs], dtype=np.float64)
+    normals = np.array([disc.normal for disc in discs], dtype=np.float64)
+    radii_m = np.array([0.5 * disc.diameter_m for disc in discs])
+    return Circles3D.with_normals(pose.transform(positions), normals @ pose.rotation.T, radii_m)
+
+
+def _board(camera: Camera, pose: Pose, scene: FieldScene, optics: Optics) -> FloatArray | None:
+    """Return the frame with the bare board; None where it has no end."""
+    if scene.board_m is None:
+        return None
+    left, top, right, bottom = scene.board_m
+    outline = ConvexPolygon(((left, top), (right, top), (right, bottom), (left, bottom)))
+    columns, rows = np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)
+    frame = scene.surround * scene.light(camera, columns, rows)
+    _add(frame, camera, pose, [outline], scene.ground - scene.surround, scene, optics)
+    return frame
+
+
+def _add(
+    frame: FloatArray,
+    camera: Camera,
+    plane: Pose,
+    shapes: Sequence[Region],
+    radiance: float,
+    scene: FieldScene,
+    optics: Optics,
+) -> None:
+    """Add the first shape, less the others, to a frame's light."""
+    window = _window(camera, plane, shapes[0], optics)
+    if window.width <= 0 or window.height <= 0:
+        return
+    longest = max(window.width, window.height)
+    oversampling = int(np.clip(_SUB_PIXELS_ACROSS // longest, _FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS))
+    raster = PlaneRaster.of(camera, plane, window, oversampling)
+    covered = np.zeros_like(raster.x_m)
+    for number, shape in enumerate(shapes):
+        raster.paint(covered, shape, 1.0 if number == 0 else 0.0)
+    step = 1.0 / oversampling
+    x_px = window.column - 0.5 + step * (np.arange(covered.shape[1]) + 0.5)
+    y_px = window.row - 0.5 + step * (np.arange(covered.shape[0]) + 0.5)
+    covered *= radiance * scene.light(camera, x_px, y_px)
+    part = optics.spread(covered, oversampling, window.row)
+    top, left = max(window.row, 0), max(window.column, 0)
+    bottom = min(window.row + window.height, camera.height)
+    right = min(window.column + window.width, camera.width)
+    if top < bottom and left < right:
+        inside = part[top - window.row : bottom - window.row, left - window.column :]
+        frame[top:bottom, left:right] += inside[:, : right - left]
+
+
+def _window(camera: Camera, plane: Pose, shape: Region, optics: Optics) -> PixelWindow:
+    """Return the window with all that a shape sends light to, as far as it is near the frame."""
+    corner, size = outline_box(camera, plane, shape)
+    margin = optics.reach_px + 1
+    column, row = np.floor(corner).astype(int) - margin
+    last_column, last_row = np.ceil(corner + size).astype(int) + margin
+    window = PixelWindow(
+        int(column), int(row), int(last_column - column) + 1, int(last_row - row) + 1
+    )
+    return window.near(camera, margin)
