@@ -56,7 +56,7 @@ def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> Non
     assert len(EXAMPLES) >= 5
     assert re.match(r"\d+\.\d{3} m ± \d+\.\d mm \[", lines[0])
     assert (tmp_path / "results" / "bias_report.html").exists()
-    assert (tmp_path / "results" / "gcp_list.txt").exists()
+    assert (tmp_path / "results" / "odm" / "gcp_list.txt").exists()
     flight = kgcp.read_flight(ROOT / "sample_flight")
     table = tmp_path / "results" / "detections.parquet"
     assert kgcp.make_gcps(flight, table).doubts == ()

@@ -90,9 +90,9 @@ def command(
 
     Interpolates the vehicle's trajectory at every frame's time, adds the lever arm, and writes
     the kinematic ground control points to FLIGHT/kgcp: kgcps.parquet, kgcps.csv and OpenDroneMap's
-    gcp_list.txt. Run 'kgcp detect' first. flight.toml needs a crs and either a [vehicle] or targets
-    with position_m. With reference poses, the summary reports how well they agree with the vehicle
-    and what to correct.
+    odm/gcp_list.txt. Run 'kgcp detect' first. flight.toml needs a crs and either a [vehicle] or
+    targets with position_m. With reference poses, the summary reports how well they agree with the
+    vehicle and what to correct.
 
     Example: kgcp export-gcp sample_flight --format odm
     """

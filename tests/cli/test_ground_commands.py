@@ -156,7 +156,7 @@ def test_export_writes_the_contracts_table_and_the_formats(flight: FlightFolder)
 
 def test_plain_csv_agrees_with_the_table(flight: FlightFolder) -> None:
     flight.run("export-gcp", "--format", "csv")
-    assert not (flight.out / "gcp_list.txt").exists()
+    assert not (flight.out / "odm/gcp_list.txt").exists()
     with (flight.out / "kgcps.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     table = read_table(flight.out / "kgcps.parquet", GCP_COLUMNS)
@@ -170,7 +170,7 @@ def test_plain_csv_agrees_with_the_table(flight: FlightFolder) -> None:
 
 def test_odm_list_follows_its_grammar(flight: FlightFolder) -> None:
     flight.run("export-gcp", "--format", "odm")
-    lines = (flight.out / "gcp_list.txt").read_text(encoding="utf-8").splitlines()
+    lines = (flight.out / "odm/gcp_list.txt").read_text(encoding="utf-8").splitlines()
     assert lines[0] == "EPSG:25831"
     points = [line.split() for line in lines[1:] if not line.startswith("#")]
     assert len(points) == 5
@@ -184,7 +184,7 @@ def test_odm_list_follows_its_grammar(flight: FlightFolder) -> None:
 def test_wgs84_utm_gets_the_header_that_no_reader_mistakes(flight: FlightFolder) -> None:
     flight.edit("EPSG:25831", "EPSG:32631")
     flight.run("export-gcp")
-    text = (flight.out / "gcp_list.txt").read_text(encoding="utf-8")
+    text = (flight.out / "odm/gcp_list.txt").read_text(encoding="utf-8")
     assert text.startswith("WGS84 UTM 31N\n")
 
 
@@ -205,7 +205,7 @@ def test_a_static_target_is_one_point_with_many_rays(flight: FlightFolder) -> No
     (flight.path / "flight.toml").write_text(without, encoding="utf-8")
     result = flight.run("export-gcp")
     assert result.exit_code == 0, result.output
-    text = (flight.out / "gcp_list.txt").read_text(encoding="utf-8")
+    text = (flight.out / "odm/gcp_list.txt").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines()[1:] if not line.startswith("#")]
     assert {tuple(line.split()[:3]) for line in lines} == {
         ("430606.1000000", "4583523.0000000", "122.0000000")
@@ -217,7 +217,7 @@ def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder
     result = flight.run("export-gcp", "--format", "all")
     assert result.exit_code == 0, result.output
     assert "left out colmap: there is no camera position" in result.stderr
-    for name in ("kgcps.csv", "gcp_list.txt", "opf/project.opf", "mmvii/kgcp.obs"):
+    for name in ("kgcps.csv", "odm/gcp_list.txt", "opf/project.opf", "mmvii/kgcp.obs"):
         assert (flight.out / name).is_file()
     assert "camera position" in flight.fails("export-gcp", "--format", "colmap")
     flight.detect(lambda row: row.update(frame=f"my {row['frame']}"))

@@ -24,9 +24,8 @@ def _in_folder(folder: str, names: str, description: str) -> Format:
 
 FORMATS: Mapping[str, Format] = {
     "csv": Format(("kgcps.csv",), "all that kgcp knows about every point"),
-    "odm": Format(
-        ("gcp_list.txt", "odm/HOWTO.txt", "[odm/geo.txt]"),
-        "OpenDroneMap: points; camera positions",
+    "odm": _in_folder(
+        "odm", "gcp_list.txt HOWTO.txt [geo.txt]", "OpenDroneMap: points; camera positions"
     ),
     "opensfm": _in_folder(
         "opensfm",

@@ -32,7 +32,8 @@ from kgcp.io.exporters.points import (
     pixel,
 )
 
-FILE_NAME = "gcp_list.txt"
+_FOLDER = "odm"
+_LIST = "gcp_list.txt"
 _WGS84_UTM = re.compile(r"32([67])(\d\d)")
 _NOTE = """\
 # x (easting or longitude), y, height [m], pixel x, y, image, point
@@ -43,8 +44,8 @@ _CAMERA_FROM_BODY: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 _HOWTO = """\
 OpenDroneMap
 
-Copy gcp_list.txt, which lies one folder up, into the project's folder; ODM finds it there.
-Or name it: --gcp PATH/gcp_list.txt
+Copy gcp_list.txt into the project's folder; ODM finds it there. Or name it:
+--gcp PATH/gcp_list.txt
 
   --force-gps        needed. Each moving point is seen in one image only. ODM aligns the block
                      by points that are seen in two or more images; without them and without
@@ -65,7 +66,7 @@ axes. Points kept for checking are not in the list.
 
 
 def files(points: MapPoints) -> Mapping[str, str]:
-    """Return `gcp_list.txt`, and a folder with HOWTO.txt and geo.txt, if there are priors.
+    """Return `gcp_list.txt`, HOWTO.txt and, if there are priors, geo.txt.
 
     Raises
     ------
@@ -73,15 +74,15 @@ def files(points: MapPoints) -> Mapping[str, str]:
         If the CRS has no form that ODM reads, an image's name has white space, or two images in
         different folders have the same name.
     """
-    texts = {FILE_NAME: _gcp_list(points), "odm/HOWTO.txt": _HOWTO.format(heights=points.heights)}
+    texts = {_LIST: _gcp_list(points), "HOWTO.txt": _HOWTO.format(heights=points.heights)}
     if points.priors:
-        texts["odm/geo.txt"] = _geo(points)
-    return texts
+        texts["geo.txt"] = _geo(points)
+    return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
 
 
 def _gcp_list(points: MapPoints) -> str:
-    names = image_names((point.frame for point in points.gcps), FILE_NAME, r"\s")
-    label = labels(points.gcps, FILE_NAME)
+    names = image_names((point.frame for point in points.gcps), _LIST, r"\s")
+    label = labels(points.gcps, _LIST)
     height_factor = _metres_per_height_unit(points.parsed_crs)
     lines = [_header(points.crs, points.parsed_crs), _NOTE]
     owners: dict[tuple[str, str, str], str] = {}
@@ -137,7 +138,7 @@ def _header(text: str, crs: CRS) -> str:
         if "+proj" in text:
             return text
         raise KgcpError(
-            f"{FILE_NAME}: crs {text!r} has no EPSG code, which ODM needs;"
+            f"{_LIST}: crs {text!r} has no EPSG code, which ODM needs;"
             " give crs in flight.toml as 'EPSG:code' or a PROJ string, or leave out the format odm"
         )
     utm = _WGS84_UTM.fullmatch(str(code))

@@ -19,7 +19,7 @@ def _moved(points: MapPoints, position: tuple[float, float, float]) -> MapPoints
 
 
 def _lines(points: MapPoints) -> list[str]:
-    return str(odm.files(points)["gcp_list.txt"]).splitlines()
+    return str(odm.files(points)["odm/gcp_list.txt"]).splitlines()
 
 
 def _rows(points: MapPoints) -> list[list[str]]:
@@ -153,5 +153,5 @@ def test_no_accuracies_are_made_up(points: MapPoints) -> None:
 
 def test_how_to_names_the_option_that_matters(make_points: Factory) -> None:
     texts = odm.files(make_points())
-    assert set(texts) == {"gcp_list.txt", "odm/HOWTO.txt"}
+    assert set(texts) == {"odm/gcp_list.txt", "odm/HOWTO.txt"}
     assert "--force-gps" in texts["odm/HOWTO.txt"]
