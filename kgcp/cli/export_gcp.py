@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 ALL = "all"
 MANY = 12
+WITH_EXTENSION, WITHOUT_EXTENSION = "with-extension", "without-extension"
 
 
 def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> None:  # noqa: FBT001 - click's signature
@@ -72,6 +73,13 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     show_default=True,
     help="Least standard deviation of an image point in the files of other programs [px].",
 )
+@click.option(
+    "--image-names",
+    type=click.Choice([WITH_EXTENSION, WITHOUT_EXTENSION]),
+    default=WITH_EXTENSION,
+    show_default=True,
+    help="Names of images for metashape and realityscan, whose projects may lack the extension.",
+)
 @selection_options
 @detections_option
 @json_option
@@ -81,6 +89,7 @@ def command(
     formats: tuple[str, ...],
     crs: str | None,
     mark_floor_px: float,
+    image_names: str,
     detections: Path | None,
     *,
     as_json: bool,
@@ -107,14 +116,25 @@ def command(
         source = detections or workspace.out / DETECTIONS
         made = make_gcps(the_flight, source, selection=Selection(**selection), crs=crs)
         written = write_gcps(made, workspace.out)
-        more, left_out = _export(made, formats, workspace.out, mark_floor_px)
+        more, left_out = _export(
+            made,
+            formats,
+            workspace.out,
+            mark_floor_px=mark_floor_px,
+            image_extensions=image_names == WITH_EXTENSION,
+        )
         written += more
         older = not_renewed(workspace.out, written)
     _report(made, written, left_out, older, workspace.named, as_json=as_json)
 
 
 def _export(
-    made: GcpSet, formats: tuple[str, ...], folder: Path, mark_floor_px: float
+    made: GcpSet,
+    formats: tuple[str, ...],
+    folder: Path,
+    *,
+    mark_floor_px: float,
+    image_extensions: bool,
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the named formats; with `all`, every format that can hold the points.
 
@@ -126,7 +146,13 @@ def _export(
     written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):
         try:
-            written += export_gcps(made, (name,), folder, mark_floor_px=mark_floor_px)
+            written += export_gcps(
+                made,
+                (name,),
+                folder,
+                mark_floor_px=mark_floor_px,
+                image_extensions=image_extensions,
+            )
         except KgcpError as error:
             if name in formats:
                 raise

@@ -161,6 +161,7 @@ def export_gcps(
     folder: Path | str | None = None,
     *,
     mark_floor_px: float = MARK_FLOOR_PX,
+    image_extensions: bool = True,
 ) -> list[Path]:
     """Write the files of some formats, and return their paths.
 
@@ -174,6 +175,8 @@ def export_gcps(
         Of the files; by default the flight's results folder.
     mark_floor_px : float
         Least standard deviation of a mark in the files of packages [px].
+    image_extensions : bool
+        Whether names of images end in their extension, in formats whose users may have removed it.
 
     Raises
     ------
@@ -191,6 +194,7 @@ def export_gcps(
         gcp_set.flight.camera,
         gcp_set.camera_priors,
         mark_floor_px,
+        image_extensions,
     )
     return [path for name in dict.fromkeys(formats) for path in export(points, name, folder)]
 

@@ -226,6 +226,16 @@ def test_all_formats_leave_out_what_these_points_do_not_fit(flight: FlightFolder
     assert '"my%20f_0.jpg"' in (flight.out / "opf/camera_list.json").read_text(encoding="utf-8")
 
 
+def test_names_of_images_may_lack_their_extension(flight: FlightFolder) -> None:
+    for option, name in (("with-extension", "f_0.jpg"), ("without-extension", "f_0")):
+        options = ("--format", "realityscan", "--format", "odm", "--image-names", option)
+        assert flight.run("export-gcp", *options).exit_code == 0
+        marks = (flight.out / "realityscan/measurements.csv").read_text(encoding="utf-8")
+        assert f"\n{name},K0001," in marks
+        points = (flight.out / "odm/gcp_list.txt").read_text(encoding="utf-8")
+        assert " f_0.jpg K0001" in points, "ODM knows files"
+
+
 def test_marks_of_packages_have_a_floor_and_the_table_has_not(flight: FlightFolder) -> None:
     for options, accuracy in ((), 0.1), (("--mark-floor-px", "0.3"), 0.3):
         assert flight.run("export-gcp", "--format", "pix4d", *options).exit_code == 0

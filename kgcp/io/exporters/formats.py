@@ -34,18 +34,30 @@ FORMATS: Mapping[str, Format] = {
     ),
     "metashape": _in_folder(
         "metashape",
-        "markers.csv markers.xml scale_bars.csv add_scale_bars.py HOWTO.txt [cameras.csv]",
-        "Agisoft Metashape: markers with accuracies, distances as scale bars; cameras",
+        "import_into_metashape.py markers.csv marks.csv scale_bars.csv markers.xml HOWTO.txt"
+        " [cameras.csv]",
+        "Agisoft Metashape: one script that sets markers, marks, distances and cameras",
     ),
     "pix4d": _in_folder(
         "pix4d",
         "gcps.csv marks.csv HOWTO.txt [checkpoints.csv]",
-        "Pix4D: points and marks with accuracies",
+        "PIX4Dmatic: points and marks with accuracies",
     ),
     "opf": _in_folder(
         "opf",
-        "project.opf camera_list.json input_control_points.json HOWTO.txt",
-        "Open Photogrammetry Format: points and marks with standard deviations",
+        "project.opf camera_list.json input_control_points.json HOWTO.txt"
+        " [scene_reference_frame.json]",
+        "Open Photogrammetry Format (PIX4Dmatic): points and marks with standard deviations",
+    ),
+    "realityscan": _in_folder(
+        "realityscan",
+        "ground_control.csv measurements.csv HOWTO.txt [checkpoints.csv]",
+        "RealityScan, RealityCapture: points and marks with accuracies",
+    ),
+    "itwin": _in_folder(
+        "itwin",
+        "block.xml add_to_block.py HOWTO.txt",
+        "iTwin Capture, ContextCapture: points with accuracies and marks, as a block",
     ),
     "micmac": _in_folder(
         "micmac",

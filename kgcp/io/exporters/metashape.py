@@ -1,8 +1,8 @@
-"""Agisoft Metashape: reference of markers and cameras, markers XML, scale bars to the cameras.
+"""Agisoft Metashape: tables of markers, marks, distances and cameras, and a script that sets them.
 
-By the Python API's reference (importReference, importMarkers, addScalebar): the CSV's columns are
-chosen on import, x is easting or longitude; (0, 0) px is the corner of the top-left pixel, since a
-centred principal point is half the width.
+By the reference of the Python API 2 (Marker, Scalebar, Camera.Reference, CoordinateSystem): x is
+easting or longitude; (0, 0) px is the corner of the top-left pixel, since a centred principal point
+is half the width. markers.xml is for those who cannot run scripts.
 """
 
 from __future__ import annotations
@@ -11,6 +11,10 @@ from collections.abc import Iterable, Mapping
 from importlib.resources import files as resources
 from xml.etree import ElementTree as ET
 
+from pyproj.enums import WktVersion
+from pyproj.exceptions import CRSError
+
+from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior, opk_covs, opk_deg
@@ -32,24 +36,26 @@ _FOLDER = "metashape"
 _HOWTO = """\
 Agisoft Metashape (Professional)
 
-With the photos added to a chunk, before or after their alignment. The files call cameras by their
-file names; where the chunk's labels lack the extension, only the script finds them, and the others
-need it taken off:
+1. Add the photos to a chunk. Align them now or later.
+2. Tools > Run Script: import_into_metashape.py. It reads the CSV files beside it and sets
+   - the markers, their coordinates in {crs}
+     and their accuracies; z is {heights}.
+     Points kept for checking are not enabled: Metashape shows their errors;
+   - their projections in the photos. Labels may have the extension or not;
+   - a scale bar from every marker to the camera that saw it, with its length and accuracy;
+   - the accuracy of marker projections, of which Metashape has one for all: {mark_px} px, the RMS
+     of these. It concerns also other markers of the chunk;
+   - positions and angles of cameras, if cameras.csv is here, where the photos have none of their
+     own. They come from the plate and its vehicle's attitude and are weak.
+   The script may be run again, after another export; it prints what it has set.
+3. Optimise the cameras (Reference > Optimize Cameras).
 
-1. File > Import > Import Markers: markers.xml (places in the images, and coordinates).
-2. Reference > Import Reference: markers.csv. Comma, first row 2, columns label, x, y, z and the
-   three accuracies [m]; the coordinate system is {crs}, x is easting or
-   longitude, z is {heights}.
-   The accuracies come only by this file. Points kept for checking have enabled = 0.
-3. Tools > Run Script: add_scale_bars.py, which reads scale_bars.csv beside it and adds a scale bar
-   from every marker to the camera that saw it, with its length and accuracy [m].
-4. cameras.csv, if it is here, has the cameras' positions [m] and angles from the plate and its
-   vehicle's attitude, for the images that show the target: omega, phi, kappa (set this in
-   Reference > Settings). They are weak; import it only where the photos' own reference is worse.
+Every scale bar has the weight of its own accuracy. Metashape ignores correlations.
 
-Optimise the cameras afterwards. Metashape has one accuracy for all marker projections (Reference >
-Settings, marker accuracy, by default 0.5 px): set it to {mark_px} px, the RMS of these. Every scale
-bar has the weight of its own accuracy. Metashape ignores correlations.
+Without scripts: File > Import > Import Markers: markers.xml (kgcp export-gcp --image-names writes
+labels like the chunk's); then Reference > Import Reference: markers.csv, for the accuracies; comma,
+first row 2, columns label, x, y, z and three accuracies, coordinate system as above. Scale bars to
+cameras can only be set by the script.
 
 {marks}
 
@@ -62,23 +68,27 @@ def files(points: MapPoints) -> Mapping[str, str]:
     Raises
     ------
     KgcpError
-        If an image's name has a comma or quote, or two images have the same name.
+        If an image's name has a comma or quote, two images have the same name, or the CRS has no
+        form that Metashape reads.
     """
-    names = image_names((point.frame for point in points.gcps), _FOLDER, ',"')
+    names = image_names(
+        (point.frame for point in points.gcps), _FOLDER, ',"', extensions=points.image_extensions
+    )
     label = labels(points.gcps, _FOLDER)
-    script = resources("kgcp.io.exporters").joinpath("scripts/metashape_scale_bars.txt")
+    mark_px = _rms_mark_px(points.gcps)
     texts = {
         "HOWTO.txt": _HOWTO.format(
             crs=points.crs,
             heights=points.heights,
-            mark_px=_rms_mark_px(points.gcps),
+            mark_px=mark_px or "its own",
             marks=marks_note(points),
             focal_length=focal_length_note(points.controls),
         ),
         "markers.csv": _markers(points, label),
         "markers.xml": _markers_xml(points, names, label),
         "scale_bars.csv": _scale_bars(points.controls, names, label),
-        "add_scale_bars.py": script.read_text(encoding="utf-8"),
+        "marks.csv": _marks(points.gcps, names, label),
+        "import_into_metashape.py": _script(points, mark_px),
     }
     if points.priors:
         texts["cameras.csv"] = _cameras(points, names)
@@ -90,8 +100,31 @@ def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:
 
 
 def _rms_mark_px(gcps: Iterable[Gcp]) -> str:
+    """Return the RMS standard deviation of marks along an axis [px]; empty if none is known."""
     traces = [point.centre_cov_px2.trace() for point in gcps if point.centre_cov_px2 is not None]
-    return f"{(0.5 * sum(traces) / len(traces)) ** 0.5:.3f}" if traces else "unknown"
+    return f"{(0.5 * sum(traces) / len(traces)) ** 0.5:.3f}" if traces else ""
+
+
+def _script(points: MapPoints, mark_px: str) -> str:
+    template = resources("kgcp.io.exporters").joinpath("scripts/metashape_import.txt")
+    text = template.read_text(encoding="utf-8").replace("@CRS@", repr(_definition(points)))
+    return text.replace("@MARK_PX@", mark_px or "None")
+
+
+def _definition(points: MapPoints) -> str:
+    """Return a CRS as Metashape's CoordinateSystem takes it: a code, or well-known text 1."""
+    crs = points.parsed_crs
+    whole = crs if crs.is_compound else crs.to_2d()
+    code = None if crs.is_compound else whole.to_epsg()
+    if code is not None:
+        return f"EPSG::{code}"
+    try:
+        return whole.to_wkt(WktVersion.WKT1_GDAL)
+    except CRSError:
+        raise KgcpError(
+            f"{_FOLDER}: crs {points.crs!r} has no form that Metashape reads; export in another CRS"
+            " or leave this format out"
+        ) from None
 
 
 def _markers(points: MapPoints, label: Mapping[str, str]) -> str:
@@ -115,6 +148,11 @@ def _cameras(points: MapPoints, names: Mapping[str, str]) -> str:
         "accuracy_omega_deg,accuracy_phi_deg,accuracy_kappa_deg",
         map(row, points.priors, opk_deg(points.priors), opk_covs(points.priors)),
     )
+
+
+def _marks(gcps: Iterable[Gcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:
+    rows = ((label[point.id], names[point.frame], *pixel(point, CORNER_PX)) for point in gcps)
+    return _table("marker,camera,x_px,y_px", rows)
 
 
 def _scale_bars(gcps: Iterable[Gcp], names: Mapping[str, str], label: Mapping[str, str]) -> str:

@@ -1,4 +1,4 @@
-"""Pix4D's CSV of ground control points and of their marks in the images.
+"""PIX4Dmatic's CSV of ground control points and of their marks in the images.
 
 By support.pix4d.com 360038397752 and 360035474951: label, two coordinates in the order of the CRS's
 own definition, height, horizontal and vertical accuracy; image, label, x, y, accuracy [px], with
@@ -26,7 +26,7 @@ from kgcp.io.exporters.shared import marks_note
 
 _FOLDER = "pix4d"
 _HOWTO = """\
-PIX4Dmatic, PIX4Dmapper
+PIX4Dmatic
 
 1. Import ground control points: gcps.csv, coordinate system {crs},
    z is {heights}: choose it as such, or points and images are
@@ -38,8 +38,11 @@ PIX4Dmatic, PIX4Dmapper
 
 Pix4D takes one horizontal accuracy, which here is that of the worst direction, and a vertical one.
 Every mark has the weight of its own accuracy. Pix4D ignores correlations and distances. Whether it
-uses points with a mark in a single image is not documented for this route; OPF (--format opf) is
-the better one for PIX4Dmatic.
+uses points with a mark in a single image is not documented. --format opf writes the same points as
+a project, with three standard deviations each.
+
+PIX4Dmapper reads gcps.csv, too (GCP/MTP Manager > Import GCPs). Whether it reads marks.csv is not
+known; its points can be marked by hand, in rayCloud.
 
 {marks}
 """

@@ -40,6 +40,8 @@ class MapPoints:
     priors: tuple[CameraPrior, ...] = ()  # of the frames for which there is one
     # least standard deviation of a mark for packages [px]; `kgcp.io.exporters.weights`
     mark_floor_px: float = MARK_FLOOR_PX
+    # whether names of images end in their extension, for formats whose users may have removed it
+    image_extensions: bool = True
 
     @property
     def parsed_crs(self) -> CRS:
@@ -154,7 +156,12 @@ def labels(gcps: Iterable[Gcp], where: str) -> Mapping[str, str]:
 
 
 def image_names(
-    frames: Iterable[str], where: str, refused: str, *, keep_folder: bool = False
+    frames: Iterable[str],
+    where: str,
+    refused: str,
+    *,
+    keep_folder: bool = False,
+    extensions: bool = True,
 ) -> Mapping[str, str]:
     r"""Return the names by which a package knows frames: by default the files', without folder.
 
@@ -166,6 +173,8 @@ def image_names(
         Characters that the file cannot hold, for a regular expression's set: `\s,`.
     keep_folder : bool
         Whether the package knows images by their path below the frames folder.
+    extensions : bool
+        Whether names end in their extension, `.jpg`.
 
     Raises
     ------
@@ -175,7 +184,8 @@ def image_names(
     names: dict[str, str] = {}
     owners: dict[str, str] = {}
     for frame in frames:
-        name = frame if keep_folder else PurePosixPath(frame).name
+        path = PurePosixPath(frame) if extensions else PurePosixPath(frame).with_suffix("")
+        name = str(path) if keep_folder else path.name
         if re.search(f"[{refused}\\x00-\\x1f\\x7f-\\x9f\\u2028\\u2029]", name):
             what = "white space" if re.search(r"\s", name) else "a character"
             raise KgcpError(
@@ -184,8 +194,8 @@ def image_names(
             )
         if owners.setdefault(name, frame) != frame:
             raise KgcpError(
-                f"{where}: frames {owners[name]!r} and {frame!r} have the same file name, and"
-                " images are known by that; rename one or leave this format out"
+                f"{where}: frames {owners[name]!r} and {frame!r} have the same file name {name!r},"
+                " and images are known by that; rename one or leave this format out"
             )
         names[frame] = name
     return names

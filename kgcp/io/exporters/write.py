@@ -13,6 +13,7 @@ from kgcp.io.exporters import (
     colmap,
     geojson,
     geopackage,
+    itwin,
     metashape,
     micmac,
     mmvii,
@@ -21,6 +22,7 @@ from kgcp.io.exporters import (
     opf,
     pix4d,
     plain_csv,
+    realityscan,
 )
 from kgcp.io.exporters.formats import FORMATS
 from kgcp.io.exporters.points import MapPoints
@@ -34,6 +36,8 @@ _WRITERS: Mapping[str, ModuleType] = {
     "metashape": metashape,
     "pix4d": pix4d,
     "opf": opf,
+    "realityscan": realityscan,
+    "itwin": itwin,
     "micmac": micmac,
     "mmvii": mmvii,
     "colmap": colmap,

@@ -1,146 +1,22 @@
-"""Metashape, Pix4D, OPF and OpenSfM: what a reader of the format gets out of the files."""
+"""Pix4D, OPF and OpenSfM: what a reader of the format gets out of the files."""
 
 from __future__ import annotations
 
-import csv
 import json
-import runpy
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 from pyproj import Transformer
 
 from kgcp.errors import KgcpError
-from kgcp.georef.camera_priors import opk_deg
 from kgcp.io.exporters import metashape, opensfm, opf, pix4d
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.write import export
 
 Factory = Callable[..., MapPoints]
-
-
-def _table(text: str) -> list[dict[str, str]]:
-    return [*csv.DictReader(text.splitlines())]
-
-
-def _xyz(row: dict[str, str]) -> list[float]:
-    return [float(row[name]) for name in "xyz"]
-
-
-# --- Metashape ---------------------------------------------------------------------------------
-
-
-def test_metashape_markers_have_accuracies_and_roles(points: MapPoints) -> None:
-    rows = _table(metashape.files(points)["metashape/markers.csv"])
-    expected = points.gcps[:6]  # the gate once
-    assert [row["label"] for row in rows] == [
-        *(point.id for point in expected[:5]),
-        "north_gate",
-    ]
-    for row, point in zip(rows, expected, strict=True):
-        np.testing.assert_allclose(_xyz(row), point.position_map, atol=1e-6, rtol=0)
-        sds = [float(row[f"accuracy_{axis}_m"]) for axis in "xyz"]
-        np.testing.assert_allclose(sds, [0.02, 0.03, 0.04], atol=1e-9)
-        assert row["enabled"] == str(int(not point.is_checkpoint))
-
-
-def test_metashape_has_longitude_first(in_degrees: MapPoints) -> None:
-    (row,) = _table(metashape.files(in_degrees)["metashape/markers.csv"])
-    assert (float(row["x"]), float(row["y"])) == pytest.approx(
-        (2.1701234567, 41.4007654321), abs=1e-11
-    )
-
-
-def test_metashape_marks_begin_at_the_corner(points: MapPoints) -> None:
-    text = metashape.files(points)["metashape/markers.xml"]
-    chunk = ET.fromstring(text.encode()).find("chunk")  # noqa: S314 - has just been written
-    assert chunk is not None
-    size = chunk.find("sensors/sensor/resolution")
-    assert size is not None
-    assert (size.get("width"), size.get("height")) == ("1600", "1201")
-    cameras = {str(one.get("id")): one.get("label") for one in chunk.findall("cameras/camera")}
-    markers = {str(one.get("id")): one for one in chunk.findall("markers/marker")}
-    seen = {}
-    for rays in chunk.findall("frames/frame/markers/marker"):
-        label = markers[str(rays.get("marker_id"))].get("label")
-        for ray in rays.findall("location"):
-            key = (label, cameras[str(ray.get("camera_id"))])
-            seen[key] = (float(str(ray.get("x"))), float(str(ray.get("y"))))
-    assert len(seen) == 7
-    assert seen["K0001", "IMG_1.JPG"] == pytest.approx((0.0, 1201.0), abs=1e-6)
-    assert seen["K0002", "IMG_2.JPG"] == pytest.approx((1600.0, 0.0), abs=1e-6)
-    assert seen["K0003", "IMG_3.JPG"] == pytest.approx((812.8456789, 78.2654321), abs=1e-6)
-    assert seen["north_gate", "IMG_3.JPG"] == pytest.approx((1111.5, 222.5), abs=1e-6)
-    reference = markers["2"].find("reference")
-    assert reference is not None
-    where = [float(str(reference.get(name))) for name in "xyz"]
-    np.testing.assert_allclose(where, points.gcps[2].position_map, atol=1e-6, rtol=0)
-
-
-def test_metashape_cameras_have_angles_and_accuracies(points: MapPoints) -> None:
-    rows = _table(metashape.files(points)["metashape/cameras.csv"])
-    for row, prior in zip(rows, points.priors, strict=True):
-        np.testing.assert_allclose(_xyz(row), prior.position_map, atol=1e-6, rtol=0)
-        angles = [float(row[f"{name}_deg"]) for name in ("omega", "phi", "kappa")]
-        np.testing.assert_allclose(angles, opk_deg([prior])[0], atol=1e-6)
-        assert float(row["accuracy_x_m"]) == pytest.approx(0.3, rel=1e-3)
-        assert 0.2 < float(row["accuracy_kappa_deg"]) < 0.5
-
-
-@dataclass
-class FakeBar:
-    """What the script touches of Metashape.Scalebar."""
-
-    point0: object
-    point1: object
-    label: str = ""
-    reference: SimpleNamespace = field(default_factory=SimpleNamespace)
-
-
-@dataclass
-class FakeChunk:
-    markers: list[SimpleNamespace]
-    cameras: list[SimpleNamespace]
-    scalebars: list[FakeBar] = field(default_factory=list)
-
-    def addScalebar(self, point0: object, point1: object) -> FakeBar:  # noqa: N802 - Metashape's
-        self.scalebars.append(FakeBar(point0, point1))
-        return self.scalebars[-1]
-
-
-def test_the_script_adds_scale_bars_from_markers_to_cameras(
-    points: MapPoints,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    export(points, "metashape", tmp_path)
-    markers = [SimpleNamespace(label=name) for name in ("K0001", "K0002", "K0003", "north_gate")]
-    cameras = [
-        SimpleNamespace(label="IMG_1", photo=None),  # labels may lack the extension
-        SimpleNamespace(label="renamed", photo=SimpleNamespace(path="/photos/IMG_3.JPG")),
-    ]
-    chunk = FakeChunk(markers, cameras)
-    fake = ModuleType("Metashape")
-    fake.app = SimpleNamespace(document=SimpleNamespace(chunk=chunk))  # type: ignore[attr-defined] # a stand-in
-    monkeypatch.setitem(sys.modules, "Metashape", fake)
-    script = tmp_path / "metashape" / "add_scale_bars.py"
-    for _ in range(2):  # twice: the same bars
-        runpy.run_path(str(script), run_name="__main__")
-    assert [(bar.point0, bar.point1) for bar in chunk.scalebars] == [
-        (markers[0], cameras[0]),
-        (markers[2], cameras[1]),
-        (markers[3], cameras[1]),
-    ]
-    assert chunk.scalebars[1].reference.distance == pytest.approx(81.123456, abs=1e-6)
-    assert chunk.scalebars[1].reference.accuracy == pytest.approx(np.hypot(0.0153, 0.0123456789))
-    assert "3 scale bars set, 3 rows" in capsys.readouterr().out
 
 
 def test_separators_in_file_names_are_refused(points: MapPoints) -> None:
@@ -214,6 +90,44 @@ def test_pyopf_reads_the_project(points: MapPoints, tmp_path: Path) -> None:
         assert mark.accuracy == pytest.approx(0.1), "the floor"
     assert len(gcps["north gate"].marks) == 2
     np.testing.assert_allclose(gcps["K0001"].marks[0].position_px, [0.0, 1201.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "swaps", "unit_m"),
+    [("EPSG:25831", False, 1.0), ("EPSG:2180", True, 1.0), ("EPSG:2263", False, 1200 / 3937)],
+)
+def test_the_scene_frame_brings_points_near_zero_in_right_handed_metres(
+    points: MapPoints, tmp_path: Path, crs: str, unit_m: float, *, swaps: bool
+) -> None:
+    pytest.importorskip("pyopf")
+    from pyopf.io import load
+    from pyopf.resolve import resolve
+
+    export(replace(points, crs=crs, priors=()), "opf", tmp_path)
+    project = resolve(load(tmp_path / "opf" / "project.opf"))
+    frame = project.scene_reference_frame
+    step = frame.base_to_canonical
+    assert step.swap_xy is swaps
+    gcps = project.input_control_points.gcps
+    assert frame.crs.definition == gcps[0].geolocation.crs.definition
+    for gcp, point in zip(gcps, points.gcps, strict=False):
+        metres = np.array(gcp.geolocation.coordinates) * step.scale
+        near = (metres[[1, 0, 2]] if swaps else metres) + step.shift
+        assert np.abs(near).max() < 110.0
+        first = points.gcps[0].position_map
+        east, north, up = (point.position_map - first) * [unit_m, unit_m, 1.0]
+        at_first = np.array(gcps[0].geolocation.coordinates) * step.scale
+        offset = near - ((at_first[[1, 0, 2]] if swaps else at_first) + step.shift)
+        np.testing.assert_allclose(offset, [east, north, up], atol=1e-6)
+
+
+def test_points_in_degrees_have_no_scene_frame(
+    points: MapPoints, in_degrees: MapPoints, tmp_path: Path
+) -> None:
+    export(points, "opf", tmp_path)
+    export(in_degrees, "opf", tmp_path)
+    assert not (tmp_path / "opf/scene_reference_frame.json").exists()
+    assert "scene_reference_frame" not in (tmp_path / "opf/project.opf").read_text("utf-8")
 
 
 def test_opf_escapes_paths_and_says_what_feet_are(make_points: Factory) -> None:

@@ -38,7 +38,7 @@ def test_a_format_writes_the_files_it_declares(
     assert all(any(fnmatch(path, pattern) for path in written) for pattern in declared)
     assert name == "csv" or any(path.endswith("HOWTO.txt") for path in written)
     assert not [path for path in tmp_path.rglob("*") if path.suffix == ".part"]
-    if name not in {"colmap", "camera-priors"}:
+    if name not in {"colmap", "camera-priors", "opf"}:
         always = [pattern for pattern in FORMATS[name].files if pattern[0] != "["]
         plain = make_points(gcps=points.controls)
         left = {str(path.relative_to(tmp_path)) for path in export(plain, name, tmp_path)}

@@ -112,7 +112,7 @@ def test_metashape_is_told_the_accuracy_and_gets_distances(
 ) -> None:
     export(sharp, "metashape", tmp_path)
     howto = (tmp_path / "metashape/HOWTO.txt").read_text(encoding="utf-8")
-    assert "set it to 0.100 px" in howto
+    assert "has one for all: 0.100 px" in howto
     assert "the share is 0.016 % here" in howto
     rows = csv.DictReader(io.StringIO((tmp_path / "metashape/scale_bars.csv").read_text()))
     expected = math.hypot(0.0004, 0.0123456789)
