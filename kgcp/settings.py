@@ -50,6 +50,9 @@ class DetectSettings:
         `kgcp.measurement.search.false_alarm`.
     is_guided : bool
         Whether frames without a target are looked at again where it must be.
+    is_learning : bool
+        Whether all frames together say what the tone curve of the camera is near to, where it is
+        not known.
     canny_low, canny_high : float
         With `paper`: hysteresis thresholds of the Canny detector on 8-bit grey values (§2.1).
     max_circle_deviation : float
@@ -61,6 +64,7 @@ class DetectSettings:
     min_score: float = 0.86
     false_alarm: float = 1e-5
     is_guided: bool = True
+    is_learning: bool = True
     canny_low: float = 40.0
     canny_high: float = 100.0
     max_circle_deviation: float = 0.15

@@ -67,6 +67,13 @@ _DEFAULTS = DetectSettings()
     help="Search again, more closely, where other frames or reference poses predict a target.",
 )
 @click.option(
+    "--learn/--no-learn",
+    "is_learning",
+    default=_DEFAULTS.is_learning,
+    show_default=True,
+    help="Learn from all frames together what an unknown tone curve of the camera is near to.",
+)
+@click.option(
     "--overlay",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
@@ -123,6 +130,7 @@ def command(
     all_candidates: bool,
     scheduler: str | None,
     is_guided: bool,
+    is_learning: bool,
     is_restart: bool,
     is_profiled: bool,
     is_quiet: bool,
@@ -154,6 +162,7 @@ def command(
         min_score=min_score,
         false_alarm=false_alarm,
         is_guided=is_guided,
+        is_learning=is_learning,
     )
     with open_workspace(flight, out) as workspace:
         the_flight = read_flight(workspace.flight)

@@ -177,6 +177,11 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
         lines.append(f"{summary.guided} of them measured in the second pass")
     if summary.guide_problem is not None:
         lines.append(f"second pass without reference poses: {summary.guide_problem}")
+    if summary.tone_base is not None:
+        lines.append(
+            f"tone curve near {summary.tone_base}, learnt from {summary.measured_with_tone}"
+            f" measurements; {summary.overruled_by_tone} of them would have taken another one"
+        )
     if summary.not_drawn:
         lines.append(f"rings not drawn because their frames are missing: {summary.not_drawn}")
     lines += _about_times(summary)

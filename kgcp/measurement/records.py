@@ -40,6 +40,41 @@ class Appearance:
     blur_px: float | None = None
 
 
+class ToneBase(StrEnum):
+    """The curve that a fitted tone curve departs from."""
+
+    SRGB = "sRGB"
+    LINE = "a straight line"
+
+
+@dataclass(frozen=True, slots=True)
+class Imaging:
+    """What the fit of one target says of the camera. Grey values are 0…1 of their range.
+
+    Attributes
+    ----------
+    base : ToneBase
+        What the tone curve is near to.
+    black, white : float
+        Light of ink and plate, as grey values that the base would give.
+    tone : tuple of float
+        Three numbers that shape the curve between them; as in `photometry.Light`.
+    sharpening, sd_sharpening : float
+        Strength of the unsharp mask, and its standard deviation.
+    noise_black, noise_white : float
+        Standard deviation of the grey values of ink and plate.
+    """
+
+    base: ToneBase
+    black: float
+    white: float
+    tone: tuple[float, float, float]
+    sharpening: float
+    sd_sharpening: float
+    noise_black: float
+    noise_white: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
     """Covariances of one observation.
@@ -140,6 +175,10 @@ class Measurement:
         None where nothing is known about calibration and diameter.
     is_guided : bool
         Whether it was found only where other frames or the reference poses said it must be.
+    imaging : Imaging or None
+        None where the method fits no tone.
+    rival : RivalTone or None
+        The same by the other base of an unknown tone; None where only one base leads anywhere.
     """
 
     target: str
@@ -154,6 +193,8 @@ class Measurement:
     uncertainty: Uncertainty | None
     common: CommonUncertainty | None = None
     is_guided: bool = False
+    imaging: Imaging | None = None
+    rival: RivalTone | None = None
 
     @property
     def distance_m(self) -> float:
@@ -169,6 +210,20 @@ class Measurement:
         """Tell whether a ring lies on this plate."""
         offset = np.linalg.norm(outline.centre - self.centre_px)
         return bool(offset < self.appearance.radius_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RivalTone:
+    """A measurement by the less likely base of an unknown tone curve.
+
+    Attributes
+    ----------
+    advantage : float
+        Log-likelihood by which it is the less likely one.
+    """
+
+    measurement: Measurement
+    advantage: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -163,6 +163,8 @@ def detect_flight(
                 with stopwatch.stage("second look"):
                     predictions, guide_problem = predict_missing(flight, data, run.tracks)
                     run.guided_pass(predictions)
+            with stopwatch.stage("learning"):
+                run.learn()
             likely_cause = None
             if run.tracks.is_readable.any() and not run.tracks.found:
                 with stopwatch.stage("trial of negatives"):
@@ -171,7 +173,9 @@ def detect_flight(
                 sheet.clear()
             with stopwatch.stage("table"):
                 rows = _rows(run, predictions, flight.camera, builder)
-                about = detections_provenance(flight, settings, run.frame_sizes, data.frame_times)
+                about = detections_provenance(
+                    flight, settings, run.frame_sizes, data.frame_times, run.learnt
+                )
                 write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
                 with stopwatch.stage("overlay"):
@@ -189,6 +193,7 @@ def detect_flight(
             else 0,
             not_drawn=not_drawn,
             guide_problem=guide_problem,
+            learnt=run.learnt,
             stages_s=_stages_s(stopwatch, journal, pool),
         )
         record = {**summary.numbers(), "jobs": pool.jobs, "settings": asdict(settings)}

@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -21,7 +22,7 @@ import numpy as np
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.records import FrameResult, Miss, is_unreadable
+from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
@@ -34,8 +35,10 @@ from kgcp.pipeline.frame_task import (
     kept_frame,
     lost_frame,
     shows_negative,
+    with_common_uncertainty,
 )
 from kgcp.pipeline.guidance import FrameTracks
+from kgcp.quality.learnt_imaging import LearntImaging, by_base, learn_imaging
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
@@ -105,6 +108,8 @@ class DetectionRun:
         Frames whose first look the journal had.
     frame_sizes : dict of int
         Bytes of the file of every frame; None: missing.
+    learnt : LearntImaging or None
+        What `learn` has found.
     """
 
     def __init__(
@@ -129,6 +134,7 @@ class DetectionRun:
         self._stage, self._done, self._total = "", 0, 0
         self.tracks = FrameTracks(job.targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
+        self.learnt: LearntImaging | None = None
 
     def first_pass(self) -> None:
         """Look at all frames that the journal has not.
@@ -215,9 +221,26 @@ class DetectionRun:
         with closing(self._pool.map(partial(shows_negative, self._job), inputs)) as results:
             return any(result is True for _, result in results)
 
+    def learn(self) -> None:
+        """Find out what all frames say of the camera, if asked to; `results` follow it then."""
+        if self._job.settings.is_learning:
+            self.learnt = learn_imaging(map(self._journal.read, self._keys))
+
     def results(self) -> Iterator[FrameResult]:
         """Yield the last result of every frame, in the frames' order."""
-        return map(self._journal.read, self._keys)
+        return map(self._as_learnt, map(self._journal.read, self._keys))
+
+    def _as_learnt(self, result: FrameResult) -> FrameResult:
+        if self.learnt is None or self.learnt.base is None:
+            return result
+        base = self.learnt.base
+        outcomes = tuple(
+            with_common_uncertainty(self._job, by_base(outcome, base))
+            if isinstance(outcome, Measurement)
+            else outcome
+            for outcome in result.outcomes
+        )
+        return replace(result, outcomes=outcomes)
 
     def map_results(
         self, function: Callable[[FrameResult], _Result]

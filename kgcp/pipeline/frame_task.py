@@ -84,7 +84,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
-        outcomes = tuple(_with_common_uncertainty(job, one) for one in examination.outcomes)
+        outcomes = tuple(with_common_uncertainty(job, one) for one in examination.outcomes)
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
@@ -204,7 +204,7 @@ def _merged(
         )
         instead[target.name] = known
     for name in first.keys() & found.keys():
-        instead[name] = _with_common_uncertainty(job, found[name])
+        instead[name] = with_common_uncertainty(job, found[name])
     return tuple(
         instead[one.target] if isinstance(one, Miss) else one for one in guided_input.first.outcomes
     )
@@ -234,7 +234,8 @@ def _mid_exposure_s(
     return time_s + reference.to_middle_s(exposure.exposure_time_s)
 
 
-def _with_common_uncertainty(job: DetectionJob, outcome: Outcome) -> Outcome:
+def with_common_uncertainty(job: DetectionJob, outcome: Outcome) -> Outcome:
+    """Return an outcome with what calibration and diameter make wrong in all frames alike."""
     if isinstance(outcome, Miss):
         return outcome
     ring = next(target.ring for target in job.targets if target.name == outcome.target)

@@ -13,6 +13,7 @@ from pathlib import Path
 from kgcp.errors import Reason, Status
 from kgcp.io.formats.frame_names import likely_difference
 from kgcp.measurement.records import FrameResult, Miss, TimeSource
+from kgcp.quality.learnt_imaging import LearntImaging
 
 _KEPT_DETAILS = 1000  # per reason: numbers differ from frame to frame
 _PLACE = re.compile(r"ring at \([^)]*\), radius [\d.]+ px(, |: |$)")
@@ -61,6 +62,10 @@ class DetectionSummary:
         Rings that are not in the contact sheet, since their frame could not be read again.
     guide_problem : str or None
         Why reference poses and trajectory could not say where to look again, if they could not.
+    tone_base : str or None
+        What the tone curve of all frames is near to; None: not learnt, or near nothing known.
+    measured_with_tone, overruled_by_tone : int
+        Measurements from which it was learnt, and those that it has changed.
     stages_s : dict of float
         Time that each stage of the work took [s].
     """
@@ -81,6 +86,9 @@ class DetectionSummary:
     guided: int
     not_drawn: int
     guide_problem: str | None
+    tone_base: str | None
+    measured_with_tone: int
+    overruled_by_tone: int
     stages_s: Mapping[str, float]
 
     @property
@@ -174,6 +182,7 @@ class SummaryBuilder:
         frames_without_attitude: int,
         not_drawn: int,
         guide_problem: str | None,
+        learnt: LearntImaging | None,
         stages_s: Mapping[str, float],
     ) -> DetectionSummary:
         """Return the counts, with what else there is to say."""
@@ -199,6 +208,9 @@ class SummaryBuilder:
             guided=self._guided,
             not_drawn=not_drawn,
             guide_problem=guide_problem,
+            tone_base=None if learnt is None or learnt.base is None else learnt.base.value,
+            measured_with_tone=0 if learnt is None else learnt.measurements,
+            overruled_by_tone=0 if learnt is None else learnt.overruled,
             stages_s=dict(stages_s),
         )
 

@@ -33,7 +33,9 @@ from kgcp.io.files.safe_read import is_file
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.frame_times import FrameTimes
 from kgcp.io.tables.columns import SCHEMA_VERSION
+from kgcp.io.tables.learnt_imaging import LEARNT_IMAGING, learnt_text
 from kgcp.measurement.records import TimeSource
+from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -50,6 +52,7 @@ def detections_provenance(
     settings: DetectSettings,
     frame_sizes: Mapping[str, int | None],
     times: FrameTimes,
+    learnt: LearntImaging | None,
 ) -> dict[str, str]:
     """Return the metadata of a table of detections.
 
@@ -76,6 +79,7 @@ def detections_provenance(
         "settings": json.dumps(asdict(settings), sort_keys=True),
         "inputs": json.dumps(values),
         "digests": _digests(parts),
+        **({} if learnt is None else {LEARNT_IMAGING: learnt_text(learnt)}),
     }
 
 

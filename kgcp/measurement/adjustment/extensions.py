@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kgcp.errors import Rejection
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.likelihood import advantage_over
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.plateaus import (
@@ -24,7 +25,7 @@ from kgcp.measurement.adjustment.plateaus import (
 )
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import asks_for_levels, even_field, fit_levels
-from kgcp.measurement.adjustment.skewed import asks_for_skew, loss_per_pixel, with_skew
+from kgcp.measurement.adjustment.skewed import asks_for_skew, with_skew
 from kgcp.measurement.adjustment.solver import adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of
@@ -36,11 +37,19 @@ _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
 
 
-def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
+@dataclass(frozen=True, slots=True, eq=False)
+class FitsByTone:
+    """The fits of one target by the tones that its camera may have."""
+
+    likelier: TwoPoses
+    rival: TwoPoses | None  # over the other base; None: it leads nowhere, or the tone is known
+    advantage: float = 0.0  # of the log-likelihood, by which the likelier one is so
+
+
+def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
     """Adjust both poses; with an unknown tone over sRGB's curve and over a straight line.
 
-    Three shapes hold curves near either of them. The likelier one is returned; which one it is
-    stands in its fits' problem.
+    Three shapes hold curves near either of them.
 
     Raises
     ------
@@ -48,7 +57,7 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
         As `_fit_in_any_light`, if neither leads anywhere.
     """
     if problem.tone is not Tone.UNKNOWN:
-        return _fit_in_any_light(problem, pose, blur)
+        return FitsByTone(_fit_in_any_light(problem, pose, blur), None)
     fits = []
     for tone in (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE):
         try:
@@ -57,7 +66,13 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
             failure = rejection
     if not fits:
         raise failure
-    return min(fits, key=lambda both: loss_per_pixel(both.best))
+    if len(fits) == 1:
+        return FitsByTone(fits[0], None)
+    over_srgb, over_line = fits
+    advantage = advantage_over(over_srgb.best, over_line.best)
+    if advantage > 0.0:
+        return FitsByTone(over_line, over_srgb, advantage)
+    return FitsByTone(over_srgb, over_line, -advantage)
 
 
 def _fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
@@ -107,7 +122,10 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
             )
     if not skewed:
         return poses
-    return replace(min(skewed, key=lambda both: loss_per_pixel(both.best)), even=poses.even)
+    likelier = skewed[0]
+    for one in skewed[1:]:
+        likelier = one if advantage_over(likelier.best, one.best) > 0.0 else likelier
+    return replace(likelier, even=poses.even)
 
 
 def _fit_skewed(

@@ -6,6 +6,7 @@ are adjusted; the one that fits better is reported, the other one kept with how 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 
@@ -17,7 +18,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
-from kgcp.measurement.adjustment.appearance import appearance_of
+from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
@@ -32,7 +33,7 @@ from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
 from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
-from kgcp.measurement.records import Alternative, InitialPose, Measurement
+from kgcp.measurement.records import Alternative, InitialPose, Measurement, RivalTone
 from kgcp.targets.layout import Target
 
 _MARGIN_PX = 12.0
@@ -74,16 +75,32 @@ def measure_by_model(
     pose = _without_edge_shift(start)
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
     problem = replace(problem, visible=visible)
-    poses = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
-    if prior.normal is not None:
-        poses = choose_by_prior(poses.best.sample.problem, poses, prior.normal)
+    fits = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
+    measurement = _checked(camera, target, start, fits.likelier, prior.normal)
+    if fits.rival is not None:
+        with contextlib.suppress(Rejection):  # then the likelier one has no rival
+            rival = _checked(camera, target, start, fits.rival, prior.normal)
+            measurement = replace(measurement, rival=RivalTone(rival, fits.advantage))
+    return measurement
+
+
+def _checked(
+    camera: Camera,
+    target: Target,
+    start: InitialPose,
+    poses: TwoPoses,
+    prior: NormalPrior | None,
+) -> Measurement:
+    """Choose between the two poses, and make the measurement of a fit that may be believed."""
+    if prior is not None:
+        poses = choose_by_prior(poses.best.sample.problem, poses, prior)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
     if poses.even is not None:
         check_code(poses.even, target.ring)
-    observation = _observation(camera, target, start, poses, prior.normal)
-    check_precision(observation)
-    return observation
+    measurement = _measurement(camera, target, start, poses, prior)
+    check_precision(measurement)
+    return measurement
 
 
 def _without_edge_shift(start: InitialPose) -> Pose:
@@ -166,7 +183,7 @@ def _start_blur(start: InitialPose, binning: int) -> Blur:
     return Blur(variance, variance, 0.0)
 
 
-def _observation(
+def _measurement(
     camera: Camera,
     target: Target,
     start: InitialPose,
@@ -188,6 +205,7 @@ def _observation(
         centre_px=camera.project(pose.translation_m[None])[0],
         heading_deg=image_heading_deg(camera, pose),
         appearance=appearance_of(camera, target, best),
+        imaging=imaging_of(best),
         alternative=Alternative(other.parameters.pose, ambiguity),
         uncertainty=propagate(camera, pose, pose_cov),
     )

@@ -75,7 +75,7 @@ def residual_image_of(
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
     if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and asks_for_levels(fit):
-        best = fit_in_any_light(problem, pose, start.blur).best
+        best = fit_in_any_light(problem, pose, start.blur).likelier.best
         fit = best if best.parameters.field is not None else fit
     problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
     parameters = fit.parameters.at(pose)

@@ -51,11 +51,3 @@ def with_skew(unknowns: Unknowns) -> Unknowns:
     precision = unknowns.precision.copy()
     precision[SKEW_PARAMS] = _SKEW_SD_PX3**-2
     return Unknowns(free, unknowns.mean, precision, precision[free])
-
-
-def loss_per_pixel(fit: TargetFit) -> float:
-    """Return the negative log-likelihood with the priors, noise included, by pixel.
-
-    Fits with spreads of other shapes use other pixels: their sums do not compare.
-    """
-    return (fit.total + float(np.sum(np.log(fit.sd)))) / len(fit.sd)

@@ -70,7 +70,7 @@ class TargetFit:
     @property
     def total(self) -> float:
         """Negative log-likelihood with the priors."""
-        return _total(self.misfit, self.unknowns, self.parameters)
+        return negative_log_posterior(self.misfit, self.unknowns, self.parameters)
 
 
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
@@ -241,7 +241,7 @@ def minimise(
     relative_sd = float(sd.mean()) / contrast
     prediction, jacobian = linearise(sample, parameters) if linear is None else linear
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
-    total = _total(current, unknowns, parameters)
+    total = negative_log_posterior(current, unknowns, parameters)
     equations_of = equations_of or _plain_equations_of(sd, unknowns)
     equations = equations_of(parameters, jacobian, current)
     for number in range(steps):
@@ -253,7 +253,7 @@ def minimise(
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian
             trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
-            trial_total = _total(trial, unknowns, candidate)
+            trial_total = negative_log_posterior(trial, unknowns, candidate)
             is_better = trial_total <= total + _NEGLIGIBLE
             if is_better or promised < enough or damping > _MAX_DAMPING:
                 break
@@ -277,7 +277,7 @@ def _plain_equations_of(sd: FloatArray, unknowns: Unknowns) -> EquationsOf:
     return lambda _, jacobian, current: PlainEquations.of(jacobian, sd, current, unknowns)
 
 
-def _total(current: Misfit, unknowns: Unknowns, parameters: Parameters) -> float:
-    """Return the negative log-likelihood with all priors."""
+def negative_log_posterior(current: Misfit, unknowns: Unknowns, parameters: Parameters) -> float:
+    """Return the negative log-likelihood of pixels of known noise, with all priors."""
     of_field = 0.0 if parameters.field is None else parameters.field.penalty
     return current.total + unknowns.penalty(parameters) + of_field

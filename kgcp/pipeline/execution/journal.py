@@ -34,7 +34,7 @@ import numpy as np
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.files.portable import OPEN_FLAGS, lock
 from kgcp.measurement import records
-from kgcp.measurement.records import Considered, FrameResult, Miss, TimeSource
+from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
 
 # All records that a result may consist of; `records` also imports those of other modules.
 _RECORDS: dict[str, type] = {
@@ -43,6 +43,7 @@ _RECORDS: dict[str, type] = {
     if isinstance(record, type) and is_dataclass(record)
 }
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
+_TONE_BASES: dict[str, ToneBase] = {base.value: base for base in ToneBase}
 _TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeSource}
 
 _MADE_BY = "made-by"  # the key of the first line
@@ -104,6 +105,8 @@ def _record(cells: dict[str, Any]) -> object:
         cells["reason"] = _REASONS[cells["reason"]]
     if kind is FrameResult:
         cells["time_source"] = _TIME_SOURCES[cells["time_source"]]
+    if kind is Imaging:
+        cells["base"] = _TONE_BASES[cells["base"]]
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in cells.items()})
 
 

@@ -15,7 +15,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
-from kgcp.measurement.records import InitialPose, Measurement
+from kgcp.measurement.records import InitialPose, Measurement, ToneBase
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 
@@ -120,6 +120,26 @@ def test_exposure_and_tone_do_not_move_the_distance(
     assert abs(np.mean(errors.distance_percent)) < 0.02
     assert rms(errors.distance_sigmas) < 1.7
     assert rms(errors.centre_sigmas) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("tone", "base"), [(ToneCurve.SRGB, ToneBase.SRGB), (ToneCurve.FILM, ToneBase.LINE)]
+)
+def test_the_base_of_an_unknown_tone_is_told_by_the_same_pixels(
+    photograph: Photograph, start_near: StartNear, tone: ToneCurve, base: ToneBase
+) -> None:
+    camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
+    pose = random_pose(camera, 40.0, rng)
+    grey = photograph(camera, pose, rng, sensor=Sensor(tone=tone), gain=1.0)
+    seen = measure_by_model(grey, camera, TARGET, start_near(camera, pose, rng))
+    assert seen.imaging is not None
+    assert seen.imaging.base is base
+    assert seen.rival is not None
+    assert 5.0 < seen.rival.advantage < 300.0
+    other = seen.rival.measurement
+    assert other.imaging is not None
+    assert other.imaging.base is not base
+    assert abs(other.distance_m / seen.distance_m - 1.0) < 5e-4
 
 
 def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from zlib import crc32
 
@@ -25,8 +25,11 @@ from kgcp.measurement.records import (
     Considered,
     ExposureSettings,
     FrameResult,
+    Imaging,
     Measurement,
     Miss,
+    RivalTone,
+    ToneBase,
     Uncertainty,
 )
 from kgcp.pipeline.execution.journal import Journal, fingerprint, from_text, to_text
@@ -64,6 +67,17 @@ observations = st.builds(
     | st.builds(Uncertainty, arrays(6, 6), arrays(2, 2), numbers, numbers, numbers, numbers),
     common=st.none() | st.builds(CommonUncertainty, arrays(6, 6), numbers, numbers),
     is_guided=st.booleans(),
+    imaging=st.none()
+    | st.builds(
+        Imaging,
+        st.sampled_from(ToneBase),
+        *(numbers, numbers, st.tuples(numbers, numbers, numbers), numbers, numbers),
+        *(numbers, numbers),
+    ),
+)
+with_rivals = st.builds(
+    lambda seen, other, advantage: replace(seen, rival=RivalTone(other, advantage)),
+    *(observations, observations, numbers),
 )
 misses = st.builds(Miss, st.text(), st.sampled_from(Reason), st.text(), maybe, st.integers(0, 99))
 candidates = st.builds(
@@ -78,7 +92,7 @@ results = st.builds(
     st.text(),
     maybe,
     st.builds(ExposureSettings, maybe, maybe, maybe),
-    st.lists(observations | misses, min_size=1, max_size=3).map(tuple),
+    st.lists(observations | with_rivals | misses, min_size=1, max_size=3).map(tuple),
     maybe,
     st.lists(candidates, max_size=2).map(tuple),
 )

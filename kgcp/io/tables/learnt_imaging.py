@@ -1,0 +1,57 @@
+"""What a flight has taught of its camera, as metadata of the table of detections."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.records import ToneBase
+from kgcp.quality.learnt_imaging import LearntImaging
+
+LEARNT_IMAGING = "learnt_imaging"
+"""Its key."""
+
+_DIGITS = 6
+
+
+def learnt_text(learnt: LearntImaging) -> str:
+    """Return it as JSON; null stands for what is not known."""
+    return json.dumps(
+        {
+            "tone_base": None if learnt.base is None else learnt.base.value,
+            "advantages": {base.value: round(x, 3) for base, x in learnt.advantages.items()},
+            "measurements": learnt.measurements,
+            "overruled": learnt.overruled,
+            "grey": _plain(learnt.grey),
+            "light": [_plain(percentile) for percentile in learnt.light],
+            "sharpening": _plain(learnt.sharpening),
+            "noise": [_plain(pair) for pair in learnt.noise],
+        }
+    )
+
+
+def learnt_from_text(text: str) -> LearntImaging:
+    """Return what `learnt_text` wrote.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If it is anything else.
+    """
+    parts = json.loads(text)
+    return LearntImaging(
+        base=None if parts["tone_base"] is None else ToneBase(parts["tone_base"]),
+        advantages={ToneBase(base): each for base, each in parts["advantages"].items()},
+        measurements=parts["measurements"],
+        overruled=parts["overruled"],
+        grey=np.array(parts["grey"], dtype=np.float64),
+        light=np.array(parts["light"], dtype=np.float64),
+        sharpening=np.array(parts["sharpening"], dtype=np.float64),
+        noise=np.array(parts["noise"], dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _plain(values: FloatArray) -> list[float | None]:
+    return [round(value, _DIGITS) if np.isfinite(value) else None for value in values.tolist()]

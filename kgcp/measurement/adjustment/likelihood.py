@@ -1,0 +1,40 @@
+"""Which of two fits of one target is the likelier one.
+
+Every fit has pixels and noise of its own, so that sums over its pixels do not compare with those of
+another fit. Both are held against the same pixels therefore: those of either, in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.measurement.adjustment.pixels import Sample
+from kgcp.measurement.adjustment.solver import TargetFit, negative_log_posterior, noise_of, predict
+from kgcp.measurement.image_model.noise import misfit
+
+
+def advantage_over(other: TargetFit, fit: TargetFit) -> float:
+    """Return by how much log-likelihood and priors are greater for `fit` than for `other`."""
+    return 0.5 * sum(
+        _loss(other, sample) - _loss(fit, sample) for sample in (fit.sample, other.sample)
+    )
+
+
+def _loss(fit: TargetFit, sample: Sample) -> float:
+    """Return the negative log-likelihood of a sample's pixels by a fit, the priors included.
+
+    Noise is what the fit leaves there, which is part of the likelihood.
+    """
+    tone = fit.sample.problem.tone
+    toned = replace(
+        sample,
+        problem=replace(sample.problem, tone=tone),
+        photometry=replace(sample.photometry, tone=tone),
+    )
+    prediction = predict(toned, fit.parameters)
+    sd = noise_of(toned, prediction).sd
+    current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
+    loss = negative_log_posterior(current, fit.unknowns, fit.parameters)
+    return loss + float(np.sum(np.log(sd)))

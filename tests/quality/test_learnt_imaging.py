@@ -1,0 +1,105 @@
+"""What many frames say together: the base of an unknown tone curve, and the curve itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason
+from kgcp.geometry.pose import Pose
+from kgcp.io.tables.learnt_imaging import learnt_from_text, learnt_text
+from kgcp.measurement.image_model.photometry import srgb_decoded
+from kgcp.measurement.records import (
+    Appearance,
+    ExposureSettings,
+    FrameResult,
+    Imaging,
+    Measurement,
+    Miss,
+    RivalTone,
+    ToneBase,
+)
+from kgcp.quality.learnt_imaging import by_base, learn_imaging
+
+SRGB, LINE = ToneBase.SRGB, ToneBase.LINE
+
+
+def imaging(base: ToneBase, white: float) -> Imaging:
+    return Imaging(base, 0.05 * white, white, (0.0, 0.0, 0.0), 0.4, 0.02, 0.004, 0.006)
+
+
+def frame(name: str, base: ToneBase, advantage: float, white: float = 0.8) -> FrameResult:
+    """A target 10 m away by the likelier base, and 11 m away by the other."""
+    plate = Measurement(
+        *("A", "A", 0, 0.9, Pose(np.eye(3), np.array([0.0, 0.0, 10.0])), np.zeros(2), 0.0),
+        *(Appearance(30.0, 0.05, 0.8, 0.0), None, None),
+        imaging=imaging(base, white),
+    )
+    other = replace(
+        plate,
+        pose=Pose(np.eye(3), np.array([0.0, 0.0, 11.0])),
+        imaging=imaging(LINE if base is SRGB else SRGB, white),
+    )
+    plate = replace(plate, rival=RivalTone(other, advantage), is_guided=True)
+    return FrameResult(name, 0.0, ExposureSettings(), (plate, Miss("B", Reason.CUT)))
+
+
+def first_of(result: FrameResult) -> Measurement:
+    outcome = result.outcomes[0]
+    assert isinstance(outcome, Measurement)
+    return outcome
+
+
+def test_the_base_that_most_of_the_likelihood_speaks_for_is_that_of_all() -> None:
+    results = [frame(f"f{k}", SRGB, 20.0 + k) for k in range(5)] + [frame("odd", LINE, 12.0)]
+    learnt = learn_imaging(results)
+    assert learnt is not None
+    assert (learnt.base, learnt.measurements, learnt.overruled) == (SRGB, 6, 1)
+    odd = first_of(results[-1])
+    turned = by_base(odd, SRGB)
+    assert turned.distance_m == 11.0
+    assert turned.is_guided
+    assert by_base(turned, LINE).distance_m == 10.0
+    assert by_base(first_of(results[0]), SRGB) is first_of(results[0])
+
+
+@pytest.mark.parametrize("against", [[1e6], [15.0, 15.0]])
+def test_one_frame_alone_never_decides(against: list[float]) -> None:
+    results = [frame(f"f{k}", SRGB, 30.0) for k in range(6)]
+    results += [frame(f"g{k}", LINE, each) for k, each in enumerate(against)]
+    learnt = learn_imaging(results)
+    assert learnt is not None
+    assert learnt.base is SRGB
+
+
+def test_where_frames_disagree_each_keeps_its_own() -> None:
+    results = [frame(f"f{k}", SRGB if k % 2 else LINE, 25.0) for k in range(7)]
+    learnt = learn_imaging(results)
+    assert learnt is not None
+    assert learnt.base is None
+    assert learnt.overruled == 0
+
+
+def test_nothing_is_learnt_where_the_tone_is_known() -> None:
+    known = first_of(frame("a", SRGB, 5.0))
+    known = replace(known, rival=None, imaging=None)
+    assert learn_imaging([FrameResult("a", 0.0, ExposureSettings(), (known,))]) is None
+
+
+def test_the_common_curve_is_that_of_all_frames_and_order_does_not_matter() -> None:
+    whites = np.linspace(0.3, 0.9, 9)
+    results = [frame(f"f{k}", SRGB, 20.0, white) for k, white in enumerate(whites)]
+    learnt = learn_imaging(results)
+    assert learnt is not None
+    known = np.isfinite(learnt.light[1])
+    assert 0.6 < np.mean(known) < 0.95, "neither the deepest shade nor burnt white was seen"
+    np.testing.assert_allclose(
+        learnt.light[:, known], np.tile(srgb_decoded(learnt.grey)[known], (3, 1)), atol=2e-3
+    )
+    np.testing.assert_allclose(learnt.sharpening, 0.4)
+    assert learnt.noise.shape == (18, 2)
+    assert learnt_text(learn_imaging(results[::-1]) or learnt) == learnt_text(learnt)
+    again = learnt_from_text(learnt_text(learnt))
+    assert learnt_text(again) == learnt_text(learnt)
