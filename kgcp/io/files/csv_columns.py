@@ -1,4 +1,7 @@
-"""Comma-separated files whose columns are known by name: texts and numbers."""
+"""Tables as text whose columns are known by name: texts and numbers.
+
+They are comma-separated with decimal points, unless a `CsvLayout` says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import csv
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +23,24 @@ SEPARATOR_REMEDY = "save it with commas between the cells and points in the numb
 
 _SEPARATORS = ((r";", "';'"), (r"\t", "tabs"), (r" +", "spaces"))
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+
+SEPARATORS = (",", ";", "\t", " ")
+"""What may stand between the cells of a file; several spaces count as one."""
+DECIMALS = (".", ",")
+"""What may stand before the decimals of a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class CsvLayout:
+    """How a file writes its table; by default as docs/conventions.md says."""
+
+    separator: str = ","
+    decimal: str = "."
+    # name in docs/conventions.md → name in the file's first line; the others have the same in both
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+
+_OWN_LAYOUT = CsvLayout()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,19 +105,23 @@ def read_csv_columns(
     required: Sequence[str],
     optional: Sequence[str],
     toml_key: str,
+    layout: CsvLayout = _OWN_LAYOUT,
 ) -> CsvColumns:
     """Read text columns and number columns, in any order; other columns are ignored.
 
     Parameters
     ----------
     path : Path
-        The file: comma-separated, UTF-8, first line names the columns.
+        The file: UTF-8, first line names the columns.
     texts : sequence of str
         Names of text columns; the file must have all of them.
     required, optional : sequence of str
         Names of number columns.
     toml_key : str
         Where flight.toml names the file, for the message if it is missing.
+    layout : CsvLayout
+        Of the file; columns have their names of docs/conventions.md in all other arguments and in
+        the result.
 
     Raises
     ------
@@ -104,11 +129,11 @@ def read_csv_columns(
         With the line: missing file or column, a cell that is not a finite number, a short row.
     """
     wanted = (*texts, *required)
-    rows = _read_rows(path, toml_key)
+    rows = _read_rows(path, toml_key, layout.separator)
     first = next(rows, None)
     if first is None:
         raise KgcpError(f"{path}: is empty; its first line must name {', '.join(wanted)}")
-    header = [name.strip() for name in first[1]]
+    header = _own_names([name.strip() for name in first[1]], layout, f"{path}, line {first[0]}")
     _check_header(header, wanted, f"{path}, line {first[0]}")
     names = tuple(name for name in (*required, *optional) if name in header)
     places = [header.index(name) for name in names]
@@ -122,7 +147,7 @@ def read_csv_columns(
         lines.append(line)
         text_cells.append([cells[header.index(name)].strip() for name in texts])
         numbers.extend(
-            _number(cells[place], f"{path}, line {line}: {name}")
+            _number(cells[place], f"{path}, line {line}: {name}", layout.decimal)
             for place, name in zip(places, names, strict=True)
         )
     columns = zip(*text_cells, strict=True) if text_cells else [()] * len(texts)
@@ -167,16 +192,36 @@ def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> N
         raise KgcpError(f"{where}: names {doubled[0]} twice; keep one of them")
 
 
-def _read_rows(path: Path, toml_key: str) -> Iterator[tuple[int, list[str]]]:
+def _own_names(header: Sequence[str], layout: CsvLayout, where: str) -> list[str]:
+    """Return the names of docs/conventions.md for those of the file that the layout translates."""
+    own = {theirs: ours for ours, theirs in layout.columns.items()}
+    for theirs, ours in own.items():
+        if theirs not in header:
+            raise KgcpError(
+                f"{where}: has no column {theirs!r}, which flight.toml names for {ours};"
+                f" name one of {', '.join(header)}"
+            )
+    # A column of the same name that stands for nothing must not be taken for the translated one.
+    return [own.get(name, "" if name in layout.columns else name) for name in header]
+
+
+def _read_rows(path: Path, toml_key: str, separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, with their line numbers."""
-    reader = csv.reader(read_lines(path, toml_key))
+    lines = read_lines(path, toml_key)
+    if separator == " ":
+        rows = ((number, line.split()) for number, line in enumerate(lines, start=1))
+        yield from ((number, cells) for number, cells in rows if cells)
+        return
+    reader = csv.reader(lines, delimiter=separator)
     try:
         yield from ((reader.line_num, cells) for cells in reader if any(map(str.strip, cells)))
     except csv.Error as error:
         raise KgcpError(f"{path}: is not a readable CSV file ({error}); repair it") from error
 
 
-def _number(text: str, where: str) -> float:
+def _number(text: str, where: str, decimal: str) -> float:
+    if decimal != ".":
+        text = text.replace(decimal, ".")
     try:
         value = float(text)
     except ValueError:

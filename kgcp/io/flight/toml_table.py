@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import os
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -105,6 +106,14 @@ class TomlTable:
                 return word
         listed = ", ".join(f'"{word}"' for word in words)
         raise self.error(key, f"{text!r} is not known", f"give one of {listed}")
+
+    def mark(self, key: str, marks: Sequence[str]) -> str:
+        """Return one of the given characters, white space among them."""
+        value = self._required(key, "give it as a text in quotes")
+        if value not in marks:
+            listed = ", ".join(map(json.dumps, marks))
+            raise self.error(key, f"{value!r} is not known", f"give one of {listed}")
+        return str(value)
 
     def boolean(self, key: str, *, default: bool) -> bool:
         """Return true or false, or the default where the key is absent."""

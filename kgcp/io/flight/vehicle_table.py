@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from kgcp.io.files.csv_columns import DECIMALS, SEPARATORS, CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.trajectories import FORMATS
+from kgcp.io.formats.trajectories.csv import COLUMNS
 from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 from kgcp.settings import VehicleSettings
 
 VEHICLE_KEYS = (
-    *("trajectory", "format", "crs", "time_system", "date", "accuracies", "wander"),
+    *("trajectory", "format", "separator", "decimal", "columns"),
+    *("crs", "time_system", "date", "accuracies", "wander"),
     *("attitude", "sd_attitude_deg", "lever_arm_m", "sd_lever_arm_m", "mount_deg"),
     *("sd_time_s", "time_offset_s", "level_sd_deg", "correlation_s"),
 )
@@ -61,6 +64,7 @@ def read_vehicle(flight: TomlTable, folder: Path) -> VehicleTable | None:
         accuracies_file=None if accuracies is None else folder / accuracies,
         wander=table.optional("wander", lambda key: table.choice(key, Wander)),
         course_sd_deg=_read_course(table),
+        layout=_read_layout(table),
     )
     return VehicleTable(settings, folder / table.path("trajectory", folder), options)
 
@@ -83,3 +87,15 @@ def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
             "sd_attitude_deg", f"{list(deviations)} is out of range", "give values of 0 to 180 deg"
         )
     return deviations
+
+
+def _read_layout(table: TomlTable) -> CsvLayout:
+    """Return how a CSV file is written; by default as docs/conventions.md says."""
+    separator = table.optional("separator", lambda key: table.mark(key, SEPARATORS)) or ","
+    decimal = table.optional("decimal", lambda key: table.mark(key, DECIMALS)) or "."
+    if separator == decimal:
+        raise table.error(
+            "separator", "is the decimal mark, too", 'give decimal = "," with separator = ";"'
+        )
+    columns = table.table("columns", COLUMNS, required=False)
+    return CsvLayout(separator, decimal, {key: columns.text(key) for key in columns.values})

@@ -55,7 +55,7 @@ def read_trajectory(
     file = ForeignFile(path, "[vehicle] trajectory")
     if not file.head.strip():
         raise file.error("is empty", "give a trajectory")
-    form = options.format or FORMATS.recognised(file)
+    form = options.format or ("csv" if options.has_layout else FORMATS.recognised(file))
     _refuse_foreign_keys(form, options)
     epochs = FORMATS.reader(file, form)(file, options, flight_crs)
     if epochs.crs != flight_crs:
@@ -86,6 +86,7 @@ def _refuse_foreign_keys(form: str, options: TrajectoryFileOptions) -> None:
         "wander": options.wander is not None and form != "sbet",
         "date": options.first_day is not None and form == "rtklib",
         "time_system": options.time_system is not None and form == "rtklib",
+        "separator, decimal or columns": options.has_layout and form != "csv",
     }
     for key, is_foreign in given.items():
         if is_foreign:

@@ -12,6 +12,9 @@ _ATTITUDE = ("roll_deg", "pitch_deg", "heading_deg")
 _SD_POSITION = tuple(f"sd_{name}" for name in _POSITION)
 _SD_ATTITUDE = tuple(f"sd_{name}" for name in _ATTITUDE)
 
+COLUMNS = ("time", *_POSITION, *_ATTITUDE, *_SD_POSITION, *_SD_ATTITUDE)
+"""Names of all columns in docs/conventions.md."""
+
 
 def matches(file: ForeignFile) -> bool:
     """Whether the first line has several cells."""
@@ -22,7 +25,8 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> 
     """Read a trajectory from a CSV file by docs/conventions.md.
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
-    in any order. The attitude may be absent where it is not wanted.
+    in any order, or what `options.layout` calls them. The attitude may be absent where it is not
+    wanted.
     """
     with_attitude = options.course_sd_deg is None
     columns = read_csv_columns(
@@ -31,8 +35,9 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> 
         (*_POSITION, *_ATTITUDE) if with_attitude else _POSITION,
         (*_SD_POSITION, *_SD_ATTITUDE),
         file.toml_key,
+        options.layout,
     )
-    times = columns.texts["time"]
+    times = [text.replace(options.layout.decimal, ".") for text in columns.texts["time"]]
     time_s = times_from_texts(file.path, columns.lines, times, options)
     check_times(file.path, time_s, lambda row: f"line {columns.lines[row]} ({times[row]})")
     return Epochs(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from enum import StrEnum
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
 
 
@@ -39,6 +40,12 @@ class TrajectoryFileOptions:
     # given, the attitude is that of the course over ground, level, with these standard deviations
     # of roll, pitch and heading; None: the file has the attitude
     course_sd_deg: tuple[float, float, float] | None = None
+    layout: CsvLayout = field(default_factory=CsvLayout)  # with CSV: how its table is written
+
+    @property
+    def has_layout(self) -> bool:
+        """Whether flight.toml says how the table of a CSV file is written."""
+        return self.layout != CsvLayout()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
