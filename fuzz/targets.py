@@ -22,6 +22,7 @@ from typing import TypeVar
 from kgcp.errors import KgcpError, KgcpWarning, Rejection
 from kgcp.geometry.camera import Camera
 from kgcp.georef.crs import parse_crs
+from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
@@ -37,6 +38,8 @@ from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.pipeline.execution.journal import from_text
+from kgcp.pipeline.init import draft_flight
+from kgcp.pipeline.init_records import InitOptions
 
 CRS = "EPSG:25832"
 FRAME_WIDTH, FRAME_HEIGHT = 40, 30
@@ -66,6 +69,10 @@ LATE_MODULES = (
 """What readers import when they are called."""
 
 _CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
+_FRAME = (  # a PNG of 1 x 1 px
+    b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x01\0\0\0\x01\x08\0\0\0\0:~\x9bU\0\0\0\nIDATx\x9cc`\0"
+    b"\0\0\x02\0\x01H\xaf\xa4q\0\0\0\0IEND\xaeB`\x82"
+)
 _COURSE = TrajectoryFileOptions(course_sd_deg=(2.0, 2.0, 3.0))
 _DATED = replace(_COURSE, first_day=date(2026, 6, 16), time_system=TimeSystem.GPS)
 _NOTATIONS = (
@@ -75,6 +82,8 @@ _NOTATIONS = (
     replace(_COURSE, format="rtklib"),
     replace(_COURSE, time_system=TimeSystem.UTC, crs="EPSG:4258"),
     replace(_COURSE, time_system=TimeSystem.GPS),
+    replace(_COURSE, layout=CsvLayout(";", ",", {"time": "GPST", "x": "E", "y": "N"})),
+    replace(_COURSE, layout=CsvLayout(" ", ".", {"time": "GPST", "x": "E", "y": "N"})),
 )
 
 _One = TypeVar("_One")
@@ -103,6 +112,20 @@ def trajectories(data: bytes, folder: Path) -> None:
     path = _written(folder, data)
     _allow(lambda: read_trajectory(path, CRS))
     read_trajectory(path, CRS, _chosen(data, _NOTATIONS))
+
+
+def bare_folder(data: bytes, folder: Path) -> None:
+    """Tell what a file beside frames is, and draft a flight.toml."""
+    (folder / "frames").mkdir(exist_ok=True)
+    (folder / "frames" / "1781597705.5.png").write_bytes(_FRAME)
+    (folder / "data.csv").write_bytes(data)
+    draft = draft_flight(folder, InitOptions(codes=("0,43,78,180",), diameter_m=0.9))
+    (folder / "flight.toml").write_text(draft.toml_text, encoding="utf-8")
+    (folder / "frames.csv").write_text(draft.frames_csv or "frame,time\n", encoding="utf-8")
+    try:
+        _allow(lambda: read_flight(folder))
+    finally:
+        (folder / "flight.toml").unlink()
 
 
 def poses(data: bytes, folder: Path) -> None:
@@ -138,7 +161,10 @@ def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
 
 TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
-    for target in (flight_toml, times, trajectories, poses, calibrations, frames, journal)
+    for target in (
+        *(flight_toml, bare_folder, times, trajectories, poses, calibrations, frames),
+        journal,
+    )
 }
 
 

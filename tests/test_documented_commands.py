@@ -22,6 +22,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg")
 OF_OTHERS = {"--force-gps", "--gcp", "--tilt", "--wander"}  # OpenDroneMap's, and of benchmarks/
 HERE = "sample_flight"
+BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
 # Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates.
 READ_ONLY = {"--scheduler", "simulate"}
 STORES = ("s3://", "gs://")
@@ -108,6 +109,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.chdir(folder)
         assert CliRunner().invoke(main, ["detect", HERE], catch_exceptions=False).exit_code == 0
         shutil.copytree(flight, folder, dirs_exist_ok=True)
+        for bare in BARE:
+            shutil.copytree(flight / "frames", folder / bare)
         yield folder
 
 
@@ -135,6 +138,8 @@ def test_what_is_shown_runs(shown: Shown, workspace: Path) -> None:
     assert result.exit_code == 0, result.stderr
     for path in set(workspace.iterdir()) - before:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for bare in BARE:
+        (workspace / bare / "flight.toml").unlink(missing_ok=True)
 
 
 def programs() -> list[str]:

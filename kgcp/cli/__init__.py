@@ -16,6 +16,7 @@ from kgcp.pipeline.execution.threads import use_one_thread_each
 
 # Name → module, in the order of use; a module is imported when its command is called.
 COMMANDS = {
+    "init": "kgcp.cli.init",
     "check": "kgcp.cli.check",
     "detect": "kgcp.cli.detect",
     "export-gcp": "kgcp.cli.export_gcp",
@@ -89,6 +90,7 @@ def main() -> None:
     The usual sequence for a flight folder:
 
     \b
+      kgcp init FLIGHT           write its flight.toml from what lies there
       kgcp check FLIGHT          report what is in a flight folder, and what does not fit
       kgcp detect FLIGHT         find and measure the target in every frame
       kgcp export-gcp FLIGHT     compute and export kinematic ground control points

@@ -10,6 +10,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import RESULTS_NAME
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
@@ -203,7 +204,9 @@ def detect_flight(
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:
-    if folder.resolve().is_relative_to(flight.frames_folder.resolve()):
+    place = folder.resolve()
+    is_result = place.is_relative_to((flight.folder / RESULTS_NAME).resolve())
+    if place.is_relative_to(flight.frames_folder.resolve()) and not is_result:
         raise KgcpError(
             f"{folder}: is among the frames, where pictures would be taken for frames;"
             " choose another folder of pictures",

@@ -194,7 +194,7 @@ class FlightInputs:
         """What does not fit, grave doubts first; without what cannot be read."""
         flight = self.flight
         found = [
-            *check_camera(flight.camera),
+            *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
             *check_targets(flight.targets),
             *check_frames(self.headers, flight.camera),
             *self._doubts_of_places(),

@@ -13,11 +13,8 @@ from pathlib import Path, PurePosixPath
 
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import FRAME_SUFFIXES
+from kgcp.io.images.frames import FRAME_SUFFIXES, RESULTS_NAME
 from kgcp.io.images.remote import StoredFolder
-
-NAME = "kgcp"
-"""Of the results' folder in that of the flight."""
 
 DETECTIONS = "detections.parquet"
 """What `kgcp detect` makes, and the other commands need."""
@@ -34,7 +31,7 @@ def results_folder(flight: Path) -> Path:
     KgcpError
         If there is such a link.
     """
-    folder = flight / NAME
+    folder = flight / RESULTS_NAME
     if folder.is_symlink():
         raise KgcpError(
             f"{folder}: is a link; delete it, or name where it leads as the results folder",
@@ -119,7 +116,7 @@ def open_workspace(
 
 
 def _results_of(flight: Path | StoredFolder) -> Path | StoredFolder:
-    return flight / NAME if isinstance(flight, StoredFolder) else results_folder(flight)
+    return flight / RESULTS_NAME if isinstance(flight, StoredFolder) else results_folder(flight)
 
 
 def _copied(flight: StoredFolder, folder: Path) -> Path:
@@ -129,7 +126,7 @@ def _copied(flight: StoredFolder, folder: Path) -> Path:
     frames = _frames_folder(folder / "flight.toml")
     if frames is not None:
         (folder / frames).mkdir(parents=True, exist_ok=True)
-    for name in flight.tree([NAME] if frames is None else [NAME, str(frames)]):
+    for name in flight.tree([RESULTS_NAME] if frames is None else [RESULTS_NAME, str(frames)]):
         if PurePosixPath(name).suffix.lower() not in FRAME_SUFFIXES:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes((flight / name).read())

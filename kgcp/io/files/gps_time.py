@@ -96,6 +96,22 @@ def clock_from_date(first_day: date, seconds: FloatArray) -> FloatArray | None:
     return clock_s
 
 
+def first_day_near(seconds: float, unix_s: float, system: TimeSystem) -> date:
+    """Return the day of seconds of the week, by their own clock, in the week nearest to a time.
+
+    Parameters
+    ----------
+    unix_s : float
+        Shortly after those seconds, or before: by less than half a week [s].
+    """
+    clock_s = unix_s
+    if system is TimeSystem.GPS:
+        clock_s += unix_s - float(unix_from_gps(np.array(unix_s)))
+    within = seconds % WEEK_S
+    weeks = round((clock_s - _GPS_START_S - within) / WEEK_S)
+    return datetime.fromtimestamp(_GPS_START_S + weeks * WEEK_S + within, UTC).date()
+
+
 def weekday(seconds: float) -> str:
     """Name the day of seconds of the week."""
     return calendar.day_name[(calendar.SUNDAY + int(seconds // _DAY_S)) % 7]

@@ -17,7 +17,7 @@ from kgcp.settings import require_range
 _NEEDED = ("fx", "fy", "cx", "cy")  # what has no default
 DEVIATION_KEYS = tuple(f"sd_{name}" for name in CALIBRATION_PARAMETERS)
 CAMERA_KEYS = (
-    *("file", "format", "camera", "width", "height", *CALIBRATION_PARAMETERS),
+    *("guessed", "file", "format", "camera", "width", "height", *CALIBRATION_PARAMETERS),
     *(*DEVIATION_KEYS, "cov_of", "cov", "plumb_sd_deg"),
     *("response", "readout_s", "motion_sd_deg_s", "time_reference"),
 )
@@ -57,7 +57,7 @@ def _inline_camera(table: TomlTable) -> Camera:
 
 
 def _file_camera(table: TomlTable, folder: Path) -> Camera:
-    for key in CALIBRATION_PARAMETERS:
+    for key in ("guessed", *CALIBRATION_PARAMETERS):
         if key in table:
             raise table.error(key, "is given beside a calibration file", "delete one of the two")
     return read_calibration(

@@ -64,6 +64,8 @@ class Flight:
         Whether EXIF gives the time of a frame that the times file, if there is one, does not name.
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
+    is_camera_guessed : bool
+        Whether the camera is no calibration but a guess, as `kgcp init` makes from EXIF.
     plumb_sd_deg : float or None
         Standard deviation of the camera's optical axis against the vertical, about either
         horizontal axis, in frames without reference attitude [deg]; None: not known.
@@ -80,6 +82,7 @@ class Flight:
     may_use_exif_times: bool
     camera: Camera
     calibration_covariance: CalibrationCovariance | None
+    is_camera_guessed: bool
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
     vehicle: VehicleTable | None
@@ -118,6 +121,7 @@ def read_flight(folder: Path | str) -> Flight:
         may_use_exif_times=times_file is None or exif_fallback,
         camera=read_camera(camera, folder),
         calibration_covariance=read_calibration_covariance(camera),
+        is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
         targets=read_targets(table),
         vehicle=vehicle,
@@ -135,6 +139,17 @@ def read_printed_targets(folder: Path) -> tuple[Target, ...]:
         As `read_flight`, for what is wrong with the targets.
     """
     return read_targets(_read_toml(folder / "flight.toml")[0])
+
+
+def read_target_tables(path: Path) -> tuple[Target, ...]:
+    """Read the targets of a file: a flight.toml, or the targets.toml of `kgcp target`.
+
+    Raises
+    ------
+    KgcpError
+        As `read_flight`, for what is wrong with the targets.
+    """
+    return read_targets(_read_toml(path)[0])
 
 
 def read_camera_and_targets(
@@ -160,7 +175,10 @@ def _name_of(folder: Path) -> str:
 def _read_toml(path: Path) -> tuple[TomlTable, str]:
     """Return the whole file as a table, and as text."""
     if not is_file(path):
-        raise KgcpError(f"{path}: does not exist; name a flight folder, which has a flight.toml")
+        raise KgcpError(
+            f"{path}: does not exist; name a flight folder, which has a flight.toml ('kgcp init'"
+            " writes one)"
+        )
     try:
         content = read_bytes(path, "FLIGHT", _MOST_BYTES)
         text = content.decode("utf-8-sig").replace("\r\n", "\n")

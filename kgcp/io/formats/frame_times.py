@@ -112,7 +112,8 @@ def _no_common_name(file: ForeignFile, names: Sequence[str], frames: Sequence[st
     )
 
 
-def _looks_like_marks(file: ForeignFile) -> bool:
+def looks_like_marks(file: ForeignFile) -> bool:
+    """Return whether a file's first line is one of DJI's marks."""
     return _MARK.match(file.head.decode("utf-8-sig", errors="replace").lstrip()) is not None
 
 
@@ -198,7 +199,7 @@ FORMATS: Registry[Callable[[ForeignFile, Sequence[str]], FrameTimes]] = Registry
     "a file of frame times",
     "give a CSV file with the columns frame and time",
     {
-        "mrk": (_looks_like_marks, _read_marks),
+        "mrk": (looks_like_marks, _read_marks),
         "rtklib": (looks_like_solution, _read_events),
         "csv": (lambda _: True, _read_csv),  # whose reader says what is wrong with the file
     },

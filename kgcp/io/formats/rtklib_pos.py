@@ -40,7 +40,8 @@ class Solution:
 def looks_like_solution(file: ForeignFile) -> bool:
     """Return whether a file is a solution, with or without its header."""
     text = file.head.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
-    return text.startswith("%") or _DATE.match(text) is not None
+    is_header = text.startswith("%") and not text.startswith("%YAML")
+    return is_header or _DATE.match(text) is not None
 
 
 def read_solution(file: ForeignFile) -> Solution:

@@ -27,6 +27,9 @@ FRAME_SUFFIXES = frozenset(
     {".bmp", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 )
 
+RESULTS_NAME = "kgcp"
+"""Of the results' folder in that of the flight."""
+
 _RAW_SUFFIXES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".fff", ".iiq", ".mef", ".nef", ".nrw"}
     | {".orf", ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f"}
@@ -53,7 +56,8 @@ def list_frames(folder: Path) -> list[str]:
     """List the images below a folder, as sorted relative paths with `/`.
 
     Hidden files and folders are passed over; the suffix decides, in any case. Links to files
-    are followed, links to folders below `folder` are not (they may run in circles).
+    are followed, links to folders below `folder` are not (they may run in circles). Where the
+    flight's own folder has the frames, the results in it are not among them.
 
     Raises
     ------
@@ -63,8 +67,12 @@ def list_frames(folder: Path) -> list[str]:
     if not is_folder(folder):
         raise KgcpError(f"{folder}: is not a folder; correct [frames] folder in flight.toml")
     names = []
+    is_flight = is_file(folder / "flight.toml")
     for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        is_top = is_flight and Path(parent) == folder
+        folders[:] = [
+            name for name in folders if name[0] != "." and not (is_top and name == RESULTS_NAME)
+        ]
         names += [(Path(parent) / name).relative_to(folder).as_posix() for name in files]
     frames = frames_among(names, str(folder))
     for name in frames:

@@ -12,9 +12,20 @@ _SQUARE = 0.9  # no sensor has pixels less square
 _SIZE_TOLERANCE = 0.12  # how far off the centre a principal point may be, in frame sizes
 
 
-def check_camera(camera: Camera) -> tuple[Doubt, ...]:
-    """Tell focal lengths in millimetres, and principal points of other frames."""
-    return (*_check_focal_length(camera), *_check_principal_point(camera))
+def check_camera(camera: Camera, *, is_guessed: bool = False) -> tuple[Doubt, ...]:
+    """Tell focal lengths in millimetres, principal points of other frames, and mere guesses."""
+    guess = mild(
+        Cause.GUESSED_CAMERA,
+        f"the camera is a guess from EXIF (fx = {camera.fx:g} px), not a calibration: distances may"
+        " be wrong by some per cent",
+        "give a calibration under [camera], and delete guessed and the sd_ keys of the guess",
+        {"fx_px": camera.fx},
+    )
+    return (
+        *_check_focal_length(camera),
+        *_check_principal_point(camera),
+        *((guess,) if is_guessed else ()),
+    )
 
 
 def _check_focal_length(camera: Camera) -> tuple[Doubt, ...]:

@@ -46,6 +46,7 @@ class Cause(StrEnum):
         "calibration_size",
         "the calibration is of frames of half, double or another size",
     )
+    GUESSED_CAMERA = "guessed_camera", "the camera is a guess from EXIF, not a calibration"
     DISTORTION_SIGN = "distortion_sign", "k1, k2 … have the sign of another distortion model"
     DIAMETERS = (
         "diameters",

@@ -68,6 +68,12 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) ->
     )
 
 
+def first_record(path: Path) -> FloatArray:
+    """Return the values (17,) of the first record."""
+    with path.open("rb") as stream:
+        return np.frombuffer(stream.read(_RECORD * _DOUBLE), dtype="<f8").astype(float)
+
+
 def _read_records(path: Path, columns: int, toml_key: str) -> FloatArray:
     data = read_bytes(path, toml_key, _MOST_BYTES)
     size = columns * _DOUBLE

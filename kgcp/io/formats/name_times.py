@@ -1,0 +1,53 @@
+"""Frame times that stand in the frames' names, as machine-vision recorders write them.
+
+Names of drones and phones hold local time in whole seconds, which is no use for a moving target.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from kgcp.errors import SettingError
+from kgcp.io.files.time_text import parse_time
+
+# Unix seconds with a fraction, or Unix milli-, micro- or nanoseconds.
+_SECONDS = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")
+_PARTS = re.compile(r"(?<!\d)(1\d{9})(\d{3}|\d{6}|\d{9})(?!\d)")
+_ISO = re.compile(
+    r"(?<!\d)(\d{4})-?(\d\d)-?(\d\d)[T_ -]?(\d\d)[:.-]?(\d\d)[:.-]?(\d\d)[.,_-]?(\d{1,9})Z"
+)
+
+
+def times_of_names(frames: Sequence[str]) -> dict[str, float] | None:
+    """Return the frames' times by their names, Unix UTC [s]; None where not every name has one.
+
+    Parameters
+    ----------
+    frames : sequence of str
+        Paths below the frames folder.
+    """
+    times: dict[str, float] = {}
+    for frame in frames:
+        time_s = _time_s(PurePosixPath(frame).stem)
+        if time_s is None:
+            return None
+        times[frame] = time_s
+    return times if len(set(times.values())) == len(times) else None
+
+
+def _time_s(stem: str) -> float | None:
+    if match := _ISO.search(stem):
+        year, month, day, hour, minute, second, fraction = match.groups()
+        text = f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction[:6]}Z"
+    elif match := _SECONDS.search(stem):
+        text = f"{match[1]}.{match[2] or match[3]}"
+    elif match := _PARTS.search(stem):
+        text = f"{match[1]}.{match[2]}"
+    else:
+        return None
+    try:
+        return parse_time(text)
+    except SettingError:
+        return None

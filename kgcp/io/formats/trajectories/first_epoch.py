@@ -1,0 +1,78 @@
+"""Where and when a trajectory begins, before flight.toml says anything about its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.georef.crs import WGS84_3D, wgs84_from_map
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.rtklib_pos import read_solution
+from kgcp.io.formats.trajectories.foreign_csv import ForeignTable
+from kgcp.io.formats.trajectories.rtklib import GEOCENTRIC
+from kgcp.io.formats.trajectories.sbet import first_record
+
+_GEODETIC, _ECEF = ("longitude", "latitude"), ("x-ecef", "y-ecef", "z-ecef")
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryFile:
+    """A file with a trajectory, in one of the formats of docs/conventions.md."""
+
+    path: Path
+    format: str
+    table: ForeignTable | None = None  # of a CSV file
+
+
+@dataclass(frozen=True, slots=True)
+class FirstEpoch:
+    """The beginning of a trajectory."""
+
+    x: float
+    y: float
+    crs: str | None  # of x, y, for pyproj; None: the file does not say
+    time: str  # as the file has it; empty where the format says all about its times
+
+
+def first_epoch(file: TrajectoryFile) -> FirstEpoch | None:
+    """Return the first epoch of a trajectory; None where the file cannot be read."""
+    try:
+        if file.format == "sbet":
+            return _of_sbet(file.path)
+        if file.format == "rtklib":
+            return _of_solution(file.path)
+        if file.table is not None:
+            return _of_table(file.table)
+        words = ForeignFile(file.path, "").first_line.split()
+        return FirstEpoch(float(words[1]), float(words[2]), None, words[0])
+    except (KgcpError, LookupError, ValueError):
+        return None
+
+
+def _of_sbet(path: Path) -> FirstEpoch:
+    seconds, latitude, longitude = first_record(path)[:3].tolist()
+    return FirstEpoch(
+        float(np.degrees(longitude)), float(np.degrees(latitude)), WGS84_3D, repr(seconds)
+    )
+
+
+def _of_solution(path: Path) -> FirstEpoch:
+    columns = read_solution(ForeignFile(path, "[vehicle] trajectory")).columns
+    if _GEODETIC[0] in columns:
+        longitude, latitude = (float(columns[name][0]) for name in _GEODETIC)
+    else:
+        place = np.array([columns[name][0] for name in _ECEF])
+        longitude, latitude = wgs84_from_map(GEOCENTRIC, [place], path.name)[0, :2].tolist()
+    return FirstEpoch(longitude, latitude, WGS84_3D, "")
+
+
+def _of_table(foreign: ForeignTable) -> FirstEpoch | None:
+    x, y = foreign.table.number("x"), foreign.table.number("y")
+    if x is None or y is None:
+        return None
+    crs = WGS84_3D if foreign.is_geographic else None
+    time = foreign.table.cells["time"].replace(foreign.table.layout.decimal, ".")
+    return FirstEpoch(x, y, crs, time)

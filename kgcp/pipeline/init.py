@@ -1,0 +1,326 @@
+"""A flight.toml for a folder that has none: what lies there, what it says, and what is missing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.time_text import format_time
+from kgcp.io.flight.flight import read_target_tables
+from kgcp.io.flight.folder import FLIGHT_TOML, FolderContents, survey_folder
+from kgcp.io.flight.target_table import target_lines
+from kgcp.io.flight.toml_draft import MISSING, DraftKey, DraftTable, DraftText
+from kgcp.io.formats.frame_times import read_times
+from kgcp.io.formats.name_times import times_of_names
+from kgcp.io.formats.point_table import PointTable
+from kgcp.io.images.exif import read_frame_header
+from kgcp.pipeline.init_camera import camera_section
+from kgcp.pipeline.init_records import Finding, Gap, InitOptions, Section
+from kgcp.pipeline.init_vehicle import crs_key, vehicle_section
+from kgcp.quality.checks.clock import time_span
+from kgcp.quality.checks.frame_header import FrameHeader
+from kgcp.targets.code_design import new_targets
+from kgcp.targets.layout import Target
+
+_FRAMES_CSV = "frames.csv"
+_NO_OPTIONS = InitOptions()
+_HEAD = (
+    '# Written by kgcp init from what lies in this folder. Lines with "# key = value" are not',
+    f"# set; those marked {MISSING} are needed. docs/conventions.md explains every key.",
+)
+_UNKNOWN_POSITION = DraftKey(
+    "position_m", None, "if it stands still", "[689412.0, 5336208.0, 545.0]", is_missing=True
+)
+_EXAMPLE_TARGET = (
+    "",
+    "# [[target]]",
+    f"# {MISSING}: the tables of targets.toml, which kgcp target writes:",
+    '# name = "A"',
+    "# outer_diameter_m = 0.9",
+    "# inner_diameter_m = 0.45",
+    "# code_diameter_m = 0.642857",
+    "# dot_diameter_m = 0.128571",
+    "# code_deg = [0, 43, 78, 180]",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FlightDraft:
+    """A flight.toml that is not yet written, and the reasons for it.
+
+    Attributes
+    ----------
+    toml_text : str
+        The file.
+    frames_csv : str or None
+        Times of the frames, where their names have them; None: another file has, or none.
+    findings : tuple of Finding
+        What the folder tells, and where it stands.
+    gaps : tuple of Gap
+        What it does not tell, and what to do about it.
+    """
+
+    toml_text: str
+    frames_csv: str | None
+    findings: tuple[Finding, ...]
+    gaps: tuple[Gap, ...]
+
+
+def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraft:
+    """Draft the flight.toml of a folder of frames.
+
+    Raises
+    ------
+    KgcpError
+        If there is a flight.toml, no folder, or no frames, or an option is wrong.
+    """
+    _require_new(folder)
+    contents = survey_folder(folder)
+    headers = [
+        read_frame_header(contents.frames_folder / frame, frame) for frame in contents.frames
+    ]
+    frames, times_s, frames_csv = _frames_section(contents, headers)
+    vehicle = vehicle_section(contents, times_s, options)
+    targets, surveyed = _targets_section(contents, options)
+    crs, crs_findings, crs_gaps = crs_key(contents, headers, surveyed, options)
+    top = DraftTable("", (DraftKey("name", _name_of(folder)), crs))
+    sections = (
+        frames,
+        camera_section(contents, headers),
+        targets,
+        Section((), crs_findings, crs_gaps),
+        vehicle,
+        _reference_section(contents),
+    )
+    blocks = (top, *(block for section in sections for block in section.blocks))
+    lines = [*_HEAD, *(line for block in blocks for line in block.lines())]
+    return FlightDraft(
+        "\n".join(lines) + "\n",
+        frames_csv,
+        tuple(finding for section in sections for finding in section.findings),
+        tuple(gap for section in sections for gap in section.gaps),
+    )
+
+
+def write_draft(draft: FlightDraft, folder: Path) -> list[Path]:
+    """Write the files of a draft, and return them.
+
+    Raises
+    ------
+    KgcpError
+        If one of them exists already, or cannot be written.
+    """
+    _require_new(folder)
+    contents = {folder / FLIGHT_TOML: draft.toml_text}
+    if draft.frames_csv is not None:
+        contents = {folder / _FRAMES_CSV: draft.frames_csv, **contents}
+    for path, text in contents.items():
+        if path.exists():
+            raise KgcpError(f"{path}: exists and is not replaced; move it away")
+        write_bytes(path, text.encode())
+    return [*contents]
+
+
+def _require_new(folder: Path) -> None:
+    path = folder / FLIGHT_TOML
+    if path.exists() or path.is_symlink():
+        raise KgcpError(
+            f"{path}: exists and is not replaced; edit it, or move it away and repeat 'kgcp init'"
+        )
+
+
+def _name_of(folder: Path) -> str:
+    name = "".join(one if one.isprintable() else "_" for one in folder.resolve().name)
+    return name.strip()[:100] or "flight"
+
+
+def _frames_section(
+    contents: FolderContents, headers: Sequence[FrameHeader]
+) -> tuple[Section, Mapping[str, float], str | None]:
+    """Return [frames], the frames' times [s], and a table of times where their names have them."""
+    suffixes = Counter(PurePosixPath(frame).suffix.lower() for frame in contents.frames)
+    kinds = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common())
+    folder = contents.relative(contents.frames_folder)
+    found = Finding("frames", f"{kinds} in {'this folder' if folder == '.' else f'{folder}/'}")
+    times = _times(contents, headers)
+    keys = (DraftKey("folder", folder, kinds), *times.keys)
+    section = Section((DraftTable("[frames]", keys),), (found, *times.findings), times.gaps)
+    return section, times.time_s, times.frames_csv
+
+
+@dataclass(frozen=True, slots=True)
+class _Times:
+    """Where the frames' times come from."""
+
+    time_s: Mapping[str, float]  # Unix UTC [s]
+    keys: tuple[DraftKey, ...]
+    findings: tuple[Finding, ...]
+    gaps: tuple[Gap, ...] = ()
+    frames_csv: str | None = None
+
+
+def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
+    """Return the frames' times by the first source that has some: file, names, EXIF."""
+    refused = []
+    for path in (*contents.times, *contents.marks, *contents.events):
+        name = contents.relative(path)
+        try:
+            known = read_times(path, contents.frames).time_s
+        except KgcpError as error:
+            refused.append(Gap("times", str(error).removeprefix(f"{path}: "), f"correct {name}"))
+            continue
+        time_s = {frame: known[frame] for frame in contents.frames if frame in known}
+        if time_s:
+            lacking = len(contents.frames) - len(time_s)
+            gap = Gap("times", f"{lacking} frames are not in {name}", "complete it, or remove them")
+            return _Times(
+                time_s,
+                (DraftKey("times", name, f"{len(time_s)} of {len(contents.frames)} frames"),),
+                (Finding("times", f"{_span(time_s)}, from {name}"),),
+                (gap,) if lacking else (),
+            )
+    if (by_name := times_of_names(contents.frames)) is not None:
+        return _times_by_name(by_name)
+    return _times_by_exif(contents, headers, tuple(refused))
+
+
+def _times_by_name(time_s: Mapping[str, float]) -> _Times:
+    rows = [f"{_cell(frame)},{format_time(moment)}" for frame, moment in time_s.items()]
+    return _Times(
+        time_s,
+        (DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names"),),
+        (Finding("times", f"{_span(time_s)}, from the frames' names, as {_FRAMES_CSV}"),),
+        frames_csv="\n".join(["frame,time", *rows]) + "\n",
+    )
+
+
+def _cell(text: str) -> str:
+    """Return a cell of a CSV file, in quotes where it has a comma or quotes."""
+    doubled = text.replace('"', '""')
+    return f'"{doubled}"' if "," in text or doubled != text else text
+
+
+def _times_by_exif(
+    contents: FolderContents, headers: Sequence[FrameHeader], refused: tuple[Gap, ...]
+) -> _Times:
+    key = DraftKey("times", None, "without it: EXIF", '"frames.csv"')
+    time_s = {each.frame: each.time_s for each in headers if each.time_s is not None}
+    is_moving = bool(contents.trajectories)
+    if time_s:
+        gap = Gap(
+            "times",
+            "EXIF is rarely good to a millisecond, in which a vehicle moves a centimetre",
+            "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time",
+        )
+        return _Times(
+            time_s,
+            (key,),
+            (Finding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)"),),
+            (*refused, *((gap,) if is_moving else ())),
+        )
+    why = "neither a file nor EXIF has the frames' times with their zone"
+    if not is_moving:
+        found = Finding("times", f"none: {why}; static targets need none")
+        return _Times({}, (key,), (found,), refused)
+    remedy = "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time"
+    return _Times({}, (replace(key, is_missing=True),), (), (*refused, Gap("times", why, remedy)))
+
+
+def _span(time_s: Mapping[str, float]) -> str:
+    return f"{time_span(np.array(sorted(time_s.values())))} UTC"
+
+
+def _targets_section(
+    contents: FolderContents, options: InitOptions
+) -> tuple[Section, tuple[PointTable, ...]]:
+    """Return the [[target]] tables, as the user or a targets.toml says, and whose places they have.
+
+    A target that a table of points names stands there; the others are carried by the vehicle.
+    """
+    targets, source = _targets(contents, options)
+    if not targets:
+        gap = Gap(
+            "targets",
+            "no targets.toml lies in the folder",
+            "copy the targets.toml of kgcp target there, or give the target's diameters and code",
+        )
+        return Section((DraftText(_EXAMPLE_TARGET),), (), (gap,)), ()
+    places, surveyed = _places(contents, targets)
+    names = ", ".join(f"{each.name} ({each.ring.outer_diameter_m:g} m)" for each in targets)
+    found = [Finding("targets", f"{names}, from {source}")]
+    if places:
+        files = ", ".join(contents.relative(points.path) for points in surveyed)
+        found.append(Finding("positions", f"of {', '.join(sorted(places))}, from {files}"))
+    is_carried = bool(contents.trajectories)
+    lost = [
+        each.name
+        for each in targets
+        if each.name not in places and each.position_m is None and not is_carried
+    ]
+    blocks = tuple(_block(each, places.get(each.name), each.name in lost) for each in targets)
+    gap = Gap(
+        "positions",
+        f"nothing says where {', '.join(lost)} {'is' if len(lost) == 1 else 'are'}: there is no"
+        " trajectory, and no table of surveyed points with that name",
+        "write position_m = [x, y, z] below the target, or put the vehicle's trajectory or a table"
+        " with the columns name, x, y, z into the folder before kgcp init",
+    )
+    return Section(blocks, tuple(found), (gap,) if lost else ()), surveyed
+
+
+def _block(
+    target: Target,
+    position_m: tuple[float, float, float] | None,
+    is_lost: bool,  # noqa: FBT001
+) -> DraftText:
+    """Return the tables of a target, with its position in the first of them."""
+    placed = target if position_m is None else replace(target, position_m=position_m)
+    plate = tuple(target_lines(replace(placed, replicas=())))
+    replicas = tuple(target_lines(placed))[len(plate) :]
+    unknown = (_UNKNOWN_POSITION.line(),) if is_lost else ()
+    return DraftText((*plate, *unknown, *replicas))
+
+
+def _targets(contents: FolderContents, options: InitOptions) -> tuple[tuple[Target, ...], str]:
+    """Return the flight's targets, and who says so."""
+    if options.targets_file is not None:
+        return read_target_tables(options.targets_file), str(options.targets_file.name)
+    if options.codes or options.diameter_m is not None:
+        return new_targets((), options.diameter_m, options.codes, 0, 0), "what you gave"
+    if contents.targets:
+        path = contents.targets[0]
+        return read_target_tables(path), contents.relative(path)
+    return (), ""
+
+
+def _places(
+    contents: FolderContents, targets: Sequence[Target]
+) -> tuple[dict[str, tuple[float, float, float]], tuple[PointTable, ...]]:
+    """Return the surveyed positions of targets by name, and the tables that have them."""
+    places: dict[str, tuple[float, float, float]] = {}
+    used = []
+    names = {target.name for target in targets}
+    for points in contents.points:
+        own = {name: place for name, place in points.positions().items() if name in names}
+        if own:
+            used.append(points)
+            places = {**own, **places}
+    return places, tuple(used)
+
+
+def _reference_section(contents: FolderContents) -> Section:
+    if not contents.references:
+        key = DraftKey("poses", None, "the camera's poses of an adjustment", '"reference.csv"')
+        return Section((DraftTable("[reference]", (key,)),), (), ())
+    name = contents.relative(contents.references[0])
+    return Section(
+        (DraftTable("[reference]", (DraftKey("poses", name),)),),
+        (Finding("reference", f"poses of the camera, from {name}"),),
+        (),
+    )

@@ -1,0 +1,171 @@
+"""The camera of a folder of frames: a calibration, DJI's DewarpData, or a guess from EXIF."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
+from kgcp.io.flight.folder import FolderContents
+from kgcp.io.flight.toml_draft import DraftKey, DraftTable
+from kgcp.io.formats.calibrations import read_calibration
+from kgcp.pipeline.init_records import Finding, Gap, Section
+from kgcp.quality.checks.frame_header import FrameHeader
+
+_SMALL_FRAME_MM = math.hypot(36.0, 24.0)  # its diagonal, to which CIPA's equivalents refer
+_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_DIGITS = 9
+# Of a focal length by EXIF: equivalents are whole millimetres, lenses a few per cent off their
+# name. Of an unknown lens' centre and distortion: what consumer cameras have.
+_SD_FOCAL, _SD_CENTRE, _SD_K1 = 0.03, 0.01, 0.1
+_REMEDY = (
+    "put a calibration file into the folder before kgcp init, or write its values, or file = …,"
+    " into [camera]"
+)
+_SHUTTER = DraftKey("readout_s", None, "rolling shutter: time from first to last row", "0.03")
+_RESPONSE = DraftKey("response", None, 'or "srgb": how grey values follow light', '"linear"')
+
+
+def camera_section(contents: FolderContents, headers: Sequence[FrameHeader]) -> Section:
+    """Return the [camera] table of some frames, from the best source that there is."""
+    sizes = Counter(header.size_px for header in headers if header.size_px is not None)
+    if not sizes:
+        return _no_camera(None, "the frames' headers do not tell their size")
+    size = max(sizes, key=lambda each: (sizes[each], each))
+    first = next(header for header in headers if header.size_px == size)
+    for section in (
+        _by_file(contents, size),
+        _by_dewarp_data(contents, first, size),
+        _by_focal_length(headers, size),
+    ):
+        if section is not None:
+            return section
+    return _no_camera(size, "neither EXIF nor a file of the folder tells the focal length")
+
+
+def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
+    """Return the first calibration file of frames of this size."""
+    for path in contents.calibrations:
+        try:
+            camera = read_calibration(path, size)
+        except KgcpError:  # of another size, or of several cameras
+            continue
+        name = contents.relative(path)
+        has_size = _has_size(contents, name)
+        keys = (
+            DraftKey("file", name, _shown(camera)),
+            *(() if has_size else _size_keys(size)),
+            _RESPONSE,
+            _SHUTTER,
+        )
+        others = [contents.relative(other) for other in contents.calibrations if other != path]
+        beside = f" (not used: {', '.join(others)})" if others else ""
+        return _section(keys, "", (Finding("camera", f"{_shown(camera)}, from {name}{beside}"),))
+    return None
+
+
+def _has_size(contents: FolderContents, name: str) -> bool:
+    try:
+        read_calibration(contents.folder / name, (None, None))
+    except KgcpError:
+        return False
+    return True
+
+
+def _by_dewarp_data(
+    contents: FolderContents, header: FrameHeader, size: tuple[int, int]
+) -> Section | None:
+    try:
+        camera = read_calibration(contents.frames_folder / header.frame, size, "dji")
+    except KgcpError:  # no DewarpData, or of an image that is dewarped already
+        return None
+    found = f"{_shown(camera)}, from the DewarpData of {header.frame}"
+    note = f"DJI's calibration of this camera: the DewarpData of {header.frame}."
+    keys = (*_size_keys(size), *_parameter_keys(camera), _RESPONSE, _SHUTTER)
+    return _section(keys, note, (Finding("camera", _named(header, found)),))
+
+
+def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
+    known = [header for header in headers if header.focal_35_mm and header.size_px == size]
+    if not known:
+        return None
+    width, height = size
+    header = known[0]
+    focal_px = round((header.focal_35_mm or 0.0) / _SMALL_FRAME_MM * math.hypot(width, height), 1)
+    camera = Camera(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
+    sd_px = round(_SD_FOCAL * focal_px, 1)
+    centre_px = round(_SD_CENTRE * width, 1)
+    keys = (
+        DraftKey("guessed", value=True, comment="delete this line once a calibration is given"),
+        *_size_keys(size),
+        *_parameter_keys(camera),
+        DraftKey("sd_fx", sd_px, "what the guess may be wrong by, 1 σ"),
+        *(DraftKey(f"sd_{key}", sd) for key, sd in (("fy", sd_px), ("cx", centre_px))),
+        *(DraftKey(f"sd_{key}", sd) for key, sd in (("cy", centre_px), ("k1", _SD_K1))),
+        _RESPONSE,
+        _SHUTTER,
+    )
+    source = f"EXIF of {header.frame}: {header.focal_35_mm:g} mm as of 35 mm film"
+    return _section(
+        keys,
+        f"GUESS from the {source}. A calibration is needed for true distances.",
+        (Finding("camera", _named(header, f"{_shown(camera)}, guessed from the {source}")),),
+        (
+            Gap(
+                "camera",
+                "the focal length of EXIF, without distortion; a calibration is needed for"
+                " distances better than some per cent",
+                f"{_REMEDY}, and delete guessed and the sd_ lines",
+                is_assumed=True,
+            ),
+        ),
+    )
+
+
+def _no_camera(size: tuple[int, int] | None, why: str) -> Section:
+    lengths = (("fx", "2900.0"), ("fy", "2900.0"), ("cx", "1023.5"), ("cy", "1023.5"))
+    keys = (
+        *(_size_keys(size) if size else _unknown(("width", "2048"), ("height", "2048"))),
+        *_unknown(*lengths),
+        _RESPONSE,
+        _SHUTTER,
+    )
+    found = (Finding("camera", f"{size[0]} x {size[1]} px"),) if size else ()
+    return _section(keys, 'Or: file = "camera.yml"', found, (Gap("camera", why, _REMEDY),))
+
+
+def _unknown(*examples: tuple[str, str]) -> tuple[DraftKey, ...]:
+    return tuple(
+        DraftKey(key, None, "from a calibration [px]", example, is_missing=True)
+        for key, example in examples
+    )
+
+
+def _size_keys(size: tuple[int, int]) -> tuple[DraftKey, DraftKey]:
+    return DraftKey("width", size[0]), DraftKey("height", size[1])
+
+
+def _parameter_keys(camera: Camera) -> tuple[DraftKey, ...]:
+    """Return the parameters that are not zero, and the four that a table must have."""
+    values = {key: float(f"{getattr(camera, key):.{_DIGITS}g}") for key in _PARAMETERS}
+    kept = {key: value for key, value in values.items() if value or key in _PARAMETERS[:4]}
+    return tuple(DraftKey(key, value) for key, value in kept.items())
+
+
+def _section(
+    keys: tuple[DraftKey, ...],
+    note: str,
+    findings: tuple[Finding, ...],
+    gaps: tuple[Gap, ...] = (),
+) -> Section:
+    return Section((DraftTable("[camera]", keys, note),), findings, gaps)
+
+
+def _named(header: FrameHeader, text: str) -> str:
+    return f"{header.camera}: {text}" if header.camera else text
+
+
+def _shown(camera: Camera) -> str:
+    return f"{camera.width} x {camera.height} px, fx = {camera.fx:.6g} px"

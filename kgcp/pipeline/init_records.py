@@ -1,0 +1,60 @@
+"""What `kgcp init` has found in a folder, what is missing, and what that makes of flight.toml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp.io.flight.toml_draft import DraftTable, DraftText
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that the folder tells, and where it stands."""
+
+    heading: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """One thing that the folder does not tell, and what to do about it."""
+
+    heading: str
+    text: str
+    remedy: str
+    is_assumed: bool = False  # flight.toml has a value for it, which nothing confirms
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of flight.toml, with the reasons for it."""
+
+    blocks: tuple[DraftTable | DraftText, ...]
+    findings: tuple[Finding, ...]
+    gaps: tuple[Gap, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class InitOptions:
+    """What the user says, beside what lies in the folder; None or empty: nothing.
+
+    Attributes
+    ----------
+    targets_file : Path or None
+        A flight.toml, or the targets.toml of `kgcp target`.
+    codes : tuple of str
+        Directions of the dots of targets, separated by commas [deg]; they need `diameter_m`.
+    diameter_m : float or None
+        Their outer diameter [m].
+    lever_arm_m : tuple of float or None
+        Trajectory point → target centre: forward, right, down [m].
+    crs : str or None
+        Of the flight, for pyproj.
+    """
+
+    targets_file: Path | None = None
+    codes: tuple[str, ...] = ()
+    diameter_m: float | None = None
+    lever_arm_m: tuple[float, float, float] | None = None
+    crs: str | None = None

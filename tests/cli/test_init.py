@@ -1,0 +1,298 @@
+"""`kgcp init`: what it makes of folders as they come from card and rover, read back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from benchmarks.first_flight.bare_folders import (
+    LEVER_ARM,
+    plan,
+    write_dji_folder,
+    write_sbet_folder,
+    write_static_folder,
+)
+from kgcp.cli import main
+from kgcp.geometry.arrays import GreyArray
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.io.images.frames import list_frames
+from kgcp.simulation.flight import FlightPlan
+
+PLAN = plan(3, seed=1)
+TARGET = ("--diameter", "0.9", "--code", "0,43,78,180")
+ARM = ("--lever-arm", *map(str, LEVER_ARM))
+TARGETS_TOML = """
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857
+dot_diameter_m = 0.128571
+code_deg = [0, 43, 78, 180]
+
+[[target]]
+name = "A-inner"
+replica_of = "A"
+scale = 0.2
+code_deg = [10, 80, 150, 250, 290]
+"""
+
+
+def blank(flight: FlightPlan, _index: int) -> GreyArray:
+    camera = flight.settings.camera
+    return np.full((camera.height, camera.width), 90, dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of every kind, with blank frames; nobody changes it."""
+    root = tmp_path_factory.mktemp("bare")
+    write_dji_folder(root / "dji", PLAN, render=blank)
+    write_sbet_folder(root / "sbet", PLAN, render=blank)
+    write_static_folder(root / "static", PLAN, render=blank)
+    return root
+
+
+def copied(bare: Path, kind: str, to: Path) -> Path:
+    return shutil.copytree(bare / kind, to / kind)
+
+
+def init(folder: Path, *options: str) -> Result:
+    return CliRunner().invoke(main, ["init", str(folder), *options], catch_exceptions=False)
+
+
+def made(folder: Path, *options: str) -> tuple[Flight, FlightData, str]:
+    """The flight that init has made, what it names, and what init has said."""
+    result = init(folder, *options)
+    assert result.exit_code == 0, result.stderr
+    flight = read_flight(folder)
+    data = FlightData(flight, list_frames(flight.frames_folder))
+    return flight, data, " ".join(result.stderr.split())
+
+
+def uncomment(folder: Path, key: str, value: str | None = None) -> None:
+    """Fill in one line, as a user does; without a value, with its example."""
+    path = folder / "flight.toml"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    (row,) = [row for row, line in enumerate(lines) if line.startswith(f"# {key} = ")]
+    lines[row] = lines[row].removeprefix("# ") if value is None else f"{key} = {value}"
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def place_errors_m(data: FlightData) -> float:
+    """Largest distance of the trajectory's points from those of the plan."""
+    trajectory = data.trajectory
+    assert trajectory is not None
+    gaps = trajectory.position_map - PLAN.trajectory.position_map
+    return float(np.abs(gaps).max())
+
+
+def test_a_dji_folder_with_marks_and_a_rtklib_solution(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "targets").mkdir()
+    (folder / "targets" / "targets.toml").write_text(TARGETS_TOML, encoding="utf-8")
+    flight, data, said = made(folder, *ARM)
+    camera = PLAN.settings.camera
+    assert (flight.camera.width, flight.camera.height) == (camera.width, camera.height)
+    for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"):
+        assert getattr(flight.camera, name) == pytest.approx(getattr(camera, name), abs=1e-6)
+    assert not flight.is_camera_guessed
+    assert [ring.name for ring in flight.targets[0].rings] == ["A", "A-inner"]
+    times = data.frame_times.time_s
+    expected = PLAN.recorded_times_s.tolist()
+    assert [times[name] for name in sorted(times)] == pytest.approx(expected, abs=2e-6)
+    assert flight.crs == "EPSG:32632"
+    assert 0.0 < place_errors_m(data) < 3e-4  # 0.1 mm each by the file and by the other ellipsoid
+    assert flight.vehicle is not None
+    assert flight.vehicle.options.course_sd_deg == (2.0, 2.0, 3.0)
+    assert flight.vehicle.settings.lever_arm_m == LEVER_ARM
+    for words in ("from the DewarpData of DJI_", "Timestamp.MRK", "rover.pos: RTKLIB", "A (0.9 m)"):
+        assert words in said
+    assert "missing" not in said
+
+
+def test_the_same_folder_gives_the_same_bytes(bare: Path, tmp_path: Path) -> None:
+    texts = []
+    for name in ("one", "two"):
+        folder = copied(bare, "dji", tmp_path / name)
+        assert init(folder).exit_code == 0
+        texts.append((folder / "flight.toml").read_bytes())
+    assert texts[0] == texts[1]
+    assert b"\r" not in texts[0]
+
+
+def test_what_is_missing_is_named_by_init_and_by_the_next_command(
+    bare: Path, tmp_path: Path
+) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    said = init(folder).stderr
+    assert "missing: lever arm" in said
+    assert "missing: targets" in said
+    fails = [("lever_arm_m", None), ("[[target]]", TARGETS_TOML)]
+    for key, text in fails:
+        result = CliRunner().invoke(main, ["check", str(folder)])
+        assert result.exit_code == 1
+        assert result.stderr.count("\n") == 1
+        assert key in result.stderr
+        if text is None:
+            uncomment(folder, "lever_arm_m")
+        else:
+            with (folder / "flight.toml").open("a", encoding="utf-8") as stream:
+                stream.write(text)
+    assert CliRunner().invoke(main, ["check", str(folder)]).exit_code == 0
+
+
+def test_frames_named_by_time_with_calibration_and_sbet(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "sbet", tmp_path)
+    flight, data, said = made(folder, *TARGET, *ARM)
+    assert flight.frames_folder == folder / "cam0"
+    assert flight.camera.k2 == PLAN.settings.camera.k2
+    times = data.frame_times.time_s
+    assert sorted(times.values()) == pytest.approx(PLAN.recorded_times_s.tolist(), abs=1e-6)
+    assert flight.vehicle is not None
+    assert 0.0 < place_errors_m(data) < 2e-4  # 0.1 mm by the other ellipsoid
+    trajectory = data.trajectory
+    assert trajectory is not None
+    assert trajectory.time_s == pytest.approx(PLAN.trajectory.time_s, abs=1e-6)
+    assert trajectory.sd_attitude_deg is not None
+    assert trajectory.attitude_deg == pytest.approx(PLAN.trajectory.attitude_deg, abs=1e-9)
+    assert "from the frames' names, as frames.csv" in said
+    assert "assumed: trajectory its times are GPS time" in said
+
+
+def test_exif_alone_gives_a_guess_that_check_keeps_naming(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "static", tmp_path)
+    rows = "Punkt;Rechtswert;Hochwert;Höhe\nT1;689432,0;5336173,0;545,6\n"
+    (folder / "points.csv").write_text(rows, encoding="utf-8")
+    flight, _, said = made(folder, *TARGET)
+    assert flight.is_camera_guessed
+    assert 0.97 < flight.camera.fx / PLAN.settings.camera.fx < 1.03
+    assert flight.calibration_covariance is not None
+    assert flight.targets[0].position_m == (689432.0, 5336173.0, 545.6)
+    assert flight.vehicle is None
+    assert "it may be EPSG:25832 or EPSG:" in said
+    uncomment(folder, "crs")
+    check = CliRunner().invoke(main, ["check", str(folder)])
+    assert check.exit_code == 0, check.output
+    assert "doubt: the camera is a guess from EXIF" in check.stdout
+    text = (folder / "flight.toml").read_text(encoding="utf-8")
+    (folder / "flight.toml").write_text(text.replace("guessed = true", ""), encoding="utf-8")
+    assert "guess" not in CliRunner().invoke(main, ["check", str(folder)]).stdout
+
+
+def csv_rows(separator: str, decimal: str, kind: str) -> str:
+    """The plan's trajectory as tables of other programs."""
+    trajectory = PLAN.trajectory
+    heads = {
+        "grid": ["UTC-Time", "Easting [m]", "Northing [m]", "Ell. Height [m]", "Sats"],
+        "attitude": ["GPS TOW (s)", "E", "N", "H", "Roll (deg)", "Pitch (deg)", "Yaw (deg)", "Q"],
+    }
+    lines = [separator.join(heads[kind])]
+    for time_s, place, angles in zip(
+        trajectory.time_s.tolist(),
+        trajectory.position_map.tolist(),
+        trajectory.attitude_deg.tolist(),
+        strict=True,
+    ):
+        moment = datetime.fromtimestamp(time_s, UTC)
+        clock = f"{moment:%Y-%m-%dT%H:%M:%S.%f}"
+        if kind == "attitude":
+            clock = f"{(time_s + 18.0 - 315964800.0) % 604800.0:.3f}"
+        cells = [f"{value:.5f}" for value in (*place, *(angles if kind == "attitude" else ()))]
+        row = [clock, *(cell.replace(".", decimal) for cell in cells), "12"]
+        row[0] = row[0].replace(".", decimal) if kind == "attitude" else row[0]
+        lines.append(separator.join(row))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal", "kind"),
+    [(";", ",", "grid"), ("\t", ".", "attitude"), (";", ",", "attitude"), (",", ".", "grid")],
+)
+def test_foreign_tables_are_recognised_shown_and_readable(
+    bare: Path, tmp_path: Path, separator: str, decimal: str, kind: str
+) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    (folder / "track.csv").write_text(csv_rows(separator, decimal, kind), encoding="utf-8")
+    flight, data, said = made(folder, *TARGET, *ARM, "--crs", "EPSG:25832")
+    assert place_errors_m(data) < 1e-5
+    trajectory = data.trajectory
+    assert trajectory is not None
+    assert trajectory.time_s == pytest.approx(PLAN.trajectory.time_s, abs=1e-3)
+    assert flight.vehicle is not None
+    layout = flight.vehicle.options.layout
+    assert (layout.separator, layout.decimal) == (separator, decimal)
+    assert "not used: " in said
+    if kind == "attitude":
+        assert trajectory.attitude_deg == pytest.approx(PLAN.trajectory.attitude_deg, abs=1e-5)
+        assert "heading_deg = 'Yaw (deg)'" in said
+        assert flight.vehicle.options.time_system == "gps"
+    else:
+        assert "x = 'Easting [m]'" in said
+        assert flight.vehicle.options.course_sd_deg is not None
+        assert flight.vehicle.options.time_system == "utc"
+
+
+def test_longitude_and_latitude_in_a_table(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "rover.pos").unlink()
+    rows = ["time,lat,lon,alt"]
+    rows += [
+        f"{time_s:.3f},48.15,{11.54 + 1e-6 * row},545"
+        for row, time_s in enumerate(PLAN.trajectory.time_s.tolist())
+    ]
+    (folder / "track.csv").write_text("\n".join(rows), encoding="utf-8")
+    flight, data, _ = made(folder, *TARGET, *ARM)
+    assert flight.crs == "EPSG:32632"
+    assert data.trajectory is not None
+    assert data.trajectory.position_map[0] == pytest.approx([688947.0, 5336084.0, 545.0], abs=600)
+
+
+def test_an_existing_flight_toml_is_never_replaced(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    (folder / "flight.toml").write_text("mine", encoding="utf-8")
+    result = init(folder)
+    assert result.exit_code == 1
+    assert "flight.toml: exists and is not replaced; " in result.stderr
+    assert (folder / "flight.toml").read_text(encoding="utf-8") == "mine"
+
+
+def test_several_trajectories_are_named_and_none_is_taken(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    shutil.copy(folder / "rover.pos", folder / "base.pos")
+    result = init(folder, "--json")
+    page = json.loads(result.stdout)
+    (gap,) = [gap for gap in page["missing"] if gap["heading"] == "trajectory"]
+    assert "base.pos, rover.pos" in gap["text"]
+    assert {"heading", "text"} == page["found"][0].keys()
+
+
+def test_folders_without_frames_and_wrong_options(bare: Path, tmp_path: Path) -> None:
+    result = init(tmp_path)
+    assert result.exit_code == 1
+    assert "holds no images" in result.stderr
+    assert "is not a folder" in init(tmp_path / "nowhere").stderr
+    folder = copied(bare, "dji", tmp_path)
+    assert init(folder, "--diameter", "0.9").exit_code == 2
+    assert init(folder, "--target", "x.toml", *TARGET).exit_code == 2
+    assert "does not exist" in init(folder, "--target", str(tmp_path / "x.toml")).stderr
+    assert not (folder / "flight.toml").exists()
+
+
+def test_results_in_the_frames_own_folder_are_no_frames(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    made(folder, *TARGET, *ARM)
+    before = list_frames(folder)
+    (folder / "kgcp" / "sheet").mkdir(parents=True)
+    shutil.copy(folder / before[0], folder / "kgcp" / "sheet" / "x.jpg")
+    assert list_frames(folder) == before
+    (folder / "flight.toml").unlink()
+    assert "kgcp/sheet/x.jpg" in list_frames(folder)

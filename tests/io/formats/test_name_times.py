@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import pytest
+
+from kgcp.io.formats.name_times import times_of_names
+
+
+@pytest.mark.parametrize(
+    ("stem", "time_s"),
+    [
+        ("1781597705.000336", 1781597705.000336),
+        ("cam0_1781597705_000336", 1781597705.000336),
+        ("1781597705000", 1781597705.0),
+        ("1781597705000336", 1781597705.000336),
+        ("left-1781597705000336000", 1781597705.000336),
+        ("20260616T081505.250Z", 1781597705.25),
+        ("img_2026-06-16_08-15-05-250000Z", 1781597705.25),
+    ],
+)
+def test_times_in_names(stem: str, time_s: float) -> None:
+    times = times_of_names([f"cam/{stem}.png"])
+    assert times is not None
+    assert times[f"cam/{stem}.png"] == pytest.approx(time_s, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["frame_0001.png"],
+        ["DJI_20260616101505_0001_V.JPG"],  # local time, whole seconds
+        ["20260616T081505Z.png"],
+        ["1781597705.png"],
+        ["20261316T081505.5Z.png"],
+        ["1781597705.5.png", "other.png"],
+        ["a/1781597705.5.png", "b/1781597705.5.png"],  # two frames of one moment
+    ],
+)
+def test_names_without_usable_times(names: list[str]) -> None:
+    assert times_of_names(names) is None
