@@ -23,6 +23,14 @@ _DEFAULTS = DetectSettings()
 @flight_place_argument
 @out_place_option
 @click.option(
+    "--frames",
+    "frame_patterns",
+    metavar="PATTERN",
+    multiple=True,
+    help="Examine only frames whose path below the frames folder matches, such as '*_00??.JPG';"
+    " may be repeated. The table then has these frames alone.",
+)
+@click.option(
     "--jobs",
     type=click.IntRange(0, 256),
     default=None,
@@ -119,6 +127,7 @@ _DEFAULTS = DetectSettings()
 def command(
     flight: Path | StoredFolder,
     out: Path | StoredFolder | None,
+    frame_patterns: tuple[str, ...],
     jobs: int | None,
     method: str,
     min_radius: float,
@@ -167,7 +176,7 @@ def command(
     with open_workspace(flight, out) as workspace:
         the_flight = read_flight(workspace.flight)
         stored_frames = workspace.frames_of(the_flight)
-        doubts = doubts_before_detecting(the_flight, stored_frames)
+        doubts = doubts_before_detecting(the_flight, stored_frames, frame_patterns)
         print_doubts(doubts, is_quiet=is_quiet, as_json=log_json)
         start = time.perf_counter()
         with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
@@ -180,6 +189,7 @@ def command(
                 overlay=overlay,
                 all_candidates=all_candidates,
                 stored_frames=stored_frames,
+                frame_patterns=frame_patterns,
             )
             summary = detect_flight(
                 the_flight, settings, out=workspace.out, options=options, listener=log

@@ -173,6 +173,8 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
         f"  {count:6d} {reason}{_about(reason, summary)}"
         for reason, count in summary.reasons.items()
     ]
+    if summary.frames_not_chosen:
+        lines.append(f"{counted(summary.frames_not_chosen, 'other frame')} not examined (--frames)")
     if summary.guided:
         lines.append(f"{summary.guided} of them measured in the second pass")
     if summary.guide_problem is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import (
@@ -63,22 +64,26 @@ def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -
 
 
 def doubts_before_detecting(
-    flight: Flight, stored_frames: StoredFolder | None = None
+    flight: Flight,
+    stored_frames: StoredFolder | None = None,
+    frame_patterns: Sequence[str] = (),
 ) -> tuple[Doubt, ...]:
-    """Return the doubts about a flight by some of its headers, grave ones first.
+    """Return the doubts about a flight by some headers of the frames wanted, grave ones first.
 
     Files that are missing or wrong are not among them: who needs them says so.
 
     Raises
     ------
     KgcpError
-        If there are no frames.
+        If there are no frames, or a pattern matches none.
     """
+    frames = frames_below(stored_frames or flight.frames_folder)
     inputs = FlightInputs.of(
         flight,
-        frames_below(stored_frames or flight.frames_folder),
+        frames,
         stored_frames,
         most_headers=SAMPLED_FRAMES,
+        headers_of=matching_frames(frames, frame_patterns),
     )
     return inputs.plausibility
 

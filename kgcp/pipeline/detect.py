@@ -10,7 +10,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import RESULTS_NAME
+from kgcp.io.images.frames import RESULTS_NAME, matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
 from kgcp.io.tables.detections import DETECTION_COLUMNS, detection_rows
@@ -34,7 +34,7 @@ from kgcp.settings import DetectSettings
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """How a flight is worked on. The table does not depend on any of it.
+    """How a flight is worked on. The table depends on `frame_patterns` alone.
 
     Attributes
     ----------
@@ -56,6 +56,9 @@ class RunOptions:
         Whether the contact sheet also shows rings that were compared with a target's and dropped.
     stored_frames : StoredFolder or None
         Where the frames are, if not in the flight's folder.
+    frame_patterns : tuple of str
+        Of the frames that are wanted, see `matching_frames`; empty: all. The table has these alone
+        and says so.
     """
 
     jobs: int | None = None
@@ -66,6 +69,7 @@ class RunOptions:
     overlay: Path | None = None
     all_candidates: bool = False
     stored_frames: StoredFolder | None = None
+    frame_patterns: tuple[str, ...] = ()
 
 
 class NoProgress:
@@ -116,8 +120,9 @@ def detect_flight(
     Raises
     ------
     KgcpError
-        If there are no frames, the times file or that of the reference poses is bad, `out` cannot
-        be written or is another process's, the scheduler is of no use, or the frames vanish.
+        If there are no frames, a pattern matches none, the times file or that of the reference
+        poses is bad, `out` cannot be written or is another process's, the scheduler is of no use,
+        or the frames vanish.
     """
     stopwatch = Stopwatch()
     out = results_folder(flight.folder) if out is None else Path(out)
@@ -126,8 +131,9 @@ def detect_flight(
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
     frames_folder = options.stored_frames or flight.frames_folder
     with stopwatch.stage("preparation"):
-        frames = frames_below(frames_folder)
-        data = FlightData(flight, frames)
+        all_frames = frames_below(frames_folder)
+        frames = matching_frames(all_frames, options.frame_patterns)
+        data = FlightData(flight, all_frames)
         times = data.frame_times.time_s
         priors = priors_of_frames(flight, data, frames)
         inputs = [
@@ -144,7 +150,8 @@ def detect_flight(
         keeps_dropped=options.overlay is not None and options.all_candidates,
     )
     table = out / DETECTIONS
-    builder = SummaryBuilder(times)
+    left_out = set(all_frames).difference(frames)
+    builder = SummaryBuilder({name: times[name] for name in times if name not in left_out})
     not_drawn = 0
     making = _making(job)
     with Journal(out / ".detections.journal", making, is_new=options.is_restart) as journal:
@@ -175,7 +182,12 @@ def detect_flight(
             with stopwatch.stage("table"):
                 rows = _rows(run, predictions, flight.camera, builder)
                 about = detections_provenance(
-                    flight, settings, run.frame_sizes, data.frame_times, run.learnt
+                    flight,
+                    settings,
+                    run.frame_sizes,
+                    data.frame_times,
+                    run.learnt,
+                    options.frame_patterns,
                 )
                 write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
@@ -185,6 +197,7 @@ def detect_flight(
         summary = builder.summary(
             table=table,
             likely_cause=likely_cause,
+            frames_not_chosen=len(left_out),
             kept=run.kept,
             frames_without_attitude=sum(
                 all(prior.normal is None for prior in frame_input.priors.values())

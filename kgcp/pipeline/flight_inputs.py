@@ -83,6 +83,7 @@ class FlightInputs:
         folder: StoredFolder | None = None,
         *,
         most_headers: int | None = None,
+        headers_of: Sequence[str] | None = None,
     ) -> FlightInputs:
         """Read the headers of a flight's frames.
 
@@ -92,12 +93,14 @@ class FlightInputs:
             Where the frames are, if not in the flight's folder.
         most_headers : int, optional
             How many headers to read; by default all.
+        headers_of : sequence of str, optional
+            The frames whose headers count; by default all.
         """
         return cls(
             flight,
             FlightData(flight, frames),
             tuple(frames),
-            read_headers(flight, frames, folder, most_headers),
+            read_headers(flight, headers_of or frames, folder, most_headers),
         )
 
     @classmethod

@@ -41,6 +41,8 @@ class DetectionSummary:
         What is behind a reason in most of its rows, where something is.
     likely_cause : str or None
         Why nothing was measured, where a trial has told.
+    frames_not_chosen : int
+        Frames that were not wanted.
     frames_without_time : int
         Frames that neither the times file nor EXIF gives a time.
     frames_not_in_times_file : int
@@ -76,6 +78,7 @@ class DetectionSummary:
     reasons: Mapping[str, int]
     details: Mapping[str, str]
     likely_cause: str | None
+    frames_not_chosen: int
     frames_without_time: int
     frames_not_in_times_file: int
     times_without_frame: int
@@ -178,6 +181,7 @@ class SummaryBuilder:
         *,
         table: Path,
         likely_cause: str | None,
+        frames_not_chosen: int,
         kept: int,
         frames_without_attitude: int,
         not_drawn: int,
@@ -198,6 +202,7 @@ class SummaryBuilder:
                 if counts and reason is not Reason.OUT_OF_VIEW
             },
             likely_cause=likely_cause,
+            frames_not_chosen=frames_not_chosen,
             frames_without_time=self._without_time,
             frames_not_in_times_file=len(self._not_named),
             times_without_frame=len(unused),

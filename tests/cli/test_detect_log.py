@@ -57,6 +57,7 @@ def test_a_speed_is_told_of_frames_that_were_worked_on(
     summary = SummaryBuilder({}).summary(
         table=tmp_path,
         likely_cause=None,
+        frames_not_chosen=0,
         kept=kept,
         frames_without_attitude=0,
         not_drawn=0,
@@ -99,6 +100,7 @@ def test_each_reason_has_its_commonest_detail_and_a_remedy(
     summary = builder.summary(
         table=tmp_path,
         likely_cause=None,
+        frames_not_chosen=0,
         kept=0,
         frames_without_attitude=0,
         not_drawn=0,

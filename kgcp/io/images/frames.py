@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import re
 import sys
@@ -29,6 +30,8 @@ FRAME_SUFFIXES = frozenset(
 
 RESULTS_NAME = "kgcp"
 """Of the results' folder in that of the flight."""
+
+_SHOWN_FRAMES = 3
 
 _RAW_SUFFIXES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".fff", ".iiq", ".mef", ".nef", ".nrw"}
@@ -105,6 +108,37 @@ def frames_among(names: Sequence[str], folder: str) -> list[str]:
     raise KgcpError(
         f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {remedy}"
     )
+
+
+def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
+    """Return the frames that match one of the patterns, in their order; without patterns all.
+
+    Parameters
+    ----------
+    frames : sequence of str
+        Paths below the frames folder.
+    patterns : sequence of str
+        Of such paths, as of `fnmatch`: `*` also stands for `/`, and letter case counts.
+
+    Raises
+    ------
+    KgcpError
+        For a pattern that matches no frame; it names some frames.
+    """
+    if not patterns:
+        return list(frames)
+    kept: set[str] = set()
+    for pattern in patterns:
+        matches = [frame for frame in frames if fnmatch.fnmatchcase(frame, pattern)]
+        if not matches:
+            some = ", ".join(frames[:_SHOWN_FRAMES])
+            raise KgcpError(
+                f"{pattern!r} matches none of {len(frames)} frames ({some}, …); give a pattern of"
+                " their paths below the frames folder, such as '*_00??.JPG'",
+                option="frames",
+            )
+        kept.update(matches)
+    return [frame for frame in frames if frame in kept]
 
 
 def _kind_of(suffix: str) -> tuple[str, str]:

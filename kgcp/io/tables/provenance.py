@@ -12,7 +12,7 @@ import json
 import os
 import platform
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, fields
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def detections_provenance(
     frame_sizes: Mapping[str, int | None],
     times: FrameTimes,
     learnt: LearntImaging | None,
+    frame_patterns: Sequence[str] = (),
 ) -> dict[str, str]:
     """Return the metadata of a table of detections.
 
@@ -62,6 +63,8 @@ def detections_provenance(
         Bytes of the file of every frame; None: missing.
     times : FrameTimes
         Entries of no frame are passed over.
+    frame_patterns : sequence of str
+        Which frames the table has; empty: all.
     """
     values = detection_inputs(flight)
     by_part: dict[str, dict[str, object]] = defaultdict(dict)
@@ -80,6 +83,7 @@ def detections_provenance(
         "inputs": json.dumps(values),
         "digests": _digests(parts),
         **({} if learnt is None else {LEARNT_IMAGING: learnt_text(learnt)}),
+        **({"choice": json.dumps({"frames": frame_patterns})} if frame_patterns else {}),
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -58,10 +59,12 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     if not inputs:
         return
     digests = _json(metadata, b"kgcp.digests")
+    today = _frames_of_today(flight)
+    chosen = _chosen(today, metadata)
     changes = [
         *_changed_keys(inputs, detection_inputs(flight)),
-        *_changed_times(table, flight, digests),
-        *_changed_frames(table, flight, digests),
+        *_changed_times(table, flight, digests, None if chosen == today else today),
+        *_changed_frames(table, flight, digests, chosen),
     ]
     if changes:
         more = len(changes) - _MOST_SHOWN
@@ -70,6 +73,24 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
             f"{path}: does not belong to this flight any more; changed since 'kgcp detect':"
             f" {listed}; {_remedy(path, flight, _json(metadata, b'kgcp.settings'))}"
         )
+
+
+def _frames_of_today(flight: Flight) -> list[str] | None:
+    """Return the frames in the flight's folder; None: moved to an archive, or in a store."""
+    try:
+        return list_frames(flight.frames_folder)
+    except KgcpError:
+        return None
+
+
+def _chosen(today: list[str] | None, metadata: Mapping[bytes, bytes]) -> list[str] | None:
+    """Return the frames that the table would have if it were made today."""
+    patterns = _json(metadata, b"kgcp.choice").get("frames")
+    if today is None or not isinstance(patterns, list) or not patterns:
+        return today
+    return [
+        frame for frame in today if any(fnmatchcase(frame, str(pattern)) for pattern in patterns)
+    ]
 
 
 def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
@@ -130,12 +151,18 @@ def _shown(value: object) -> str:
 
 
 def _changed_times(
-    table: pd.DataFrame, flight: Flight, digests: Mapping[str, object]
+    table: pd.DataFrame,
+    flight: Flight,
+    digests: Mapping[str, object],
+    all_frames: list[str] | None,
 ) -> Iterator[str]:
-    """Yield that frames have other times now, or none, if so."""
+    """Yield that frames have other times now, or none, if so.
+
+    A table of chosen frames has not `all_frames`, by which a times file without names tells them.
+    """
     frames = table.drop_duplicates("frame")
     names = frames["frame"].to_list()
-    times = FlightData(flight, names).frame_times
+    times = FlightData(flight, all_frames or names).frame_times
     if digest(digested_times(flight, names, times)) == digests.get("times"):
         return
     then_s = _unix_s(frames["time"])
@@ -177,12 +204,13 @@ def _to_middle_s(frames: pd.DataFrame, flight: Flight) -> FloatArray:
 
 
 def _changed_frames(
-    table: pd.DataFrame, flight: Flight, digests: Mapping[str, object]
+    table: pd.DataFrame,
+    flight: Flight,
+    digests: Mapping[str, object],
+    today: list[str] | None,
 ) -> Iterator[str]:
     """Yield what is new in the frames' folder; frames that are not there any more are no change."""
-    try:
-        today = list_frames(flight.frames_folder)
-    except KgcpError:  # moved to an archive, or in an object store
+    if today is None:
         return
     known = set(table["frame"])
     new = [frame for frame in today if frame not in known]
