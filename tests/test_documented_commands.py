@@ -24,7 +24,7 @@ OF_OTHERS = {"--force-gps", "--gcp", "--tilt", "--wander"}  # OpenDroneMap's, an
 HERE = "sample_flight"
 BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
 # Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates.
-READ_ONLY = {"--scheduler", "simulate"}
+READ_ONLY = {"--scheduler", "simulate", "north"}  # tests/cli/test_merging.py merges flights
 STORES = ("s3://", "gs://")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,7 @@ import click
 from kgcp.cli.doubts import doubt_json, print_doubts
 from kgcp.cli.options import (
     detections_option,
-    flight_place_argument,
+    flight_places_argument,
     json_option,
     out_place_option,
     selection_options,
@@ -19,9 +21,13 @@ from kgcp.cli.options import (
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 
 if TYPE_CHECKING:
+    from kgcp.georef.selection import Selection
     from kgcp.georef.target_positions import Vehicle
+    from kgcp.io.flight.flight import Flight
+    from kgcp.io.formats.exclusions import Exclusion
     from kgcp.io.images.remote import StoredFolder
     from kgcp.pipeline.export import GcpSet
+    from kgcp.pipeline.merge import MergedGcps
     from kgcp.quality.consistency import Consistency
 
 ALL = "all"
@@ -40,7 +46,7 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 
 
 @click.command()
-@flight_place_argument
+@flight_places_argument
 @out_place_option
 @click.option(
     "--format",
@@ -80,20 +86,34 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
     show_default=True,
     help="Names of images for metashape and realityscan, whose projects may lack the extension.",
 )
+@click.option(
+    "--exclude",
+    "exclude_files",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Leave out the frames that this file lists, one in every line, perhaps with a target"
+    " (frame,target), as the contact sheet of 'kgcp detect --overlay' writes it; may be repeated.",
+)
+@click.option(
+    "--flight-ids",
+    is_flag=True,
+    help="Begin the points' ids with the flight's name, for a project that takes several exports;"
+    " always so if several flights are exported at once.",
+)
 @selection_options
 @detections_option
 @json_option
 def command(
-    flight: Path | StoredFolder,
+    flights: tuple[Path | StoredFolder, ...],
     out: Path | StoredFolder | None,
-    formats: tuple[str, ...],
-    crs: str | None,
-    mark_floor_px: float,
-    image_names: str,
     detections: Path | None,
     *,
+    crs: str | None,
+    exclude_files: tuple[Path, ...],
+    flight_ids: bool,
     as_json: bool,
-    **selection: Any,  # noqa: ANN401 - the fields of a Selection
+    **options: Any,  # noqa: ANN401 - of the files, and the fields of a Selection
 ) -> None:
     """Compute ground control points from the measurements.
 
@@ -103,56 +123,157 @@ def command(
     targets with position_m. With reference poses, the summary reports how well they agree with the
     vehicle and what to correct.
 
-    Example: kgcp export-gcp sample_flight --format odm
-    """
+    Several flights become one set of points, whose ids begin with the flights' names, in the folder
+    of --out.
+
+    \b
+    Examples:
+      kgcp export-gcp sample_flight --format odm
+      kgcp export-gcp north south --out block --format metashape
+    """  # noqa: D301 - \b is click's mark for lines that stay
     from kgcp.georef.selection import Selection
+    from kgcp.io.formats.exclusions import read_exclusions
+
+    files = FileOptions(
+        *(options.pop(name) for name in ("formats", "mark_floor_px", "image_names"))
+    )
+    exclusions = tuple(line for file in exclude_files for line in read_exclusions(file))
+    choice = PointChoice(Selection(**options), exclusions, crs)
+    if len(flights) > 1:
+        if out is None:
+            raise click.UsageError("several flights need a folder for their points: give --out")
+        if detections is not None:
+            raise click.UsageError("--detections is of one flight; leave it out")
+        _export_several(flights, out, choice, files, as_json=as_json)
+    else:
+        _export_one(
+            flights[0], out, detections, choice, files, flight_ids=flight_ids, as_json=as_json
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PointChoice:
+    """Which points are wanted."""
+
+    selection: Selection  # without `excluded`
+    exclusions: tuple[Exclusion, ...]
+    crs: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FileOptions:
+    """Which files are wanted, and how they are to be."""
+
+    formats: tuple[str, ...]
+    mark_floor_px: float
+    image_names: str
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Arguments of the functions that write files."""
+        return {
+            "mark_floor_px": self.mark_floor_px,
+            "image_extensions": self.image_names == WITH_EXTENSION,
+        }
+
+
+def _export_one(
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    detections: Path | None,
+    choice: PointChoice,
+    files: FileOptions,
+    *,
+    flight_ids: bool,
+    as_json: bool,
+) -> None:
+    from dataclasses import replace
+
+    from kgcp.georef.gcp import with_flight_name
     from kgcp.io.exporters.write import not_renewed
     from kgcp.io.flight.flight import read_flight
-    from kgcp.pipeline.export import make_gcps, write_gcps
+    from kgcp.pipeline.export import export_gcps, write_gcps
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
 
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
-        source = detections or workspace.out / DETECTIONS
-        made = make_gcps(the_flight, source, selection=Selection(**selection), crs=crs)
+        (made,) = _made([(the_flight, detections or workspace.out / DETECTIONS)], choice)
+        if flight_ids:
+            made = replace(made, gcps=with_flight_name(made.gcps, the_flight.name))
         written = write_gcps(made, workspace.out)
         more, left_out = _export(
-            made,
-            formats,
-            workspace.out,
-            mark_floor_px=mark_floor_px,
-            image_extensions=image_names == WITH_EXTENSION,
+            files.formats,
+            lambda name: export_gcps(made, (name,), workspace.out, **files.details),
         )
         written += more
         older = not_renewed(workspace.out, written)
-    _report(made, written, left_out, older, workspace.named, as_json=as_json)
+    _report([made], made, (written, left_out, older), workspace.named, as_json=as_json)
+
+
+def _export_several(
+    flights: tuple[Path | StoredFolder, ...],
+    out: Path | StoredFolder,
+    choice: PointChoice,
+    files: FileOptions,
+    *,
+    as_json: bool,
+) -> None:
+    from kgcp.errors import KgcpError
+    from kgcp.io.exporters.write import not_renewed
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.merge import export_merged, merge_gcps, write_merged
+    from kgcp.pipeline.workspace import DETECTIONS, results_folder
+
+    if not isinstance(out, Path):
+        raise KgcpError(f"{out}: takes one flight only; write the points of several to a disk")
+    read = []
+    for flight in flights:
+        if not isinstance(flight, Path):
+            raise KgcpError(f"{flight}: several flights are merged on a disk; copy them there")
+        read.append((read_flight(flight), results_folder(flight) / DETECTIONS))
+    merged = merge_gcps(_made(read, choice))
+    written = write_merged(merged, out)
+    more, left_out = _export(
+        files.formats, lambda name: export_merged(merged, (name,), folder=out, **files.details)
+    )
+    written += more
+    older = not_renewed(out, written)
+    _report(merged.parts, merged, (written, left_out, older), str, as_json=as_json)
+
+
+def _made(flights: Sequence[tuple[Flight, Path]], choice: PointChoice) -> list[GcpSet]:
+    """Make the points of flights, each with the table of its detections."""
+    from dataclasses import replace
+
+    from kgcp.pipeline.exclude import excluded_rows, rows_of
+    from kgcp.pipeline.export import make_gcps
+
+    rows = {flight.name: rows_of(table) for flight, table in flights} if choice.exclusions else {}
+    excluded = excluded_rows(choice.exclusions, rows)
+    return [
+        make_gcps(
+            flight,
+            table,
+            selection=replace(choice.selection, excluded=excluded.get(flight.name, ())),
+            crs=choice.crs,
+        )
+        for flight, table in flights
+    ]
 
 
 def _export(
-    made: GcpSet,
-    formats: tuple[str, ...],
-    folder: Path,
-    *,
-    mark_floor_px: float,
-    image_extensions: bool,
+    formats: tuple[str, ...], write: Callable[[str], list[Path]]
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the named formats; with `all`, every format that can hold the points.
 
     Returns the paths, and by format why it was left out.
     """
     from kgcp.errors import KgcpError
-    from kgcp.pipeline.export import export_gcps
 
     written, left_out = [], {}
     for name in FORMATS if ALL in formats else dict.fromkeys(formats):
         try:
-            written += export_gcps(
-                made,
-                (name,),
-                folder,
-                mark_floor_px=mark_floor_px,
-                image_extensions=image_extensions,
-            )
+            written += write(name)
         except KgcpError as error:
             if name in formats:
                 raise
@@ -161,48 +282,70 @@ def _export(
 
 
 def _report(
-    made: GcpSet,
-    written: list[Path],
-    left_out: dict[str, str],
-    older: tuple[str, ...],
+    parts: Sequence[GcpSet],
+    whole: GcpSet | MergedGcps,
+    files: tuple[list[Path], dict[str, str], tuple[str, ...]],
     named: Callable[[object], str],
     *,
     as_json: bool,
 ) -> None:
-    from collections import Counter
-
-    reasons = Counter(skipped.reason.value for skipped in made.skipped)
-    checks = sum(point.is_checkpoint for point in made.gcps)
+    """Report points, flights and files: those written, why some were not, and older ones."""
+    written, left_out, older = files
     if as_json:
-        import json
-
-        summary = {
-            "kgcps": len(made.gcps),
-            "checkpoints": checks,
-            "skipped": dict(reasons),
-            "advice": _advice(made.consistency),
-            "doubts": [*map(doubt_json, made.doubts)],
-            "files": [*map(named, written)],
-            "left_out": left_out,
-            "not_renewed": older,
-        }
-        click.echo(json.dumps(summary))
-    of_these = f" ({checks} check points)" if checks else ""
-    click.echo(
-        f"{len(made.gcps)} KGCPs{of_these}, {len(made.skipped)} sightings left out", err=True
-    )
-    for reason, times in reasons.most_common():
-        click.echo(f"  {times:6d} {reason}", err=True)
-    _report_deviations(made.vehicle)
-    if made.consistency is not None:
-        _report_consistency(made.consistency)
-    print_doubts(made.doubts)
+        _print_json(parts, whole, files, named)
+    for part in parts:
+        heading = f"{part.flight.name}: " if len(parts) > 1 else ""
+        click.echo(f"{heading}{_counted(part)}", err=True)
+        _report_part(part)
+    if len(parts) > 1:
+        click.echo(f"all {len(parts)} flights: {_counted(whole)}", err=True)
     for path in _named(written):
         click.echo(f"wrote {named(path)}", err=True)
     for name, reason in left_out.items():
         click.echo(f"left out {name}: {reason.removeprefix(f'{name}: ')}", err=True)
     if older:
         click.echo(f"left as an earlier export wrote them: {', '.join(older)}", err=True)
+
+
+def _print_json(
+    parts: Sequence[GcpSet],
+    whole: GcpSet | MergedGcps,
+    files: tuple[list[Path], dict[str, str], tuple[str, ...]],
+    named: Callable[[object], str],
+) -> None:
+    import json
+
+    written, left_out, older = files
+    summary = {
+        "kgcps": len(whole.gcps),
+        "checkpoints": sum(point.is_checkpoint for point in whole.gcps),
+        "skipped": dict(_reasons(whole)),
+        "advice": [line for part in parts for line in _advice(part.consistency)],
+        "doubts": [doubt_json(doubt) for part in parts for doubt in part.doubts],
+        "files": [*map(named, written)],
+        "left_out": left_out,
+        "not_renewed": older,
+    }
+    click.echo(json.dumps(summary))
+
+
+def _reasons(points: GcpSet | MergedGcps) -> Counter[str]:
+    return Counter(skipped.reason.value for skipped in points.skipped)
+
+
+def _counted(points: GcpSet | MergedGcps) -> str:
+    checks = sum(point.is_checkpoint for point in points.gcps)
+    of_these = f" ({checks} check points)" if checks else ""
+    return f"{len(points.gcps)} KGCPs{of_these}, {len(points.skipped)} sightings left out"
+
+
+def _report_part(part: GcpSet) -> None:
+    for reason, times in _reasons(part).most_common():
+        click.echo(f"  {times:6d} {reason}", err=True)
+    _report_deviations(part.vehicle)
+    if part.consistency is not None:
+        _report_consistency(part.consistency)
+    print_doubts(part.doubts)
 
 
 def _named(written: list[Path]) -> list[str]:

@@ -4,6 +4,8 @@ flight_argument : `flight`, Path
     The flight folder; the current folder by default.
 flight_place_argument : `flight`, Path or StoredFolder
     The same, which may be a URL.
+flight_places_argument : `flights`, tuple of Path or StoredFolder
+    One or several such folders; the current folder by default.
 out_option : `out`, Path or None
     Folder of the results; None means FLIGHT/kgcp.
 out_place_option : `out`, Path, StoredFolder or None
@@ -41,11 +43,22 @@ def _place(
     return parsed_url(value)
 
 
+def _places(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[Path | StoredFolder, ...]:
+    places = (_place(context, parameter, value) for value in values or (".",))
+    return tuple(place for place in places if place is not None)
+
+
 flight_argument = click.argument(
     "flight", metavar="[FLIGHT]", type=click.Path(path_type=Path), default="."
 )
 
 flight_place_argument = click.argument("flight", metavar="[FLIGHT]", callback=_place, default=".")
+
+flight_places_argument = click.argument(
+    "flights", metavar="[FLIGHT]...", callback=_places, nargs=-1
+)
 
 out_option = click.option(
     "--out",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -22,7 +23,8 @@ class Gcp:
     Attributes
     ----------
     id : str
-        `K` and the number of the frame; for a static target its name, in every frame.
+        `K` and the number of the frame, perhaps behind the flight's name; for a static target its
+        name, in every frame.
     frame, target : str
         As in the sighting.
     time_s : float or None
@@ -81,6 +83,7 @@ class Flag(StrEnum):
 class SkipReason(StrEnum):
     """Why a sighting with a position does not become a KGCP."""
 
+    EXCLUDED = "excluded"
     SECOND_PLATE = "second_plate"
     DISTANCE_JUMP = Flag.DISTANCE.value
     HEIGHT_JUMP = Flag.HEIGHT.value
@@ -192,6 +195,23 @@ def _gcp(
         sd_common_distance_m=sighting.sd_common_distance_m,
         score=sighting.score,
         ambiguity=sighting.ambiguity,
+    )
+
+
+def flight_prefix(name: str) -> str:
+    """Return a flight's name as it stands in ids and paths: letters, digits, point and hyphen."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("_.") or "flight"
+
+
+def with_flight_name(gcps: Sequence[Gcp], name: str) -> tuple[Gcp, ...]:
+    """Return points of which the ids of moving ones begin with the flight's name.
+
+    Those of static targets remain: they are the same points in all flights.
+    """
+    prefix = flight_prefix(name)
+    return tuple(
+        point if point.id == point.target else replace(point, id=f"{prefix}-{point.id}")
+        for point in gcps
     )
 
 

@@ -33,6 +33,8 @@ class Selection:
         Share of the points that are to check, 0 … 1.
     keep_flagged : bool
         Whether points that do not fit a smooth flight stay.
+    excluded : tuple of (str, str)
+        Frames, and targets in them, that are not wanted; an empty target means all.
     """
 
     max_sd_m: float | None = None
@@ -41,6 +43,27 @@ class Selection:
     min_spacing_m: float = 0.0
     checkpoint_share: float = 0.0
     keep_flagged: bool = False
+    excluded: tuple[tuple[str, str], ...] = ()
+
+
+def leave_out(
+    sightings: Sequence[Sighting], excluded: Sequence[tuple[str, str]]
+) -> tuple[list[Sighting], tuple[SkippedSighting, ...]]:
+    """Return the sightings that are wanted, and the others.
+
+    Parameters
+    ----------
+    excluded : sequence of (str, str)
+        As in `Selection`.
+    """
+    unwanted = set(excluded)
+    kept, skipped = [], []
+    for sighting in sightings:
+        if unwanted.isdisjoint({(sighting.frame, ""), (sighting.frame, sighting.target)}):
+            kept.append(sighting)
+        else:
+            skipped.append(SkippedSighting(sighting.frame, sighting.target, SkipReason.EXCLUDED))
+    return kept, tuple(skipped)
 
 
 def select(

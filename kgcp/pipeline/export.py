@@ -13,7 +13,7 @@ from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
-from kgcp.georef.selection import Selection, explain_none_left, select
+from kgcp.georef.selection import Selection, explain_none_left, leave_out, select
 from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
@@ -105,12 +105,15 @@ def make_gcps(
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
-    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    if not sightings:
+    measured = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    if not measured:
         raise KgcpError(
             f"{table}: no target was measured in any frame;"
             " see the reasons that 'kgcp detect' gives"
         )
+    sightings, excluded = leave_out(measured, selection.excluded)
+    if not sightings:
+        raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
     data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
     inputs = FlightInputs.detected(flight, data, attempts)
     with naming_causes(inputs.plausibility):
@@ -140,7 +143,7 @@ def make_gcps(
         flight=flight,
         crs=local_frame.crs,
         gcps=gcps,
-        skipped=(*absent, *unwanted),
+        skipped=(*excluded, *absent, *unwanted),
         camera_priors=camera_priors(gcps, sightings, target_positions, local_frame),
         vehicle=target_positions.vehicle,
         consistency=consistency,
@@ -184,9 +187,6 @@ def export_gcps(
         If a format is unknown or cannot hold the points, there are none, or a file cannot be
         written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown:
-        raise KgcpError(f"format {unknown[0]!r}: is unknown; give one of {', '.join(FORMATS)}")
     folder = results_folder(gcp_set.flight.folder) if folder is None else Path(folder)
     points = MapPoints(
         gcp_set.crs,
@@ -196,6 +196,20 @@ def export_gcps(
         mark_floor_px,
         image_extensions,
     )
+    return write_formats(points, formats, folder)
+
+
+def write_formats(points: MapPoints, formats: Sequence[str], folder: Path) -> list[Path]:
+    """Write the files of some formats, and return their paths.
+
+    Raises
+    ------
+    KgcpError
+        As `export_gcps`.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        raise KgcpError(f"format {unknown[0]!r}: is unknown; give one of {', '.join(FORMATS)}")
     return [path for name in dict.fromkeys(formats) for path in export(points, name, folder)]
 
 

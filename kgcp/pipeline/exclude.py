@@ -1,0 +1,84 @@
+"""Which points of which flight a list of unwanted frames means."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.io.formats.exclusions import Exclusion
+from kgcp.io.tables.detections import read_detections
+
+Row = tuple[str, str]
+"""Frame and target."""
+
+_SHOWN = 3  # names in a message
+
+
+def rows_of(table: Path) -> set[Row]:
+    """Return frame and target of all rows of a table of detections.
+
+    Raises
+    ------
+    KgcpError
+        If it is missing or unreadable.
+    """
+    detections = read_detections(table)
+    return set(zip(detections["frame"], detections["target"], strict=True))
+
+
+def excluded_rows(
+    exclusions: Iterable[Exclusion], rows: Mapping[str, set[Row]]
+) -> dict[str, tuple[Row, ...]]:
+    """Return for each flight what `Selection.excluded` is to be.
+
+    Lines that mean nothing are told in a `KgcpWarning`: a slip would leave a bad point in.
+
+    Parameters
+    ----------
+    rows : mapping
+        Of the flights' detections, by the flights' names.
+
+    Raises
+    ------
+    KgcpError
+        For a line that names no flight, but a frame that several have.
+    """
+    chosen: dict[str, list[Row]] = {name: [] for name in rows}
+    unknown = []
+    for exclusion in exclusions:
+        flights = [
+            name
+            for name, known in rows.items()
+            if exclusion.flight in {"", name} and _is_known(exclusion, known)
+        ]
+        if len(flights) > 1:
+            raise KgcpError(
+                f"{exclusion.frame} is a frame of {' and '.join(flights)}; name the flight in a"
+                " column flight of the list of frames to leave out"
+            )
+        if not flights:
+            unknown.append(exclusion)
+        for name in flights:
+            chosen[name].append((exclusion.frame, exclusion.target))
+    _tell(unknown)
+    return {name: tuple(sorted(set(pairs))) for name, pairs in chosen.items()}
+
+
+def _is_known(exclusion: Exclusion, rows: set[Row]) -> bool:
+    if exclusion.target:
+        return (exclusion.frame, exclusion.target) in rows
+    return any(frame == exclusion.frame for frame, _ in rows)
+
+
+def _tell(unknown: Sequence[Exclusion]) -> None:
+    if unknown:
+        shown = "; ".join(map(str, unknown[:_SHOWN]))
+        more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
+        warnings.warn(
+            f"{len(unknown)} lines of the list of frames to leave out name no row of the"
+            f" detections ({shown}{more}); write frames as paths below the frames folder",
+            KgcpWarning,
+            stacklevel=3,
+        )
