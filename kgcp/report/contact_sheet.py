@@ -44,6 +44,11 @@ class Card:
     residual_percent: float | None = None
     stem: str | None = None  # of the picture's files; None: there is none
 
+    @property
+    def is_point(self) -> bool:
+        """Whether the row becomes a point, unless the user leaves it out."""
+        return self.status == Status.MEASURED and self.instance == 0
+
 
 class ContactSheet:
     """A folder that becomes a contact sheet; its page appears last, after all pictures.
@@ -136,6 +141,7 @@ def _render(flight_name: str, cards: Sequence[Card]) -> str:
         frames=len({card.frame for card in cards}),
         statuses=[(kind, statuses[kind]) for kind in kinds if statuses[kind]],
         reasons=sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])),
+        has_points=any(card.is_point for card in cards),
         targets=sorted({card.target for card in cards}),
         thumbnail_px=THUMBNAIL_PX,
         full_percent=100.0 * FULL_SCALE,
