@@ -11,7 +11,7 @@ from typing import TextIO
 import click
 
 from kgcp import __version__
-from kgcp.errors import KgcpError, KgcpWarning
+from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
 # Name → module, in the order of use; a module is imported when its command is called.
@@ -68,6 +68,14 @@ class Program(click.Group):
         command: click.Command = import_module(COMMANDS[cmd_name]).command
         return command
 
+    def _is_option(self, ctx: click.Context, error: KgcpError) -> bool:
+        """Whether an error begins with the name of an option of the command that was called."""
+        command = self.get_command(ctx, ctx.invoked_subcommand or "")
+        if command is None or not isinstance(error, SettingError):
+            return False
+        option = f"--{error.key.replace('_', '-')}"
+        return any(option in parameter.opts for parameter in command.params)
+
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; unexpected exceptions keep their traceback."""
         use_one_thread_each()  # before a command imports numpy
@@ -75,7 +83,8 @@ class Program(click.Group):
             with _one_line_warnings():
                 return super().invoke(ctx)
         except KgcpError as error:
-            click.echo(f"kgcp: error: {error.on_command_line()}", err=True)
+            dashes = "--" if self._is_option(ctx, error) else ""
+            click.echo(f"kgcp: error: {dashes}{error.on_command_line()}", err=True)
             ctx.exit(_EXIT_KNOWN_ERROR)
         except KeyboardInterrupt:
             click.echo("kgcp: interrupted; files written so far are complete", err=True)

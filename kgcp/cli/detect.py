@@ -179,7 +179,11 @@ def command(
         doubts = doubts_before_detecting(the_flight, stored_frames, frame_patterns)
         print_doubts(doubts, is_quiet=is_quiet, as_json=log_json)
         start = time.perf_counter()
-        with log_to_stderr(is_quiet=is_quiet, as_json=log_json) as log, stopping(log):
+        rounds = 1 if overlay is None else 2
+        with (
+            log_to_stderr(is_quiet=is_quiet, as_json=log_json, rounds=rounds) as log,
+            stopping(log),
+        ):
             options = RunOptions(
                 jobs=jobs,
                 frame_timeout_s=frame_timeout,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
+_ROUNDS = {"first look": 0, "overlay": 1}  # stages of all frames, and the rounds before them
 _PATIENCE_S = 10.0  # without progress at the start before the wait is explained
 _SHORTEST_STAGE_S = 0.0005  # shorter ones would print as 0.000
 
@@ -37,11 +38,16 @@ class Log:
     ----------
     bar : tqdm
         Disabled where it is not wanted.
+    rounds : int
+        How often the run goes through all frames: once, or twice if it draws them.
     """
 
-    def __init__(self, bar: tqdm[NoReturn], *, is_quiet: bool, as_json: bool) -> None:
+    def __init__(
+        self, bar: tqdm[NoReturn], *, is_quiet: bool, as_json: bool, rounds: int = 1
+    ) -> None:
         self._bar = bar
         self.is_quiet, self.is_json = is_quiet, as_json
+        self._rounds = rounds
         self._due_s = 0.0
         self._stage = ""
         self.done = self.total = 0
@@ -55,19 +61,38 @@ class Log:
             click.echo(f"kgcp: {text}", err=True)
 
     def progress(self, stage: str, done: int, total: int, found: int) -> None:
-        """Move the bar, or begin it anew for another stage."""
+        """Move the bar, whose total is the number of frames in all stages.
+
+        A frame that goes through two rounds counts by half after the first. A second look, which
+        few frames need, is told beside the bar.
+        """
+        is_round = stage in _ROUNDS
+        frames = self._frames(stage, done, total)
         if stage != self._stage:
             self._stage = stage
-            self._bar.reset(total)
             self._bar.set_description(stage, refresh=False)
-            self._bar.initial = done  # what is kept from before is not counted as speed
-            self._bar.n = done
         self.done, self.total = done, total
-        self._bar.set_postfix(found=found, refresh=False)
-        self._bar.update(done - self._bar.n)
+        beside: dict[str, object] = {"found": found}
+        if not is_round:
+            beside[stage.split(maxsplit=1)[0]] = f"{done}/{total}"
+        self._bar.set_postfix(beside, refresh=False)
+        self._bar.update(frames - self._bar.n)
         if self.is_json and (time.monotonic() >= self._due_s or done == total):
             self._due_s = time.monotonic() + _JSON_PROGRESS_S
             self.event("progress", stage=stage, done=done, total=total, found=found)
+
+    def _frames(self, stage: str, done: int, total: int) -> int:
+        """Return how many frames are finished, counting rounds."""
+        before = _ROUNDS.get(stage)
+        if before is None:  # between the rounds
+            return int(self._bar.n)
+        finished = total * min(before, self._rounds - 1) + done
+        frames = finished // self._rounds
+        if not self._stage:
+            self._bar.reset(total)
+            self._bar.initial = frames  # what is kept from before is not counted as speed
+            self._bar.n = frames
+        return frames
 
     def explain_wait(self) -> None:
         """Explain the wait if no frame is finished yet."""
@@ -94,12 +119,12 @@ class Log:
 
 
 @contextmanager
-def log_to_stderr(*, is_quiet: bool, as_json: bool) -> Iterator[Log]:
+def log_to_stderr(*, is_quiet: bool, as_json: bool, rounds: int = 1) -> Iterator[Log]:
     """Show progress until the block ends."""
     from tqdm import tqdm
 
     with tqdm(unit="frame", disable=is_quiet or as_json) as bar:
-        log = Log(bar, is_quiet=is_quiet, as_json=as_json)
+        log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds)
         patience = Timer(_PATIENCE_S, log.explain_wait)
         if sys.stderr.isatty():  # a person may be waiting
             patience.start()

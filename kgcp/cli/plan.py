@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,6 +62,24 @@ if TYPE_CHECKING:
     help="Required standard deviation of a single distance [% of the distance].",
 )
 @click.option(
+    "--speed",
+    "speed_mps",
+    metavar="M/S",
+    type=float,
+    default=10.0,
+    show_default=True,
+    help="Speed of the camera over the target [m/s].",
+)
+@click.option(
+    "--interval",
+    "interval_s",
+    metavar="S",
+    type=float,
+    default=1.0,
+    show_default=True,
+    help="Time between frames [s].",
+)
+@click.option(
     "--plot",
     metavar="FILE",
     type=click.Path(path_type=Path),
@@ -77,6 +95,8 @@ def command(
     blur_px: float,
     psf_px: float,
     accuracy_percent: float,
+    speed_mps: float,
+    interval_s: float,
     plot: Path | None,
     as_json: bool,
 ) -> None:
@@ -84,8 +104,9 @@ def command(
 
     Uses the camera and the target of FLIGHT's flight.toml. For each height: the ring's radius in
     the image, the probability of detection, the standard deviations of distance and centre in one
-    frame, the largest speed for a given motion blur, and the smallest target for a required
-    accuracy. Frames and trajectory need not exist.
+    frame, the largest speed for a given motion blur, the smallest target for a required accuracy,
+    the size of a pixel and of the image on the ground, and in how many frames of a pass the target
+    is whole. Frames and trajectory need not exist.
 
     \b
     Example:
@@ -95,7 +116,7 @@ def command(
     from kgcp.simulation.outlook import Conditions, look_ahead, usual_heights
     from kgcp.targets.code_design import chosen_targets
 
-    conditions = Conditions(blur_px, exposure_s, psf_px, accuracy_percent)
+    conditions = Conditions(blur_px, exposure_s, psf_px, accuracy_percent, speed_mps, interval_s)
     camera, calibration, targets = read_camera_and_targets(flight)
     target = chosen_targets(targets, (name,) if name else ())[0]
     if plot is not None:
@@ -139,21 +160,16 @@ _COLUMNS = (
     ("speed", "m/s"),
     ("diameter", "m"),
 )
+_ROUND_M = 10.0  # sides on the ground from which decimetres do not matter
+_GROUND_COLUMNS = (("height", "m"), ("GSD", "mm"), ("footprint", "m"), ("frames", "per pass"))
 
 
 def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
     """Yield the lines of the table and of the notes on its columns."""
     from kgcp.simulation.outlook import SURE_PX, TILT_DEG
 
-    lines = [
-        [heading for heading, _ in _COLUMNS],
-        [unit for _, unit in _COLUMNS],
-        *(_cells(outlook) for outlook in outlooks),
-    ]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     yield f"Target {name}"
-    for cells in lines:
-        yield "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+    yield from _aligned(_COLUMNS, map(_cells, outlooks))
     blur = f"{conditions.blur_px:g} px"
     yield f"σ: one well exposed frame, target in its middle, plate tilted by {TILT_DEG:g}°,"
     yield f"  point spread {conditions.psf_px:g} px, motion blur {blur}; centre: per axis."
@@ -163,6 +179,29 @@ def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> It
         f"diameter: the smallest for a σ of {conditions.accuracy_percent:g} % of the distance"
         f" and a radius of {SURE_PX:g} px."
     )
+    yield ""
+    yield from _aligned(_GROUND_COLUMNS, map(_ground_cells, outlooks))
+    yield (
+        f"frames per pass: with the whole target, at {conditions.speed_mps:g} m/s along the image's"
+        f" height, one every {conditions.interval_s:g} s."
+    )
+
+
+def _aligned(columns: Sequence[tuple[str, str]], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    lines = [[name for name, _ in columns], [unit for _, unit in columns], *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for cells in lines:
+        yield "  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+
+
+def _ground_cells(outlook: Outlook) -> list[str]:
+    digits = 0 if min(outlook.footprint_m) >= _ROUND_M else 1
+    return [
+        f"{outlook.height_m:g}",
+        f"{1e3 * outlook.gsd_m:.1f}",
+        " × ".join(f"{side_m:.{digits}f}" for side_m in outlook.footprint_m),
+        f"{outlook.frames_per_pass:.1f}",
+    ]
 
 
 def _cells(outlook: Outlook) -> list[str]:

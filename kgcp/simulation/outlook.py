@@ -66,12 +66,16 @@ class Conditions:
     exposure_s: float = 0.001
     psf_px: float = 0.7  # σ of the point spread of lens and sensor [px]
     accuracy_percent: float = 0.05  # wanted standard deviation of one distance [% of it]
+    speed_mps: float = 10.0  # of the camera over the target
+    interval_s: float = 1.0  # between frames
 
     def __post_init__(self) -> None:
         require_range("blur", self.blur_px, 0.0, 30.0, unit="px")
         require_range("exposure", self.exposure_s, 0.0, 60.0, unit="s", open_low=True)
         require_range("psf", self.psf_px, 0.3, 10.0, unit="px")
         require_range("accuracy", self.accuracy_percent, 0.0, 10.0, unit="%", open_low=True)
+        require_range("speed", self.speed_mps, 0.0, 1e3, unit="m/s", open_low=True)
+        require_range("interval", self.interval_s, 0.0, 3600.0, unit="s", open_low=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +98,10 @@ class Outlook:
     largest_speed_mps: float
     # of the main ring, for the wanted accuracy, and to be found for sure
     smallest_diameter_m: float
+    gsd_m: float  # size of a pixel on the ground
+    footprint_m: tuple[float, float]  # of the image on the ground: its width and height
+    # in which the main ring is whole while the camera passes along the image's height
+    frames_per_pass: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,6 +206,10 @@ def _outlook(
         sd_common_distance_m=None if common is None else common.sd_distance_m,
         largest_speed_mps=conditions.blur_px / metre_px / conditions.exposure_s,
         smallest_diameter_m=2.0 * wanted_px / metre_px,
+        gsd_m=1.0 / metre_px,
+        footprint_m=(camera.width / metre_px, camera.height / metre_px),
+        frames_per_pass=max(0.0, camera.height / metre_px - target.ring.outer_diameter_m)
+        / (conditions.speed_mps * conditions.interval_s),
     )
 
 

@@ -17,6 +17,7 @@ _CROP_START, _CROP_END = 3.0, 10.0  # of marks beyond the plate, in units of the
 _HOLE_INSET = 1.5  # from the plate's edge to a hole's centre, of the hole's diameter …
 _HOLE_RIM_MM = 6.0  # … or from its rim, if that is more
 _HOLE_CROSS = 0.7  # from a hole's centre to the ends of its cross, of its diameter
+_LEAST_ROOM = 4.0  # above the ring, for an arrow on the plate, in units of the legend
 _NARROWEST_MM = 130.0  # of the legend
 _LEGEND_FROM, _LEGEND_TO = 190.0, 800.0  # widths between which the legend grows [mm]
 
@@ -77,8 +78,9 @@ def draw_target(target: Target, plate: MountingPlate | None) -> Artwork:
     widen = max(0.0, 0.5 * (_NARROWEST_MM - box.width))
     box = Box(box.left - widen, box.top, box.right + widen, box.bottom)
     legend, bottom = _legend(target, box, radius_mm, is_beside=plate is None)
-    shapes += [_up_mark(box, radius_mm) if plate is None else _up_mark_on(plate), *legend]
-    return Artwork(tuple(shapes), Box(box.left, box.top, box.right, bottom))
+    up = _up_mark(box, radius_mm) if plate is None else _up_mark_on(plate, radius_mm)
+    shapes += [up, *legend]
+    return Artwork(tuple(shapes), Box(box.left, box.top, box.right, bottom), radius_mm)
 
 
 def _check_plate(plate: MountingPlate, radius_mm: float) -> None:
@@ -163,10 +165,22 @@ def _up_mark(box: Box, radius_mm: float) -> Polyline:
     return _arrow(box.left + 0.5 * height, box.top, height)
 
 
-def _up_mark_on(plate: MountingPlate) -> Polyline:
-    """Return an arrow above the plate, at the end of its axis."""
-    unit = _unit(plate.width_mm)
-    return _arrow(4.0 * unit, -0.5 * plate.width_mm - _CROP_END * unit, 6.0 * unit)
+def _up_mark_on(plate: MountingPlate, radius_mm: float) -> Polyline:
+    """Return an arrow on the plate, outside the white that the ring needs.
+
+    It is above the ring or, on a square plate with too little room there, beside the hole in the
+    top left corner. On a round plate without room it is outside: it is cut off.
+    """
+    unit, half = _unit(plate.width_mm), 0.5 * plate.width_mm
+    room = half - radius_mm
+    if room > _LEAST_ROOM * unit:
+        height = min(6.0 * unit, 0.6 * room)
+        return _arrow(0.0, 0.5 * (room - height) - half, height)
+    if plate.is_round:
+        return _arrow(4.0 * unit, -half - _CROP_END * unit, 6.0 * unit)
+    aside = 2.0 * plate.inset_mm if plate.hole_mm else 2.0 * unit
+    height = min(6.0 * unit, 0.4 * (math.hypot(half - aside, half) - radius_mm))
+    return _arrow(aside - half + 0.4 * height, unit - half, height)
 
 
 def _arrow(x: float, top: float, height: float) -> Polyline:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 
 Point = tuple[float, float]
 LINE_MM = 0.2
 """Width of lines, which only help to cut, drill and measure."""
+_WIDEST_LETTER = 0.75  # on average, of the type's size
 
 
 class Layer(StrEnum):
@@ -99,11 +103,35 @@ class Box:
         """Return the box elsewhere."""
         return Box(self.left + x, self.top + y, self.right + x, self.bottom + y)
 
+    def overlaps(self, other: Box) -> bool:
+        """Whether the two have a part in common."""
+        is_beside = self.right <= other.left or other.right <= self.left
+        return not (is_beside or self.bottom <= other.top or other.bottom <= self.top)
+
     def distance_to(self, x: float, y: float) -> float:
         """Return the distance of a point, 0 within [mm]."""
         dx = max(self.left - x, 0.0, x - self.right)
         dy = max(self.top - y, 0.0, y - self.bottom)
         return float((dx * dx + dy * dy) ** 0.5)
+
+
+def _is_seen(shape: Shape, box: Box) -> bool:
+    """Whether a box shows some ink of a shape, not counting what lies on top of it."""
+    if isinstance(shape, Circle):
+        nearest = box.distance_to(*shape.centre_mm)
+        farthest = max(math.dist(shape.centre_mm, corner) for corner in box.corners)
+        return nearest < shape.radius_mm and (shape.is_filled or farthest > shape.radius_mm)
+    if isinstance(shape, Text):
+        (x, y), size = shape.start_mm, shape.size_mm
+        width = min(shape.room_mm, _WIDEST_LETTER * size * len(shape.words))
+        return Box(x, y - size, x + width, y + size).overlaps(box)
+    pairs = (shape.points_mm,) if shape.is_filled else pairwise(shape.points_mm)
+    return any(_around(points).grown(LINE_MM).overlaps(box) for points in pairs)
+
+
+def _around(points: Sequence[Point]) -> Box:
+    columns, rows = zip(*points, strict=True)
+    return Box(min(columns), min(rows), max(columns), max(rows))
 
 
 def filled_rectangle(layer: Layer, box: Box) -> Polyline:
@@ -117,6 +145,14 @@ class Artwork:
 
     shapes: tuple[Shape, ...]  # in painting order
     box: Box  # what has to be on the paper
+    white_mm: float = 0.0  # radius about the origin that has to be white paper
+
+    def shows_something(self, part: Box) -> bool:
+        """Whether there is ink in a part of the artwork, or white that the target needs."""
+        if part.distance_to(0.0, 0.0) < self.white_mm:
+            return True
+        inked = (shape for shape in self.shapes if getattr(shape, "layer", None) != Layer.WHITE)
+        return any(_is_seen(shape, part) for shape in inked)
 
 
 @dataclass(frozen=True, slots=True)

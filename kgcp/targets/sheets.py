@@ -99,7 +99,7 @@ def _grid(box: Box, size_mm: tuple[float, float]) -> tuple[tuple[float, float], 
 def _tiles(
     artwork: Artwork, name: str, size_mm: tuple[float, float], rows: int, columns: int
 ) -> Iterator[Sheet]:
-    """Yield tiles of one size, row by row, each in the middle of its sheet."""
+    """Yield the tiles that show something, row by row, each in the middle of its sheet."""
     box, (sheet_width, sheet_height) = artwork.box, size_mm
     width, height = box.width / columns, box.height / rows
     left, top = 0.5 * (sheet_width - width), 0.5 * (sheet_height - height)
@@ -107,9 +107,11 @@ def _tiles(
     for row in range(rows):
         for column in range(columns):
             centre = left - box.left - column * width, top - box.top - row * height
+            if not artwork.shows_something(cut.moved(-centre[0], -centre[1])):
+                continue
             words = (
                 f"{name}: row {row + 1} of {rows}, column {column + 1} of {columns}."
-                " Cut along the marks, lay edge to edge."
+                " Cut along the marks, lay edge to edge; blank tiles are left out."
             )
             yield Sheet(
                 f"r{row + 1}c{column + 1}",

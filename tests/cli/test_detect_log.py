@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,15 +40,32 @@ def test_a_stopped_run_tells_how_far_it_came(capsys: pytest.CaptureFixture[str])
             assert said in capsys.readouterr().err
 
 
-def test_the_bar_begins_anew_with_every_stage() -> None:
-    with log_to_stderr(is_quiet=True, as_json=False) as log:
-        for stage, done, total in (
-            ("first look", 0, 9),
-            ("first look", 9, 9),
-            ("second look", 1, 2),
-        ):
-            log.progress(stage, done, total, 0)
+@pytest.mark.parametrize(("rounds", "expected"), [(1, [3, 9, 9, 9]), (2, [1, 4, 4, 4, 6, 9])])
+def test_one_bar_goes_through_all_stages(
+    rounds: int, expected: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It counts frames, its total stays, and it never goes back."""
+    stages = [
+        *(("first look", 3, 9), ("first look", 9, 9), ("second look", 0, 2), ("second look", 2, 2)),
+        *(("overlay", 3, 9), ("overlay", 9, 9))[: 6 * (rounds - 1)],
+    ]
+    with log_to_stderr(is_quiet=False, as_json=False, rounds=rounds) as log:
+        shown = []
+        for stage, done, total in stages:
+            log.progress(stage, done, total, found=2)
             assert (log.done, log.total) == (done, total)
+            log._bar.refresh()
+            line = capsys.readouterr().err.rpartition("\r")[2]
+            shown.append(int(re.findall(r"(\d+)/9 \[", line)[0]))
+            assert line.startswith(f"{stage}: ")
+            assert ("second=2/2" in line) == ((stage, done) == ("second look", 2))
+    assert shown == expected
+
+
+def test_frames_kept_from_before_are_not_counted_as_speed() -> None:
+    with log_to_stderr(is_quiet=True, as_json=False) as log:
+        log.progress("first look", 6, 9, found=2)
+        assert (log._bar.initial, log._bar.n) == (6, 6)
 
 
 @pytest.mark.parametrize(("kept", "speed"), [(0, " (0.5/s)"), (1, "")])

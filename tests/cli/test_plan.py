@@ -70,6 +70,32 @@ def test_json_has_the_same_numbers(flight: Path) -> None:
     assert sd_m == sorted(sd_m)
 
 
+def test_the_ground_has_a_table_of_its_own(flight: Path) -> None:
+    """A pixel, the image's sides, and how often the whole target is in a frame of a pass."""
+    result = run(flight, "--height", "40", "--speed", "5", "--interval", "0.5")
+    rows = result.stdout.splitlines()
+    head = next(i for i, line in enumerate(rows) if "GSD" in line)
+    assert rows[head].split() == ["height", "GSD", "footprint", "frames"]
+    # 40 m / 1902 px; 1200 x 900 px; (900 px - 0.9 m) over 2.5 m per frame
+    assert rows[head + 2].split() == ["40", "21.0", "25", "×", "19", "7.2"]
+    assert "at 5 m/s along the image's height, one every 0.5 s" in rows[head + 3]
+    plan = json.loads(run(flight, "--height", "40", "--json").stdout)["heights"][0]
+    assert plan["gsd_m"] == pytest.approx(40 / 1902)
+    assert plan["footprint_m"] == pytest.approx([1200 * 40 / 1902, 900 * 40 / 1902])
+    assert plan["frames_per_pass"] == pytest.approx((900 * 40 / 1902 - 0.9) / 10.0)
+
+
+@pytest.mark.parametrize("heights", [("50", "100"), ("10",), ()])
+def test_the_figure_has_plain_numbers(flight: Path, heights: tuple[str, ...]) -> None:
+    path = flight / "plan.svg"
+    options = [word for height in heights for word in ("--height", height)]
+    assert run(flight, "--plot", path, *options).exit_code == 0
+    text = path.read_text(encoding="utf-8")
+    assert "<!-- $" not in text, "no powers of ten"
+    for words in ("on the ground [m]", "size of a pixel on the ground [mm]", *heights):
+        assert f"<!-- {words} -->" in text
+
+
 def test_the_figure_is_drawn(flight: Path) -> None:
     path = flight / "plan.png"
     result = run(flight, "--plot", path)

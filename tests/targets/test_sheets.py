@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -98,12 +99,17 @@ def test_tiles_cover_everything_once(paper: Paper) -> None:
         sheet.window.grown(-bleed_mm).moved(-sheet.centre_mm[0], -sheet.centre_mm[1])
         for sheet in sheets
     ]
-    assert sum(cut.width * cut.height for cut in cuts) == pytest.approx(
-        artwork.box.width * artwork.box.height
-    )
     assert min(cut.left for cut in cuts) == pytest.approx(artwork.box.left)
     assert max(cut.bottom for cut in cuts) == pytest.approx(artwork.box.bottom)
     assert len({(round(cut.left, 6), round(cut.top, 6)) for cut in cuts}) == len(sheets)
+    for shape in artwork.shapes:
+        for x, y in points(shape):
+            if not isinstance(shape, Text):
+                assert min(cut.distance_to(x, y) for cut in cuts) < 1e-6, shape
+    radius_mm = margin_radius_mm(LARGE)
+    for angle in (math.radians(0.5 * step) for step in range(720)):
+        x, y = 0.999 * radius_mm * math.cos(angle), 0.999 * radius_mm * math.sin(angle)
+        assert min(cut.distance_to(x, y) for cut in cuts) == 0.0, "the white around the ring"
     for sheet in sheets:
         for mark in sheet.marks:
             for x, y in points(mark):
@@ -118,6 +124,40 @@ def test_tiles_cover_everything_once(paper: Paper) -> None:
             isinstance(mark, Polyline) and mark.is_filled and mark.layer is Layer.RULER
             for mark in sheet.marks
         )
+
+
+def test_blank_tiles_are_left_out() -> None:
+    """On A4, the tiles beside the legend and beyond the plate show nothing."""
+    artwork = draw_target(LARGE, MountingPlate(1200.0))
+    sheets = lay_out(artwork, "A", Paper.A4, is_tiled=True)
+    labels = [tuple(map(int, re.findall(r"\d+", sheet.label))) for sheet in sheets]
+    rows, columns = (max(places) for places in zip(*labels, strict=True))
+    assert len(sheets) < rows * columns
+    assert (rows, columns) not in labels, "right of the legend"
+    assert any("blank tiles are left out" in str(mark) for mark in sheets[0].marks)
+
+
+@pytest.mark.parametrize("width_mm", [1126.0, 1150.0, 1200.0, 2000.0])
+@pytest.mark.parametrize("hole_mm", [None, 8.0])
+def test_the_arrow_is_on_the_plate_and_outside_the_white(
+    width_mm: float, hole_mm: float | None
+) -> None:
+    plate = MountingPlate(width_mm, hole_mm=hole_mm)
+    shapes = draw_target(LARGE, plate).shapes
+    (arrow,) = (
+        shape
+        for shape in shapes
+        if isinstance(shape, Polyline) and shape.layer is Layer.TEXT and shape.is_filled
+    )
+    assert len(arrow.points_mm) == 3
+    for x, y in arrow.points_mm:
+        assert max(abs(x), abs(y)) < 0.5 * width_mm
+        assert math.hypot(x, y) > margin_radius_mm(LARGE)
+        for hole in plate.holes_mm():
+            assert math.dist(hole, (x, y)) > 0.7 * (hole_mm or 0.0)
+    left, apex, right = arrow.points_mm
+    assert apex[1] < left[1] == right[1], "it points up"
+    assert left[1] - apex[1] > 10.0, "it can be seen"
 
 
 def test_a_ruler_is_as_long_as_it_says() -> None:
