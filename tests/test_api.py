@@ -55,7 +55,9 @@ def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> Non
         lines.append(done.stdout)
     assert len(EXAMPLES) >= 5
     assert re.match(r"\d+\.\d{3} m ± \d+\.\d mm \[", lines[0])
-    assert (tmp_path / "results" / "bias_report.html").exists()
+    report = (tmp_path / "results" / "bias_report.html").read_text(encoding="utf-8")
+    assert re.search(r"by vehicle and by camera differ by\s+\d+ mm along", report)
+    assert re.search(r"24: 21 measured, 3 out of view", report)
     assert (tmp_path / "results" / "odm" / "gcp_list.txt").exists()
     flight = kgcp.read_flight(ROOT / "sample_flight")
     table = tmp_path / "results" / "detections.parquet"

@@ -19,7 +19,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
-from kgcp.io.tables.detections import read_attempts, read_settings
+from kgcp.io.tables.detections import Outcomes, read_attempts, read_outcomes, read_settings
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
@@ -28,10 +28,11 @@ from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.quality.advice import advice
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.checks.measured import measured_doubts
-from kgcp.quality.consistency import study_consistency
+from kgcp.quality.consistency import Consistency, study_consistency
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -44,6 +45,7 @@ from kgcp.report.bias.figures import (
     standardised_histogram,
 )
 from kgcp.report.bias.numbers import SPREAD, BiasNumbers, bias_numbers, evenly
+from kgcp.report.bias.origin import agreement, facts, headline
 from kgcp.report.bias.page import Content, render_page
 from kgcp.report.bias.reexposure import Reexposed, measure_again
 from kgcp.report.bias.summary import Json, finite, summary_of
@@ -95,6 +97,10 @@ class FlightBias:
         What the comparisons were made from: the metadata of their table.
     doubts : tuple of Doubt
         What does not fit, with its likely cause, grave doubts first.
+    outcomes : Outcomes or None
+        What became of the frames; None: not known.
+    consistency : Consistency or None
+        How well vehicle and camera agree; None: too few frames to compare.
     """
 
     flight: Flight
@@ -102,6 +108,8 @@ class FlightBias:
     study: BiasStudy
     provenance: Mapping[str, str]
     doubts: tuple[Doubt, ...] = ()
+    outcomes: Outcomes | None = None
+    consistency: Consistency | None = None
 
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, without re-exposed frames."""
@@ -168,8 +176,14 @@ class FlightBias:
         again = evenly(numbers.data.distance_m, reexpose)
         closeups, reexposed = _look(numbers, self.flight, frames, self.settings, shown, again)
         verdict = assess(numbers, reexposed)
+        consistency = self.consistency
         return Content(
             name=self.flight.name,
+            headline=headline(self.flight, self.outcomes),
+            facts=facts(self.flight, self.settings, self.outcomes, self.provenance),
+            agreement=agreement(consistency),
+            advice=() if consistency is None else advice(consistency),
+            doubts=self.doubts,
             numbers=numbers,
             verdict=verdict,
             pictures=_pictures(numbers, self.flight, reexposed),
@@ -210,6 +224,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         )
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
     poses, positions = data.reference_poses, data.target_positions
+    consistency = study_consistency(sightings, positions, poses, flight.camera)
     doubts = measured_doubts(
         inputs.plausibility,
         sightings,
@@ -217,10 +232,12 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
         poses,
         flight.camera,
         inputs.headers,
-        study_consistency(sightings, positions, poses, flight.camera),
+        consistency,
     )
     provenance = derived_provenance(flight, table, {}, has_reference=True)
-    return FlightBias(flight, settings, study, provenance, doubts)
+    return FlightBias(
+        flight, settings, study, provenance, doubts, read_outcomes(table), consistency
+    )
 
 
 def _look(

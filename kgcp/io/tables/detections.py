@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -212,6 +213,40 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     readable = table[table["status"] != Status.UNREADABLE.value]
     ordered = readable.sort_values(["frame", "target", "instance"])
     return [_attempt(row, numbers[row["frame"]]) for row in ordered.to_dict("records")]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """What became of the frames of a flight."""
+
+    frames: int
+    rows: int  # frames times targets, and further plates
+    measured: int
+    reasons: tuple[tuple[str, int], ...]  # why rows were not measured, the commonest first
+    # times of the first and the last frame, Unix UTC [s]; None: no frame has one
+    first_s: float | None
+    last_s: float | None
+
+
+def read_outcomes(path: Path) -> Outcomes:
+    """Count what became of the frames in a table of detections.
+
+    Raises
+    ------
+    KgcpError
+        As `read_detections`.
+    """
+    table = read_detections(path)
+    reasons = Counter(table["reason"][table["status"] != Status.MEASURED.value])
+    times = table["time"].dropna()
+    return Outcomes(
+        frames=table["frame"].nunique(),
+        rows=len(table),
+        measured=int((table["status"] == Status.MEASURED.value).sum()),
+        reasons=tuple(reasons.most_common()),
+        first_s=None if times.empty else times.min().timestamp(),
+        last_s=None if times.empty else times.max().timestamp(),
+    )
 
 
 def read_settings(path: Path) -> DetectSettings:

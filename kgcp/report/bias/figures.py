@@ -26,7 +26,7 @@ _CONFIDENCE = 1.96  # standard deviations: 95 %
 def error_against_distance(numbers: BiasNumbers) -> Picture:
     """Draw the paper's Figure 9: errors with moving mean and spread, in metres and percent."""
     distance = numbers.data.distance_m
-    with sheet(7.2) as figure:
+    with sheet(6.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True)
         metres = _errors(
             upper, numbers, numbers.data.residual_m, numbers.sd_m, _systematic_m(numbers)
@@ -38,7 +38,7 @@ def error_against_distance(numbers: BiasNumbers) -> Picture:
         upper.set_ylabel("error [m]")
         lower.set_ylabel("error [% of distance]")
         lower.set_xlabel("reference distance [m]")
-        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=5)
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return picture(figure, [metres, percent])
 
 
@@ -66,7 +66,7 @@ def _errors(
 
 def detection_rate(numbers: BiasNumbers) -> Picture:
     """Draw the paper's Figure 8: detection rate, with 95 % intervals."""
-    with sheet(6.4) as figure:
+    with sheet(5.4) as figure:
         upper, lower = figure.subplots(2, 1)
         _rates(upper, numbers.rates, [0.5 * (rate.low + rate.high) for rate in numbers.rates])
         upper.set_xlabel("reference distance [m]  (small numbers: frames)")
@@ -112,7 +112,7 @@ def standardised_histogram(numbers: BiasNumbers) -> Picture:
     """Draw errors over their reported standard deviations, and the normal distribution."""
     raw = numbers.data.residual_m / numbers.sd_m
     left = (numbers.data.residual_m - _systematic_m(numbers)) / numbers.sd_m
-    with sheet(4.0) as figure:
+    with sheet(3.8) as figure:
         axes = figure.subplots()
         for values, colour, filled, label in (
             (raw, BLUE, True, "error / reported sd"),
@@ -149,7 +149,7 @@ def error_in_time(numbers: BiasNumbers) -> Picture:
     minutes, label = (time_s - time_s[0]) / 60.0, "time since the first [min]"
     if not np.isfinite(time_s).all():
         minutes, label = np.arange(float(len(time_s))), "frame, in order"
-    with sheet(3.6) as figure:
+    with sheet(3.2) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
         points = scatter(axes, np.arange(len(minutes)), minutes, numbers.data.residual_m)
@@ -162,7 +162,7 @@ def error_over_image(numbers: BiasNumbers, camera: Camera) -> Picture:
     """Draw errors in percent where in the image they were measured."""
     measured = (pair.attempt.sighting for pair in numbers.compared)
     centre_px = np.array([sighting.centre_px for sighting in measured if sighting is not None])
-    with sheet(0.8 + 5.1 * min(1.4, camera.height / camera.width)) as figure:
+    with sheet(0.8 + 3.9 * min(1.4, camera.height / camera.width)) as figure:
         axes = figure.subplots()
         axes.set_aspect("equal")
         points = _coloured(figure, axes, centre_px, numbers.residual_percent, "error [%]")
@@ -177,7 +177,7 @@ def flight_map(numbers: BiasNumbers) -> Picture:
     """Draw where the cameras were, and where the target was, coloured by the error."""
     places = np.array([pair.place_m for pair in numbers.compared])
     cameras = np.array([pair.camera_m for pair in numbers.compared])
-    with sheet(6.0) as figure:
+    with sheet(4.8) as figure:
         axes = figure.subplots()
         axes.set_aspect("equal", adjustable="datalim")
         sights = np.stack((cameras, places, np.full_like(places, np.nan)), axis=1).reshape(-1, 3)
@@ -218,7 +218,7 @@ def error_against_exposure(numbers: BiasNumbers) -> Picture:
         if numbers.is_displaced and influence.quantity.name != "edge_shift_px"
     ]
     count = -(-(len(numbers.influences) + len(displaced)) // 2)
-    with sheet(2.7 * count) as figure:
+    with sheet(2.3 * count) as figure:
         panels = iter(figure.subplots(count, 2, squeeze=False).ravel())
         points = []
         # pairs side by side, and δ, which has no partner, behind them
@@ -246,7 +246,8 @@ def _line(axes: Axes, influence: Influence, slope: Slope | None) -> None:
     """Draw a fitted line with its confidence, and name the abscissa."""
     axes.set_xlabel(influence.quantity.label, fontsize=11)
     axes.tick_params(labelsize=10)
-    axes.locator_params(nbins=5)
+    axes.locator_params(nbins=4)
+    axes.locator_params(axis="x", nbins=3)
     if slope is None:
         return
     x = np.linspace(influence.values.min(), influence.values.max(), 60)
@@ -268,7 +269,7 @@ def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
     """Draw errors of the distances by one edge and by two, and their difference against δ."""
     rows = edges.rows
     distance = numbers.data.distance_m[rows]
-    with sheet(6.4) as figure:
+    with sheet(5.6) as figure:
         upper, lower = figure.subplots(2, 1)
         upper.axhline(0.0, color="black", linewidth=0.8)
         by_one, by_two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
@@ -291,7 +292,7 @@ def change_by_reexposure(results: Sequence[Reexposed]) -> Picture:
     """Draw the paper's Figure 10: how distances move when grey values are multiplied."""
     gains = sorted({result.gain for result in results})
     colours = dict(zip(gains, (BLUE, VERMILION, GREEN, GREY), strict=False))
-    with sheet(4.2) as figure:
+    with sheet(3.8) as figure:
         axes = figure.subplots()
         axes.axhline(0.0, color="black", linewidth=0.8)
         points: list[Points] = []

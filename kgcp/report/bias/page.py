@@ -14,16 +14,30 @@ from markupsafe import Markup
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.tables.gcps import BIAS_COLUMNS
+from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.quality.number_text import minus
 from kgcp.report.bias import wording
 from kgcp.report.bias.numbers import BiasNumbers
+from kgcp.report.bias.origin import Fact
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.bias.summary import Json, finite
 from kgcp.report.bias.verdict import LIMITS, Verdict
 from kgcp.report.ring_picture import CLOSEUP_PX
 from kgcp.report.style import MARK_STEPS, Picture
 
+_TITLES = {
+    "error": "error against distance",
+    "causes": "what the error is made of",
+    "rate": "detection rate",
+    "exposure": "error against exposure",
+    "edges": "one edge against two",
+    "reexposure": "measured again",
+    "standardised": "errors over their standard deviations",
+    "worst": "largest residuals",
+    "left-out": "what is left out",
+}
+"""Of the sections that findings lead to, by their ids."""
 _DIGITS = 7  # significant, of the values in the page; bias.parquet has all
 
 
@@ -32,6 +46,11 @@ class Content:
     """All that a page shows."""
 
     name: str  # of the flight
+    headline: str  # program, day, camera, target, CRS
+    facts: Sequence[Fact]  # what the report was made from
+    agreement: str  # of vehicle and camera, in a sentence
+    advice: Sequence[str]  # what to change in flight.toml
+    doubts: Sequence[Doubt]  # what else does not fit
     numbers: BiasNumbers
     verdict: Verdict
     # by the name of the figure; one that is missing is left out of the page
@@ -66,6 +85,7 @@ def render_page(content: Content) -> str:
         data=_embedded(_data(content)),
         limits=LIMITS,
         words=wording,
+        titles=_TITLES,
     )
 
 

@@ -7,12 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+from kgcp.quality.bias_causes import Term
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
     LABELS,
     exposure_sentence,
     meaning_of,
+    reference_allows,
     signed_amount,
     value_of,
 )
@@ -132,7 +134,11 @@ def _bias(numbers: BiasNumbers) -> Finding:
 
 
 def _mean(row: RangeRow) -> str:
-    return signed_amount(row.percent.mean, row.sd_mean_percent, "%")
+    """Return a mean error with its own noise, and what the reference may be wrong by."""
+    text = signed_amount(row.percent.mean, row.percent.sd_mean, "%")
+    if row.sd_reference_percent is None:
+        return text
+    return f"{text} (the reference allows ± {row.sd_reference_percent:.2g} %)"
 
 
 def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
@@ -143,19 +149,30 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
         return
     basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
     if not any(term.is_significant for term in basic):
-        values = " and ".join(f"{LABELS[term.name]} {value_of(term)}" for term in basic)
+        values = " and ".join(
+            f"{LABELS[term.name]} {value_of(term)}{_allowed(term, numbers)}" for term in basic
+        )
         yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
     large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
         if term.name in large and term.is_significant:
             material = abs(term.value) >= large[term.name]
-            yield Finding(Grade.LOOK if material else Grade.GOOD, meaning_of(term), "causes")
+            text = meaning_of(term)
+            allowed = reference_allows(term, numbers)
+            if allowed is not None:
+                text += f" Errors of the reference allow {allowed}."
+            yield Finding(Grade.LOOK if material else Grade.GOOD, text, "causes")
         elif term.name == "edge_curvature_px2":
             yield Finding(Grade.LOOK, meaning_of(term), "causes")
     material = (
         regression.is_exposure_significant and regression.exposure_share >= LIMITS.exposure_share
     )
     yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(regression), "exposure")
+
+
+def _allowed(term: Term, numbers: BiasNumbers) -> str:
+    allowed = reference_allows(term, numbers)
+    return "" if allowed is None else f" (the reference allows {allowed})"
 
 
 def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:

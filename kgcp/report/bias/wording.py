@@ -5,6 +5,7 @@ from __future__ import annotations
 from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.quality.number_text import amount, minus
+from kgcp.report.bias.numbers import BiasNumbers
 
 LABELS = {
     "scale": "scale",
@@ -31,6 +32,15 @@ def value_of(term: Term) -> str:
     if term.name == "edge_curvature_px2":
         return signed_amount(term.value, term.sd, "px²")
     return signed_amount(term.value, term.sd, f"px per {_PER[term.name]}")
+
+
+def reference_allows(term: Term, numbers: BiasNumbers) -> str | None:
+    """Return what errors of the reference distances may feign of a term; None: not known."""
+    if term.name == "scale" and numbers.total.sd_reference_percent is not None:
+        return f"± {numbers.total.sd_reference_percent:.2g} %"
+    if term.name == "offset_m" and numbers.sd_reference_m is not None:
+        return f"± {1000.0 * numbers.sd_reference_m:.2g} mm"
+    return None
 
 
 def meaning_of(term: Term) -> str:

@@ -140,6 +140,30 @@ def test_every_figure_is_drawn_and_nothing_is_wider_than_the_window(page: Page) 
     assert all(page.evaluate(INK, image) > 0.1 for image in page.query_selector_all("#gallery img"))
 
 
+def test_figures_fit_the_window(page: Page) -> None:
+    for plot in page.query_selector_all(".plot"):
+        assert plot.evaluate("(e) => e.parentElement.scrollWidth <= e.parentElement.clientWidth")
+
+
+def test_tables_that_go_on_show_it(page: Page) -> None:
+    """A table wider than the window scrolls by itself, with a shadow where it goes on."""
+    for box in page.query_selector_all(".wide:has(table)"):
+        assert box.evaluate("(e) => getComputedStyle(e).overflowX") == "auto"
+        assert "local" in box.evaluate("(e) => getComputedStyle(e).backgroundAttachment")
+
+
+def test_the_first_printed_page_is_full(page: Page) -> None:
+    """On A4, verdict, agreement and origin take more than half of it; a figure takes the next."""
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": 688, "height": 1009})  # 182 mm by 267 mm
+    bottom = page.evaluate("document.querySelector('#origin').getBoundingClientRect().bottom")
+    assert 0.55 < bottom / 1009.0 < 1.0
+    for plot in page.query_selector_all(".plot"):
+        box = plot.bounding_box()
+        assert box is not None
+        assert box["height"] < 0.7 * 1009.0
+
+
 def test_hovering_names_the_frame_and_a_click_shows_it(page: Page) -> None:
     tip, dialog = page.locator("#tip"), page.locator("dialog")
     for name in ("error", "exposure", "edges", "reexposure", "time", "image", "map"):
@@ -205,7 +229,11 @@ def test_tables_and_numbers_can_be_saved(page: Page, made: Made) -> None:
     summary = json.loads((made.folder / "bias_summary.json").read_text(encoding="utf-8"))
     assert json.loads(saved(page, "bias_summary.json")) == summary
     causes = list(csv.reader(io.StringIO(saved(page, "causes.csv"), newline="")))
-    assert causes[0] == ["Cause", "Estimate ± sd", "p", "In words"]
+    assert causes[0] == ["Cause", "Estimate ± sd", "Reference allows", "p", "In words"]
+    for name, unit in (("distance", "m"), ("radius", "px")):
+        rates = list(csv.reader(io.StringIO(saved(page, f"rates_by_{name}.csv"), newline="")))
+        assert rates[0][0] == name.capitalize()
+        assert all(row[0].endswith(f" {unit}") for row in rates[1:])
     assert causes[1][0] == "scale"
 
 

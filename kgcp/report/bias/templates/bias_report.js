@@ -206,7 +206,7 @@
       } else if (name === "bias.csv") {
         save(name, measurements(), "text/csv");
       } else {
-        save(name, tableText(button.closest("section").querySelector("table")), "text/csv");
+        save(name, tableText(button.parentElement.previousElementSibling.querySelector("table")), "text/csv");
       }
     });
   }

@@ -1,0 +1,163 @@
+"""What a bias report was made from, in print: program, frames, camera, target, files, settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp import __version__
+from kgcp.io.files.time_text import format_time
+from kgcp.io.flight.flight import Flight
+from kgcp.io.tables.detections import Outcomes
+from kgcp.quality.advice import advice, rms_m
+from kgcp.quality.consistency import Consistency
+from kgcp.quality.number_text import minus
+from kgcp.settings import DetectSettings, Method
+from kgcp.targets.layout import Target
+
+_LONGEST = 80  # of a CRS in print
+_DIGITS = 8  # of a file's digest
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One line of what a report was made from."""
+
+    label: str
+    text: str
+
+
+def headline(flight: Flight, outcomes: Outcomes | None) -> str:
+    """Return one line that identifies the report: program, day, camera, target, CRS."""
+    camera, rings = flight.camera, [target.ring for target in flight.targets]
+    parts = [f"kgcp {__version__}"]
+    if outcomes is not None and outcomes.first_s is not None:
+        parts.append(f"flown {format_time(outcomes.first_s)[:10]}")
+    parts.append(f"camera {camera.width} × {camera.height} px, f {camera.fx:.0f} px")
+    parts += [f"target {ring.name}, {ring.outer_diameter_m:g} m" for ring in rings]
+    if flight.crs is not None:
+        parts.append(_short(flight.crs))
+    return " · ".join(parts)
+
+
+def facts(
+    flight: Flight,
+    settings: DetectSettings,
+    outcomes: Outcomes | None,
+    provenance: Mapping[str, str],
+) -> tuple[Fact, ...]:
+    """Return what a report was made from, line by line.
+
+    Parameters
+    ----------
+    outcomes : Outcomes, optional
+        Of the table of detections; None: there is none.
+    provenance : mapping of str
+        The metadata of `bias.parquet`.
+    """
+    return (
+        Fact("Program", _program(provenance)),
+        *_frames(outcomes),
+        Fact("Camera", _camera(flight)),
+        *(Fact("Target", _target(target)) for target in flight.targets),
+        Fact("CRS", "none" if flight.crs is None else _short(flight.crs)),
+        Fact("Files", ", ".join(_files(flight, provenance))),
+        Fact("Settings", _settings(settings)),
+    )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def _program(provenance: Mapping[str, str]) -> str:
+    own = f"kgcp {provenance.get('version', __version__)}"
+    detections = json.loads(provenance.get("detections", "{}")).get("version")
+    return own if detections in {None, own[5:]} else f"{own}; detections by kgcp {detections}"
+
+
+def _frames(outcomes: Outcomes | None) -> Iterator[Fact]:
+    if outcomes is None:
+        return
+    counts = [f"{outcomes.measured} measured"]
+    counts += [f"{count} {reason.replace('_', ' ')}" for reason, count in outcomes.reasons]
+    rows = "" if outcomes.rows == outcomes.frames else f", {outcomes.rows} with their targets"
+    yield Fact("Frames", f"{outcomes.frames}{rows}: {', '.join(counts)}")
+    if outcomes.first_s is not None and outcomes.last_s is not None:
+        first, last = format_time(outcomes.first_s), format_time(outcomes.last_s)
+        yield Fact("Time of the frames", f"{_minute(first)} to {_minute(last)} UTC")
+
+
+def _minute(text: str) -> str:
+    return text[:19].replace("T", " ")
+
+
+def _camera(flight: Flight) -> str:
+    camera = flight.camera
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    terms = [f"{name} {minus(f'{value:g}')}" for name in names if (value := getattr(camera, name))]
+    shutter = f"; readout {1000.0 * camera.readout_s:g} ms" if camera.readout_s else ""
+    stated = "stated" if flight.calibration_covariance is not None else "not stated"
+    return (
+        f"{camera.width} × {camera.height} px; fx {camera.fx:g}, fy {camera.fy:g},"
+        f" cx {camera.cx:g}, cy {camera.cy:g} px; {', '.join(terms) or 'no distortion'};"
+        f" response {camera.response.value}{shutter}; accuracy of the calibration {stated}"
+    )
+
+
+def _target(target: Target) -> str:
+    ring = target.ring
+    dots = ", ".join(f"{angle:g}" for angle in ring.code_deg)
+    replicas = f"; with {', '.join(each.name for each in target.replicas)}" * bool(target.replicas)
+    sd = ring.sd_outer_diameter_m
+    known = f"{1000.0 * sd:g} mm" if sd else "not stated"
+    return (
+        f"{target.name}: {ring.outer_diameter_m:g} m across, inner circle"
+        f" {ring.inner_diameter_m:g} m, dots at {dots}°{replicas}; accuracy of the print {known}"
+    )
+
+
+def _files(flight: Flight, provenance: Mapping[str, str]) -> Iterator[str]:
+    digests = json.loads(provenance.get("digests", "{}"))
+    detections = json.loads(json.loads(provenance.get("detections", "{}")).get("digests", "{}"))
+    vehicle, reference = flight.vehicle, flight.reference
+    yield "flight.toml"
+    yield from _file(flight.times_file, detections.get("times"))
+    if vehicle is not None:
+        yield from _file(vehicle.trajectory_file, digests.get("trajectory"))
+    if reference is not None:
+        yield from _file(reference.file, digests.get("reference"))
+
+
+def _file(path: Path | None, digest: str | None) -> Iterator[str]:
+    if path is not None:
+        yield path.name if digest is None else f"{path.name} ({digest[:_DIGITS]})"
+
+
+def _settings(settings: DetectSettings) -> str:
+    again = "" if settings.is_guided else "; no second pass"
+    if settings.method is Method.PAPER:
+        again += "; the closed-form chain alone"
+    return (
+        f"method {settings.method.value}; rings from {settings.min_radius_px:g} px; score from"
+        f" {settings.min_score:g}; at most one false alarm in {1.0 / settings.false_alarm:.0f}"
+        f" frames{again}"
+    )
+
+
+def agreement(consistency: Consistency | None) -> str:
+    """Return one sentence on how well vehicle and camera agree."""
+    if consistency is None:
+        return (
+            "Not examined: it takes ten frames with the moving target, a reference pose and a time."
+        )
+    along, across, up = rms_m(consistency)
+    outliers = sum(each.is_outlier for each in consistency.discrepancies)
+    due = "" if advice(consistency) else " No correction of flight.toml is due."
+    return (
+        f"The target's positions by vehicle and by camera differ by {1000.0 * along:.0f} mm along"
+        f" the track, {1000.0 * across:.0f} mm across and {1000.0 * up:.0f} mm up (RMS of"
+        f" {len(consistency.discrepancies) - outliers} frames, {outliers} outliers).{due}"
+    )
