@@ -1,0 +1,1 @@
+"""Calibration compared with published adjustments and with other people's photographs."""

@@ -1,0 +1,1 @@
+"""Adjustment of the cameras, poses and points behind many photographs of circular targets."""

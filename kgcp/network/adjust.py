@@ -1,0 +1,218 @@
+"""Least-squares adjustment of a network, robust against discs that are not what they seem."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.network.covariance import camera_covariance, pose_inverses, redundancy_numbers
+from kgcp.network.equations import (
+    ReducedSystem,
+    computed,
+    inner_constraints,
+    moved,
+    prior_cost,
+    reduce_poses,
+    view_rows,
+    whitened,
+)
+from kgcp.network.records import Estimate, Network, Solution
+
+_FIRST_DAMPING = 1e-4
+_MOST_DAMPING = 1e12
+_CONVERGED = 1e-10  # relative decrease of the cost
+_HUBER = 2.0  # in units of the robust deviation of a disc's residual
+_MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
+_LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
+_ROUNDS = 12
+_LEAST_DISCS = 4  # of a photograph: fewer determine no pose
+
+
+@dataclass(frozen=True, slots=True)
+class Robustness:
+    """What is done about discs that do not fit.
+
+    Attributes
+    ----------
+    is_huber : bool
+        Whether residuals beyond twice the robust deviation count less.
+    rejection : float
+        Discs with residuals beyond this multiple of the robust deviation are rejected as a whole;
+        infinite: none.
+    """
+
+    is_huber: bool = True
+    rejection: float = 5.0
+
+
+PLAIN = Robustness(is_huber=False, rejection=math.inf)
+"""Least squares with all observations."""
+
+ROBUST = Robustness()
+
+
+def adjust(network: Network, start: Estimate, robustness: Robustness = ROBUST) -> Solution:
+    """Adjust cameras, poses and points to the observed discs.
+
+    Gauss-Newton with Levenberg's damping, in rounds of reweighting. The poses are eliminated
+    photograph by photograph. A free network gets inner constraints.
+
+    Parameters
+    ----------
+    start : Estimate
+        Close enough that all points lie on their side of the camera.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If an unknown is not determined at all, not even by a prior.
+    """
+    count = len(network.observations.view)
+    weights, is_used = np.ones(count), np.ones(count, dtype=np.bool_)
+    estimate, iterations = start, 0
+    for _ in range(_ROUNDS if robustness != PLAIN else 1):
+        estimate, steps = _minimise(network, estimate, weights)
+        iterations += steps
+        if robustness == PLAIN:
+            break
+        next_weights, next_used = _reweighted(network, estimate, robustness)
+        is_stable = np.array_equal(next_used, is_used) and np.allclose(
+            next_weights, weights, atol=0.02
+        )
+        weights, is_used = next_weights, next_used
+        if is_stable:
+            estimate, steps = _minimise(network, estimate, weights)
+            iterations += steps
+            break
+    return _solution(network, estimate, weights, is_used, iterations)
+
+
+def _minimise(
+    network: Network, estimate: Estimate, weights: FloatArray, most_steps: int = 100
+) -> tuple[Estimate, int]:
+    """Return the estimate with the least weighted sum of squares, and the steps taken."""
+    damping = _FIRST_DAMPING
+    cost = _cost(network, estimate, weights)
+    for step in range(most_steps):
+        equations = view_rows(network, estimate, weights)
+        while True:
+            system = reduce_poses(network, estimate, equations, damping)
+            trial = moved(network, estimate, system, _solved(network, estimate, system))
+            trial_cost = _cost(network, trial, weights)
+            if trial_cost <= cost or damping > _MOST_DAMPING:
+                break
+            damping *= 10.0
+        if trial_cost > cost:
+            return estimate, step
+        is_done = cost - trial_cost <= _CONVERGED * cost
+        estimate, cost = trial, trial_cost
+        damping = max(damping / 10.0, 1e-15)
+        if is_done:
+            return estimate, step + 1
+    return estimate, most_steps
+
+
+def _cost(network: Network, estimate: Estimate, weights: FloatArray) -> float:
+    residuals = network.observations.places - computed(network, estimate)
+    if not np.all(np.isfinite(residuals)):
+        return math.inf
+    return float(np.sum(whitened(network, residuals, weights) ** 2)) + prior_cost(network, estimate)
+
+
+def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> FloatArray:
+    """Return the step (u,); with inner constraints the field as a whole stays where it is."""
+    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scaled = system.normal * np.outer(scale, scale)
+    if network.points.datum_defect == 0:
+        factor = linalg.cho_factor(scaled)
+        return np.asarray(scale * linalg.cho_solve(factor, scale * system.right))
+    basis = inner_constraints(network, network.points.nominal) / scale.max()
+    bordered = _bordered(scaled, basis * scale[:, None])
+    first = network.cameras.values.size
+    shift = (network.points.nominal - estimate.points).ravel()
+    right = np.concatenate((scale * system.right, basis[first:].T @ shift))
+    solved = linalg.solve(bordered, right, assume_a="sym")
+    return np.asarray(scale * solved[: len(scale)])
+
+
+def _bordered(normal: FloatArray, basis: FloatArray) -> FloatArray:
+    corner = np.zeros((basis.shape[1],) * 2)
+    return np.block([[normal, basis], [basis.T, corner]])
+
+
+def _reweighted(
+    network: Network, estimate: Estimate, robustness: Robustness
+) -> tuple[FloatArray, BoolArray]:
+    """Return the weight of every disc, and which are kept: a photograph keeps its best four."""
+    observations = network.observations
+    residuals = observations.places - computed(network, estimate)
+    sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
+    deviation = max(float(np.median(sizes)) / _MEDIAN_OF_TWO, _LEAST_DEVIATION)
+    limit = robustness.rejection * deviation
+    is_used = sizes <= limit
+    for view in range(len(network.view_camera)):
+        mine = np.flatnonzero(observations.view == view)
+        best = mine[np.argsort(sizes[mine], kind="stable")[:_LEAST_DISCS]]
+        is_used[best] = True
+    weights = is_used.astype(np.float64)
+    if robustness.is_huber:
+        huber = _HUBER * deviation * math.sqrt(2.0)
+        weights *= np.minimum(1.0, huber / np.maximum(sizes, np.finfo(float).tiny))
+    return weights, is_used
+
+
+def _solution(
+    network: Network,
+    estimate: Estimate,
+    weights: FloatArray,
+    is_used: BoolArray,
+    iterations: int,
+) -> Solution:
+    equations = view_rows(network, estimate, weights)
+    system = reduce_poses(network, estimate, equations)
+    inverse = _inverse(network, system)
+    residuals = network.observations.places - computed(network, estimate)
+    redundancy = redundancy_numbers(equations, system, inverse, len(weights))
+    squares = float(np.sum(whitened(network, residuals, weights) ** 2))
+    squares += prior_cost(network, estimate)
+    factor = squares / max(_degrees_of_freedom(network, weights, len(inverse)), 1)
+    return Solution(
+        estimate,
+        residuals,
+        is_used,
+        weights,
+        redundancy,
+        factor,
+        inverse,
+        pose_inverses(system, inverse),
+        camera_covariance(network, equations, inverse, factor),
+        iterations,
+    )
+
+
+def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) -> int:
+    """Return observations plus priors minus unknowns."""
+    used = 2 * int(np.count_nonzero(weights))
+    priors = int(np.count_nonzero(np.isfinite(network.cameras.sd))) + len(network.points.bars)
+    if network.points.information is not None:
+        priors += int(np.linalg.matrix_rank(network.points.information).sum())
+    poses = 6 * len(network.view_camera)
+    return used + priors + network.points.datum_defect - unknowns - poses
+
+
+def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
+    """Return the inverse (u, u) of the reduced normal equations, under the inner constraints."""
+    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scaled = system.normal * np.outer(scale, scale)
+    if network.points.datum_defect == 0:
+        inverse: FloatArray = linalg.cho_solve(linalg.cho_factor(scaled), np.eye(len(scale)))
+    else:
+        basis = inner_constraints(network, network.points.nominal) / scale.max()
+        bordered = _bordered(scaled, basis * scale[:, None])
+        inverse = np.linalg.inv(bordered)[: len(scale), : len(scale)]
+    inverse = 0.5 * (inverse + inverse.T)
+    return np.asarray(inverse * np.outer(scale, scale))

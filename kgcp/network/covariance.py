@@ -1,0 +1,125 @@
+"""How well a network determines its unknowns: formal, by photograph, and what it cannot tell apart.
+
+The formal covariance s₀² N⁻¹ takes all discs for independent. They are not: what bends a photograph
+(a shutter, the light, a model that does not fit) bends all discs of it. Halves of the same sets of
+photographs differ by 2.5 to 7 formal standard deviations. So the covariance is estimated from the
+scatter between photographs (CR3 of Bell & McCaffrey 2002, the jackknife over clusters).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.network.equations import ReducedSystem, ViewRows, whitened
+from kgcp.network.records import Network, Solution
+
+_LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, a photograph decides it alone
+
+
+def pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
+    """Return the cofactors (v, 6, 6) of the poses, cameras and points being unknown too."""
+    cofactors = []
+    for normal, coupling, columns in zip(
+        system.pose_normals, system.couplings, system.columns, strict=True
+    ):
+        own = np.linalg.inv(normal)
+        back = own @ coupling.T
+        cofactors.append(own + back @ inverse[np.ix_(columns, columns)] @ back.T)
+    return np.array(cofactors)
+
+
+def redundancy_numbers(
+    equations: Sequence[ViewRows], system: ReducedSystem, inverse: FloatArray, count: int
+) -> FloatArray:
+    """Return the share (n,) of each disc's two coordinates that checks the others, 0…2."""
+    redundancy = np.zeros(count)
+    for view, normal in zip(equations, system.pose_normals, strict=True):
+        projected, _ = _without_pose(view)
+        own = np.einsum("ij,jk,ik->i", view.by_pose, np.linalg.inv(normal), view.by_pose)
+        shared = inverse[np.ix_(view.columns, view.columns)]
+        leverage = own + np.einsum("ij,ij->i", projected @ shared, projected)
+        redundancy[view.rows] = 2.0 - leverage.reshape(-1, 2).sum(axis=1)
+    return redundancy
+
+
+def camera_covariance(
+    network: Network, equations: Sequence[ViewRows], inverse: FloatArray, factor: float
+) -> FloatArray:
+    """Return the covariance (c p, c p) of the camera parameters, clustered by photograph.
+
+    In no direction is it below the formal one, which few photographs may seem to allow.
+    """
+    cameras = network.cameras.values.size
+    reach = inverse[:cameras]
+    formal = factor * inverse[:cameras, :cameras]
+    influences = [reach[:, view.columns] @ _score(view, inverse) for view in equations]
+    clustered = sum((np.outer(each, each) for each in influences), np.zeros_like(formal))
+    # what comes from priors does not scatter between photographs
+    known = inverse[:cameras, :cameras] / network.cameras.sd.ravel() ** 2
+    clustered += known @ inverse[:cameras, :cameras]
+    return never_below(clustered, formal)
+
+
+def _score(view: ViewRows, inverse: FloatArray) -> FloatArray:
+    """Return a photograph's Aᵀ (I - H)⁻¹ r (k,), the pose eliminated."""
+    projected, residuals = _without_pose(view)
+    shared = inverse[np.ix_(view.columns, view.columns)]
+    values, vectors = np.linalg.eigh(np.eye(len(residuals)) - projected @ shared @ projected.T)
+    along = vectors.T @ residuals
+    is_checked = values > _LEAST_REDUNDANCY
+    along[is_checked] /= values[is_checked]
+    along[~is_checked] = 0.0
+    return np.asarray(projected.T @ (vectors @ along))
+
+
+def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives (2m, k) and residuals (2m,) without the part that the pose takes up."""
+    basis = np.linalg.qr(view.by_pose)[0]
+    dense = view.dense()
+    return dense - basis @ (basis.T @ dense), view.residuals - basis @ (basis.T @ view.residuals)
+
+
+def never_below(cov: FloatArray, floor: FloatArray) -> FloatArray:
+    """Return a covariance that is `floor` in the directions in which `cov` is smaller."""
+    scale = np.sqrt(floor.diagonal())
+    root = np.linalg.cholesky(floor / np.outer(scale, scale)) * scale[:, None]
+    relative = np.linalg.solve(root, np.linalg.solve(root, cov).T)
+    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    raised = (vectors * np.maximum(values, 1.0)) @ vectors.T
+    result = root @ raised @ root.T
+    return np.asarray(0.5 * (result + result.T))
+
+
+def tangled(names: Sequence[str], cov: FloatArray, most_inflation: float) -> tuple[str, ...]:
+    """Return the parameters that cannot be told apart, empty if all can.
+
+    They are those of the weakest eigenvector of the correlation matrix, if the other parameters
+    inflate the variance of one of them by more than `most_inflation`.
+    """
+    sd = np.sqrt(cov.diagonal())
+    correlation = cov / np.outer(sd, sd)
+    inflation = np.linalg.inv(correlation).diagonal()
+    if inflation.max() <= most_inflation:
+        return ()
+    _, vectors = np.linalg.eigh(correlation)
+    weakest = np.abs(vectors[:, 0])
+    return tuple(
+        name for name, part in zip(names, weakest, strict=True) if part > 0.3 * weakest.max()
+    )
+
+
+def variance_components(network: Network, solution: Solution, group: IndexArray) -> FloatArray:
+    """Return s₀² (g,) of every group of observations, by residuals over redundancy.
+
+    Parameters
+    ----------
+    group : (n,) array
+        Index of the group of each disc: its photograph, its kind of mark.
+    """
+    squares = np.sum(whitened(network, solution.residuals, solution.weights) ** 2, axis=1)
+    count = int(group.max()) + 1
+    total = np.bincount(group, solution.redundancy, count)
+    return np.asarray(np.bincount(group, squares, count) / np.maximum(total, 1e-9))

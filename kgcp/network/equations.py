@@ -1,0 +1,287 @@
+"""Normal equations of a network: poses eliminated photograph by photograph (Schur complement)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.pose import rotation_about
+from kgcp.network.records import Estimate, Network, PointPrior, ScaleBar
+
+_LEAST_DEPTH = 1e-9  # of the distance: a point in the camera's own plane has no image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewRows:
+    """Whitened equations of one photograph, of m discs.
+
+    Rows are in units of the standard deviation of their observation: x and y of a disc, after the
+    inverse Cholesky factor of its covariance and the root of its weight.
+    """
+
+    rows: IndexArray  # (m,): which observations
+    columns: IndexArray  # (k,): of the reduced unknowns that take part: camera, then points
+    by_pose: FloatArray  # (2m, 6)
+    by_camera: FloatArray  # (2m, p)
+    by_point: FloatArray | None  # (m, 2, 3): each disc by its own point; None: points are fixed
+    residuals: FloatArray  # (2m,)
+
+    def dense(self) -> FloatArray:
+        """Return the derivatives (2m, k) by the reduced unknowns."""
+        if self.by_point is None:
+            return self.by_camera
+        count = len(self.rows)
+        blocks = np.zeros((count, 2, count, 3))
+        index = np.arange(count)
+        blocks[index, :, index, :] = self.by_point
+        return np.hstack((self.by_camera, blocks.reshape(2 * count, 3 * count)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReducedSystem:
+    """Normal equations after the poses are eliminated, and what brings the poses back."""
+
+    normal: FloatArray  # (u, u)
+    right: FloatArray  # (u,)
+    pose_normals: FloatArray  # (v, 6, 6)
+    pose_rights: FloatArray  # (v, 6)
+    couplings: tuple[FloatArray, ...]  # per photograph (k, 6)
+    columns: tuple[IndexArray, ...]  # per photograph (k,)
+
+
+def computed(network: Network, estimate: Estimate) -> FloatArray:
+    """Return where the discs must be (n, 2) by the current values of all unknowns."""
+    seen = network.observations
+    rays = _camera_points(network, estimate)
+    normalised = rays[:, :2] / rays[:, 2:]
+    places = np.empty_like(seen.places)
+    cameras = network.view_camera[seen.view]
+    for camera in range(len(estimate.cameras)):
+        mine = cameras == camera
+        places[mine] = network.model.places(estimate.cameras[camera], normalised[mine])
+    return places
+
+
+def _camera_points(network: Network, estimate: Estimate) -> FloatArray:
+    seen = network.observations
+    turned = np.einsum("nij,nj->ni", estimate.rotations[seen.view], estimate.points[seen.point])
+    points: FloatArray = turned + estimate.translations[seen.view]
+    flat = np.abs(points[:, 2]) < _LEAST_DEPTH * np.linalg.norm(points, axis=1)
+    points[flat, 2] = _LEAST_DEPTH
+    return points
+
+
+def whitened(network: Network, residuals: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return residuals (n, 2) in units of their standard deviations, times the root weights."""
+    factors = np.linalg.cholesky(network.observations.cov)
+    scaled = np.linalg.solve(factors, residuals[:, :, None])[:, :, 0]
+    return np.asarray(scaled * np.sqrt(weights)[:, None])
+
+
+def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list[ViewRows]:
+    """Return the whitened equations of every photograph, linear at an estimate.
+
+    A pose changes as in `Pose.moved`: translation, and a left rotation vector in the camera frame.
+    """
+    seen = network.observations
+    parameters = len(network.model.names)
+    first_point = network.cameras.values.size
+    camera_points = _camera_points(network, estimate)
+    factors = np.linalg.cholesky(seen.cov)
+    equations = []
+    for view, camera in enumerate(network.view_camera.tolist()):
+        rows = np.flatnonzero((seen.view == view) & (weights > 0.0))
+        x, y, z = camera_points[rows].T
+        image = network.model.image(estimate.cameras[camera], np.stack((x / z, y / z), axis=1))
+        zero = np.zeros_like(x)
+        ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
+        by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
+        arm = camera_points[rows] - estimate.translations[view]
+        by_turn = -by_place @ _cross_matrices(arm)
+        white = np.linalg.inv(factors[rows]) * np.sqrt(weights[rows])[:, None, None]
+        points = seen.point[rows]
+        columns = camera * parameters + np.arange(parameters)
+        by_point = None
+        if not network.points.is_fixed:
+            by_point = white @ by_place @ estimate.rotations[view]
+            own = first_point + 3 * points[:, None] + np.arange(3)
+            columns = np.concatenate((columns, own.ravel()))
+        gaps = (seen.places[rows] - image.places)[:, :, None]
+        equations.append(
+            ViewRows(
+                rows,
+                columns,
+                np.reshape(white @ np.concatenate((by_place, by_turn), axis=2), (-1, 6)),
+                np.reshape(white @ image.by_parameter, (-1, parameters)),
+                by_point,
+                np.ravel(white @ gaps),
+            )
+        )
+    return equations
+
+
+def reduce_poses(
+    network: Network, estimate: Estimate, equations: list[ViewRows], damping: float = 0.0
+) -> ReducedSystem:
+    """Return the normal equations of cameras and points.
+
+    Parameters
+    ----------
+    damping : float
+        Levenberg-Marquardt: share of each diagonal element that is added to it.
+    """
+    size = network.cameras.values.size
+    if not network.points.is_fixed:
+        size += estimate.points.size
+    normal, right = _priors(network, estimate, size)
+    diagonal = normal.diagonal().copy()
+    pose_normals, pose_rights, couplings = [], [], []
+    for view in equations:
+        pose_normal = view.by_pose.T @ view.by_pose
+        pose_normal[np.diag_indices(6)] *= 1.0 + damping
+        pose_right = view.by_pose.T @ view.residuals
+        direct, coupling, direct_right = _unreduced(view)
+        back = np.linalg.solve(pose_normal, coupling.T)
+        normal[np.ix_(view.columns, view.columns)] += direct - coupling @ back
+        right[view.columns] += direct_right - back.T @ pose_right
+        diagonal[view.columns] += direct.diagonal()
+        pose_normals.append(pose_normal)
+        pose_rights.append(pose_right)
+        couplings.append(coupling)
+    normal[np.diag_indices(size)] += damping * diagonal
+    return ReducedSystem(
+        normal,
+        right,
+        np.array(pose_normals),
+        np.array(pose_rights),
+        tuple(couplings),
+        tuple(view.columns for view in equations),
+    )
+
+
+def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a photograph's normal matrix (k, k), its coupling with the pose (k, 6), and right."""
+    if view.by_point is None:
+        by = view.by_camera
+        return by.T @ by, by.T @ view.by_pose, by.T @ view.residuals
+    parameters, count = view.by_camera.shape[1], len(view.rows)
+    by_camera = view.by_camera.reshape(count, 2, parameters)
+    by_pose = view.by_pose.reshape(count, 2, 6)
+    residuals = view.residuals.reshape(count, 2)
+    points = view.by_point.transpose(0, 2, 1)
+    size = parameters + 3 * count
+    direct = np.zeros((size, size))
+    direct[:parameters, :parameters] = view.by_camera.T @ view.by_camera
+    across = (points @ by_camera).reshape(3 * count, parameters)
+    direct[parameters:, :parameters] = across
+    direct[:parameters, parameters:] = across.T
+    blocks = direct[parameters:, parameters:].reshape(count, 3, count, 3)
+    index = np.arange(count)
+    blocks[index, :, index, :] = points @ view.by_point
+    coupling = np.vstack(
+        (view.by_camera.T @ view.by_pose, (points @ by_pose).reshape(3 * count, 6))
+    )
+    right = np.concatenate(
+        (view.by_camera.T @ view.residuals, (points @ residuals[:, :, None]).ravel())
+    )
+    return direct, coupling, right
+
+
+def _priors(network: Network, estimate: Estimate, size: int) -> tuple[FloatArray, FloatArray]:
+    """Return what is known of cameras and points beforehand, as normal equations."""
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    information = network.cameras.sd.ravel() ** -2.0
+    cameras = np.arange(network.cameras.values.size)
+    normal[cameras, cameras] = information
+    right[cameras] = information * (network.cameras.values - estimate.cameras).ravel()
+    prior = network.points
+    if prior.information is None:
+        return normal, right
+    first = len(cameras)
+    index = np.arange(len(prior.nominal))
+    blocks = normal[first:, first:].reshape(len(index), 3, len(index), 3)
+    blocks[index, :, index, :] = prior.information
+    gaps = prior.nominal - estimate.points
+    right[first:] = np.einsum("nij,nj->ni", prior.information, gaps).ravel()
+    for bar in prior.bars:
+        columns, slope, gap = _bar_row(bar, estimate.points, first)
+        normal[np.ix_(columns, columns)] += np.outer(slope, slope)
+        right[columns] += slope * gap
+    return normal, right
+
+
+def _bar_row(bar: ScaleBar, points: FloatArray, first: int) -> tuple[IndexArray, FloatArray, float]:
+    across = points[bar.second] - points[bar.first]
+    length = float(np.linalg.norm(across))
+    columns = np.concatenate(
+        [first + 3 * index + np.arange(3) for index in (bar.first, bar.second)]
+    )
+    slope = np.concatenate((-across, across)) / (length * bar.sd)
+    return columns, slope, (bar.length - length) / bar.sd
+
+
+def prior_cost(network: Network, estimate: Estimate) -> float:
+    """Return the weighted sum of squares of what deviates from the priors and the bars."""
+    cost = float(np.sum(((estimate.cameras - network.cameras.values) / network.cameras.sd) ** 2))
+    prior: PointPrior = network.points
+    if prior.information is not None:
+        gaps = estimate.points - prior.nominal
+        cost += float(np.einsum("ni,nij,nj->", gaps, prior.information, gaps))
+        cost += sum(_bar_row(bar, estimate.points, 0)[2] ** 2 for bar in prior.bars)
+    return cost
+
+
+def moved(
+    network: Network, estimate: Estimate, system: ReducedSystem, step: FloatArray
+) -> Estimate:
+    """Return the estimate after a step (u,) of the reduced unknowns, with the poses that follow."""
+    pose_steps = [
+        np.linalg.solve(normal, right - coupling.T @ step[columns])
+        for normal, right, coupling, columns in zip(
+            system.pose_normals,
+            system.pose_rights,
+            system.couplings,
+            system.columns,
+            strict=True,
+        )
+    ]
+    poses = np.array(pose_steps).reshape(-1, 6)
+    cameras = estimate.cameras.size
+    points = estimate.points
+    if not network.points.is_fixed:
+        points = points + step[cameras:].reshape(points.shape)
+    turns = [rotation_about(turn) for turn in poses[:, 3:]]
+    return Estimate(
+        estimate.cameras + step[:cameras].reshape(estimate.cameras.shape),
+        np.array([turn @ r for turn, r in zip(turns, estimate.rotations, strict=True)]),
+        estimate.translations + poses[:, :3],
+        points,
+    )
+
+
+def inner_constraints(network: Network, points: FloatArray) -> FloatArray:
+    """Return the directions (u, d) of the unknowns in which the whole field may move.
+
+    Shift, turn and, without a bar, scale of all points about their mean, as orthonormal columns.
+    The adjustment of a free network keeps its points from moving along them.
+    """
+    cameras = network.cameras.values.size
+    defect = network.points.datum_defect
+    centred = points - points.mean(axis=0)
+    shifts = np.tile(np.eye(3), (len(points), 1))
+    turns = -_cross_matrices(centred).reshape(-1, 3)
+    scale = centred.reshape(-1, 1)
+    whole = np.hstack((shifts, turns, scale))[:, :defect]
+    basis = np.zeros((cameras + points.size, defect))
+    basis[cameras:] = np.linalg.qr(whole)[0]
+    return basis
+
+
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Return the matrices (n, 3, 3) of the products v × ·."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    rows = np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=1)
+    return rows.reshape(-1, 3, 3)

@@ -1,0 +1,71 @@
+"""kgcp's frame camera as the model of an adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.geometry.camera import Camera
+from kgcp.network.records import ImageSlopes
+
+DISTORTION = CALIBRATION_PARAMETERS[4:]
+"""Terms of distortion, of which an adjustment may have any."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameCameraModel:
+    """A frame camera some of whose parameters are unknown.
+
+    With `is_same_aspect` the one principal distance is fx, and fy keeps its ratio to it.
+    """
+
+    template: Camera  # frame size, and the values of the parameters that stay as they are
+    distortion: tuple[str, ...]  # of `DISTORTION`
+    is_same_aspect: bool = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns: `fx` alone where it stands for both principal distances."""
+        focal = ("fx",) if self.is_same_aspect else ("fx", "fy")
+        return (*focal, "cx", "cy", *self.distortion)
+
+    def values_of(self, camera: Camera) -> FloatArray:
+        """Return the unknowns (p,) of a camera."""
+        values = [getattr(camera, name) for name in self.names]
+        return np.array(values, dtype=np.float64)
+
+    def camera(self, values: FloatArray) -> Camera:
+        """Return the camera of some unknowns (p,)."""
+        fields = dict(zip(self.names, values.tolist(), strict=True))
+        if self.is_same_aspect:
+            fields["fy"] = fields["fx"] * self.template.fy / self.template.fx
+        return replace(self.template, **fields)
+
+    def places(self, values: FloatArray, normalised: FloatArray) -> FloatArray:
+        """Map normalised coordinates (n, 2) to pixels (n, 2); NaN if there is no such camera."""
+        try:
+            return self.camera(values).distort(normalised)
+        except SettingError:  # a step of the adjustment that went too far
+            return np.full(normalised.shape, np.nan)
+
+    def image(self, values: FloatArray, normalised: FloatArray) -> ImageSlopes:
+        """Map normalised coordinates (n, 2) to pixels, with derivatives."""
+        camera = self.camera(values)
+        return ImageSlopes(
+            camera.distort(normalised),
+            camera.distort_jacobian(normalised),
+            image_by_calibration(camera, normalised) @ self.to_calibration(),
+        )
+
+    def to_calibration(self) -> FloatArray:
+        """Return how `CALIBRATION_PARAMETERS` follow the unknowns (12, p)."""
+        matrix = np.zeros((len(CALIBRATION_PARAMETERS), len(self.names)))
+        for column, name in enumerate(self.names):
+            matrix[CALIBRATION_PARAMETERS.index(name), column] = 1.0
+        if self.is_same_aspect:
+            matrix[1, 0] = self.template.fy / self.template.fx
+        return matrix

@@ -1,0 +1,132 @@
+"""What a network of photographs consists of, and what its adjustment returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageSlopes:
+    """Places of n points in the image, and how they move."""
+
+    places: FloatArray  # (n, 2), in the unit of the image: pixels, or millimetres on the sensor
+    by_ray: FloatArray  # (n, 2, 2): by the normalised coordinates x/z, y/z
+    by_parameter: FloatArray  # (n, 2, p): by the parameters of the camera
+
+
+class CameraModel(Protocol):
+    """A model of the camera, with the parameters that an adjustment may change."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the p parameters."""
+
+    def image(self, values: FloatArray, normalised: FloatArray) -> ImageSlopes:
+        """Map normalised coordinates (n, 2) to the image, for parameters (p,)."""
+
+    def places(self, values: FloatArray, normalised: FloatArray) -> FloatArray:
+        """Map normalised coordinates (n, 2) to the image (n, 2), without derivatives."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleBar:
+    """A measured distance between two points."""
+
+    first: int  # indices of the points
+    second: int
+    length: float  # in the unit of the points
+    sd: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointPrior:
+    """Where the points of a field are supposed to be, and how firmly."""
+
+    nominal: FloatArray  # (m, 3)
+    # (m, 3, 3): inverse covariances of the deviations from `nominal`; zeros: free; None: the points
+    # are exactly at `nominal`
+    information: FloatArray | None
+    bars: tuple[ScaleBar, ...] = ()
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the points are no unknowns."""
+        return self.information is None
+
+    @property
+    def datum_defect(self) -> int:
+        """How many of shift, turn and scale nothing determines but inner constraints: 0, 6 or 7."""
+        if self.information is None or np.any(self.information):
+            return 0
+        return 6 if self.bars else 7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """What is known beforehand of the parameters of the cameras."""
+
+    values: FloatArray  # (c, p)
+    sd: FloatArray  # (c, p); infinite: nothing is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Centres of n discs in photographs."""
+
+    view: IndexArray  # (n,): index of the photograph
+    point: IndexArray  # (n,): index of the point of the field
+    places: FloatArray  # (n, 2)
+    cov: FloatArray  # (n, 2, 2)
+
+    def chosen(self, which: BoolArray) -> Observations:
+        """Return some of the observations."""
+        return Observations(
+            self.view[which], self.point[which], self.places[which], self.cov[which]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Network:
+    """Observations, and what the adjustment may know and change."""
+
+    model: CameraModel
+    view_camera: IndexArray  # (v,): index of each photograph's camera
+    observations: Observations
+    points: PointPrior
+    cameras: CameraPrior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Values of all unknowns."""
+
+    cameras: FloatArray  # (c, p)
+    rotations: FloatArray  # (v, 3, 3): p_cam = R p + t
+    translations: FloatArray  # (v, 3)
+    points: FloatArray  # (m, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Outcome of an adjustment.
+
+    `inverse` is that of the reduced normal equations: poses eliminated, cameras first, then points
+    if they are unknowns. It has the scale of the stated covariances; `variance_factor` multiplies
+    it.
+    """
+
+    estimate: Estimate
+    residuals: FloatArray  # (n, 2): observed minus computed
+    is_used: BoolArray  # (n,): whether a disc was kept
+    weights: FloatArray  # (n,): robust weights in 0…1; 0 where a disc was rejected
+    redundancy: FloatArray  # (n,): of the two coordinates together, 0…2
+    variance_factor: float  # s₀²
+    inverse: FloatArray  # (u, u)
+    pose_inverses: FloatArray  # (v, 6, 6): translation, left rotation vector; as `inverse`
+    robust_camera_cov: FloatArray  # (c p, c p): clustered by photograph, never below s₀² N⁻¹
+    iterations: int
