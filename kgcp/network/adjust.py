@@ -213,6 +213,6 @@ def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
     else:
         basis = inner_constraints(network, network.points.nominal) / scale.max()
         bordered = _bordered(scaled, basis * scale[:, None])
-        inverse = np.linalg.inv(bordered)[: len(scale), : len(scale)]
-    inverse = 0.5 * (inverse + inverse.T)
-    return np.asarray(inverse * np.outer(scale, scale))
+        inverse = np.asarray(np.linalg.inv(bordered)[: len(scale), : len(scale)])
+    symmetric = 0.5 * (inverse + inverse.T)
+    return np.asarray(symmetric * np.outer(scale, scale))

@@ -19,7 +19,13 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
-from kgcp.io.tables.detections import Outcomes, read_attempts, read_outcomes, read_settings
+from kgcp.io.tables.detections import (
+    Outcomes,
+    read_attempts,
+    read_learnt_imaging,
+    read_outcomes,
+    read_settings,
+)
 from kgcp.io.tables.gcps import BIAS_COLUMNS, bias_row
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import derived_provenance
@@ -33,6 +39,8 @@ from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.checks.measured import measured_doubts
 from kgcp.quality.consistency import Consistency, study_consistency
+from kgcp.quality.learnt_imaging import LearntImaging
+from kgcp.report.bias.camera_figure import learnt_camera, learnt_sentence
 from kgcp.report.bias.figures import (
     change_by_reexposure,
     detection_rate,
@@ -59,6 +67,7 @@ REEXPOSED_FRAMES = 12
 
 FIGURE_FILES = {
     "error": "bias_error.png",
+    "camera": "bias_camera.png",
     "rate": "bias_detection_rate.png",
     "exposure": "bias_exposure.png",
     "edges": "bias_edges.png",
@@ -101,6 +110,8 @@ class FlightBias:
         What became of the frames; None: not known.
     consistency : Consistency or None
         How well vehicle and camera agree; None: too few frames to compare.
+    learnt : LearntImaging or None
+        What the frames say together of the camera; None: nothing was learnt.
     """
 
     flight: Flight
@@ -110,6 +121,7 @@ class FlightBias:
     doubts: tuple[Doubt, ...] = ()
     outcomes: Outcomes | None = None
     consistency: Consistency | None = None
+    learnt: LearntImaging | None = None
 
     def summary(self) -> Json:
         """Return the numbers of `bias_summary.json`, without re-exposed frames."""
@@ -186,7 +198,8 @@ class FlightBias:
             doubts=self.doubts,
             numbers=numbers,
             verdict=verdict,
-            pictures=_pictures(numbers, self.flight, reexposed),
+            learnt="" if self.learnt is None else learnt_sentence(self.learnt),
+            pictures=_pictures(numbers, self.flight, reexposed, self.learnt),
             rows=[bias_row(pair, self.study.method) for pair in numbers.compared],
             closeups=closeups,
             reexposed=reexposed,
@@ -236,7 +249,14 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     )
     provenance = derived_provenance(flight, table, {}, has_reference=True)
     return FlightBias(
-        flight, settings, study, provenance, doubts, read_outcomes(table), consistency
+        flight=flight,
+        settings=settings,
+        study=study,
+        provenance=provenance,
+        doubts=doubts,
+        outcomes=read_outcomes(table),
+        consistency=consistency,
+        learnt=read_learnt_imaging(table),
     )
 
 
@@ -283,9 +303,14 @@ def _view(camera: Camera, ring: Ring, pose: Pose, centre_px: FloatArray) -> Ring
 
 
 def _pictures(
-    numbers: BiasNumbers, flight: Flight, reexposed: list[Reexposed]
+    numbers: BiasNumbers,
+    flight: Flight,
+    reexposed: list[Reexposed],
+    learnt: LearntImaging | None,
 ) -> Mapping[str, Picture]:
     pictures = {"error": error_against_distance(numbers)}
+    if learnt is not None:
+        pictures["camera"] = learnt_camera(learnt)
     if numbers.expected_visible:
         pictures["rate"] = detection_rate(numbers)
     if numbers.influences:

@@ -153,8 +153,7 @@ def detect_flight(
     left_out = set(all_frames).difference(frames)
     builder = SummaryBuilder({name: times[name] for name in times if name not in left_out})
     not_drawn = 0
-    making = _making(job)
-    with Journal(out / ".detections.journal", making, is_new=options.is_restart) as journal:
+    with Journal(out / ".detections.journal", _making(job), is_new=options.is_restart) as journal:
         with open_pool(
             options.jobs,
             options.frame_timeout_s,

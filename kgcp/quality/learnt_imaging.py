@@ -130,7 +130,8 @@ def _advantages(measurements: Sequence[Measurement]) -> dict[ToneBase, float]:
 
 def _noise_of(imaging: Imaging) -> FloatArray:
     levels = encoded(np.array((imaging.black, imaging.white)), _TONES[imaging.base])
-    return np.stack((levels, (imaging.noise_black, imaging.noise_white)), axis=1)
+    noise = np.stack((levels, (imaging.noise_black, imaging.noise_white)), axis=1)
+    return np.asarray(noise[levels < 1.0])  # of a plate burnt white none is seen
 
 
 def _common_curve(images: list[Imaging], grey: FloatArray) -> FloatArray:

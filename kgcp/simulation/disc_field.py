@@ -166,8 +166,8 @@ def _add(
     for number, shape in enumerate(shapes):
         raster.paint(covered, shape, 1.0 if number == 0 else 0.0)
     step = 1.0 / oversampling
-    x_px = window.column - 0.5 + step * (np.arange(covered.shape[1]) + 0.5)
-    y_px = window.row - 0.5 + step * (np.arange(covered.shape[0]) + 0.5)
+    x_px = np.asarray(window.column - 0.5 + step * (np.arange(covered.shape[1]) + 0.5))
+    y_px = np.asarray(window.row - 0.5 + step * (np.arange(covered.shape[0]) + 0.5))
     covered *= radiance * scene.light(camera, x_px, y_px)
     part = optics.spread(covered, oversampling, window.row)
     top, left = max(window.row, 0), max(window.column, 0)

@@ -35,6 +35,7 @@ from kgcp.io.tables.columns import (
     sd_cell,
     time_cell,
 )
+from kgcp.io.tables.learnt_imaging import LEARNT_IMAGING, learnt_from_text
 from kgcp.io.tables.parquet import read_table
 from kgcp.io.tables.staleness import require_current
 from kgcp.measurement.records import (
@@ -46,6 +47,7 @@ from kgcp.measurement.records import (
     Outcome,
     Uncertainty,
 )
+from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings, Method
 
 _Cells = Mapping[Hashable, object]
@@ -268,6 +270,18 @@ def read_settings(path: Path) -> DetectSettings:
             f"{path}: its settings are not of this version of kgcp ({error});"
             " run 'kgcp detect' on this flight again"
         ) from error
+
+
+def read_learnt_imaging(path: Path) -> LearntImaging | None:
+    """Read what a flight has taught of its camera; None if nothing, or in another version's words.
+
+    It is shown only, and changes no result.
+    """
+    text = (pq.read_schema(path).metadata or {}).get(f"kgcp.{LEARNT_IMAGING}".encode())
+    try:
+        return None if text is None else learnt_from_text(text.decode())
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
+        return None
 
 
 def _attempt(row: _Cells, number: int) -> Attempt:

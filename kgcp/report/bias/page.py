@@ -53,6 +53,7 @@ class Content:
     doubts: Sequence[Doubt]  # what else does not fit
     numbers: BiasNumbers
     verdict: Verdict
+    learnt: str  # of the camera, in sentences; empty: nothing
     # by the name of the figure; one that is missing is left out of the page
     pictures: Mapping[str, Picture]
     rows: Sequence[Mapping[str, object]]  # of `bias.parquet`, for the measurements in time

@@ -19,8 +19,10 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.gcps import BIAS_COLUMNS
+from kgcp.measurement.records import ToneBase
 from kgcp.pipeline.bias_report import FIGURE_FILES, FlightBias
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
+from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings
 
 Compare = Callable[..., Comparison]
@@ -57,6 +59,19 @@ PLACE = """(name) => {
 }"""
 
 
+GREY = np.linspace(0.0, 1.0, 65)
+LEARNT = LearntImaging(
+    base=ToneBase.SRGB,
+    advantages={ToneBase.SRGB: 240.0, ToneBase.LINE: 9.0},
+    measurements=20,
+    overruled=2,
+    grey=GREY,
+    light=np.outer([0.98, 1.0, 1.02], GREY**2.2),
+    sharpening=np.array([0.35, 0.4, 0.45]),
+    noise=np.column_stack((np.repeat([0.1, 0.8], 20), np.linspace(0.006, 0.012, 40))),
+)
+
+
 @dataclass(frozen=True)
 class Made:
     """A report that was written, and what complained while it was looked at."""
@@ -89,7 +104,7 @@ def sighted(row: pd.Series[float], frame: str, delta_px: float) -> Comparison:
 
 
 def of_sample(compared: BiasStudy) -> FlightBias:
-    return FlightBias(read_flight(SAMPLE), DetectSettings(), compared, {})
+    return FlightBias(read_flight(SAMPLE), DetectSettings(), compared, {}, learnt=LEARNT)
 
 
 @pytest.fixture(scope="module")
