@@ -46,11 +46,11 @@ def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> Fl
 
     Of a plate that a step has turned edge-on it is not finite, and cannot be solved.
     """
-    return _normal_matrix(scaled, current.weight, unknowns.free_precision)
+    return weighted_products(scaled, current.weight, unknowns.free_precision)
 
 
 @summed
-def _normal_matrix(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
+def weighted_products(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
     """Return Σ weight · row · rowᵀ with the precision on the diagonal, two by two rows at a time.
 
     It takes half the time of a general product, which makes both of its like halves.

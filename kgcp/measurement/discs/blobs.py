@@ -50,7 +50,7 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
     image, octave = eight_bit(grey), 0
     blobs: list[tuple[float, ...]] = []
     polarities: list[Polarity] = []
-    while min(image.shape) >= _SMALLEST_SIDE:
+    while octave == 0 or min(image.shape) >= _SMALLEST_SIDE:
         for polarity, mask in zip(Polarity, _sides(image), strict=True):
             contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
             for contour, links in zip(contours, _links(hierarchy), strict=True):

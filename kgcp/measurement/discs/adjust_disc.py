@@ -1,0 +1,195 @@
+"""One disc adjusted in rounds: pixels, foreign pixels and noise are settled anew in each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.measurement.discs.affine_model import Geometry, distances_px
+from kgcp.measurement.discs.fit_disc import (
+    DiscFit,
+    DiscSample,
+    DiscState,
+    FreeParameters,
+    fit_disc,
+)
+from kgcp.measurement.discs.pixel_choice import (
+    DiscWindow,
+    choose_pixels,
+    cut_disc_window,
+    window_reach_px,
+)
+from kgcp.measurement.discs.records import (
+    DiscOutline,
+    DiscReason,
+    Polarity,
+    moments_of_ellipse,
+)
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.noise import find_censoring, median_at_edges
+from kgcp.measurement.image_model.photometry import Tone, light_of_levels, plateau_levels
+
+_ROUNDS = 3
+_SETTLED_PX, _SETTLED_BLUR = 0.05, 0.1  # a round that moves less is the last
+_FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
+_LEAST_CONTRAST_COUNTS = 4.0
+_MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the fit may be from the outline: pixels, of the radius
+_MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.15, 0.3  # as of coded targets: of the contrast; share
+_FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
+
+
+class DiscRejection(Exception):  # noqa: N818 - the outcome of one disc
+    """A disc cannot be measured."""
+
+    def __init__(self, reason: DiscReason, detail: str = "") -> None:
+        super().__init__(reason, detail)
+        self.reason, self.detail = reason, detail
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscTask:
+    """One disc to be measured."""
+
+    grey: GreyArray
+    outline: DiscOutline
+    others: Sequence[Geometry]  # edges whose pixels are left out
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether it is darker than the ground."""
+        return self.outline.polarity is Polarity.DARK
+
+    @property
+    def radius_px(self) -> float:
+        """Mean radius of the outline [px]."""
+        return self.outline.ellipse.mean_radius
+
+
+def geometry_of(vector: FloatArray) -> Geometry:
+    """Return centre and symmetric stretch (5,), of which the moments (5,) are M M / 4."""
+    square = 4.0 * vector[[2, 3, 3, 4]].reshape(2, 2)
+    area = math.sqrt(max(float(np.linalg.det(square)), 1e-12))
+    root = (square + area * np.eye(2)) / math.sqrt(float(np.trace(square)) + 2.0 * area)
+    return np.array((*vector[:2], root[0, 0], root[0, 1], root[1, 1]))
+
+
+def outline_geometry(outline: DiscOutline) -> Geometry:
+    """Return centre and stretch (5,) of an outline."""
+    return geometry_of(moments_of_ellipse(outline.ellipse))
+
+
+def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = None) -> DiscFit:
+    """Adjust a disc from its outline, or from an earlier state with the same light.
+
+    Raises
+    ------
+    DiscRejection, NoFit
+    """
+    first_px = min(_FIRST_BLUR_PX, _FIRST_BLUR * task.radius_px)
+    blur = Blur(first_px**2, first_px**2, 0.0) if start is None else start.blur
+    geometry = outline_geometry(task.outline) if start is None else start.geometry
+    state = start
+    for _ in range(_ROUNDS):
+        window = cut_disc_window(task.grey, geometry, window_reach_px(blur))
+        _check_inside(task.grey, geometry)
+        state = state or _start(window, geometry, blur, free.tone, is_dark=task.is_dark)
+        index, is_enough = choose_pixels(window, geometry, blur, task.others)
+        if not is_enough:
+            raise DiscRejection(DiscReason.CROWDED, "too little free ground")
+        fit = _adjust_on(task, window, index, state, free)
+        foreign = _foreign(fit, window, index)
+        if foreign is not None:
+            fit = _adjust_on(task, window, index[~foreign[index]], fit.state, free)
+        state = fit.state
+        moved_px = float(np.abs(state.geometry - geometry).max())
+        widened = abs(state.blur.largest_sd_px / blur.largest_sd_px - 1.0)
+        geometry, blur = state.geometry, state.blur
+        if moved_px < _SETTLED_PX and widened < _SETTLED_BLUR:
+            break
+    return fit
+
+
+def _adjust_on(
+    task: DiscTask, window: DiscWindow, index: IndexArray, state: DiscState, free: FreeParameters
+) -> DiscFit:
+    limits = find_censoring(window.levels, window.levels_per_count)
+    sample = DiscSample.of(
+        window, index, state, limits, free, is_dark=task.is_dark, radius_px=task.radius_px
+    )
+    return fit_disc(sample, state, free)
+
+
+def _start(
+    window: DiscWindow, geometry: Geometry, blur: Blur, tone: Tone, *, is_dark: bool
+) -> DiscState:
+    """Return levels from the middle of the disc and the ground around it.
+
+    Raises
+    ------
+    DiscRejection
+        `NO_CONTRAST`.
+    """
+    off_px = distances_px(window.places_px(np.arange(len(window.levels))), geometry)
+    order = np.argsort(off_px)
+    inmost = order[: max(3, int(np.count_nonzero(off_px < -2.0 * blur.mean_sd_px) // 2))]
+    around = (off_px > 1.5 * blur.mean_sd_px) & (off_px < 1.5 * blur.mean_sd_px + 3.0)
+    inside, outside = (
+        float(np.median(window.levels[inmost])),
+        float(np.median(window.levels[around])),
+    )
+    dark, bright = (inside, outside) if is_dark else (outside, inside)
+    if bright - dark < _LEAST_CONTRAST_COUNTS * window.levels_per_count:
+        raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {inside:.3f} and {outside:.3f}")
+    return DiscState.of(geometry, blur, light_of_levels(dark, bright, tone))
+
+
+def _check_inside(grey: GreyArray, geometry: Geometry) -> None:
+    """Refuse a disc that is not wholly within the photograph."""
+    x, y, xx, xy, yy = geometry.tolist()
+    half_x, half_y = math.hypot(xx, xy) + 1.0, math.hypot(xy, yy) + 1.0
+    height, width = grey.shape
+    if x - half_x < 0 or y - half_y < 0 or x + half_x > width - 1 or y + half_y > height - 1:
+        raise DiscRejection(DiscReason.CUT, "at the border of the photograph")
+
+
+def _foreign(fit: DiscFit, window: DiscWindow, index: IndexArray) -> BoolArray | None:
+    """Return which pixels of the window show neither disc nor ground; None if there are none."""
+    black, white = plateau_levels(fit.state.light, fit.free.tone)
+    limit = np.maximum(_FOREIGN_SIGMAS * fit.sd, _FOREIGN_CONTRAST * (white - black))
+    clips = fit.sample.censoring
+    model = np.clip(fit.levels, clips.low, clips.high)
+    off = np.abs(fit.sample.levels - model) > limit
+    if not off.any():
+        return None
+    mask = np.zeros(len(window.levels), np.uint8)
+    mask[index[off]] = 1
+    grown = cv2.dilate(mask.reshape(window.height, window.width), np.ones((3, 3), np.uint8))
+    return np.asarray(grown.ravel() > 0)
+
+
+def check_fit(fit: DiscFit, outline: DiscOutline) -> None:
+    """Refuse a fit that is not that of the outlined disc.
+
+    Raises
+    ------
+    DiscRejection
+        `POOR_FIT` or `NO_CONTRAST`.
+    """
+    clips = fit.sample.censoring
+    seen = ~(clips.at_high | clips.at_low)
+    outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
+    black, white = plateau_levels(fit.state.light, fit.free.tone)
+    residual = median_at_edges(fit.sd, fit.share, 0.2, 0.8, math.nan)
+    if not white - black > _LEAST_CONTRAST_COUNTS * fit.sample.levels_per_count:
+        raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {black:.3f} and {white:.3f}")
+    if not residual < _MAX_EDGE_NOISE * (white - black) or outlying > _MAX_OUTLIERS:
+        share = residual / (white - black)
+        raise DiscRejection(DiscReason.POOR_FIT, f"residuals {share:.0%} of the contrast")
+    off_px = np.abs(fit.state.geometry - outline_geometry(outline)).max()
+    if off_px > max(_MAX_OFF_PX, _MAX_OFF * outline.ellipse.mean_radius):
+        raise DiscRejection(DiscReason.POOR_FIT, f"{off_px:.1f} px from its outline")

@@ -1,0 +1,153 @@
+"""Covariance of a disc's centroid and moments, from the residuals as they are.
+
+As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, their
+scatter is held against what independent residuals of this very fit would leave, and variances are
+nowhere below those of independent pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.discs.fit_disc import GEOMETRY_COUNT, DiscFit
+from kgcp.measurement.image_model.noise import median_at_edges
+from kgcp.measurement.image_model.photometry import plateau_levels, share_at
+
+_ARC_PX = 6.0
+_FEWEST_ARCS = 8
+_ARCS_IN_COMMON = 40.0  # what all discs of a photograph scatter counts like so many arcs
+_LEAST_LEFT = 1.0  # of the scatter, after the fit
+_FLOOR_PX = 0.0005  # of centre and edge: no print and no pixel is known better, …
+_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
+_EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscScatter:
+    """What the residuals of one disc say of its covariance."""
+
+    independent: FloatArray  # (5, 5): of centroid [px] and moments [px²], for independent residuals
+    common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
+    ratio: float  # mean ratio of the scatter of scores to that of independent residuals
+    arcs: int  # that it was found from
+
+    def cov(self, inflation: float) -> FloatArray:
+        """Return the covariance (5, 5) for an inflation of the independent part."""
+        return inflation * self.independent + self.common
+
+
+def scatter_of(fit: DiscFit) -> DiscScatter:
+    """Return the parts of the covariance of centroid and second moments."""
+    scaled, inverse = fit.scaled, np.linalg.inv(fit.normal)
+    own = inverse[:GEOMETRY_COUNT]
+    root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
+    to_own = np.linalg.solve(root, own)  # in units of N⁻¹
+    sums, products, arcs = _over_arcs(
+        np.ascontiguousarray((to_own @ scaled).T),
+        np.ascontiguousarray(scaled.T),
+        fit.misfit.score,
+        fit.misfit.weight,
+        _arcs(fit),
+    )
+    # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
+    left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
+    ratio = float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
+    common_px = _common_displacement_px(fit)
+    # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
+    grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
+    common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
+    to_moments = moments_by_stretch(fit.state.geometry)
+    return DiscScatter(
+        to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T,
+        to_moments @ common @ to_moments.T,
+        ratio,
+        arcs,
+    )
+
+
+def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
+    """Return by how much to inflate the covariances (n,) of the discs of one photograph.
+
+    The ratio of one disc is uncertain, and that of a photograph is not: compression and jagged
+    print are the same for all. Each disc's own ratio counts like its arcs, the photograph's like
+    forty.
+    """
+    if not scatters:
+        return np.empty(0)
+    ratios = np.array([each.ratio for each in scatters])
+    arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
+    pooled = (arcs * ratios + _ARCS_IN_COMMON * np.median(ratios)) / (arcs + _ARCS_IN_COMMON)
+    return np.asarray(np.maximum(pooled, 1.0))
+
+
+def moments_by_stretch(geometry: Geometry) -> FloatArray:
+    """Return the derivatives (5, 5) of the moments x, y and M M / 4 by x, y and M."""
+    _, _, xx, xy, yy = geometry.tolist()
+    slopes = np.eye(GEOMETRY_COUNT)
+    slopes[2:, 2:] = [
+        [0.5 * xx, 0.5 * xy, 0.0],
+        [0.25 * xy, 0.25 * (xx + yy), 0.25 * xy],
+        [0.0, 0.5 * xy, 0.5 * yy],
+    ]
+    return slopes
+
+
+def _common_displacement_px(fit: DiscFit) -> float:
+    """Return the standard deviation of the displacement that all of the edge shares [px].
+
+    As of coded targets: from what edges scatter beyond the noise of the plateaus, and from how far
+    the middle of the edge is within what is clipped.
+    """
+    noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
+    light, tone, limits = fit.state.light, fit.free.tone, fit.sample.censoring
+    excess = noise.sd**2 - noise.plateau_sd**2
+    at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)
+    black, white = plateau_levels(light, tone)
+    slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * blur_px)
+    burnt, sunk = share_at(limits.high, light, tone), share_at(limits.low, light, tone)
+    hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
+    reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
+    of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
+    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px)
+
+
+def _arcs(fit: DiscFit) -> IndexArray:
+    """Return the number (n,) of the arc that every pixel is at."""
+    geometry, places = fit.state.geometry, fit.sample.pixels.places_px
+    stretch = geometry[[2, 3, 3, 4]].reshape(2, 2)
+    u, v = np.linalg.solve(stretch, places - geometry[:2, None])
+    length_px = 2.0 * math.pi * math.sqrt(abs(float(np.linalg.det(stretch))))
+    count = max(round(length_px / _ARC_PX), _FEWEST_ARCS)
+    turn = np.arctan2(v, u) / (2.0 * np.pi) % 1.0
+    return np.asarray(np.minimum((turn * count).astype(np.intp), count - 1))
+
+
+@compiled
+def _over_arcs(
+    of_own: FloatArray, of_all: FloatArray, score: FloatArray, weight: FloatArray, arc: IndexArray
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return sums over arcs, and how many of them have pixels.
+
+    Of the scores with derivatives `of_own` (n, 5): (arcs, 5); and of the products of these and
+    those `of_all` (n, p): (arcs, 5, p).
+    """
+    count, own, room = arc.max() + 1, of_own.shape[1], of_all.shape[1]
+    sums, products = np.zeros((count, own)), np.zeros((count, own, room))
+    pixels = np.zeros(count, np.intp)
+    for i in range(len(arc)):
+        a = arc[i]
+        pixels[a] += 1
+        for k in range(own):
+            sums[a, k] += of_own[i, k] * score[i]
+            weighted = of_own[i, k] * weight[i]
+            for j in range(room):
+                products[a, k, j] += weighted * of_all[i, j]
+    return sums, products, (pixels > 0).sum()

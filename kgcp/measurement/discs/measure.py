@@ -1,0 +1,173 @@
+"""Discs measured from their grey values: (x, y, S_xx, S_xy, S_yy) with its covariance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Response
+from kgcp.measurement.discs.adjust_disc import (
+    DiscRejection,
+    DiscTask,
+    adjust_disc,
+    check_fit,
+    geometry_of,
+    outline_geometry,
+)
+from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.discs.camera_tone import CameraTone, learn_tone, parameters_of
+from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
+from kgcp.measurement.discs.covariance import DiscScatter, inflations, scatter_of
+from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
+from kgcp.measurement.discs.records import (
+    Disc,
+    DiscMiss,
+    DiscOutline,
+    DiscReason,
+    Operator,
+    Polarity,
+    moments_of_ellipse,
+)
+from kgcp.measurement.image_model.photometry import plateau_levels
+
+_NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
+
+
+def measure_discs(
+    grey: GreyArray,
+    outlines: Sequence[DiscOutline],
+    *,
+    response: Response = Response.UNKNOWN,
+    operator: Operator = Operator.MODEL,
+) -> list[Disc | DiscMiss]:
+    """Measure many discs of one photograph: one outcome for each outline, in their order.
+
+    What the camera does to all of them, an unknown tone curve and sharpening, is learned from the
+    largest first.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Grey values of 8 or 16 bits.
+    outlines : sequence of DiscOutline
+        By `find_outlines` or `follow_outlines`. Each one's pixels are kept clear of the others.
+    response : Response
+        How grey values follow light.
+    """
+    tasks = [
+        DiscTask(grey, outline, _others(outline, [outlines[j] for j in near]))
+        for outline, near in zip(outlines, _neighbours(outlines), strict=True)
+    ]
+    return _measured(tasks, response, operator)
+
+
+def measure_disc(
+    grey: GreyArray,
+    outline: DiscOutline,
+    *,
+    neighbours: Sequence[DiscOutline] = (),
+    response: Response = Response.UNKNOWN,
+    operator: Operator = Operator.MODEL,
+) -> Disc | DiscMiss:
+    """Measure one disc, or one edge of a ring.
+
+    Parameters
+    ----------
+    grey, response
+        As for `measure_discs`.
+    neighbours : sequence of DiscOutline
+        Other edges that may be near: their pixels are left out.
+    """
+    return _measured([DiscTask(grey, outline, _others(outline, neighbours))], response, operator)[0]
+
+
+def _measured(
+    tasks: Sequence[DiscTask], response: Response, operator: Operator
+) -> list[Disc | DiscMiss]:
+    if operator is not Operator.MODEL:
+        measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
+        return [measure(task) for task in tasks]
+    camera = learn_tone(tasks, response)
+    fits = [_fitted(task, camera) for task in tasks]
+    scatters = [scatter_of(fit) for fit in fits if isinstance(fit, DiscFit)]
+    parts = iter(zip(scatters, inflations(scatters).tolist(), strict=True))
+    return [
+        _disc(fit, task.outline, *next(parts)) if isinstance(fit, DiscFit) else fit
+        for task, fit in zip(tasks, fits, strict=True)
+    ]
+
+
+def _fitted(task: DiscTask, camera: CameraTone) -> DiscFit | DiscMiss:
+    try:
+        fit = adjust_disc(task, parameters_of(task, camera))
+        check_fit(fit, task.outline)
+        np.linalg.cholesky(fit.normal)  # what follows needs its inverse
+    except DiscRejection as rejection:
+        return DiscMiss(task.outline, rejection.reason, rejection.detail)
+    except (NoFit, np.linalg.LinAlgError):
+        return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
+    return fit
+
+
+def _others(outline: DiscOutline, neighbours: Sequence[DiscOutline]) -> list[Geometry]:
+    """Return the edges whose pixels are left out, the outline's own hole among them."""
+    others = [outline_geometry(each) for each in neighbours]
+    if outline.hole is not None:
+        others.append(geometry_of(moments_of_ellipse(outline.hole)))
+    return others
+
+
+def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
+    """Return, for each outline, which others may be in its window.
+
+    Beside it, only those of its polarity: of a dark disc and a bright one side by side, one is what
+    is left of the ground between discs.
+    """
+    if not outlines:
+        return []
+    centres = np.array([each.ellipse.centre for each in outlines])
+    radii = np.array([each.ellipse.a for each in outlines])
+    tree, near = cKDTree(centres), []
+    for i, outline in enumerate(outlines):
+        reach = min(_NEIGHBOUR_PX, _NEIGHBOUR_RADII * radii[i]) + radii[i] + radii.max()
+        near.append(
+            [
+                j
+                for j in sorted(tree.query_ball_point(centres[i], reach))
+                if j != i
+                and (
+                    outlines[j].polarity is outline.polarity
+                    or math.dist(centres[i], centres[j]) < max(radii[i], radii[j])
+                )
+            ]
+        )
+    return near
+
+
+def _disc(fit: DiscFit, outline: DiscOutline, scatter: DiscScatter, inflation: float) -> Disc:
+    x, y, xx, xy, yy = fit.state.geometry.tolist()
+    moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
+    light, blur, clips = fit.state.light, fit.state.blur, fit.sample.censoring
+    gradient = np.array((light.slope_x, light.slope_y)) / fit.sample.radius_px
+    # The light falls on the scene before it is blurred: a gradient g displaces the whole image of
+    # the disc by −B g, if B is the blur's covariance.
+    spread = np.array(((blur.xx, blur.xy), (blur.xy, blur.yy)))
+    centre = np.array((x, y)) + spread @ gradient
+    black, white = plateau_levels(light, fit.free.tone)
+    inside, outside = (black, white) if outline.polarity is Polarity.DARK else (white, black)
+    return Disc(
+        outline=outline,
+        vector=np.concatenate((centre, moments)),
+        cov=scatter.cov(inflation),
+        inside=inside,
+        outside=outside,
+        gradient=gradient,
+        blur_px=blur.mean_sd_px,
+        clipped=float(np.mean(clips.at_high | clips.at_low)),
+        inflation=inflation,
+        pixels=len(fit.levels),
+    )

@@ -1,0 +1,151 @@
+"""Which pixels tell of a disc's edge: those around it, but none that another edge reaches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.image_model.blur import Blur
+
+# Pixels beyond the reach of the blur, which tell the levels and how the light falls off. A ring of
+# 3 px leaves 5 % of the bound on discs of 5 px; a wider one meets more of what is not ground.
+_FLAT_PX = 3.0
+_REACH_SIGMAS = 3.5
+_CLEAR_SIGMAS, _CLEAR_PX = 2.8, 0.6  # nearer to another edge than this, a pixel feels it
+_EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level
+_LEAST_GROUND = 0.12  # share of the pixels outside that must be left: within a ring, half a pixel
+_MIN_GROUND = 10
+_MARGIN_PX = 4  # around the pixels, for the mask of a camera's sharpening
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscWindow:
+    """A rectangle of a photograph around a disc."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
+    levels: FloatArray  # (height · width,): 0…1 of the grey values' range
+    levels_per_count: float
+
+    def places_px(self, index: IndexArray) -> FloatArray:
+        """Return the raw pixel coordinates (2, n) of flat indices."""
+        rows, columns = np.divmod(index, self.width)
+        return np.stack((columns + self.x0, rows + self.y0)).astype(np.float64)
+
+
+def cut_disc_window(grey: GreyArray, geometry: Geometry, reach_px: float) -> DiscWindow:
+    """Cut out an ellipse with so much around it, as far as the photograph goes."""
+    x, y, xx, xy, yy = geometry.tolist()
+    half_x, half_y = math.hypot(xx, xy) + reach_px, math.hypot(xy, yy) + reach_px
+    x0, y0 = max(math.floor(x - half_x), 0), max(math.floor(y - half_y), 0)
+    x1 = min(math.ceil(x + half_x) + 1, grey.shape[1])
+    y1 = min(math.ceil(y + half_y) + 1, grey.shape[0])
+    scale = float(np.iinfo(grey.dtype).max) if np.issubdtype(grey.dtype, np.integer) else 1.0
+    levels = grey[y0:y1, x0:x1].astype(np.float64).ravel() / scale
+    # floats have no steps: as fine as 16 bits
+    count = 1.0 / scale if np.issubdtype(grey.dtype, np.integer) else 1.0 / 65535.0
+    return DiscWindow(x0, y0, x1 - x0, y1 - y0, levels, count)
+
+
+def outward_px(blur: Blur) -> float:
+    """Return how far from the edge pixels are used [px]."""
+    return _REACH_SIGMAS * blur.largest_sd_px + _FLAT_PX
+
+
+def window_reach_px(blur: Blur) -> float:
+    """Return how far from the edge a window reaches [px]."""
+    return outward_px(blur) + _MARGIN_PX
+
+
+def choose_pixels(
+    window: DiscWindow,
+    geometry: Geometry,
+    blur: Blur,
+    neighbours: Sequence[Geometry],
+    *,
+    is_thinned: bool = True,
+) -> tuple[IndexArray, bool]:
+    """Return flat indices of the pixels to use, and whether they are enough of the ground.
+
+    Parameters
+    ----------
+    neighbours : sequence of Geometry
+        Other edges: beside this one, around it, or inside it.
+    is_thinned : bool
+        Whether the middle of large discs is left out but for some of its pixels.
+    """
+    sd_px = blur.largest_sd_px
+    others = np.array(neighbours, dtype=np.float64).reshape(-1, 5)
+    chosen = np.zeros(window.height * window.width, np.bool_)
+    clear_px = _CLEAR_SIGMAS * sd_px + _CLEAR_PX
+    ground, possible = _choose(
+        (window.x0, window.y0, window.width, window.height),
+        geometry,
+        (outward_px(blur), clear_px, sd_px),
+        others,
+        _EVERY_PX if is_thinned else 1,
+        chosen,
+    )
+    is_enough = ground >= max(_LEAST_GROUND * possible, _MIN_GROUND)
+    return np.flatnonzero(chosen), bool(is_enough)
+
+
+@compiled
+def _choose(
+    box: tuple[int, int, int, int],
+    geometry: FloatArray,
+    lengths_px: tuple[float, float, float],
+    others: FloatArray,
+    every_px: int,
+    chosen: BoolArray,
+) -> tuple[int, int]:
+    """Mark pixels; return how many of them are on the ground, and how many could be."""
+    x0, y0, width, height = box
+    reach_px, clear_px, sd_px = lengths_px
+    is_around = np.zeros(len(others), np.bool_)
+    for k in range(len(others)):
+        is_around[k] = (
+            _off(geometry[0], geometry[1], others[k]) < 0.0
+            and others[k, 2] * others[k, 4] - others[k, 3] ** 2
+            > geometry[2] * geometry[4] - geometry[3] ** 2
+        )
+    ground, possible = 0, 0
+    for row in range(height):
+        for column in range(width):
+            x, y = float(x0 + column), float(y0 + row)
+            off_px = _off(x, y, geometry)
+            if off_px > reach_px:
+                continue
+            if off_px < -reach_px and not (row % every_px == 0 and column % every_px == 0):
+                continue
+            is_ground = off_px > sd_px
+            possible += is_ground
+            is_free = True
+            for k in range(len(others)):
+                off_other = _off(x, y, others[k])
+                is_free &= off_other < -clear_px if is_around[k] else off_other > clear_px
+            if is_free:
+                chosen[row * width + column] = True
+                ground += is_ground
+    return ground, possible
+
+
+@compiled
+def _off(px: float, py: float, geometry: FloatArray) -> float:
+    """Return the distance of a point outside an ellipse, negative inside; first order."""
+    determinant = geometry[2] * geometry[4] - geometry[3] * geometry[3]
+    a, b, d = geometry[4] / determinant, -geometry[3] / determinant, geometry[2] / determinant
+    x, y = px - geometry[0], py - geometry[1]
+    u, v = a * x + b * y, b * x + d * y
+    rho = math.sqrt(u * u + v * v)
+    slope_x, slope_y = a * u + b * v, b * u + d * v
+    slope = math.sqrt(slope_x * slope_x + slope_y * slope_y)
+    return (rho - 1.0) * rho / slope if rho > 1e-6 else -math.sqrt(determinant)

@@ -1,0 +1,176 @@
+"""Discs of rendered fields: all are found, and measured as well as they say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.discs.measure import measure_disc, measure_discs
+from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
+from kgcp.measurement.discs.records import (
+    Disc,
+    DiscMiss,
+    DiscOutline,
+    DiscReason,
+    Operator,
+    Polarity,
+    ellipse_of_moments,
+    moments_of_ellipse,
+)
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.imaging import Optics, Sensor
+
+CAMERA = Camera(330, 250, 640.0, 640.0, 165.3, 122.8, -0.12, 0.03)
+POSE = Pose(rotation_about(np.array([0.25, -0.35, 0.2])), np.array([0.0, 0.0, 0.62]))
+
+
+@dataclass(frozen=True)
+class Rendered:
+    photo: GreyArray
+    moments: FloatArray  # (n, 5): of the outer circles
+    discs: tuple[FieldDisc, ...]
+
+    @property
+    def rings(self) -> FloatArray:
+        return np.array([disc.inner_diameter_m > 0.0 for disc in self.discs])
+
+
+def render(*, ground: float, ink: float, seed: int = 1) -> Rendered:
+    discs = tuple(
+        FieldDisc((0.034 * i, 0.034 * j, 0.0), 0.018, 0.008 if (i, j) in {(0, 0), (1, 0)} else 0.0)
+        for j in range(-2, 3)
+        for i in range(-3, 4)
+    )
+    scene = FieldScene(discs, ground, ink, gradient=(7e-4, -4e-4))
+    photo = photograph(CAMERA, POSE, scene, Optics(0.6), Sensor(), np.random.default_rng(seed))
+    return Rendered(photo, circle_images(CAMERA, field_circles(POSE, discs)).moments, discs)
+
+
+@pytest.fixture(scope="module")
+def dark() -> Rendered:
+    return render(ground=0.7, ink=0.08)
+
+
+@pytest.fixture(scope="module")
+def bright() -> Rendered:
+    return render(ground=0.1, ink=0.6)
+
+
+def outer(outlines: tuple[DiscOutline, ...]) -> list[DiscOutline]:
+    return [each for each in outlines if not each.is_hole]
+
+
+def nearest(centres: FloatArray, moments: FloatArray) -> IndexArray:
+    apart = np.linalg.norm(centres[:, None] - moments[None, :, :2], axis=2)
+    return np.asarray(apart.argmin(axis=1))
+
+
+@pytest.mark.parametrize("field", ["dark", "bright"])
+def test_all_discs_and_holes_are_found(field: str, request: pytest.FixtureRequest) -> None:
+    rendered = request.getfixturevalue(field)
+    outlines = find_outlines(rendered.photo)
+    discs = outer(outlines)
+    assert len(discs) == len(rendered.discs)
+    assert len(outlines) == len(rendered.discs) + int(rendered.rings.sum())
+    assert {each.polarity for each in discs} == {Polarity(field)}
+    which = nearest(np.array([each.ellipse.centre for each in discs]), rendered.moments)
+    assert sorted(which.tolist()) == list(range(len(rendered.discs)))
+    off = np.array([moments_of_ellipse(each.ellipse) for each in discs]) - rendered.moments[which]
+    assert np.abs(off[:, :2]).max() < 0.2
+    has_hole = np.array([each.hole is not None for each in discs])
+    assert (has_hole == rendered.rings[which]).all()
+
+
+@pytest.mark.parametrize("field", ["dark", "bright"])
+def test_moments_are_as_good_as_they_say(field: str, request: pytest.FixtureRequest) -> None:
+    rendered = request.getfixturevalue(field)
+    outlines = outer(find_outlines(rendered.photo))
+    discs = measure_discs(rendered.photo, outlines, response=Response.LINEAR)
+    assert all(isinstance(each, Disc) for each in discs)
+    measured = [each for each in discs if isinstance(each, Disc)]
+    which = nearest(np.array([each.centre_px for each in measured]), rendered.moments)
+    errors = np.array([each.vector for each in measured]) - rendered.moments[which]
+    sds = np.sqrt([np.diag(each.cov) for each in measured])
+    z = np.sqrt(np.mean((errors / sds) ** 2, axis=0))
+    assert np.all((z > 0.65) & (z < 1.35)), z
+    assert 0.002 < np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.008  # R = 9 px
+    assert np.median([each.inflation for each in measured]) < 1.3
+    assert np.median([each.blur_px for each in measured]) == pytest.approx(0.67, abs=0.03)
+    gradient = np.median([each.gradient for each in measured], axis=0)
+    assert gradient == pytest.approx([7e-4, -4e-4], abs=1.5e-4)
+    outside = np.median([each.outside for each in measured])
+    assert outside == pytest.approx(0.7 if field == "dark" else 0.1, abs=0.01)
+
+
+def test_holes_are_measured_as_circles_of_their_own(dark: Rendered) -> None:
+    photo, truth = dark.photo, dark.moments[dark.rings]
+    outlines = find_outlines(photo)
+    holes = [i for i, each in enumerate(outlines) if each.is_hole]
+    discs = measure_discs(photo, outlines, response=Response.LINEAR)
+    assert len(holes) == 2
+    for i in holes:
+        hole = discs[i]
+        assert isinstance(hole, Disc)
+        assert hole.polarity is Polarity.BRIGHT
+        ring = truth[nearest(hole.centre_px[None], truth)[0]]
+        # nearer to the image of the centre than the outer circle's centroid: eccentricity
+        assert np.linalg.norm(hole.centre_px - ring[:2]) < 0.2
+        area = np.sqrt(np.linalg.det(hole.vector[[2, 3, 3, 4]].reshape(2, 2)))
+        whole = np.sqrt(np.linalg.det(ring[[2, 3, 3, 4]].reshape(2, 2)))
+        assert area / whole == pytest.approx((8.0 / 18.0) ** 2, rel=0.01)
+
+
+def test_operators_for_comparison_agree_roughly(dark: Rendered) -> None:
+    photo = dark.photo
+    outlines = outer(find_outlines(photo))[:4]
+    model = measure_discs(photo, outlines, response=Response.LINEAR)
+    for operator, within_px in ((Operator.GAUSSIAN, 0.15), (Operator.CENTROID, 0.4)):
+        for other, disc in zip(
+            measure_discs(photo, outlines, operator=operator), model, strict=True
+        ):
+            assert isinstance(other, Disc)
+            assert isinstance(disc, Disc)
+            assert other.operator is operator
+            assert 0.0 < np.linalg.norm(other.centre_px - disc.centre_px) < within_px
+
+
+def test_predicted_outlines_are_followed(dark: Rendered) -> None:
+    photo, moments = dark.photo, dark.moments
+    off = np.array([1.2, -0.9, 0.0, 0.0, 0.0])
+    guesses = [
+        DiscOutline.predicted(ellipse_of_moments(each + off), Polarity.DARK) for each in moments
+    ]
+    followed = follow_outlines(photo, guesses)
+    for each, truth in zip(followed, moments, strict=True):
+        assert each is not None
+        assert each.ellipse.centre == pytest.approx(truth[:2], abs=0.2)
+    away = replace(guesses[0], ellipse=replace(guesses[0].ellipse, x=guesses[0].ellipse.x + 14.0))
+    assert follow_outlines(photo, [away]) == (None,)
+    assert follow_outlines(photo, []) == ()
+
+
+def test_what_cannot_be_measured_says_why(dark: Rendered) -> None:
+    photo, moments = dark.photo, dark.moments
+    outline = DiscOutline.predicted(ellipse_of_moments(moments[0]), Polarity.DARK)
+
+    def reason(outline: DiscOutline, neighbours: tuple[DiscOutline, ...] = ()) -> DiscReason:
+        outcome = measure_disc(photo, outline, neighbours=neighbours, response=Response.LINEAR)
+        assert isinstance(outcome, DiscMiss)
+        return outcome.reason
+
+    at_border = replace(outline, ellipse=replace(outline.ellipse, x=3.0))
+    assert reason(at_border) is DiscReason.CUT
+    between = replace(
+        outline, ellipse=replace(outline.ellipse, y=outline.ellipse.y + 18.0, a=3.0, b=3.0)
+    )
+    assert reason(between) is DiscReason.NO_CONTRAST
+    around = replace(outline, ellipse=outline.ellipse.scaled(1.3))
+    assert reason(outline, (around,)) is DiscReason.CROWDED
+    swapped = replace(outline, polarity=Polarity.BRIGHT)
+    assert reason(swapped) is DiscReason.NO_CONTRAST
