@@ -1,1 +1,1 @@
-"""Calibration compared with published adjustments and with other people's photographs."""
+"""Benchmarks of discs and of the calibration from them."""

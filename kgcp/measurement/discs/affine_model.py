@@ -46,11 +46,9 @@ class DiscPixels:
         cls, places_px: FloatArray, geometry: Geometry, blur: Blur, *, is_dark: bool
     ) -> DiscPixels:
         """Find which pixels (2, n) feel the edge."""
-        smallest, _ = semi_axes(geometry)
+        smallest, largest = semi_axes(geometry)
         sd_px = blur.largest_sd_px
-        rule = quadrature_for(
-            np.array([smallest / sd_px]), np.array([smallest / sharpest_px(blur)])
-        )
+        rule = quadrature_for(np.array([smallest / sd_px]), np.array([largest / sharpest_px(blur)]))
         reach_px = REACH_SIGMAS * sd_px + _SLACK_PX
         off_px = distances_px(places_px, geometry)
         members = np.flatnonzero(np.abs(off_px) <= reach_px)

@@ -1,0 +1,284 @@
+"""Discs measured in rendered fields: error over the Cramér-Rao bound, bias, stated deviations.
+
+One line per case, polarity, radius and axis ratio; benchmarks/README.md explains the columns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from benchmarks.calibrate.bound import centroid_bound
+from benchmarks.pool import ordered_map
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.discs.records import Disc, Operator, Polarity
+from kgcp.pipeline.execution.threads import use_one_thread_each
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+
+_FOCAL_PX = 200_000.0  # so long that images are affine
+_COLUMNS, _ROWS = 5, 4  # of a photograph
+_GAP_PX = 14.0
+_BRIGHT, _DARK = 0.62, 0.10
+_GRADIENT = 0.05  # of the light over one radius, at most over …
+_LARGEST_FALL = 0.3  # … the photograph's half width
+_PSF_PX = 0.6
+_POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What the camera does, and the limit of RMS over bound."""
+
+    tone: ToneCurve
+    response: Response
+    limit: float
+    gain: float = 1.0
+    sharpening: float = 0.0
+    quality: int = 0  # of JPEG; 0: none
+
+
+CASES = {
+    "linear": Case(ToneCurve.LINEAR, Response.LINEAR, 1.15),
+    "srgb": Case(ToneCurve.SRGB, Response.SRGB, 1.3),
+    "clipped": Case(ToneCurve.LINEAR, Response.LINEAR, 1.6, gain=1.5 / _BRIGHT),
+    "clipped_srgb": Case(ToneCurve.SRGB, Response.SRGB, 1.6, gain=1.5 / _BRIGHT),
+    "unknown_srgb": Case(ToneCurve.SRGB, Response.UNKNOWN, 1.5),
+    "unknown_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.5),
+    "unknown_linear": Case(ToneCurve.LINEAR, Response.UNKNOWN, 1.5),
+    "consumer": Case(ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """One line of the table."""
+
+    case: str
+    polarity: Polarity
+    radius_px: float
+    ratio: float
+    photographs: int
+    operator: Operator
+    gradient: float  # over one radius
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What became of the discs of one setup."""
+
+    setup: Setup
+    present: int
+    errors: FloatArray  # (n, 5)
+    covariances: FloatArray  # (n, 5, 5)
+    bound_px2: FloatArray  # (2, 2): of a disc in the frame's middle
+    along_light_px: FloatArray  # (n,): errors of the centre along the light's gradient
+    ms_per_disc: float
+
+    @property
+    def over_bound(self) -> float:
+        """RMS of the centre over the bound."""
+        return float(np.sqrt(np.mean(self.errors[:, :2] ** 2) / (0.5 * np.trace(self.bound_px2))))
+
+    @property
+    def bias_px(self) -> float:
+        """Mean error of the centre along the light's gradient [px]."""
+        return float(np.mean(self.along_light_px))
+
+    @property
+    def radius_bias_px(self) -> float:
+        """Mean error of the radius [px]."""
+        return float(np.mean(self.errors[:, 2] + self.errors[:, 4]) / self.setup.radius_px)
+
+    @property
+    def z(self) -> float:
+        """RMS of the centre's errors over their stated deviations."""
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, :2]
+        return float(np.sqrt(np.mean(self.errors[:, :2] ** 2 / variances)))
+
+    @property
+    def mahalanobis2(self) -> float:
+        """Median squared Mahalanobis distance of the five numbers."""
+        solved = np.linalg.solve(self.covariances, self.errors[..., None])[..., 0]
+        return float(np.median(np.sum(solved * self.errors, axis=1)))
+
+
+def measure(setup: Setup) -> Outcome:
+    """Render photographs of discs with random tilts and places, and measure them."""
+    cv2.setNumThreads(1)
+    case, radius = CASES[setup.case], setup.radius_px
+    rng = np.random.default_rng([setup.seed, int(10 * radius), len(setup.case)])
+    pitch = 2.0 * radius + _GAP_PX
+    width, height = int((_COLUMNS + 0.3) * pitch), int((_ROWS + 0.3) * pitch)
+    camera = Camera(width, height, _FOCAL_PX, _FOCAL_PX, 0.5 * (width - 1), 0.5 * (height - 1))
+    sensor = Sensor(tone=case.tone, sharpening=case.sharpening)
+    fall = min(setup.gradient / radius, _LARGEST_FALL / (0.5 * width))
+    errors, covariances, along, seconds = [], [], [], 0.0
+    for _ in range(setup.photographs):
+        scene = _scene(setup, pitch, fall, rng)
+        photo = photograph(camera, _POSE, scene, Optics(_PSF_PX), sensor, rng, case.gain)
+        photo = _compressed(photo, case.quality)
+        truth = circle_images(camera, field_circles(_POSE, scene.discs)).moments
+        outlines = [each for each in find_outlines(photo) if each.polarity is setup.polarity]
+        start = time.process_time()
+        discs = measure_discs(photo, outlines, response=case.response, operator=setup.operator)
+        seconds += time.process_time() - start
+        direction = np.array(scene.gradient) / max(math.hypot(*scene.gradient), 1e-12)
+        for expected in truth:
+            disc = _nearest(discs, expected, radius)
+            if disc is not None:
+                errors.append(disc.vector - expected)
+                covariances.append(disc.cov)
+                along.append(float((disc.vector - expected)[:2] @ direction))
+    present = setup.photographs * _COLUMNS * _ROWS
+    return Outcome(
+        setup,
+        present,
+        np.array(errors).reshape(-1, 5),
+        np.array(covariances).reshape(-1, 5, 5),
+        _bound(setup, sensor, fall),
+        np.array(along),
+        1e3 * seconds / present,
+    )
+
+
+def _scene(setup: Setup, pitch_px: float, fall: float, rng: np.random.Generator) -> FieldScene:
+    discs = []
+    for row, column in itertools.product(range(_ROWS), range(_COLUMNS)):
+        place = np.array([column - 0.5 * (_COLUMNS - 1), row - 0.5 * (_ROWS - 1)]) * pitch_px
+        x, y = ((place + rng.uniform(-0.5, 0.5, 2)) / _FOCAL_PX).tolist()
+        normal = _normal(setup.ratio, rng.uniform(0.0, 2.0 * math.pi))
+        discs.append(FieldDisc((x, y, 0.0), 2.0 * setup.radius_px / _FOCAL_PX, 0.0, normal))
+    turn = rng.uniform(0.0, 2.0 * math.pi)
+    gradient = (fall * math.cos(turn), fall * math.sin(turn))
+    return FieldScene(tuple(discs), *_levels(setup.polarity), gradient=gradient)
+
+
+def _levels(polarity: Polarity) -> tuple[float, float]:
+    """Return the radiances of ground and disc."""
+    return (_BRIGHT, _DARK) if polarity is Polarity.DARK else (_DARK, _BRIGHT)
+
+
+def _normal(ratio: float, turn_rad: float) -> tuple[float, float, float]:
+    """Return the normal of a disc whose image has this axis ratio."""
+    axis = np.array([math.cos(turn_rad), math.sin(turn_rad), 0.0])
+    x, y, z = rotation_about(math.acos(ratio) * axis)[:, 2].tolist()
+    return x, y, z
+
+
+def _compressed(photo: GreyArray, quality: int) -> GreyArray:
+    if not quality:
+        return photo
+    _, buffer = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE))
+
+
+def _nearest(discs: Sequence[object], expected: FloatArray, radius_px: float) -> Disc | None:
+    near = [
+        disc
+        for disc in discs
+        if isinstance(disc, Disc) and math.dist(disc.centre_px, expected[:2]) < 0.5 * radius_px
+    ]
+    return near[0] if len(near) == 1 else None
+
+
+def _bound(setup: Setup, sensor: Sensor, fall: float) -> FloatArray:
+    """Return the bound of a disc with its place between pixels and tilt in the middle of all."""
+    case, radius = CASES[setup.case], setup.radius_px
+    side = 2 * math.ceil(radius + 12.0) + 1
+    camera = Camera(side, side, _FOCAL_PX, _FOCAL_PX, 0.5 * (side - 1), 0.5 * (side - 1))
+    place = (0.31 / _FOCAL_PX, 0.17 / _FOCAL_PX, 0.0)
+    normal = _normal(setup.ratio, 0.6)
+    disc = FieldDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, normal)
+    scene = FieldScene((disc,), *_levels(setup.polarity), gradient=(fall, 0.0))
+    return centroid_bound(
+        camera,
+        scene,
+        Optics(_PSF_PX),
+        replace(sensor, sharpening=0.0),
+        case.gain,
+        tone_is_unknown=case.response is Response.UNKNOWN,
+    )
+
+
+def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
+    """Yield the lines of the table."""
+    for case, radius in itertools.product(arguments.cases, arguments.radii):
+        few = max(2, round(arguments.discs / (_COLUMNS * _ROWS)))
+        ratios = (0.5, 0.8, 1.0) if arguments.ratio is None else (arguments.ratio,)
+        for number, polarity in enumerate(Polarity):
+            # each polarity with one tilt of the three, another for the next radius
+            ratio = ratios[(number + arguments.radii.index(radius)) % len(ratios)]
+            yield Setup(
+                case,
+                polarity,
+                radius,
+                ratio,
+                few if radius < 100.0 else 2,
+                Operator(arguments.operator),
+                arguments.gradient,
+                arguments.seed,
+            )
+
+
+HEAD = (
+    f"{'case':15}{'':8}{'R px':>6}{'ratio':>6}{'found':>9}{'bound px':>10}{'/ bound':>9}"
+    f"{'limit':>7}{'bias px':>9}{'R bias':>9}{'z':>6}{'Mahal.²':>9}{'ms':>7}"
+)
+
+
+def line(outcome: Outcome) -> str:
+    """Return one line of the table."""
+    setup = outcome.setup
+    found = f"{len(outcome.errors)}/{outcome.present}"
+    head = (
+        f"{setup.case:15}{setup.polarity.value:8}{setup.radius_px:6g}{setup.ratio:6.1f}{found:>9}"
+    )
+    if not len(outcome.errors):
+        return head
+    bound = math.sqrt(0.5 * float(np.trace(outcome.bound_px2)))
+    return (
+        f"{head}{bound:10.5f}{outcome.over_bound:9.2f}{CASES[setup.case].limit:7.2f}"
+        f"{outcome.bias_px:9.4f}{outcome.radius_bias_px:9.4f}{outcome.z:6.2f}"
+        f"{outcome.mahalanobis2:9.2f}{outcome.ms_per_disc:7.1f}"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
+    radii = [3.0, 5.0, 8.0, 15.0, 30.0, 60.0, 150.0]
+    parser.add_argument("--radii", nargs="+", type=float, default=radii)
+    parser.add_argument("--ratio", type=float, help="axis ratio of all; default: 0.5, 0.8, 1")
+    parser.add_argument("--gradient", type=float, default=_GRADIENT, help="of light per radius")
+    parser.add_argument("--discs", type=int, default=120, help="per line; 40 of R >= 100 px")
+    parser.add_argument("--operator", choices=[each.value for each in Operator], default="model")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    print(HEAD, flush=True)
+    todo = list(setups(arguments))
+    pooled = ordered_map(
+        measure, todo, jobs=arguments.jobs, start=use_one_thread_each, start_arguments=()
+    )
+    for outcome in pooled:
+        print(line(outcome), flush=True)
+
+
+if __name__ == "__main__":
+    main()
