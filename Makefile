@@ -7,7 +7,7 @@ MINIMUM := (3, 11)
 CANDIDATES := $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed soak torture fuzz sample-flight dist clean
+.PHONY: help demo test check lint types format bench-aat bench-accuracy bench-search bench-speed soak torture fuzz sample-flight first-flights dist clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ PHOTOS := ../shared/real
 bench-search: $(VENV)/.runs ## search hard frames and photographs: found, missed, wrong (half an hour)
 	$(BIN)/python -m benchmarks.search.hard_frames $(BENCH)
 	$(BIN)/python -m benchmarks.search.false_alarms $(PHOTOS)
+
+first-flights: $(VENV)/.runs ## record docs/first_flight_runs.md anew: a minute
+	$(BIN)/python -m benchmarks.first_flight.runs --write
 
 bench-speed: $(VENV)/.runs ## search and detection as multiples of decoding, jobs, memory, sizes (minutes)
 	$(BIN)/python -m benchmarks.speed.relative_costs --flights ../shared/flights --photos $(PHOTOS) $(BENCH)

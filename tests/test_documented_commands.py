@@ -19,6 +19,8 @@ from kgcp.io.flight.flight import read_flight
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+# Runs of bare folders, which tests/benchmarks/test_first_flight.py repeats.
+FIRST_FLIGHTS = {"first_flight.md", "first_flight_runs.md"}
 FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg")
 OF_OTHERS = {"--force-gps", "--gcp", "--tilt", "--wander"}  # OpenDroneMap's, and of benchmarks/
 HERE = "sample_flight"
@@ -54,7 +56,8 @@ def calls(text: str, where: str) -> Iterator[Shown]:
 
 def shown_on_pages() -> Iterator[Shown]:
     for page in PAGES:
-        for block in code_blocks(page.read_text(encoding="utf-8")):
+        text = "" if page.name in FIRST_FLIGHTS else page.read_text(encoding="utf-8")
+        for block in code_blocks(text):
             yield from calls(block, page.name)
 
 

@@ -27,7 +27,7 @@ _WORDS = {
 }
 _WEEK_S, _UNIX_S = 2e6, 1e8  # seconds of a week are below the first, Unix seconds above the second
 _SHOWN_CRS = 3
-_CRS_REMEDY = "write crs = … into flight.toml: that in which the rover's coordinates are"
+_CRS_REMEDY = "write crs = … into flight.toml: the CRS of the surveyed coordinates"
 _LEVER_ARM = "forward, right, down [m] to the target"
 
 
