@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -150,8 +150,7 @@ def detect_flight(
         keeps_dropped=options.overlay is not None and options.all_candidates,
     )
     table = out / DETECTIONS
-    left_out = set(all_frames).difference(frames)
-    builder = SummaryBuilder({name: times[name] for name in times if name not in left_out})
+    builder = SummaryBuilder(_without(times, set(all_frames).difference(frames)))
     not_drawn = 0
     with Journal(out / ".detections.journal", _making(job), is_new=options.is_restart) as journal:
         with open_pool(
@@ -196,7 +195,7 @@ def detect_flight(
         summary = builder.summary(
             table=table,
             likely_cause=likely_cause,
-            frames_not_chosen=len(left_out),
+            frames_not_chosen=len(all_frames) - len(frames),
             kept=run.kept,
             frames_without_attitude=sum(
                 all(prior.normal is None for prior in frame_input.priors.values())
@@ -213,6 +212,10 @@ def detect_flight(
         write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
+
+
+def _without(times: Mapping[str, float], left_out: Collection[str]) -> dict[str, float]:
+    return {name: time_s for name, time_s in times.items() if name not in left_out}
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:

@@ -1,4 +1,4 @@
-"""The first flight as the documents tell it: from bare folders to points that are where they are."""
+"""The first flight as the documents tell it: from bare folders to points in their places."""
 
 from __future__ import annotations
 
