@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from kgcp.io.flight.camera_table import CAMERA_KEYS
 from kgcp.io.flight.flight import FRAMES_KEYS, REFERENCE_KEYS
 from kgcp.io.flight.target_table import PLATE_KEYS, REPLICA_KEYS
 from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
+from kgcp.io.formats import calibrations, frame_times, orientations, trajectories
 from kgcp.io.tables.columns import Column
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
@@ -23,13 +25,15 @@ from kgcp.quality.checks.doubt import Cause
 from tests.test_layers import LAYERS, MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
-CONVENTIONS = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+TABLES = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
+FLIGHT_TOML = (ROOT / "docs" / "flight_toml.md").read_text(encoding="utf-8")
+FOREIGN_FILES = (ROOT / "docs" / "foreign_files.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DESIGN = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 
-def section(heading: str, page: str = CONVENTIONS) -> str:
+def section(heading: str, page: str = TABLES) -> str:
     """The text below a heading of a page, up to the next one of any level."""
     match = re.search(rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
     assert match, heading
@@ -80,8 +84,58 @@ def test_every_cause_of_a_doubt_is_documented_in_its_own_words() -> None:
     ),
 )
 def test_every_key_of_flight_toml_is_documented(key: str) -> None:
-    text = section("flight.toml")
+    text = section("flight.toml", FLIGHT_TOML)
     assert f"`{key}`" in text or (key[0] == "k" and "`k1` … `k6`" in text)
+
+
+@pytest.mark.parametrize(
+    ("heading", "formats"),
+    [
+        ("Calibrations", calibrations.FORMATS.names),
+        ("Poses", orientations.FORMATS.names),
+        ("Trajectories and times", {*trajectories.FORMATS.names, *frame_times.FORMATS.names}),
+    ],
+)
+def test_every_format_that_is_read_is_documented(heading: str, formats: Iterable[str]) -> None:
+    documented = {*first_column(section(heading, FOREIGN_FILES))}
+    assert documented - {"format", "times_format"} == {*formats}
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    """By one link, or by two."""
+    linked = {ROOT / target for target in links(README)}
+    again = {
+        page.parent / target
+        for page in linked
+        if page.suffix == ".md"
+        for target in links(page.read_text(encoding="utf-8"))
+    }
+    reached = {path.resolve() for path in linked | again}
+    assert {page for page in PAGES if page.parent.name == "docs"} <= reached
+
+
+def links(text: str) -> list[str]:
+    targets = re.findall(r"\]\(([^)\s#]+)", text)
+    return [target for target in targets if not target.startswith("https://")]
+
+
+QUESTIONS = (ROOT / "docs" / "questions.md").read_text(encoding="utf-8")
+
+
+def test_every_question_has_an_answer_that_leads_on() -> None:
+    headings = re.findall(r"^## (.*)$", QUESTIONS, re.MULTILINE)
+    assert len(headings) >= 15
+    for heading in headings:
+        assert heading.endswith("?"), heading
+        answer = section(heading, QUESTIONS)
+        assert 150 < len(answer) < 2500, heading
+        assert links(answer), f"{heading}: an answer names the page that has more"
+
+
+def test_the_contents_of_the_questions_are_its_headings() -> None:
+    contents = QUESTIONS.partition("\n## ")[0]
+    anchors = re.findall(r"^- \[([^\]]+)\]\(#", contents, re.MULTILINE)
+    assert anchors == re.findall(r"^## (.*)$", QUESTIONS, re.MULTILINE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

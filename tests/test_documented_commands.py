@@ -22,7 +22,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Runs of bare folders, which tests/benchmarks/test_first_flight.py repeats.
 FIRST_FLIGHTS = {"first_flight.md", "first_flight_runs.md"}
 FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg")
-OF_OTHERS = {"--force-gps", "--gcp", "--tilt", "--wander"}  # OpenDroneMap's, and of benchmarks/
+# OpenDroneMap's, and of benchmarks/
+OF_OTHERS = {"--force-gps", "--gcp", "--gps-accuracy", "--tilt", "--wander"}
 HERE = "sample_flight"
 BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
 # Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates.

@@ -45,7 +45,7 @@ class KgcpSet:
     position_enu_m : (n, 3) array
         Own coordinates, brought into the block's frame [m].
     cov_m2 : (3 n, 3 n) array
-        Their covariance with the correlations of docs/conventions.md.
+        Their covariance with the correlations of docs/tables.md.
     pixels : (n, 2) array
         Image points [px].
     pixel_cov_px2 : (n, 2, 2) array
@@ -222,7 +222,7 @@ def _assembled(points: Sequence[Gcp], slopes: FloatArray, correlation_s: float) 
 def joint_covariance(
     times_s: FloatArray, cov_m2: FloatArray, common_m: FloatArray, correlation_s: float
 ) -> FloatArray:
-    """Return the covariance (3 n, 3 n) of all points, as docs/conventions.md describes it.
+    """Return the covariance (3 n, 3 n) of all points, as docs/tables.md describes it.
 
     Between the points i and j it is C_i C_jᵀ + a L_i L_jᵀ, where C are the common effects,
     L Lᵀ = cov − C Cᵀ, and a = exp(−|Δt| / correlation_s).

@@ -63,7 +63,7 @@ _TRUTH_COLUMNS = (
 
 
 def flight_toml(plan: FlightPlan) -> str:
-    """Return flight.toml by docs/conventions.md."""
+    """Return flight.toml by docs/flight_toml.md."""
     lines = [
         f"name = {json.dumps(plan.settings.name)}",
         f"crs = {json.dumps(CRS)}  # x, y: easting, northing [m]; z: ellipsoidal height [m]",

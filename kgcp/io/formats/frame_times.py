@@ -42,7 +42,7 @@ class FrameTimes:
 
 
 def read_times(path: Path, frames: Sequence[str], times_format: str | None = None) -> FrameTimes:
-    """Read the times of frames, in one of the `FORMATS` of docs/conventions.md.
+    """Read the times of frames, in one of the `FORMATS` of docs/foreign_files.md.
 
     Parameters
     ----------

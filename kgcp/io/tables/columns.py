@@ -1,6 +1,6 @@
 """Columns of the tables that kgcp writes: name, type, and where in a record the value is.
 
-What each column means is said once, in docs/conventions.md.
+What each column means is said once, in docs/tables.md.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ def detection_rows(result: FrameResult) -> list[Row]:
 
 
 def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFrame:
-    """Read a table of detections, whose columns docs/conventions.md explains.
+    """Read a table of detections, whose columns docs/tables.md explains.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ def read_calibration(
     form: str | None = None,
     camera: str | None = None,
 ) -> Camera:
-    """Read a calibration file of one of the `FORMATS`; docs/conventions.md has their conversions.
+    """Read a calibration file of one of the `FORMATS`; docs/foreign_files.md has their conversions.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from kgcp.io.formats.registry import Registry
 
 FORMATS: Registry[Callable[[ForeignFile], SourcePoses]] = Registry(
     "a file of reference poses",
-    "convert it to the columns of docs/conventions.md",
+    "convert it to the columns of docs/foreign_files.md",
     {
         "opf": (opf.matches, opf.poses),
         "opensfm": (opensfm.matches, opensfm.poses),
@@ -40,7 +40,7 @@ def read_reference_poses(
     crs: str | None = None,
     frames: Sequence[str] = (),
 ) -> ReferencePoses:
-    """Read reference poses in one of the `FORMATS`; docs/conventions.md has their conversions.
+    """Read reference poses in one of the `FORMATS`; docs/foreign_files.md has their conversions.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Reference poses in the columns of docs/conventions.md."""
+"""Reference poses in the columns of docs/foreign_files.md."""
 
 from __future__ import annotations
 

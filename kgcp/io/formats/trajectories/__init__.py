@@ -39,7 +39,7 @@ _CONTRACT = TrajectoryFileOptions()
 def read_trajectory(
     path: Path, flight_crs: str, options: TrajectoryFileOptions = _CONTRACT
 ) -> Trajectory:
-    """Read the vehicle's trajectory, in one of the `FORMATS` of docs/conventions.md.
+    """Read the vehicle's trajectory, in one of the `FORMATS` of docs/foreign_files.md.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ def matches(file: ForeignFile) -> bool:
 
 
 def read(file: ForeignFile, options: TrajectoryFileOptions, flight_crs: str) -> Epochs:
-    """Read a trajectory from a CSV file by docs/conventions.md.
+    """Read a trajectory from a CSV file by docs/foreign_files.md.
 
     Columns time, x, y, z, roll_deg, pitch_deg, heading_deg and, optionally, sd_x … sd_heading_deg,
     in any order, or what `options.layout` calls them. The attitude may be absent where it is not

@@ -18,7 +18,7 @@ from kgcp.io.formats.trajectories.records import TrajectoryFileOptions
 def times_from_texts(
     path: Path, lines: Sequence[int], texts: Sequence[str], options: TrajectoryFileOptions
 ) -> FloatArray:
-    """Return the Unix times (n,) of texts by docs/conventions.md, "Trajectories and times".
+    """Return the Unix times (n,) of texts by docs/foreign_files.md, "Trajectories and times".
 
     Raises
     ------
