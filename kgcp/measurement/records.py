@@ -130,10 +130,13 @@ class Alternative:
         How much worse it fits; 0: cannot be told apart. By the image model: Δχ² of the image,
         deflated by the correlation of its residuals, and of the prior; by the paper's chain:
         misfit of the inner ellipse's centre [px].
+    pose_cov : (6, 6) array or None
+        As in `Uncertainty`, if it were the right pose; None where the image is sure that it is not.
     """
 
     pose: Pose
     ambiguity: float
+    pose_cov: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,9 +20,11 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.georef.neighbouring_normals import Place, preferences_of_neighbours
 from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
+from kgcp.measurement.other_pose import weighed_anew
+from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
@@ -109,7 +111,7 @@ class DetectionRun:
     frame_sizes : dict of int
         Bytes of the file of every frame; None: missing.
     learnt : LearntImaging or None
-        What `learn` has found.
+        What `learn` has found of the camera.
     """
 
     def __init__(
@@ -135,6 +137,7 @@ class DetectionRun:
         self.tracks = FrameTracks(job.targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
         self.learnt: LearntImaging | None = None
+        self._preferences: Mapping[Place, float] = {}
 
     def first_pass(self) -> None:
         """Look at all frames that the journal has not.
@@ -222,25 +225,39 @@ class DetectionRun:
             return any(result is True for _, result in results)
 
     def learn(self) -> None:
-        """Find out what all frames say of the camera, if asked to; `results` follow it then."""
+        """Find out what the frames say of each other; `results` follow it from now on.
+
+        All of them together say what the tone curve is near to, and those before and after a frame
+        which of two normals is the likelier one, as far as the settings ask for either.
+        """
         if self._job.settings.is_learning:
             self.learnt = learn_imaging(map(self._journal.read, self._keys))
+        if self._job.settings.is_guided:
+            self._preferences = preferences_of_neighbours(self.results())
 
     def results(self) -> Iterator[FrameResult]:
         """Yield the last result of every frame, in the frames' order."""
         return map(self._as_learnt, map(self._journal.read, self._keys))
 
     def _as_learnt(self, result: FrameResult) -> FrameResult:
-        if self.learnt is None or self.learnt.base is None:
-            return result
-        base = self.learnt.base
         outcomes = tuple(
-            with_common_uncertainty(self._job, by_base(outcome, base))
+            self._measured_as_learnt(result.frame, outcome)
             if isinstance(outcome, Measurement)
             else outcome
             for outcome in result.outcomes
         )
         return replace(result, outcomes=outcomes)
+
+    def _measured_as_learnt(self, frame: str, measurement: Measurement) -> Outcome:
+        learnt = measurement
+        if self.learnt is not None and self.learnt.base is not None:
+            learnt = by_base(learnt, self.learnt.base)
+        preference = self._preferences.get((frame, learnt.target, learnt.instance))
+        if preference is not None:
+            learnt = weighed_anew(self._job.camera, learnt, preference)
+        if learnt is measurement:
+            return measurement
+        return with_common_uncertainty(self._job, learnt)
 
     def map_results(
         self, function: Callable[[FrameResult], _Result]

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import expit, ndtri
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
@@ -217,6 +217,16 @@ def _over_arcs(
             for j in range(room):
                 products[a, k, j] += weighted * of_all[i, j]
     return sums, products, (pixels > 0).sum()
+
+
+def spread_over_both(pose: Pose, other: Pose, ambiguity: float) -> FloatArray:
+    """Return what the other pose adds to the covariance of the translation (3, 3) [m²].
+
+    It may be the right one, with the probability that goes with the ambiguity: the mean square of
+    the deviation from the reported one.
+    """
+    apart_m = other.translation_m - pose.translation_m
+    return np.asarray(expit(-0.5 * ambiguity) * np.outer(apart_m, apart_m))
 
 
 def propagate(camera: Camera, pose: Pose, pose_cov: FloatArray) -> Uncertainty:

@@ -11,7 +11,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import expit
 
 from kgcp.errors import Rejection
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
@@ -19,7 +18,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
-from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
+from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.two_poses import (
@@ -39,6 +38,7 @@ from kgcp.targets.layout import Target
 _MARGIN_PX = 12.0
 _SHARP_PX2, _LARGEST_START_BLUR = 0.5, 0.15  # of the radius
 _LARGEST_RADIUS_PX = 150.0  # enough for the last digit that calibrations can tell
+_DOUBTFUL_SIDE = 10.0  # Δχ² of the other pose below which more than this frame is asked
 _NOTHING_KNOWN = PlatePrior()
 _SHARPENING_PX = 1.2  # usual in cameras; 0.7 … 1.7 change little, see docs/method.md
 
@@ -195,7 +195,8 @@ def _measurement(
     covariance = pose_covariance(best)
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
-    pose_cov[:3, :3] += _spread_over_both(poses, ambiguity)
+    pose_cov[:3, :3] += spread_over_both(pose, other.parameters.pose, ambiguity)
+    of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
     return Measurement(
         target=target.name,
         ring=start.ring,
@@ -206,16 +207,6 @@ def _measurement(
         heading_deg=image_heading_deg(camera, pose),
         appearance=appearance_of(camera, target, best),
         imaging=imaging_of(best),
-        alternative=Alternative(other.parameters.pose, ambiguity),
+        alternative=Alternative(other.parameters.pose, ambiguity, of_other),
         uncertainty=propagate(camera, pose, pose_cov),
     )
-
-
-def _spread_over_both(poses: TwoPoses, ambiguity: float) -> FloatArray:
-    """Return what the other pose adds to the covariance of the translation (3, 3) [m²].
-
-    It may be the right one, with the probability that goes with the ambiguity: the mean square of
-    the deviation from the reported one.
-    """
-    best, other = (fit.parameters.pose.translation_m for fit in (poses.best, poses.other))
-    return np.asarray(expit(-0.5 * ambiguity) * np.outer(other - best, other - best))

@@ -62,7 +62,7 @@ observations = st.builds(
     centre_px=arrays(2),
     heading_deg=numbers,
     appearance=st.builds(Appearance, numbers, numbers, numbers, numbers, maybe, maybe),
-    alternative=st.none() | st.builds(Alternative, poses, numbers),
+    alternative=st.none() | st.builds(Alternative, poses, numbers, st.none() | arrays(6, 6)),
     uncertainty=st.none()
     | st.builds(Uncertainty, arrays(6, 6), arrays(2, 2), numbers, numbers, numbers, numbers),
     common=st.none() | st.builds(CommonUncertainty, arrays(6, 6), numbers, numbers),

@@ -1,0 +1,38 @@
+"""A measurement with its two poses weighed anew, once more is known than the frame itself shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import image_heading_deg
+from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
+from kgcp.measurement.records import Alternative, Measurement
+
+
+def weighed_anew(camera: Camera, measurement: Measurement, preference: float) -> Measurement:
+    """Add to the χ² of the other pose, and let the poses change places if it is the better one.
+
+    Parameters
+    ----------
+    preference : float
+        χ² by which the other pose is the worse one, besides its ambiguity.
+    """
+    other = measurement.alternative
+    if other is None:
+        return measurement
+    ambiguity = other.ambiguity + preference
+    if ambiguity >= 0.0 or other.pose_cov is None or measurement.uncertainty is None:
+        return replace(measurement, alternative=replace(other, ambiguity=max(ambiguity, 0.0)))
+    pose_cov = other.pose_cov.copy()
+    pose_cov[:3, :3] += spread_over_both(other.pose, measurement.pose, -ambiguity)
+    before = measurement.uncertainty.pose_cov.copy()
+    before[:3, :3] -= spread_over_both(measurement.pose, other.pose, other.ambiguity)
+    return replace(
+        measurement,
+        pose=other.pose,
+        centre_px=camera.project(other.pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, other.pose),
+        alternative=Alternative(measurement.pose, -ambiguity, before),
+        uncertainty=propagate(camera, other.pose, pose_cov),
+    )

@@ -1,0 +1,83 @@
+"""Which normal the frames before and after make likely, and a measurement weighed anew by that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.georef.neighbouring_normals import preferences_of_neighbours
+from kgcp.measurement.other_pose import weighed_anew
+from kgcp.measurement.records import (
+    Alternative,
+    Appearance,
+    ExposureSettings,
+    FrameResult,
+    Measurement,
+    Uncertainty,
+)
+
+CAMERA = Camera(1200, 900, 1900.0, 1905.0, 590.0, 455.0)
+COV = np.diag([1e-6, 1e-6, 4e-4, 3e-4, 3e-4, 1e-5])
+OTHER_COV = np.diag([1e-6, 1e-6, 4e-4, 5e-4, 2e-4, 1e-5])
+
+
+def plate(number: int, *, is_sure: bool, is_turned: bool = False) -> FrameResult:
+    """A plate that is always tilted by about 20° to the same side; turned: by the other pose."""
+    rng = np.random.default_rng(number)
+    tilt = np.radians([20.0, 3.0, 0.0] + rng.normal(0.0, 1.5, 3) * [1.0, 1.0, 0.0])
+    true = Pose(Rotation.from_rotvec(tilt).as_matrix(), np.array([3.0, -2.0, 40.0]))
+    pose, other = (true.mirrored(), true) if is_turned else (true, true.mirrored())
+    measurement = Measurement(
+        *("A", "A", 0, 0.9, pose, CAMERA.project(pose.translation_m[None])[0], 0.0),
+        *(
+            Appearance(20.0, 0.05, 0.8, 0.0),
+            Alternative(other, 60.0 if is_sure else 1.2, OTHER_COV),
+        ),
+        Uncertainty(COV, np.diag([1e-4, 1e-4]), 0.02, 1.0, 1.0, 0.2),
+    )
+    return FrameResult(f"f{number:02d}.jpg", 100.0 + number, ExposureSettings(), (measurement,))
+
+
+def test_neighbours_turn_a_doubtful_normal_to_theirs_and_confirm_one_that_is() -> None:
+    results = [plate(k, is_sure=k not in {4, 7}, is_turned=k == 7) for k in range(12)]
+    preferences = preferences_of_neighbours(results)
+    assert preferences.keys() == {("f04.jpg", "A", 0), ("f07.jpg", "A", 0)}
+    assert 15.0 < preferences["f04.jpg", "A", 0] <= 25.0
+    assert -25.0 <= preferences["f07.jpg", "A", 0] < -15.0
+    assert preferences_of_neighbours(results[::-1]) == preferences
+
+
+@pytest.mark.parametrize("sure", [range(0), range(5), (0, 1, 2, 3, 30, 31, 32)])
+def test_few_or_far_neighbours_say_nothing(sure: range | tuple[int, ...]) -> None:
+    doubtful = FrameResult("x", 116.0, ExposureSettings(), plate(9, is_sure=False).outcomes)
+    assert preferences_of_neighbours([*(plate(k, is_sure=True) for k in sure), doubtful]) == {}
+
+
+def test_the_poses_change_places_with_all_that_follows_from_them() -> None:
+    (before,) = plate(3, is_sure=False).outcomes
+    assert isinstance(before, Measurement)
+    assert before.alternative is not None
+    kept = weighed_anew(CAMERA, before, 4.0)
+    assert kept.pose is before.pose
+    assert kept.alternative is not None
+    assert kept.alternative.ambiguity == pytest.approx(5.2)
+    turned = weighed_anew(CAMERA, before, -8.0)
+    assert turned.pose is before.alternative.pose
+    assert turned.alternative is not None
+    assert turned.alternative.pose is before.pose
+    assert turned.alternative.ambiguity == pytest.approx(6.8)
+    np.testing.assert_array_equal(
+        turned.centre_px, CAMERA.project(turned.pose.translation_m[None])[0]
+    )
+    assert turned.uncertainty is not None
+    np.testing.assert_allclose(turned.uncertainty.pose_cov[3:, 3:], OTHER_COV[3:, 3:])
+    unknown = replace(before, alternative=replace(before.alternative, pose_cov=None))
+    held = weighed_anew(CAMERA, unknown, -8.0)
+    assert held.pose is before.pose
+    assert held.alternative is not None
+    assert held.alternative.ambiguity == 0.0
