@@ -32,7 +32,7 @@ _FRAMES_CSV = "frames.csv"
 _NO_OPTIONS = InitOptions()
 _HEAD = (
     '# Written by kgcp init from what lies in this folder. Lines with "# key = value" are not',
-    f"# set; those marked {MISSING} are needed. docs/conventions.md explains every key.",
+    f"# set; those marked {MISSING} are needed. docs/flight_toml.md explains every key.",
 )
 _UNKNOWN_POSITION = DraftKey(
     "position_m", None, "if it stands still", "[689412.0, 5336208.0, 545.0]", is_missing=True

@@ -32,11 +32,11 @@ DECIMALS = (".", ",")
 
 @dataclass(frozen=True, slots=True)
 class CsvLayout:
-    """How a file writes its table; by default as docs/conventions.md says."""
+    """How a file writes its table; by default as docs/foreign_files.md says."""
 
     separator: str = ","
     decimal: str = "."
-    # name in docs/conventions.md → name in the file's first line; the others have the same in both
+    # name in docs/foreign_files.md → name in the file's first line; the others have the same in both
     columns: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -120,7 +120,7 @@ def read_csv_columns(
     toml_key : str
         Where flight.toml names the file, for the message if it is missing.
     layout : CsvLayout
-        Of the file; columns have their names of docs/conventions.md in all other arguments and in
+        Of the file; columns have their names of docs/foreign_files.md in all other arguments and in
         the result.
 
     Raises
@@ -193,7 +193,7 @@ def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> N
 
 
 def _own_names(header: Sequence[str], layout: CsvLayout, where: str) -> list[str]:
-    """Return the names of docs/conventions.md for those of the file that the layout translates."""
+    """Return the names of docs/foreign_files.md for those of the file that the layout translates."""
     own = {theirs: ours for ours, theirs in layout.columns.items()}
     for theirs, ours in own.items():
         if theirs not in header:

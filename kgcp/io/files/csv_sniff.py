@@ -34,7 +34,7 @@ class SniffedTable:
     """The table of a file, as far as its first lines tell."""
 
     layout: CsvLayout  # which translates every known column whose name differs
-    cells: Mapping[str, str]  # of the first row, by the names of docs/conventions.md
+    cells: Mapping[str, str]  # of the first row, by the names of docs/foreign_files.md
     header: tuple[str, ...]  # names in the file
 
     def name_of(self, column: str) -> str:
@@ -59,7 +59,7 @@ def sniff_table(file: ForeignFile, known: Mapping[str, Sequence[str]]) -> Sniffe
     Parameters
     ----------
     known : mapping
-        Name in docs/conventions.md → what others call it, in lower case without blanks, marks and
+        Name in docs/foreign_files.md → what others call it, in lower case without blanks, marks and
         units. The name itself need not be among them.
     """
     rows = _first_rows(file)

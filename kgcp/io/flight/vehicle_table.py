@@ -90,7 +90,7 @@ def _read_course(table: TomlTable) -> tuple[float, float, float] | None:
 
 
 def _read_layout(table: TomlTable) -> CsvLayout:
-    """Return how a CSV file is written; by default as docs/conventions.md says."""
+    """Return how a CSV file is written; by default as docs/foreign_files.md says."""
     separator = table.optional("separator", lambda key: table.mark(key, SEPARATORS)) or ","
     decimal = table.optional("decimal", lambda key: table.mark(key, DECIMALS)) or "."
     if separator == decimal:

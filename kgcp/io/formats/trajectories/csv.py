@@ -13,7 +13,7 @@ _SD_POSITION = tuple(f"sd_{name}" for name in _POSITION)
 _SD_ATTITUDE = tuple(f"sd_{name}" for name in _ATTITUDE)
 
 COLUMNS = ("time", *_POSITION, *_ATTITUDE, *_SD_POSITION, *_SD_ATTITUDE)
-"""Names of all columns in docs/conventions.md."""
+"""Names of all columns in docs/foreign_files.md."""
 
 
 def matches(file: ForeignFile) -> bool:

@@ -20,7 +20,7 @@ _GEODETIC, _ECEF = ("longitude", "latitude"), ("x-ecef", "y-ecef", "z-ecef")
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFile:
-    """A file with a trajectory, in one of the formats of docs/conventions.md."""
+    """A file with a trajectory, in one of the formats of docs/foreign_files.md."""
 
     path: Path
     format: str

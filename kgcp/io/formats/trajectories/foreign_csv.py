@@ -1,4 +1,4 @@
-"""CSV trajectories of other programs: which of their columns are those of docs/conventions.md."""
+"""CSV trajectories of other programs: which of their columns are those of docs/foreign_files.md."""
 
 from __future__ import annotations
 
