@@ -132,6 +132,7 @@ def _render(flight_name: str, cards: Sequence[Card]) -> str:
     )
     statuses = Counter(card.status for card in cards)
     reasons = Counter(card.reason for card in cards if card.reason)
+    missed = Counter(card.reason for card in cards if card.reason and card.status != DROPPED)
     kinds = [*(status.value for status in Status), DROPPED]
     return environment.get_template("contact_sheet.html").render(
         name=flight_name,
@@ -141,6 +142,7 @@ def _render(flight_name: str, cards: Sequence[Card]) -> str:
         frames=len({card.frame for card in cards}),
         statuses=[(kind, statuses[kind]) for kind in kinds if statuses[kind]],
         reasons=sorted(reasons.items(), key=lambda pair: (-pair[1], pair[0])),
+        missed=missed.most_common(),
         has_points=any(card.is_point for card in cards),
         targets=sorted({card.target for card in cards}),
         thumbnail_px=THUMBNAIL_PX,

@@ -111,7 +111,9 @@ def test_every_frame_has_its_card_and_every_ring_its_picture(flight: Path, tmp_p
     assert "a #1 &amp; &#39;x&#39;.png" in seen
     assert re.search(r"<b>9\.0\d\d m ± 0\.\d mm</b> centre \(19\d\.\d\d, 9\d\.\d\d\)", seen)
     assert re.search(r'data-e="\d\.\d\d"', seen), "residuals to sort by"
-    assert re.search(r'class="rejected" data-target="A" data-reason="\w+" data-r=', other)
+    assert re.search(
+        r'class="rejected" data-frame="[^"]+" data-target="A" data-reason="\w+" data-r=', other
+    )
     assert "ring at (19" in other
     assert "no_candidate" in empty
     assert "decode_failed" in broken

@@ -77,6 +77,15 @@ def test_every_row_has_its_card_and_pictures_wait_until_they_are_seen(tmp_path: 
     assert "http" not in page, "nothing is fetched"
 
 
+def test_reasons_are_counted_and_in_words(tmp_path: Path) -> None:
+    page = write(tmp_path).page.read_text(encoding="utf-8")
+    header = re.sub(r"\s+", " ", page.partition("</header>")[0])
+    assert "Not measured: 1 too small, 1 decode failed. </p>" in header
+    assert "<b>too small</b>" in page
+    assert '<option value="too_small">too small (1)</option>' in page
+    assert 'data-reason="too_small"' in page, "the table's word, for those who look it up"
+
+
 def test_the_page_comes_last_and_goes_first(tmp_path: Path) -> None:
     write(tmp_path)
     sheet = ContactSheet(tmp_path)

@@ -36,7 +36,7 @@ class CsvLayout:
 
     separator: str = ","
     decimal: str = "."
-    # name in docs/foreign_files.md → name in the file's first line; the others have the same in both
+    # name in docs/foreign_files.md → name in the file's first line; the others are alike in both
     columns: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -193,7 +193,7 @@ def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> N
 
 
 def _own_names(header: Sequence[str], layout: CsvLayout, where: str) -> list[str]:
-    """Return the names of docs/foreign_files.md for those of the file that the layout translates."""
+    """Return names of docs/foreign_files.md for those of the file that the layout translates."""
     own = {theirs: ours for ours, theirs in layout.columns.items()}
     for theirs, ours in own.items():
         if theirs not in header:
