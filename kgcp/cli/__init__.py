@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": "kgcp.cli.simulate",
 }
 
+_WHOLE = 200  # letters: more than a first sentence has
 _EXIT_KNOWN_ERROR = 1  # 2 is click's own, for wrong usage
 _EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells count
 
@@ -67,6 +68,18 @@ class Program(click.Group):
             return None
         command: click.Command = import_module(COMMANDS[cmd_name]).command
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands with the whole first sentence of each, however narrow the terminal."""
+        commands = ((name, self.get_command(ctx, name)) for name in self.list_commands(ctx))
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [
+                    (name, command.get_short_help_str(_WHOLE))
+                    for name, command in commands
+                    if command is not None
+                ]
+            )
 
     def _is_option(self, ctx: click.Context, error: KgcpError) -> bool:
         """Whether an error begins with the name of an option of the command that was called."""

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
 import warnings
+from pathlib import Path
 
 import click
 import pytest
@@ -93,11 +95,23 @@ def test_every_command_is_listed() -> None:
         assert f"\n  {name} " in text
 
 
-def test_the_list_of_commands_has_whole_sentences() -> None:
-    text = CliRunner().invoke(main, ["--help"]).stdout
-    lines = text.partition("Commands:\n")[2].splitlines()
-    assert len(lines) == len(COMMANDS)
-    assert all(line.endswith(".") and not line.endswith("...") for line in lines)
+@pytest.mark.parametrize("width", [50, 80, 200])
+def test_the_list_of_commands_has_whole_sentences(width: int) -> None:
+    result = CliRunner().invoke(main, ["--help"], terminal_width=width)
+    listed = " ".join(result.stdout.partition("\nCommands:")[2].split())
+    assert "..." not in listed
+    for name in COMMANDS:
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        sentence = re.split(r"(?<=\.)\s", " ".join((command.help or "").split()))[0]
+        assert f"{name} {sentence}" in listed
+
+
+def test_an_error_of_an_option_begins_with_its_dashes(tmp_path: Path) -> None:
+    arguments = ["target", "--new", "1", "--diameter", "0.9", "--sheet", "A4"]
+    result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path)])
+    assert result.stderr.startswith("kgcp: error: --sheet: 'T1' needs 1145 × ")
+    assert result.exit_code == 1
 
 
 def test_the_module_runs_and_knows_its_version() -> None:
