@@ -200,7 +200,27 @@ def test_the_script_adds_the_points_to_a_block(
     text = capsys.readouterr().out
     assert "3 control points in" in text
     assert "4 photos are not in the block" in text
-    assert "IMG_2.JPG, IMG_4.JPG, IMG_5.JPG, IMG_6.JPG" in text
+    assert "a/IMG_2.JPG, a/IMG_4.JPG, a/IMG_5.JPG, a/IMG_6.JPG" in text
+
+
+def test_names_that_repeat_are_told_apart_by_their_folders(
+    points: MapPoints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third = points.gcps[:3]
+    gcps = tuple(
+        replace(point, frame=frame)
+        for point, frame in (
+            (first, "north/IMG_1.JPG"),
+            (second, "south/IMG_1.JPG"),
+            (third, "north/IMG_3.JPG"),
+        )
+    )
+    block = (BLOCK % "").replace(r"flight\IMG_1.JPG", r"south\IMG_1.JPG")
+    result = add_to_block(replace(points, gcps=gcps, priors=()), tmp_path, block, monkeypatch)
+    controls = read_block(result)
+    assert [*controls] == ["K0002", "K0003"], "the north's IMG_1 is not in the block"
+    assert [*controls["K0002"].marks] == [r"D:\south\IMG_1.JPG"]
+    assert [*controls["K0003"].marks] == [r"D:\flight\IMG_3.JPG"]
 
 
 def test_the_script_refuses_other_files(
