@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import TextIO
+from typing import Any, TextIO
 
 import click
 
@@ -55,8 +57,23 @@ def _one_line_warnings() -> Iterator[None]:
         yield
 
 
+def _print_anything() -> None:
+    """Let streams replace characters that they cannot print, as the arrows on Windows' code pages.
+
+    Output that is redirected there has such an encoding, and would end the command.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
 class Program(click.Group):
     """The `kgcp` command: imports a command when it is called, prints known errors as one line."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 - click's signature
+        """Run the program; its help, too, has characters that not every stream prints."""
+        _print_anything()
+        return super().main(*args, **kwargs)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Return the commands in the order of use."""

@@ -24,6 +24,7 @@ def test_patterns_choose_by_the_whole_path() -> None:
     assert matching_frames(frames, ()) == frames
     assert matching_frames(frames, ("*1.jpg",)) == ["a/1.jpg"]
     assert matching_frames(frames, ("b/*", "a/[!1]*")) == ["a/2.jpg", "b/1.JPG"]
+    assert matching_frames(frames, ("a\\*",)) == ["a/1.jpg", "a/2.jpg"]
     with pytest.raises(KgcpError, match=r"'2.jpg' matches none of 3 frames \(a/1.jpg, a/2.jpg, "):
         matching_frames(frames, ("a/*", "2.jpg"))
 

@@ -47,7 +47,8 @@ def windows(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(AS_ON_WINDOWS, encoding="utf-8")
     paths = os.pathsep.join((str(tmp_path / "site"), str(ROOT)))
-    return {**os.environ, "PYTHONPATH": paths}
+    # the code page of a redirected output
+    return {**os.environ, "PYTHONPATH": paths, "PYTHONIOENCODING": "cp1252"}
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def kgcp(environment: dict[str, str], *arguments: str) -> subprocess.CompletedPr
         (sys.executable, "-m", "kgcp", *arguments),
         env=environment,
         capture_output=True,
-        text=True,
+        encoding="cp1252",
         check=False,
     )
 
@@ -84,6 +85,20 @@ def test_tables_are_the_same(windows: dict[str, str], flight: Path, tmp_path: Pa
     run = kgcp(windows, "export-gcp", str(flight), "--format", "csv")
     assert run.returncode == 0, run.stderr
     assert (out / "kgcps.parquet").exists()
+
+
+def test_characters_that_a_code_page_lacks_end_no_command(
+    windows: dict[str, str], flight: Path
+) -> None:
+    toml = flight / "flight.toml"
+    toml.write_text(toml.read_text("utf-8").replace("-1.95", "1.95"), "utf-8")
+    for arguments in (("check", str(flight)), ("export-gcp", "--help")):
+        run = kgcp(windows, *arguments)
+        assert run.returncode == 0, run.stderr
+        assert "?" in run.stdout  # an arrow, a delta
+    assert "lever arm puts the target 1.95 m below" in " ".join(
+        kgcp(windows, "check", str(flight)).stdout.split()
+    )
 
 
 def test_two_at_once_are_told(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:

@@ -118,7 +118,8 @@ def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]
     frames : sequence of str
         Paths below the frames folder.
     patterns : sequence of str
-        Of such paths, as of `fnmatch`: `*` also stands for `/`, and letter case counts.
+        Of such paths, as of `fnmatch`: `*` also stands for `/`, and letter case counts. Folders may
+        be separated by backslashes.
 
     Raises
     ------
@@ -127,18 +128,24 @@ def matching_frames(frames: Sequence[str], patterns: Sequence[str]) -> list[str]
     """
     if not patterns:
         return list(frames)
-    kept: set[str] = set()
     for pattern in patterns:
-        matches = [frame for frame in frames if fnmatch.fnmatchcase(frame, pattern)]
-        if not matches:
+        if not any(is_chosen(frame, (pattern,)) for frame in frames):
             some = ", ".join(frames[:_SHOWN_FRAMES])
             raise KgcpError(
                 f"{pattern!r} matches none of {len(frames)} frames ({some}, …); give a pattern of"
                 " their paths below the frames folder, such as '*_00??.JPG'",
                 option="frames",
             )
-        kept.update(matches)
-    return [frame for frame in frames if frame in kept]
+    return [frame for frame in frames if is_chosen(frame, patterns)]
+
+
+def is_chosen(frame: str, patterns: Sequence[str]) -> bool:
+    """Return whether a frame matches one of the patterns of `matching_frames`."""
+    return any(
+        fnmatch.fnmatchcase(frame, notation)
+        for pattern in patterns
+        for notation in (pattern, pattern.replace("\\", "/"))
+    )
 
 
 def _kind_of(suffix: str) -> tuple[str, str]:

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.portable import file_of
@@ -188,7 +189,9 @@ def parsed_url(text: str) -> Path | StoredFolder:
         return Path(text)
     parts = urlsplit(text)
     if parts.scheme == "file":
-        return Path(parts.path)
+        return Path(url2pathname(parts.path))
+    if len(parts.scheme) == 1:  # the letter of a drive
+        return Path(text)
     if parts.scheme not in _KNOWN or not parts.netloc:
         raise KgcpError(
             f"{text}: unsupported location; use a folder, s3://bucket/folder or gs://bucket/folder"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,11 +14,21 @@ from kgcp.io.print.dxf import dxf_of
 from kgcp.targets.shapes import Sheet
 
 FORMATS = ("pdf", "svg", "dxf", "png")
+_LONGEST_STEM = 100  # bytes: names have at most 255, whole paths on Windows mostly 260
 
 
 def file_stem(name: str) -> str:
-    """Return a file name for a target, without what file systems do not like."""
-    return "target_" + re.sub(r"[^\w.-]+", "_", name)
+    """Return a file name for a target that every file system takes.
+
+    It begins with a word, so that it is none of the names that Windows keeps for devices (CON,
+    NUL, …). Of long names it has the beginning and a digest, for the letters that are left out.
+    """
+    stem = "target_" + re.sub(r"[^\w.-]+", "_", name)
+    encoded = stem.encode()
+    if len(encoded) <= _LONGEST_STEM:
+        return stem
+    digest = hashlib.sha256(encoded).hexdigest()[:8]
+    return f"{encoded[:_LONGEST_STEM].decode(errors='ignore')}_{digest}"
 
 
 def check_stems(names: Sequence[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.images.frames import list_frames
+from kgcp.io.images.frames import is_chosen, list_frames
 from kgcp.io.images.remote import sizes_of
 from kgcp.io.tables.provenance import (
     TARGET_TABLE,
@@ -88,9 +87,7 @@ def _chosen(today: list[str] | None, metadata: Mapping[bytes, bytes]) -> list[st
     patterns = _json(metadata, b"kgcp.choice").get("frames")
     if today is None or not isinstance(patterns, list) or not patterns:
         return today
-    return [
-        frame for frame in today if any(fnmatchcase(frame, str(pattern)) for pattern in patterns)
-    ]
+    return [frame for frame in today if is_chosen(frame, [*map(str, patterns)])]
 
 
 def _json(metadata: Mapping[bytes, bytes], key: bytes) -> dict[str, object]:
