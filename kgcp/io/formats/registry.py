@@ -25,6 +25,8 @@ class Registry(Generic[Read]):
     # name in flight.toml → whether a file is of this format, and its reader. They are tried in this
     # order: the most specific first.
     formats: Mapping[str, tuple[Callable[[ForeignFile], bool], Read]]
+    # what to do with a table whose cells are not separated by commas
+    separator_remedy: str = SEPARATOR_REMEDY
 
     @property
     def names(self) -> Iterable[str]:
@@ -60,7 +62,7 @@ class Registry(Generic[Read]):
         if "csv" in self.formats and separator is not None:
             raise file.error(
                 f"is not {self.kind} of a known format: its cells are separated by {separator}",
-                SEPARATOR_REMEDY,
+                self.separator_remedy,
             )
         known = ", ".join(sorted(self.formats))
         raise file.error(f"is not {self.kind} of a known format ({known})", self.remedy)

@@ -17,6 +17,7 @@ from kgcp.errors import KgcpError
 from kgcp.georef.crs import convert_positions
 from kgcp.georef.local_frame import map_axes_ecef, turn_covariances
 from kgcp.georef.trajectory import Trajectory, attitude_from_course
+from kgcp.io.files.csv_columns import SEPARATOR_REMEDY
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.registry import Registry
 from kgcp.io.formats.rtklib_pos import looks_like_solution
@@ -32,6 +33,8 @@ FORMATS: Registry[Callable[[ForeignFile, TrajectoryFileOptions, str], Epochs]] =
         "csv": (csv.matches, csv.read),
         "tum": (tum.matches, tum.read),
     },
+    "declare separator, decimal and columns under [vehicle], as 'kgcp init' does, or"
+    f" {SEPARATOR_REMEDY}",
 )
 _CONTRACT = TrajectoryFileOptions()
 
