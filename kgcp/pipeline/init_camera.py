@@ -20,6 +20,7 @@ _DIGITS = 9
 # Of a focal length by EXIF: equivalents are whole millimetres, lenses a few per cent off their
 # name. Of an unknown lens' centre and distortion: what consumer cameras have.
 _SD_FOCAL, _SD_CENTRE, _SD_K1 = 0.03, 0.01, 0.1
+_SD_FACTORY = 0.001  # of a focal length; docs/calibrations.md
 _REMEDY = (
     "put a calibration file into the folder before kgcp init, or write its values, or file = …,"
     " into [camera]"
@@ -83,8 +84,22 @@ def _by_dewarp_data(
         return None
     found = f"{_shown(camera)}, from the DewarpData of {header.frame}"
     note = f"DJI's calibration of this camera: the DewarpData of {header.frame}."
-    keys = (*_size_keys(size), *_parameter_keys(camera), _RESPONSE, _SHUTTER)
-    return _section(keys, note, (Finding("camera", _named(header, found)),))
+    sd_px = round(_SD_FACTORY * camera.mean_focal_px, 1)
+    keys = (
+        *_size_keys(size),
+        *_parameter_keys(camera),
+        DraftKey("sd_fx", sd_px, "ASSUMED: 1 in 1000, as of factory calibrations"),
+        DraftKey("sd_fy", sd_px),
+        _RESPONSE,
+        _SHUTTER,
+    )
+    gap = Gap(
+        "camera",
+        "the factory's calibration is good to 1 in 1000 of the focal length",
+        "correct sd_fx and sd_fy in [camera], or use a calibration of this flight",
+        is_assumed=True,
+    )
+    return _section(keys, note, (Finding("camera", _named(header, found)),), (gap,))
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
