@@ -193,7 +193,7 @@ def _check_header(header: Sequence[str], wanted: Sequence[str], where: str) -> N
 
 
 def _own_names(header: Sequence[str], layout: CsvLayout, where: str) -> list[str]:
-    """Return names of docs/foreign_files.md for those of the file that the layout translates."""
+    """Return the first line with the names of docs/foreign_files.md, as the layout translates."""
     own = {theirs: ours for ours, theirs in layout.columns.items()}
     for theirs, ours in own.items():
         if theirs not in header:

@@ -1,0 +1,58 @@
+"""Whether `kgcp target --new N` works for every N that it offers, and how far apart the codes are.
+
+    python -m benchmarks.target_codes
+
+proposes 1 to 50 codes of 4, 5 and 6 dots, checks them as flight.toml is checked, and prints the
+least distance in dots and the time; some ten minutes. Fails if a number has no codes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from kgcp.errors import SettingError
+from kgcp.targets.code_design import LEAST_DISTANCE, check_new_codes, least_apart, new_targets
+
+MOST = 50
+DOTS = (4, 5, 6)
+
+
+def distance_of(count: int, dots: int) -> float:
+    """Return how far apart so many proposed codes are [dots].
+
+    Raises
+    ------
+    SettingError
+        If there are not so many.
+    """
+    targets = new_targets((), 0.9, (), count, dots)
+    check_new_codes(targets, ())
+    assert len(targets) == count
+    return least_apart([target.ring for target in targets])
+
+
+def main() -> None:
+    """Print a line for every number of codes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--counts", type=int, nargs="*", default=[*range(1, MOST + 1)])
+    counts = parser.parse_args().counts
+    failed = 0
+    for dots in DOTS:
+        for count in counts:
+            start = time.perf_counter()
+            try:
+                distance = distance_of(count, dots)
+            except SettingError as error:
+                print(f"{dots} dots, {count:2d} codes: {error}")
+                failed += 1
+                continue
+            seconds = time.perf_counter() - start
+            print(f"{dots} dots, {count:2d} codes: {distance:.2f} dots apart, {seconds:.1f} s")
+            assert distance >= LEAST_DISTANCE
+    if failed:
+        raise SystemExit(f"{failed} numbers have no codes")
+
+
+if __name__ == "__main__":
+    main()
