@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -31,12 +31,13 @@ from kgcp.measurement.discs.records import (
     moments_of_ellipse,
 )
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.noise import find_censoring, median_at_edges
+from kgcp.measurement.image_model.noise import Censoring, find_censoring, median_at_edges
 from kgcp.measurement.image_model.photometry import Tone, light_of_levels, plateau_levels
 
 _ROUNDS = 3
 _SETTLED_PX, _SETTLED_BLUR = 0.05, 0.1  # a round that moves less is the last
 _FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
+_MUCH_CLIPPED = 0.05  # share of the window's pixels
 _LEAST_CONTRAST_COUNTS = 4.0
 _MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the fit may be from the outline: pixels, of the radius
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.15, 0.3  # as of coded targets: of the contrast; share
@@ -98,13 +99,16 @@ def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = 
         window = cut_disc_window(task.grey, geometry, window_reach_px(blur))
         _check_inside(task.grey, geometry)
         state = state or _start(window, geometry, blur, free.tone, is_dark=task.is_dark)
+        limits = find_censoring(window.levels, window.levels_per_count)
+        if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
+            free = replace(free, has_ink_slope=False)
         index, is_enough = choose_pixels(window, geometry, blur, task.others)
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
-        fit = _adjust_on(task, window, index, state, free)
+        fit = _adjust_on(task, window, limits, index, state, free)
         foreign = _foreign(fit, window, index)
         if foreign is not None:
-            fit = _adjust_on(task, window, index[~foreign[index]], fit.state, free)
+            fit = _adjust_on(task, window, limits, index[~foreign[index]], fit.state, free)
         state = fit.state
         moved_px = float(np.abs(state.geometry - geometry).max())
         widened = abs(state.blur.largest_sd_px / blur.largest_sd_px - 1.0)
@@ -115,9 +119,13 @@ def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = 
 
 
 def _adjust_on(
-    task: DiscTask, window: DiscWindow, index: IndexArray, state: DiscState, free: FreeParameters
+    task: DiscTask,
+    window: DiscWindow,
+    limits: Censoring,
+    index: IndexArray,
+    state: DiscState,
+    free: FreeParameters,
 ) -> DiscFit:
-    limits = find_censoring(window.levels, window.levels_per_count)
     sample = DiscSample.of(
         window, index, state, limits, free, is_dark=task.is_dark, radius_px=task.radius_px
     )

@@ -21,12 +21,11 @@ from kgcp.measurement.image_model.photometry import Tone
 
 _MOST_DISCS = 12
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are any
-_LARGE_RADIUS_PX = 20.0  # from there on, the two levels fall off differently enough to tell
+# From there on, the two levels fall off differently enough to tell, but for an unknown curve.
+_LARGE_RADIUS_PX = 20.0
 _MOST_CLIPPED = 0.05  # share of pixels
-# Of each parameter, whatever many discs say: levels differ a little from disc to disc, and with
-# them the part of the curve that is between.
-_LEAST_SD = 0.03
-_SCATTER = 2.0  # variances of single discs are too small by about this: the model is not perfect
+_LEAST_SD = 0.03  # of each parameter, however many discs agree
+_MEDIAN_SQUARE, _OF_MEDIAN = 0.455, 1.57  # median of χ²₁; variance of a median over that of a mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +66,7 @@ def parameters_of(task: DiscTask, camera: CameraTone) -> FreeParameters:
     return FreeParameters(
         camera.tone,
         sharpens=camera.sharpens,
-        has_ink_slope=task.radius_px >= _LARGE_RADIUS_PX,
+        has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
         camera=camera.camera,
     )
 
@@ -86,44 +85,40 @@ def _fits(tasks: Sequence[DiscTask], first: Tone, then: Tone) -> dict[int, DiscF
     """Adjust discs by a known curve, and from there with all free; those that lead anywhere."""
     fits = {}
     for number, task in enumerate(tasks):
-        has_ink_slope = task.radius_px >= _LARGE_RADIUS_PX
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
-            fit = adjust_disc(
-                task, FreeParameters(first, sharpens=True, has_ink_slope=has_ink_slope)
-            )
+            fit = adjust_disc(task, FreeParameters(first, sharpens=True))
             if then is not first:
-                shaped = FreeParameters(then, sharpens=True, has_ink_slope=has_ink_slope)
-                fit = adjust_disc(task, shaped, fit.state)
+                fit = adjust_disc(task, FreeParameters(then, sharpens=True), fit.state)
             check_fit(fit, task.outline)
             fits[number] = fit
     return fits
 
 
 def _pooled(tone: Tone, fits: dict[int, DiscFit]) -> CameraTone:
-    """Return the weighted mean of what some fits say of the camera, without their priors."""
+    """Return what the discs together say of the camera: medians, and how far each may be off.
+
+    Levels differ from disc to disc, and with them the part of the curve that is between. So the
+    scatter beyond the noise counts as well as the uncertainty of the median.
+    """
     rows = [row for row in CAMERA_ROWS if tone.is_shaped or row == CAMERA_ROWS[-1]]
     clean = [fit for fit in fits.values() if fit.sample.censoring.share <= _MOST_CLIPPED]
-    said = [_said(fit, rows) for fit in clean or fits.values()]
-    if not said:
+    learned = clean or list(fits.values())
+    if not learned:
         return CameraTone(tone, sharpens=True)
-    own = said[0][2]
-    information = np.sum([each[0] for each in said], axis=0) / _SCATTER
-    pull = np.sum([each[1] for each in said], axis=0) / _SCATTER
-    inverse = np.linalg.inv(information + np.diag(own))
-    means, sds = inverse @ pull, np.sqrt(np.diag(inverse) + _LEAST_SD**2)
-    known = dict(zip(rows, zip(means.tolist(), sds.tolist(), strict=True), strict=True))
+    values = np.array([fit.state.vector[rows] for fit in learned])
+    medians = np.median(values, axis=0)
+    scatter = np.median(np.square(values - medians), axis=0) / _MEDIAN_SQUARE
+    noise = np.median([_variances(fit, rows) for fit in learned], axis=0)
+    variances = np.maximum(scatter - noise, 0.0) + _LEAST_SD**2
+    variances += _OF_MEDIAN * np.maximum(scatter, noise) / len(learned)
+    known = dict(
+        zip(rows, zip(medians.tolist(), np.sqrt(variances).tolist(), strict=True), strict=True)
+    )
     return CameraTone(
         tone, sharpens=True, camera=tuple(known.get(row, (0.0, 1.0)) for row in CAMERA_ROWS)
     )
 
 
-def _said(fit: DiscFit, rows: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what a fit alone says of some parameters: information, that times values, prior."""
-    places = np.searchsorted(fit.free.rows, rows)
-    mean, precision = fit.free.prior
-    inverse = np.linalg.inv(fit.normal)[np.ix_(places, places)]
-    information = np.linalg.inv(inverse) - np.diag(precision[rows])
-    values = fit.state.vector[rows]
-    # the estimate is between the prior's mean and the disc's own: take the prior out again
-    pull = np.linalg.inv(inverse) @ values - precision[rows] * mean[rows]
-    return information, pull, precision[rows]
+def _variances(fit: DiscFit, rows: list[int]) -> FloatArray:
+    """Return the variances of some parameters of a fit."""
+    return np.asarray(np.diag(np.linalg.inv(fit.normal))[np.searchsorted(fit.free.rows, rows)])

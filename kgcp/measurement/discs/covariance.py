@@ -28,6 +28,12 @@ _LEAST_LEFT = 1.0  # of the scatter, after the fit
 _FLOOR_PX = 0.0005  # of centre and edge: no print and no pixel is known better, …
 _COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
+# Of the blur: an unknown tone curve that three parameters do not hold displaces all edges alike, by
+# 0.05 to 0.13 px where σ is 0.67 px (`benchmarks.calibrate.operator`, case `unknown_film`).
+_TONED_SHARE = 0.15
+# … and where the light falls off, it displaces opposite edges differently: of the blur, for light
+# that falls off by all of itself over one radius.
+_TONED_FALL = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +70,10 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
+    if fit.free.tone.is_shaped:
+        falling = np.array((fit.state.light.slope_x, fit.state.light.slope_y))
+        aside_px = _TONED_FALL * fit.state.blur.mean_sd_px * falling
+        common[:2, :2] += np.outer(aside_px, aside_px)
     to_moments = moments_by_stretch(fit.state.geometry)
     return DiscScatter(
         to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T,
@@ -116,7 +126,8 @@ def _common_displacement_px(fit: DiscFit) -> float:
     hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
     reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
     of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
-    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px)
+    of_tone_px = _TONED_SHARE * blur_px if tone.is_shaped else 0.0
+    return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, of_tone_px)
 
 
 def _arcs(fit: DiscFit) -> IndexArray:

@@ -37,6 +37,7 @@ COUNT = PLAIN_COUNT + 2
 _SHARPENING_PX = 1.2  # σ of the cameras' unsharp mask, as for coded targets
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
+_MOST_FLAT = 0.6  # by how much a tone curve may be less steep at its ends than in the mean
 _STEPS = 12
 _ENOUGH = 0.02  # of log-likelihood, promised by a step
 _NOISE_ROUNDS, _SETTLED_NOISE = 3, 0.05
@@ -46,11 +47,13 @@ _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 _PRIOR_SD = {
     int(Param.BLUR_DIFFERENCE): 0.3,  # px²
     int(Param.BLUR_XY): 0.3,
-    int(Param.SLOPE_X): 0.2,
-    int(Param.SLOPE_Y): 0.2,
-    int(Param.TONE_1): 0.7,
-    int(Param.TONE_2): 0.5,
-    int(Param.TONE_3): 0.5,
+    int(Param.SLOPE_X): 0.1,
+    int(Param.SLOPE_Y): 0.1,
+    # narrower than for coded targets: a disc has one edge, and a point spread with wide tails looks
+    # like a curve that is flat at its end
+    int(Param.TONE_1): 0.25,
+    int(Param.TONE_2): 0.1,
+    int(Param.TONE_3): 0.1,
     int(Param.SHARPENING): 0.7,
     INK_SLOPE_X: 0.05,
     INK_SLOPE_Y: 0.05,
@@ -148,12 +151,23 @@ class DiscState:
         if step[Param.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
             moved[Param.BLUR_MEAN] = before**2 / (before - step[Param.BLUR_MEAN])
         moved[Param.BLUR_MEAN] = max(moved[Param.BLUR_MEAN], _MIN_VARIANCE_PX2)
+        moved[_TONES[0] : _TONES[-1] + 1] *= _steep_enough(*moved[_TONES[0] : _TONES[-1] + 1])
         elongation = math.hypot(moved[Param.BLUR_DIFFERENCE], moved[Param.BLUR_XY])
         excess = elongation / (_MAX_ANISOTROPY * moved[Param.BLUR_MEAN])
         if excess > 1.0:
             moved[Param.BLUR_DIFFERENCE] /= excess
             moved[Param.BLUR_XY] /= excess
         return DiscState(moved)
+
+
+def _steep_enough(tone_1: float, tone_2: float, tone_3: float) -> float:
+    """Return a factor 0…1 that keeps a tone curve from being flat at its ends.
+
+    Where it is flat, the ground shows no gradient of the light however large it is, and the
+    gradient explains whatever makes opposite edges differ: coma, or the order of the rows.
+    """
+    flattest = max(tone_1 + tone_2 + tone_3, tone_2 - tone_1 - tone_3)
+    return min(1.0, _MOST_FLAT / flattest) if flattest > 0.0 else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

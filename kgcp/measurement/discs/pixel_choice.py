@@ -17,9 +17,11 @@ from kgcp.measurement.image_model.blur import Blur
 # 3 px leaves 5 % of the bound on discs of 5 px; a wider one meets more of what is not ground.
 _FLAT_PX = 3.0
 _REACH_SIGMAS = 3.5
-_CLEAR_SIGMAS, _CLEAR_PX = 2.8, 0.6  # nearer to another edge than this, a pixel feels it
+# Nearer to another edge than this, a pixel feels it: σ and pixels. On crowded boards so little
+# ground is left that some feeling (2 % of the contrast at most) costs less.
+_CLEAR, _CROWDED = (2.8, 0.6), (2.0, 0.4)
 _EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level
-_LEAST_GROUND = 0.12  # share of the pixels outside that must be left: within a ring, half a pixel
+_LEAST_GROUND = 0.3  # pixels beside the edge that must be left, per pixel of its length
 _MIN_GROUND = 10
 _MARGIN_PX = 4  # around the pixels, for the mask of a camera's sharpening
 
@@ -84,18 +86,16 @@ def choose_pixels(
     """
     sd_px = blur.largest_sd_px
     others = np.array(neighbours, dtype=np.float64).reshape(-1, 5)
-    chosen = np.zeros(window.height * window.width, np.bool_)
-    clear_px = _CLEAR_SIGMAS * sd_px + _CLEAR_PX
-    ground, possible = _choose(
-        (window.x0, window.y0, window.width, window.height),
-        geometry,
-        (outward_px(blur), clear_px, sd_px),
-        others,
-        _EVERY_PX if is_thinned else 1,
-        chosen,
-    )
-    is_enough = ground >= max(_LEAST_GROUND * possible, _MIN_GROUND)
-    return np.flatnonzero(chosen), bool(is_enough)
+    box = (window.x0, window.y0, window.width, window.height)
+    length_px = 2.0 * math.pi * math.sqrt(max(geometry[2] * geometry[4] - geometry[3] ** 2, 0.0))
+    least = max(_LEAST_GROUND * length_px, _MIN_GROUND)
+    for sigmas, more_px in (_CLEAR, _CROWDED):
+        chosen = np.zeros(window.height * window.width, np.bool_)
+        lengths_px = (outward_px(blur), sigmas * sd_px + more_px, sd_px)
+        ground = _choose(box, geometry, lengths_px, others, _EVERY_PX if is_thinned else 1, chosen)
+        if ground >= least:
+            break
+    return np.flatnonzero(chosen), bool(ground >= least)
 
 
 @compiled
@@ -106,8 +106,8 @@ def _choose(
     others: FloatArray,
     every_px: int,
     chosen: BoolArray,
-) -> tuple[int, int]:
-    """Mark pixels; return how many of them are on the ground, and how many could be."""
+) -> int:
+    """Mark pixels; return how many of them are on the ground."""
     x0, y0, width, height = box
     reach_px, clear_px, sd_px = lengths_px
     is_around = np.zeros(len(others), np.bool_)
@@ -117,7 +117,7 @@ def _choose(
             and others[k, 2] * others[k, 4] - others[k, 3] ** 2
             > geometry[2] * geometry[4] - geometry[3] ** 2
         )
-    ground, possible = 0, 0
+    ground = 0
     for row in range(height):
         for column in range(width):
             x, y = float(x0 + column), float(y0 + row)
@@ -126,16 +126,14 @@ def _choose(
                 continue
             if off_px < -reach_px and not (row % every_px == 0 and column % every_px == 0):
                 continue
-            is_ground = off_px > sd_px
-            possible += is_ground
             is_free = True
             for k in range(len(others)):
                 off_other = _off(x, y, others[k])
                 is_free &= off_other < -clear_px if is_around[k] else off_other > clear_px
             if is_free:
                 chosen[row * width + column] = True
-                ground += is_ground
-    return ground, possible
+                ground += off_px > sd_px
+    return ground
 
 
 @compiled
