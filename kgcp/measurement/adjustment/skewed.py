@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
@@ -23,13 +21,11 @@ def asks_for_skew(fit: TargetFit) -> bool:
     """Tell whether third moments would take more of the residuals than chance (score test)."""
     if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= SKEW_PARAMS[0]:
         return False
-    scaled = np.vstack((fit.scaled_jacobian, _by_skew(fit) / fit.sd))
-    precision = np.append(fit.unknowns.free_precision, np.zeros(len(SKEW_PARAMS)))
-    normal = normal_matrix(scaled, fit.misfit, replace(fit.unknowns, free_precision=precision))
-    count = len(fit.unknowns.free)
-    score = scaled[count:] @ fit.misfit.score
-    mixed = np.linalg.solve(normal[:count, :count], normal[:count, count:])
-    own = normal[count:, count:] - normal[count:, :count] @ mixed
+    scaled, by_skew = fit.scaled_jacobian, _by_skew(fit) / fit.sd
+    normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
+    score, weighted = by_skew @ fit.misfit.score, by_skew * fit.misfit.weight
+    mixed = scaled @ weighted.T
+    own = weighted @ by_skew.T - mixed.T @ np.linalg.solve(normal, mixed)
     return bool(score @ np.linalg.solve(own, score) > _ASKS)
 
 
@@ -39,6 +35,8 @@ def _by_skew(fit: TargetFit) -> FloatArray:
     rows = skew_rows(
         parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
     )
+    if sample.photometry.mask is None and parameters.field is None:
+        return sample.photometry.slopes(fit.prediction.share, parameters.light) * rows
     by_geometry = np.vstack((np.zeros((GEOMETRY_ROWS, rows.shape[1])), rows))
     share = WhiteShare(fit.prediction.points_m, fit.prediction.share, by_geometry)
     added = added_levels(sample, parameters)

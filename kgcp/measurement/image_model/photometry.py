@@ -176,6 +176,16 @@ class PhotometricModel:
             return value
         return value + light.sharpening * self._detail(self.mask, value, light, added)
 
+    def slopes(self, share: FloatArray, light: Light) -> FloatArray:
+        """Return the derivatives (n,) of the levels by the share, in even light, unsharpened."""
+        slopes, values = _tone_slopes(share, light.values), light.values
+        slopes *= 1.0 + values[2] * self.offsets[0] + values[3] * self.offsets[1]
+        if self.tone.is_srgb:
+            value = np.empty(len(share))
+            _expose(share, self.offsets, values, _NOTHING, value)
+            slopes *= srgb_slope(value)
+        return slopes
+
     def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the levels of ink and of plate at all pixels, where the light is uneven."""
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
