@@ -85,7 +85,7 @@ def test_the_ground_has_a_table_of_its_own(flight: Path) -> None:
     assert plan["frames_per_pass"] == pytest.approx((900 * 40 / 1902 - 0.9) / 10.0)
 
 
-@pytest.mark.parametrize("heights", [("50", "100"), ("10",), ()])
+@pytest.mark.parametrize("heights", [("50", "100"), ("10",)])
 def test_the_figure_has_plain_numbers(flight: Path, heights: tuple[str, ...]) -> None:
     path = flight / "plan.svg"
     options = [word for height in heights for word in ("--height", height)]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from statistics import median
 
 from kgcp.quality.bias_causes import Term
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
@@ -257,12 +258,16 @@ def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
 def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
     """Yield the reservations against the numbers."""
     if numbers.sd_reference_m is not None:
-        yield Finding(
-            Grade.GOOD,
-            f"The reference distance itself is known to {1000.0 * numbers.sd_reference_m:.0f} mm"
-            " (median standard deviation).",
-            "error",
-        )
+        text = f"Reference distances are known to {1000.0 * numbers.sd_reference_m:.2g} mm"
+        sds_m = [
+            pair.attempt.sighting.sd_distance_m
+            for pair in numbers.compared
+            if pair.attempt.sighting
+        ]
+        stated_m = [sd_m for sd_m in sds_m if sd_m is not None]
+        if stated_m:
+            text += f", measured ones to {1000.0 * median(stated_m):.2g} mm"
+        yield Finding(Grade.GOOD, f"{text} (median standard deviations).", "error")
     if not numbers.attitudes_agree:
         yield Finding(
             Grade.LOOK,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -224,3 +225,16 @@ def test_amounts_are_rounded_by_their_deviation() -> None:
 def test_every_term_has_its_sentence(name: str, value: float, words: str) -> None:
     assert words in meaning_of(Term(name, value, 0.01, 1e-9))
     assert meaning_of(Term(name, value, 0.01, 0.5)).startswith("No ")
+
+
+def test_measurement_and_reference_are_stated_side_by_side(fly: Fly) -> None:
+    """Flown with 20 mm and 1 mm of the reference, and 1 mm of the measurement."""
+    assert "Reference distances are known to 20 mm, measured ones to 1 mm" in texts(fly())
+
+
+def test_what_the_reference_allows_stands_beside_each_bias(fly: Fly) -> None:
+    biased = texts(fly(lambda distance: 0.005 * distance))
+    assert re.search(r"by \+0\.\d+ ± 0\.\d+ % \(the reference allows ± 0\.\d+ %\)", biased)
+    assert re.search(r"as much\. Errors of the reference allow ± 0\.\d+ %\.", biased)
+    fine = texts(fly())
+    assert re.search(r"constant offset \S+ ± \S+ mm \(the reference allows ± 20 mm\)", fine)
