@@ -143,7 +143,7 @@ def test_flights_that_cannot_be_one_set(
     places, block = (north.path, south.path), ("--out", tmp_path / "block")
     assert export(*places).exit_code == 2
     assert export(*places, *block, "--detections", "x.parquet").exit_code == 2
-    line = error_of(*places, *block, "--format", "metashape")
+    line = error_of(*places, *block, "--format", "pix4d")
     assert f"'north/{FRAMES[0]}' and 'south_bank/{FRAMES[0]}' have the same file name" in line
     south.edit(('crs = "EPSG:25832"', 'crs = "EPSG:25833"'))
     line = error_of(*places, *block)

@@ -34,8 +34,8 @@ FORMATS: Mapping[str, Format] = {
     ),
     "metashape": _in_folder(
         "metashape",
-        "import_into_metashape.py markers.csv marks.csv scale_bars.csv markers.xml HOWTO.txt"
-        " [cameras.csv]",
+        "import_into_metashape.py markers.csv marks.csv scale_bars.csv HOWTO.txt"
+        " [markers.xml] [cameras.csv]",
         "Agisoft Metashape: one script that sets markers, marks, distances and cameras",
     ),
     "pix4d": _in_folder(

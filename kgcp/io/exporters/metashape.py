@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from importlib.resources import files as resources
+from pathlib import PurePosixPath
 from xml.etree import ElementTree as ET
 
 from pyproj.enums import WktVersion
@@ -41,7 +42,8 @@ Agisoft Metashape (Professional)
    - the markers, their coordinates in {crs}
      and their accuracies; z is {heights}.
      Points kept for checking are not enabled: Metashape shows their errors;
-   - their projections in the photos. Labels may have the extension or not;
+   - their projections in the photos. Labels may have the extension or not. Photos of several
+     flights that have the same name are told apart by a folder with the flight's name;
    - a scale bar from every marker to the camera that saw it, with its length and accuracy;
    - the accuracy of marker projections, of which Metashape has one for all: {mark_px} px, the RMS
      of these. It concerns also other markers of the chunk;
@@ -53,9 +55,10 @@ Agisoft Metashape (Professional)
 Every scale bar has the weight of its own accuracy. Metashape ignores correlations.
 
 Without scripts: File > Import > Import Markers: markers.xml (kgcp export-gcp --image-names writes
-labels like the chunk's); then Reference > Import Reference: markers.csv, for the accuracies; comma,
-first row 2, columns label, x, y, z and three accuracies, coordinate system as above. Scale bars to
-cameras can only be set by the script.
+labels like the chunk's; where images in several folders have the same name, there is no such file);
+then Reference > Import Reference: markers.csv, for the accuracies; comma, first row 2, columns
+label, x, y, z and three accuracies, coordinate system as above. Scale bars to cameras can only be
+set by the script.
 
 {marks}
 
@@ -68,12 +71,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
     Raises
     ------
     KgcpError
-        If an image's name has a comma or quote, two images have the same name, or the CRS has no
-        form that Metashape reads.
+        If an image's name has a comma or quote, or the CRS has no form that Metashape reads.
     """
-    names = image_names(
-        (point.frame for point in points.gcps), _FOLDER, ',"', extensions=points.image_extensions
-    )
+    names, are_labels = _names(points)
     label = labels(points.gcps, _FOLDER)
     mark_px = _rms_mark_px(points.gcps)
     texts = {
@@ -85,7 +85,7 @@ def files(points: MapPoints) -> Mapping[str, str]:
             focal_length=focal_length_note(points.controls),
         ),
         "markers.csv": _markers(points, label),
-        "markers.xml": _markers_xml(points, names, label),
+        **({"markers.xml": _markers_xml(points, names, label)} if are_labels else {}),
         "scale_bars.csv": _scale_bars(points.controls, names, label),
         "marks.csv": _marks(points.gcps, names, label),
         "import_into_metashape.py": _script(points, mark_px),
@@ -93,6 +93,19 @@ def files(points: MapPoints) -> Mapping[str, str]:
     if points.priors:
         texts["cameras.csv"] = _cameras(points, names)
     return {f"{_FOLDER}/{name}": text for name, text in texts.items()}
+
+
+def _names(points: MapPoints) -> tuple[Mapping[str, str], bool]:
+    """Return the names of images, and whether labels can be like them.
+
+    Where images in several folders have the same name, it is their path: the script can tell them
+    apart, labels cannot.
+    """
+    frames, extensions = [point.frame for point in points.gcps], points.image_extensions
+    paths = {*map(PurePosixPath, frames)}
+    keep_folder = len({path.name if extensions else path.stem for path in paths}) < len(paths)
+    names = image_names(frames, _FOLDER, ',"', keep_folder=keep_folder, extensions=extensions)
+    return names, not keep_folder
 
 
 def _table(columns: str, rows: Iterable[Iterable[str]]) -> str:

@@ -154,6 +154,28 @@ def test_positions_and_markers_of_others_stay_as_they_are(
     assert expected in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("extensions", [True, False])
+def test_photos_of_one_name_are_told_apart_by_their_folders(
+    points: MapPoints, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, extensions: bool
+) -> None:
+    """As of two flights whose cameras count from 1: labels repeat, folders do not."""
+    frames = ("north/IMG_1.JPG", "south/IMG_1.JPG", "south/IMG_2.JPG")
+    gcps = tuple(
+        replace(point, frame=frame) for point, frame in zip(points.gcps[:3], frames, strict=True)
+    )
+    paths = ("/data/north/frames/IMG_1.JPG", r"D:\data\south\frames\IMG_1.JPG", "/other/IMG_2.JPG")
+    chunk = Chunk([Camera(key, f"IMG_{min(key, 1) + 1}", path) for key, path in enumerate(paths)])
+    chunk.cameras[1].label = "IMG_1"
+    run(replace(points, gcps=gcps, priors=(), image_extensions=extensions), tmp_path, chunk)
+    seen = {
+        each.label: [camera.key for camera, _ in each.projections.items()] for each in chunk.markers
+    }
+    assert seen == {"K0001": [0], "K0002": [1], "K0003": []}
+    assert [bar.point1 for bar in chunk.scalebars] == chunk.cameras[:2]
+    assert "1 photos are not in the chunk" in capsys.readouterr().out
+    assert not (tmp_path / "metashape/markers.xml").exists(), "labels cannot tell them apart"
+
+
 def test_photos_that_are_missing_or_double_are_named(
     points: MapPoints, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -265,5 +287,5 @@ def test_stems_that_two_photos_share_are_refused(points: MapPoints) -> None:
     raw = replace(points.gcps[1], frame="a/IMG_1.TIF")
     both = replace(points, gcps=(points.gcps[0], raw), priors=())
     metashape.files(both)
-    with pytest.raises(KgcpError, match="same file name 'IMG_1'"):
+    with pytest.raises(KgcpError, match="same file name 'a/IMG_1'"):
         metashape.files(replace(both, image_extensions=False))
