@@ -153,11 +153,13 @@ def agreement(consistency: Consistency | None) -> str:
         return (
             "Not examined: it takes ten frames with the moving target, a reference pose and a time."
         )
-    along, across, up = rms_m(consistency)
+    rms = rms_m(consistency)
+    is_near = max(rms) < 1.0
+    along, across, up = (f"{1000.0 * m:.0f} mm" if is_near else f"{m:.2f} m" for m in rms)
     outliers = sum(each.is_outlier for each in consistency.discrepancies)
     due = "" if advice(consistency) else " No correction of flight.toml is due."
     return (
-        f"The target's positions by vehicle and by camera differ by {1000.0 * along:.0f} mm along"
-        f" the track, {1000.0 * across:.0f} mm across and {1000.0 * up:.0f} mm up (RMS of"
-        f" {len(consistency.discrepancies) - outliers} frames, {outliers} outliers).{due}"
+        f"The target's positions by vehicle and by camera differ by {along} along the track,"
+        f" {across} across and {up} up (RMS of {len(consistency.discrepancies) - outliers} frames,"
+        f" {outliers} outliers).{due}"
     )

@@ -128,7 +128,7 @@ def _bias(numbers: BiasNumbers) -> Finding:
         text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
         return Finding(Grade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
-    parts = [f"too {side} {row.label}, by {_mean(row)} on average" for row, side in sides]
+    parts = [f"too {side} {row.label}, on average by {_mean(row)}" for row, side in sides]
     material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
     text = f"Biased: distances are measured {'; '.join(parts)}."
     return Finding(Grade.LOOK if material else Grade.GOOD, text, "error")
