@@ -27,6 +27,7 @@ from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.calibrations import read_calibration
+from kgcp.io.formats.exclusions import read_exclusions
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
@@ -128,6 +129,13 @@ def bare_folder(data: bytes, folder: Path) -> None:
         (folder / "flight.toml").unlink()
 
 
+def exclusions(data: bytes, folder: Path) -> None:
+    """Read a list of frames to leave out."""
+    path = _written(folder, data)
+    for exclusion in read_exclusions(path):
+        str(exclusion)
+
+
 def poses(data: bytes, folder: Path) -> None:
     """Read reference poses."""
     path = _written_among_parts(folder, data)
@@ -162,8 +170,8 @@ def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
 TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
-        *(flight_toml, bare_folder, times, trajectories, poses, calibrations, frames),
-        journal,
+        *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
+        *(frames, journal),
     )
 }
 

@@ -117,7 +117,11 @@ def first_flights(
             f"kgcp init flight {_TARGET}",
             Edit(
                 "flight/flight.toml",
-                {"crs": '"EPSG:25832"', "position_m": str(STATIC_MAP.tolist())},
+                {
+                    "crs": '"EPSG:25832"',
+                    "position_m": str(STATIC_MAP.tolist()),
+                    "sd_position_m": "[0.01, 0.01, 0.015]",
+                },
             ),
             "kgcp check flight",
             "kgcp detect flight",

@@ -122,4 +122,8 @@ def _print_page(draft: FlightDraft, written: list[Path]) -> None:
 def _filled(heading: str, text: str) -> str:
     import textwrap
 
-    return textwrap.fill(text, _WIDTH, initial_indent=f"{heading:22s}", subsequent_indent=" " * 22)
+    from kgcp.errors import one_line
+
+    return textwrap.fill(
+        one_line(text), _WIDTH, initial_indent=f"{heading:22s}", subsequent_indent=" " * 22
+    )

@@ -37,6 +37,9 @@ _HEAD = (
 _UNKNOWN_POSITION = DraftKey(
     "position_m", None, "if it stands still", "[689412.0, 5336208.0, 545.0]", is_missing=True
 )
+_SD_POSITION = DraftKey(
+    "sd_position_m", None, "how well it is surveyed, 1 σ", "[0.01, 0.01, 0.015]"
+)
 _EXAMPLE_TARGET = (
     "",
     "# [[target]]",
@@ -217,6 +220,7 @@ def _times_by_exif(
             "times",
             "EXIF is rarely good to a millisecond, in which a vehicle moves a centimetre",
             "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time",
+            is_assumed=True,
         )
         return _Times(
             time_s,
@@ -284,7 +288,9 @@ def _block(
     plate = tuple(target_lines(replace(placed, replicas=())))
     replicas = tuple(target_lines(placed))[len(plate) :]
     unknown = (_UNKNOWN_POSITION.line(),) if is_lost else ()
-    return DraftText((*plate, *unknown, *replicas))
+    is_static = is_lost or placed.position_m is not None
+    sd = (_SD_POSITION.line(),) if is_static and not any(placed.sd_position_m) else ()
+    return DraftText((*plate, *unknown, *sd, *replicas))
 
 
 def _targets(contents: FolderContents, options: InitOptions) -> tuple[tuple[Target, ...], str]:
@@ -292,7 +298,9 @@ def _targets(contents: FolderContents, options: InitOptions) -> tuple[tuple[Targ
     if options.targets_file is not None:
         return read_target_tables(options.targets_file), str(options.targets_file.name)
     if options.codes or options.diameter_m is not None:
-        return new_targets((), options.diameter_m, options.codes, 0, 0), "what you gave"
+        return new_targets(
+            (), options.diameter_m, options.codes, 0, 0
+        ), "the diameter and code given"
     if contents.targets:
         path = contents.targets[0]
         return read_target_tables(path), contents.relative(path)

@@ -15,6 +15,7 @@ from kgcp.pipeline.init_records import Finding, Gap, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
 _SMALL_FRAME_MM = math.hypot(36.0, 24.0)  # its diagonal, to which CIPA's equivalents refer
+_WIDE, _FULL_SHAPE = 1.7, 0.75
 _PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _DIGITS = 9
 # Of a focal length by EXIF: equivalents are whole millimetres, lenses a few per cent off their
@@ -103,12 +104,13 @@ def _by_dewarp_data(
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
-    known = [header for header in headers if header.focal_35_mm and header.size_px == size]
-    if not known:
+    """Return a guess from EXIF, with what it may be wrong by."""
+    guesses = (_guessed_px(header) for header in headers if header.size_px == size)
+    guess = next((guess for guess in guesses if guess is not None), None)
+    if guess is None:
         return None
     width, height = size
-    header = known[0]
-    focal_px = round((header.focal_35_mm or 0.0) / _SMALL_FRAME_MM * math.hypot(width, height), 1)
+    header, focal_px, source = guess
     camera = Camera(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))
     sd_px = round(_SD_FOCAL * focal_px, 1)
     centre_px = round(_SD_CENTRE * width, 1)
@@ -122,7 +124,6 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
         _RESPONSE,
         _SHUTTER,
     )
-    source = f"EXIF of {header.frame}: {header.focal_35_mm:g} mm as of 35 mm film"
     return _section(
         keys,
         f"GUESS from the {source}. A calibration is needed for true distances.",
@@ -137,6 +138,30 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
             ),
         ),
     )
+
+
+def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
+    """Return a focal length by EXIF [px], and in words where it is from."""
+    if header.size_px is None:
+        return None
+    where = f"EXIF of {header.frame}"
+    if header.focal_35_mm is not None:
+        focal_px = header.focal_35_mm / _SMALL_FRAME_MM * _full_diagonal_px(*header.size_px)
+        return header, round(focal_px, 1), f"{where}: {header.focal_35_mm:g} mm as of 35 mm film"
+    if header.focal_px is not None:
+        source = f"{where}: {header.focal_mm:g} mm and the sensor's resolution"
+        return header, round(header.focal_px, 1), source
+    return None
+
+
+def _full_diagonal_px(width: int, height: int) -> float:
+    """Return the diagonal of the sensor, to which equivalents refer.
+
+    Frames of 16:9 are cut out of sensors of 4:3: with its own diagonal, the focal length of
+    Phantom 3's camera (20 mm, 4000 x 2250 px) would be 8 % too short.
+    """
+    long, short = max(width, height), min(width, height)
+    return math.hypot(long, _FULL_SHAPE * long if long > _WIDE * short else short)
 
 
 def _no_camera(size: tuple[int, int] | None, why: str) -> Section:

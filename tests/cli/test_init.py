@@ -296,3 +296,15 @@ def test_results_in_the_frames_own_folder_are_no_frames(bare: Path, tmp_path: Pa
     assert list_frames(folder) == before
     (folder / "flight.toml").unlink()
     assert "kgcp/sheet/x.jpg" in list_frames(folder)
+
+
+def test_names_of_files_are_no_lines_of_the_file(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    first = min(folder.glob("*.JPG"))
+    first.rename(folder / 'DJI\n[vehicle]\x1b]0;#"_0001_V.JPG')
+    result = init(folder, *TARGET, *ARM)
+    assert "\x1b" not in result.stderr
+    text = (folder / "flight.toml").read_text(encoding="utf-8")
+    assert text.count("\n[vehicle]") == 1
+    assert "\x1b" not in text
+    assert read_flight(folder).camera.fx == pytest.approx(PLAN.settings.camera.fx)

@@ -83,6 +83,7 @@ def test_names_that_mean_nothing_are_told(measured: SampleFlight) -> None:
         ("a,b,c\n", "line 1: has 3 cells"),
         (",A\n", "line 1: names no frame"),
         ("frame,flight\n,x\n", "line 2: names no frame"),
+        ("x" * 200_000, "line 1: field larger than field limit"),
     ],
 )
 def test_faulty_lists_are_errors(measured: SampleFlight, text: str, words: str) -> None:
@@ -153,6 +154,25 @@ def test_flights_that_cannot_be_one_set(
     assert "are both named 'north'; give each" in error_of(*places, *block)
     south.edit(('name = "north"', 'name = "x"'), ("outer_diameter_m = 0.9", "outer_diameter_m = 1"))
     assert "does not belong to this flight any more" in error_of(*places, *block)
+
+
+def test_a_static_target_of_two_flights_is_one_point(
+    two: tuple[SampleFlight, SampleFlight], tmp_path: Path
+) -> None:
+    code, place = "code_deg = [0, 43, 78, 180]", "position_m = [689500.0, 5336200.0, 547.0]"
+    for flight in two:
+        flight.edit((code, f"{code}\n{place}\nsd_position_m = [0.01, 0.01, 0.02]"))
+    arguments = (two[0].path, two[1].path, "--out", tmp_path / "block", "--format", "micmac")
+    line = error_of(*arguments)
+    assert "have the same file name" in line  # not their ids
+    result = export(*arguments[:-1], "csv")
+    assert result.exit_code == 0, result.stderr
+    points = pd.read_parquet(tmp_path / "block" / "kgcps.parquet")
+    assert set(points["id"]) == {"A"}
+    assert points["frame"].is_unique
+    two[1].edit(("689500.0", "689501.0"))
+    line = error_of(*arguments)
+    assert f"target 'A' stands at different places in north/{FRAMES[0]} and south_bank/" in line
 
 
 def test_formats_of_one_camera_are_known(

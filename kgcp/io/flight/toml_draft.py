@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 
+from kgcp.errors import one_line
+
 _COMMENT_COLUMN = 44
 MISSING = "MISSING"
 """What stands in front of a comment on a key that a command will ask for."""
@@ -47,13 +49,14 @@ class DraftTable:
             is_set = any(key.value is not None for key in self.keys)
             yield self.heading if is_set else f"# {self.heading}"
         if self.note:
-            yield f"# {self.note}"
+            yield f"# {one_line(self.note)}"
         for key in self.keys:
             yield key.line()
 
 
 def _commented(text: str, comment: str) -> str:
-    return f"{text:<{_COMMENT_COLUMN - 2}}  # {comment}" if comment else text
+    """Return a line with a comment, which may quote names of files and must not end the line."""
+    return f"{text:<{_COMMENT_COLUMN - 2}}  # {one_line(comment)}" if comment else text
 
 
 def toml_text(value: TomlValue) -> str:

@@ -51,7 +51,11 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         text = line.strip()
         if text and not text.startswith("#"):
             separator = ";" if ";" in text and "," not in text else ","
-            yield number, [cell.strip() for cell in next(csv.reader([text], delimiter=separator))]
+            try:
+                cells = next(csv.reader([text], delimiter=separator))
+            except csv.Error as error:
+                raise KgcpError(f"{path}, line {number}: {error}; repair the line") from error
+            yield number, [cell.strip() for cell in cells]
 
 
 def _exclusion(path: Path, line: int, columns: Sequence[str], cells: Sequence[str]) -> Exclusion:

@@ -22,6 +22,8 @@ from kgcp.measurement.records import ExposureSettings
 from kgcp.quality.checks.frame_header import FrameHeader
 
 _EXIF_MARK = b"Exif\0\0"
+_INCH = 2.0
+_UNITS_MM = {_INCH: 25.4, 3.0: 10.0, 4.0: 1.0}  # of resolutions, by their number in EXIF
 _RELATIVE_ALTITUDE = re.compile(
     rb"""drone-dji:RelativeAltitude(?:="|>)\s*([+-]?\d{1,5}(?:\.\d{0,9})?)"""
 )
@@ -114,12 +116,14 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
         longitude_deg = _angle_deg(tags.gps, GPS.GPSLongitude, GPS.GPSLongitudeRef, "W", 180.0)
         latitude_deg = _angle_deg(tags.gps, GPS.GPSLatitude, GPS.GPSLatitudeRef, "S", 90.0)
         is_placed = longitude_deg is not None and latitude_deg is not None
+        size_px = tags.size_px or _size_px(path)
         return FrameHeader(
             frame,
-            tags.size_px or _size_px(path),
+            size_px,
             camera=" ".join(filter(None, words)),
             focal_mm=_positive(tags.main.get(Base.FocalLength)),
             focal_35_mm=_positive(tags.main.get(Base.FocalLengthIn35mmFilm)),
+            focal_px=_focal_px(tags.main, size_px),
             time_s=_time_s(tags.main),
             longitude_deg=longitude_deg if is_placed else None,
             latitude_deg=latitude_deg if is_placed else None,
@@ -127,6 +131,17 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
         )
     except Exception:  # Pillow's parsers raise whatever a damaged header makes them stumble over
         return FrameHeader(frame, _size_px(path))
+
+
+def _focal_px(tags: Mapping[int, Any], size_px: tuple[int, int] | None) -> float | None:
+    """Return the focal length by the resolution of the focal plane, also of a resized frame."""
+    focal_mm = _positive(tags.get(Base.FocalLength))
+    per_unit = _positive(tags.get(Base.FocalPlaneXResolution))
+    unit_mm = _UNITS_MM.get(_positive(tags.get(Base.FocalPlaneResolutionUnit)) or _INCH)
+    if focal_mm is None or per_unit is None or unit_mm is None or size_px is None:
+        return None
+    full_px = _positive(tags.get(Base.ExifImageWidth)) or size_px[0]
+    return focal_mm * per_unit / unit_mm * size_px[0] / full_px
 
 
 def _size_px(path: Path) -> tuple[int, int] | None:

@@ -28,6 +28,7 @@ class FrameHeader:
     # focal length, and the one of a small-format camera with the same angle of view
     focal_mm: float | None = None
     focal_35_mm: float | None = None
+    focal_px: float | None = None  # the first by the resolution of the focal plane
     time_s: float | None = None  # Unix UTC, as far as the header names its time zone [s]
     # of the camera, WGS 84
     longitude_deg: float | None = None

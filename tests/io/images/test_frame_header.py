@@ -60,3 +60,23 @@ def test_what_is_absent_or_damaged_is_none(tmp_path: Path) -> None:
     assert read_frame_header(tmp_path / "a.jpg", "a").altitude_m is None
     Image.fromarray(np.zeros((48, 64), dtype=np.uint8)).save(tmp_path / "plain.tif")
     assert read_frame_header(tmp_path / "plain.tif", "t") == FrameHeader("t", (64, 48))
+
+
+@pytest.mark.parametrize(
+    ("tags", "focal_px"),
+    [
+        ({Base.FocalPlaneXResolution: 16393.44, Base.FocalPlaneResolutionUnit: 2}, 46.47),
+        ({Base.FocalPlaneXResolution: 16393.44}, 46.47),  # inches unless it says otherwise
+        ({Base.FocalPlaneXResolution: 6454.1, Base.FocalPlaneResolutionUnit: 3}, 46.47),
+        ({Base.FocalPlaneXResolution: 16393.44, Base.FocalPlaneResolutionUnit: 9}, None),
+        ({Base.FocalPlaneXResolution: 0.0}, None),
+    ],
+)
+def test_the_focal_length_in_pixels_of_a_resized_frame(
+    tmp_path: Path, tags: dict[int, float], focal_px: float | None
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif).update({Base.FocalLength: 4.5, Base.ExifImageWidth: 4000, **tags})
+    Image.fromarray(np.zeros((48, 64), dtype=np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    found = read_frame_header(tmp_path / "a.jpg", "a.jpg").focal_px
+    assert found == (None if focal_px is None else pytest.approx(focal_px, abs=0.01))
