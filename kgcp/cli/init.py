@@ -87,6 +87,14 @@ def command(
     if as_json:
         _print_json(draft, written)
     _print_page(draft, written)
+    needs_edit = any(not gap.is_assumed for gap in draft.gaps)
+    first = "fill in what is MISSING there, then " if needs_edit else ""
+    click.echo(f"next: {first}kgcp check {_quoted(flight)}", err=True)
+
+
+def _quoted(flight: Path) -> str:
+    """Return a folder as it is typed."""
+    return f'"{flight}"' if " " in str(flight) else str(flight)
 
 
 def _print_json(draft: FlightDraft, written: list[Path]) -> None:

@@ -60,11 +60,13 @@ def projected_crs_near(
 
 
 def _is_near(crs: str, xy: tuple[float, float], place: tuple[float, float]) -> bool:
-    """Whether a point of a CRS is within kilometres of a place: a coarse datum shift will do."""
+    """Whether a point of a CRS is within kilometres of a place, whatever the datum."""
     try:
         parsed = CRS.from_user_input(crs)
-        transformer = Transformer.from_crs("EPSG:4326", parsed, always_xy=True)
-        x, y = transformer.transform(*place)
+        geodetic = parsed.geodetic_crs
+        if geodetic is None:
+            return False
+        x, y = Transformer.from_crs(geodetic, parsed, always_xy=True).transform(*place)
     except ProjError:
         return False
     factor = parsed.axis_info[0].unit_conversion_factor

@@ -43,7 +43,8 @@ def test_the_example_of_the_page_runs_as_it_stands(
         result = CliRunner().invoke(main, list(arguments), catch_exceptions=False)
         assert result.exit_code == 0, result.stderr
         if arguments[0] == "init":
-            *found, _ = result.stderr.splitlines()
+            *found, _, following = result.stderr.splitlines()
+            assert following == "next: kgcp check flight"
             assert "\n".join(f"    {line}" for line in found) in page
             path = Path("flight/flight.toml")
             text = path.read_text(encoding="utf-8")

@@ -135,6 +135,7 @@ def test_what_is_missing_is_named_by_init_and_by_the_next_command(
     said = init(folder).stderr
     assert "missing: lever arm" in said
     assert "missing: targets" in said
+    assert f"next: fill in what is MISSING there, then kgcp check {folder}" in said
     fails = [("lever_arm_m", None), ("[[target]]", TARGETS_TOML)]
     for key, text in fails:
         result = CliRunner().invoke(main, ["check", str(folder)])

@@ -101,6 +101,16 @@ def test_characters_that_a_code_page_lacks_end_no_command(
     )
 
 
+def test_a_flight_begins(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare photos"
+    shutil.copytree(flight / "frames", bare)
+    shutil.copy(flight / "vehicle.csv", bare)
+    run = kgcp(windows, "init", str(bare), "--lever-arm", "-0.8", "0.15", "-1.95")
+    assert run.returncode == 0, run.stderr
+    assert b"\r" not in (bare / "flight.toml").read_bytes()
+    assert f'then kgcp check "{bare}"' in run.stderr
+
+
 def test_two_at_once_are_told(windows: dict[str, str], flight: Path, tmp_path: Path) -> None:
     holder = (
         "import sys, time\n"
