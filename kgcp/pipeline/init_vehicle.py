@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from kgcp.errors import SettingError
-from kgcp.georef.crs import WGS84_3D, longitude_latitude
+from kgcp.georef.crs import WGS84_3D, longitude_latitude, parse_crs
 from kgcp.georef.crs_guess import is_geographic_place, projected_crs_near, utm_crs
 from kgcp.io.files.gps_time import TimeSystem, first_day_near
 from kgcp.io.files.time_text import NUMBER, parse_time
@@ -25,7 +25,7 @@ _WORDS = {
     "csv": "CSV table",
     "tum": "TUM trajectory",
 }
-_WEEK_S, _UNIX_S = 2e6, 1e8  # seconds of a week are below the first, Unix seconds above the second
+_WEEK_S = 2e6  # seconds of a week are below, Unix seconds far above
 _SHOWN_CRS = 3
 _CRS_REMEDY = "write crs = … into flight.toml: the CRS of the surveyed coordinates"
 _LEVER_ARM = "forward, right, down [m] to the target"
@@ -67,8 +67,14 @@ def vehicle_section(
     return Section(
         (DraftTable("[vehicle]", keys),),
         (Finding("trajectory", text), *lever_findings),
-        (*time_gaps, *lever_gaps),
+        (*_unreadable(name, start), *time_gaps, *lever_gaps),
     )
+
+
+def _unreadable(name: str, start: FirstEpoch | None) -> tuple[Gap, ...]:
+    if start is not None:
+        return ()
+    return (Gap("trajectory", f"{name} cannot be read", "see what kgcp check says of it"),)
 
 
 def crs_key(
@@ -83,17 +89,24 @@ def crs_key(
     ----------
     surveyed : sequence of PointTable
         Whose coordinates flight.toml takes over.
+
+    Raises
+    ------
+    KgcpError
+        If the given CRS is none.
     """
     if options.crs is not None:
+        parse_crs(options.crs, "crs")
         return DraftKey("crs", options.crs, "as given"), (Finding("crs", options.crs),), ()
     file = contents.trajectories[0] if len(contents.trajectories) == 1 else None
     start = None if file is None else first_epoch(file)
     place = _place(start, headers)
     if surveyed and surveyed[0].first_xy is not None:
         return _crs_by_place(contents.relative(surveyed[0].path), surveyed[0].first_xy, place)
-    if file is None or start is None:
-        return _unknown_crs("nothing in the folder has coordinates")
-    source = contents.relative(file.path)
+    source = "" if file is None else contents.relative(file.path)
+    if start is None:
+        why = f"{source} cannot be read" if source else "nothing in the folder has coordinates"
+        return _unknown_crs(why)
     if start.crs is not None and place is None:
         return _unknown_crs(f"{source} begins nowhere on Earth")
     if start.crs is None or place is None:
@@ -142,7 +155,9 @@ def _crs_by_place(
 def _unknown_crs(
     why: str, likely: str = "EPSG:25832"
 ) -> tuple[DraftKey, tuple[Finding, ...], tuple[Gap, ...]]:
-    key = DraftKey("crs", None, "of all coordinates here", f'"{likely}"', is_missing=True)
+    key = DraftKey(
+        "crs", None, "of all coordinates; heights ellipsoidal", f'"{likely}"', is_missing=True
+    )
     return key, (), (Gap("crs", why, _CRS_REMEDY),)
 
 

@@ -285,7 +285,22 @@ def test_folders_without_frames_and_wrong_options(bare: Path, tmp_path: Path) ->
     assert init(folder, "--diameter", "0.9").exit_code == 2
     assert init(folder, "--target", "x.toml", *TARGET).exit_code == 2
     assert "does not exist" in init(folder, "--target", str(tmp_path / "x.toml")).stderr
+    assert "crs 'EPSG:1' cannot be used" in init(folder, "--crs", "EPSG:1").stderr
     assert not (folder / "flight.toml").exists()
+
+
+def test_a_trajectory_that_cannot_be_read_is_named(bare: Path, tmp_path: Path) -> None:
+    folder = copied(bare, "dji", tmp_path)
+    path = folder / "rover.pos"
+    lines = path.read_text(encoding="ascii").splitlines()
+    path.write_text("\n".join([*lines[:5], "2026/06/16 08:15:20 48.1"]), encoding="ascii")
+    said = init(folder, *TARGET, *ARM).stderr
+    assert "rover.pos cannot be read" in said
+    assert "missing: crs" in said
+    uncomment(folder, "crs")
+    check = CliRunner().invoke(main, ["check", str(folder)])
+    assert check.exit_code == 1
+    assert "line 6: has 1 cells after the time" in " ".join(check.stdout.split())
 
 
 def test_results_in_the_frames_own_folder_are_no_frames(bare: Path, tmp_path: Path) -> None:
