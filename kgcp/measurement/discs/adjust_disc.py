@@ -12,6 +12,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, distances_px
 from kgcp.measurement.discs.fit_disc import (
+    CAMERA_ROWS,
     DiscFit,
     DiscSample,
     DiscState,
@@ -32,10 +33,10 @@ from kgcp.measurement.discs.records import (
 )
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import Censoring, find_censoring, median_at_edges
-from kgcp.measurement.image_model.photometry import Tone, light_of_levels, plateau_levels
+from kgcp.measurement.image_model.photometry import light_of_levels, plateau_levels
 
 _ROUNDS = 3
-_SETTLED_PX, _SETTLED_BLUR = 0.05, 0.1  # a round that moves less is the last
+_SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
 _FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
 _MUCH_CLIPPED = 0.05  # share of the window's pixels
 _LEAST_CONTRAST_COUNTS = 4.0
@@ -91,14 +92,14 @@ def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = 
     ------
     DiscRejection, NoFit
     """
-    first_px = min(_FIRST_BLUR_PX, _FIRST_BLUR * task.radius_px)
+    first_px = free.blur_px or min(_FIRST_BLUR_PX, _FIRST_BLUR * task.radius_px)
     blur = Blur(first_px**2, first_px**2, 0.0) if start is None else start.blur
     geometry = outline_geometry(task.outline) if start is None else start.geometry
     state = start
     for _ in range(_ROUNDS):
         window = cut_disc_window(task.grey, geometry, window_reach_px(blur))
         _check_inside(task.grey, geometry)
-        state = state or _start(window, geometry, blur, free.tone, is_dark=task.is_dark)
+        state = state or _start(window, geometry, blur, free, is_dark=task.is_dark)
         limits = find_censoring(window.levels, window.levels_per_count)
         if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
             free = replace(free, has_ink_slope=False)
@@ -133,7 +134,7 @@ def _adjust_on(
 
 
 def _start(
-    window: DiscWindow, geometry: Geometry, blur: Blur, tone: Tone, *, is_dark: bool
+    window: DiscWindow, geometry: Geometry, blur: Blur, free: FreeParameters, *, is_dark: bool
 ) -> DiscState:
     """Return levels from the middle of the disc and the ground around it.
 
@@ -153,7 +154,10 @@ def _start(
     dark, bright = (inside, outside) if is_dark else (outside, inside)
     if bright - dark < _LEAST_CONTRAST_COUNTS * window.levels_per_count:
         raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {inside:.3f} and {outside:.3f}")
-    return DiscState.of(geometry, blur, light_of_levels(dark, bright, tone))
+    start = DiscState.of(geometry, blur, light_of_levels(dark, bright, free.tone))
+    for row, (value, _) in zip(CAMERA_ROWS, free.camera, strict=False):
+        start.vector[row] = value
+    return start
 
 
 def _check_inside(grey: GreyArray, geometry: Geometry) -> None:

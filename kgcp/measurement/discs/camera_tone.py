@@ -19,11 +19,12 @@ from kgcp.measurement.discs.adjust_disc import DiscRejection, DiscTask, adjust_d
 from kgcp.measurement.discs.fit_disc import CAMERA_ROWS, DiscFit, FreeParameters, NoFit
 from kgcp.measurement.image_model.photometry import Tone
 
-_MOST_DISCS = 12
+_MOST_DISCS = 9
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are any
 # From there on, the two levels fall off differently enough to tell, but for an unknown curve.
 _LARGE_RADIUS_PX = 20.0
 _MOST_CLIPPED = 0.05  # share of pixels
+_LARGEST_BLUR = 0.3  # of the radius, to start from
 _LEAST_SD = 0.03  # of each parameter, however many discs agree
 _MEDIAN_SQUARE, _OF_MEDIAN = 0.455, 1.57  # median of χ²₁; variance of a median over that of a mean
 
@@ -35,6 +36,7 @@ class CameraTone:
     tone: Tone
     sharpens: bool = False
     camera: tuple[tuple[float, float], ...] = ()  # as of `FreeParameters`
+    blur_px: float = 0.0  # median of those that it was learned from; 0: none
 
 
 def learn_tone(tasks: Sequence[DiscTask], response: Response) -> CameraTone:
@@ -68,6 +70,7 @@ def parameters_of(task: DiscTask, camera: CameraTone) -> FreeParameters:
         sharpens=camera.sharpens,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
         camera=camera.camera,
+        blur_px=min(camera.blur_px, _LARGEST_BLUR * task.radius_px),
     )
 
 
@@ -115,7 +118,10 @@ def _pooled(tone: Tone, fits: dict[int, DiscFit]) -> CameraTone:
         zip(rows, zip(medians.tolist(), np.sqrt(variances).tolist(), strict=True), strict=True)
     )
     return CameraTone(
-        tone, sharpens=True, camera=tuple(known.get(row, (0.0, 1.0)) for row in CAMERA_ROWS)
+        tone,
+        sharpens=True,
+        camera=tuple(known.get(row, (0.0, 1.0)) for row in CAMERA_ROWS),
+        blur_px=float(np.median([fit.state.blur.mean_sd_px for fit in learned])),
     )
 
 

@@ -81,6 +81,7 @@ class FreeParameters:
     # mean and standard deviation of tone and sharpening, as other discs of the photograph show
     # them, in the order of `CAMERA_ROWS`; empty: not known
     camera: tuple[tuple[float, float], ...] = ()
+    blur_px: float = 0.0  # to start from; 0: not known
 
     @property
     def rows(self) -> IndexArray:

@@ -20,7 +20,11 @@ _REACH_SIGMAS = 3.5
 # Nearer to another edge than this, a pixel feels it: σ and pixels. On crowded boards so little
 # ground is left that some feeling (2 % of the contrast at most) costs less.
 _CLEAR, _CROWDED = (2.8, 0.6), (2.0, 0.4)
-_EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level
+_EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level, …
+# … and of what else no blur reaches, of large discs every second or third: it is half of all pixels
+# and costs 2 % of the bound.
+_SECOND_RADIUS_PX, _THIRD_RADIUS_PX = 12.0, 25.0
+_BLURRED_SIGMAS = 3.5
 _LEAST_GROUND = 0.3  # pixels beside the edge that must be left, per pixel of its length
 _MIN_GROUND = 10
 _MARGIN_PX = 4  # around the pixels, for the mask of a camera's sharpening
@@ -88,14 +92,20 @@ def choose_pixels(
     others = np.array(neighbours, dtype=np.float64).reshape(-1, 5)
     box = (window.x0, window.y0, window.width, window.height)
     length_px = 2.0 * math.pi * math.sqrt(max(geometry[2] * geometry[4] - geometry[3] ** 2, 0.0))
+    every = (_EVERY_PX, _every(length_px / (2.0 * math.pi))) if is_thinned else (1, 1)
     least = max(_LEAST_GROUND * length_px, _MIN_GROUND)
     for sigmas, more_px in (_CLEAR, _CROWDED):
         chosen = np.zeros(window.height * window.width, np.bool_)
         lengths_px = (outward_px(blur), sigmas * sd_px + more_px, sd_px)
-        ground = _choose(box, geometry, lengths_px, others, _EVERY_PX if is_thinned else 1, chosen)
+        ground = _choose(box, geometry, lengths_px, others, every, chosen)
         if ground >= least:
             break
     return np.flatnonzero(chosen), bool(ground >= least)
+
+
+def _every(radius_px: float) -> int:
+    """Return which of the pixels that no blur reaches are used."""
+    return 1 + int(radius_px >= _SECOND_RADIUS_PX) + int(radius_px >= _THIRD_RADIUS_PX)
 
 
 @compiled
@@ -104,7 +114,7 @@ def _choose(
     geometry: FloatArray,
     lengths_px: tuple[float, float, float],
     others: FloatArray,
-    every_px: int,
+    every: tuple[int, int],
     chosen: BoolArray,
 ) -> int:
     """Mark pixels; return how many of them are on the ground."""
@@ -124,7 +134,10 @@ def _choose(
             off_px = _off(x, y, geometry)
             if off_px > reach_px:
                 continue
-            if off_px < -reach_px and not (row % every_px == 0 and column % every_px == 0):
+            in_middle, beside = every
+            if off_px < -reach_px and (row % in_middle or column % in_middle):
+                continue
+            if abs(off_px) > _BLURRED_SIGMAS * sd_px and (row + column) % beside:
                 continue
             is_free = True
             for k in range(len(others)):
@@ -132,7 +145,7 @@ def _choose(
                 is_free &= off_other < -clear_px if is_around[k] else off_other > clear_px
             if is_free:
                 chosen[row * width + column] = True
-                ground += off_px > sd_px
+                ground += (off_px > sd_px) * (beside if off_px > _BLURRED_SIGMAS * sd_px else 1)
     return ground
 
 
