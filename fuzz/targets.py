@@ -19,8 +19,10 @@ from datetime import date
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from kgcp.errors import KgcpError, KgcpWarning, Rejection
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.georef.crs import parse_crs
 from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
@@ -38,6 +40,9 @@ from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import read_grey
+from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
+from kgcp.measurement.discs.records import Operator
 from kgcp.pipeline.execution.journal import from_text
 from kgcp.pipeline.init import draft_flight
 from kgcp.pipeline.init_records import InitOptions
@@ -70,6 +75,7 @@ LATE_MODULES = (
 """What readers import when they are called."""
 
 _CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
+_ROW = 64  # grey values
 _FRAME = (  # a PNG of 1 x 1 px
     b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x01\0\0\0\x01\x08\0\0\0\0:~\x9bU\0\0\0\nIDATx\x9cc`\0"
     b"\0\0\x02\0\x01H\xaf\xa4q\0\0\0\0IEND\xaeB`\x82"
@@ -159,6 +165,15 @@ def frames(data: bytes, folder: Path) -> None:
     read_grey(path, _CAMERA)
 
 
+def discs(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
+    """Find and measure discs in the bytes as grey values, 64 in a row."""
+    grey = np.frombuffer(data[: len(data) // _ROW * _ROW], np.uint8).reshape(-1, _ROW)
+    outlines = find_outlines(grey)
+    follow_outlines(grey, outlines)
+    operator = _chosen(data[::-1], tuple(Operator))
+    measure_discs(grey, outlines, response=_chosen(data, tuple(Response)), operator=operator)
+
+
 def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
     """Read the result of a frame that an interrupted run has left in the flight's folder."""
     try:
@@ -171,7 +186,7 @@ TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
         *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
-        *(frames, journal),
+        *(frames, discs, journal),
     )
 }
 

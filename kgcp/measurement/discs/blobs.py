@@ -29,7 +29,7 @@ _LEAST_FILL = (
 )
 _MOST_ASPECT = 4.5  # of the axes: tilts to 77°
 _LEAST_RADIUS_REDUCED_PX = 5.0  # smaller ones are better seen in the image before reduction
-_SMALLEST_SIDE = 48  # pixels of a reduced image
+_SMALLEST_SIDE, _SMALLEST_FRAME = 48, 8  # pixels of a reduced image, and of any
 
 
 def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
@@ -47,10 +47,11 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
         times this matrix.
     polarities : list of Polarity
     """
-    image, octave = eight_bit(grey), 0
+    octave = 0
+    image = eight_bit(grey) if min(grey.shape) >= _SMALLEST_FRAME else grey
     blobs: list[tuple[float, ...]] = []
     polarities: list[Polarity] = []
-    while octave == 0 or min(image.shape) >= _SMALLEST_SIDE:
+    while min(image.shape) >= (_SMALLEST_SIDE if octave else _SMALLEST_FRAME):
         for polarity, mask in zip(Polarity, _sides(image), strict=True):
             contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
             for contour, links in zip(contours, _links(hierarchy), strict=True):

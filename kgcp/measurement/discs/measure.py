@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +35,7 @@ from kgcp.measurement.discs.records import (
 )
 from kgcp.measurement.image_model.photometry import plateau_levels
 
+_LARGEST_SD_PX = 1.0  # of the centre, and of the moments over the radius
 _NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
 
 
@@ -90,13 +92,13 @@ def _measured(
 ) -> list[Disc | DiscMiss]:
     if operator is not Operator.MODEL:
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
-        return [measure(task) for task in tasks]
+        return [_certain(measure(task)) for task in tasks]
     camera = learn_tone(tasks, response)
     fits = [_fitted(task, camera) for task in tasks]
     scatters = [scatter_of(fit) for fit in fits if isinstance(fit, DiscFit)]
     parts = iter(zip(scatters, inflations(scatters).tolist(), strict=True))
     return [
-        _disc(fit, task.outline, *next(parts)) if isinstance(fit, DiscFit) else fit
+        _certain(_disc(fit, task.outline, *next(parts))) if isinstance(fit, DiscFit) else fit
         for task, fit in zip(tasks, fits, strict=True)
     ]
 
@@ -111,6 +113,23 @@ def _fitted(task: DiscTask, camera: CameraTone) -> DiscFit | DiscMiss:
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
     return fit
+
+
+def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
+    """Refuse a disc whose place or size is hardly known: clutter, or noise."""
+    if isinstance(outcome, DiscMiss):
+        return outcome
+    ellipse = outcome.outline.ellipse
+    scale = np.array((1.0, 1.0, *[ellipse.mean_radius] * 3))
+    if not np.isfinite(outcome.cov).all():
+        return DiscMiss(outcome.outline, DiscReason.POOR_FIT, "singular equations")
+    sd_px = np.sqrt(np.abs(np.diag(outcome.cov))) / scale
+    xx, xy, yy = outcome.vector[2:].tolist()
+    is_ellipse = xx > 0.0 and xx * yy > xy * xy
+    least = np.linalg.eigvalsh(outcome.cov / np.outer(scale, scale))[0]
+    if is_ellipse and least > 0.0 and float(sd_px.max()) < _LARGEST_SD_PX:
+        return replace(outcome, cov=0.5 * (outcome.cov + outcome.cov.T))
+    return DiscMiss(outcome.outline, DiscReason.POOR_FIT, f"uncertain by {sd_px.max():.1f} px")
 
 
 def _others(outline: DiscOutline, neighbours: Sequence[DiscOutline]) -> list[Geometry]:

@@ -1,0 +1,55 @@
+"""Photographs that show no field: whatever is found and measured, nothing breaks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import GreyArray
+from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.discs.records import Disc, Operator
+
+_ROWS, _COLUMNS = np.mgrid[0:90, 0:120]
+PHOTOS: dict[str, GreyArray] = {
+    "one pixel": np.zeros((1, 1), np.uint8),
+    "nothing": np.zeros((0, 7), np.uint8),
+    "a line": np.zeros((3, 300), np.uint8),
+    "even": np.full((60, 60), 255, np.uint8),
+    "noise": np.random.default_rng(0).integers(0, 256, (90, 120)).astype(np.uint8),
+    "deep noise": np.random.default_rng(0).integers(0, 65536, (90, 120)).astype(np.uint16),
+    "floats": np.random.default_rng(0).uniform(0.0, 1.0, (90, 120)),
+    "blocks": np.kron(np.random.default_rng(1).integers(0, 256, (18, 24)), np.ones((5, 5))).astype(
+        np.uint8
+    ),
+    "circles": (np.hypot(_COLUMNS - 60, _ROWS - 45) % 14 < 7).astype(np.uint8) * 255,
+}
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_nothing_breaks(name: str) -> None:
+    photo = PHOTOS[name]
+    outlines = find_outlines(photo)
+    assert (len(outlines) > 0) is (name == "circles")
+    for operator in Operator:
+        for disc in measure_discs(photo, outlines, operator=operator):
+            if isinstance(disc, Disc):
+                assert np.isfinite(disc.vector).all()
+                assert np.linalg.eigvalsh(disc.cov)[0] > 0.0
+
+
+def test_read_only_and_deep_photographs_give_the_same(sharp: GreyArray) -> None:
+    shallow = find_outlines(sharp)
+    sharp.flags.writeable = False
+    assert find_outlines(sharp) == shallow
+    deep = find_outlines(sharp.astype(np.uint16) * 257)
+    assert len(deep) == len(shallow) == 1
+    assert deep[0].ellipse.x == pytest.approx(shallow[0].ellipse.x, abs=1e-6)
+    assert deep[0].contrast == pytest.approx(shallow[0].contrast, rel=1e-6)
+
+
+@pytest.fixture
+def sharp() -> GreyArray:
+    disc = np.clip(np.hypot(_COLUMNS - 60.3, _ROWS - 44.6) - 15.0, -0.5, 0.5) + 0.5
+    levels: GreyArray = (20.0 + 180.0 * disc).astype(np.uint8)
+    return levels
