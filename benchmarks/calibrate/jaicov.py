@@ -15,6 +15,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.network.adjust import PLAIN, adjust
+from kgcp.network.covariance import precision
 from kgcp.network.records import (
     CameraPrior,
     Estimate,
@@ -22,6 +23,7 @@ from kgcp.network.records import (
     Network,
     Observations,
     PointPrior,
+    Precision,
     ScaleBar,
     Solution,
 )
@@ -188,16 +190,16 @@ class Comparison:
     point_sd_ratio: FloatArray  # (m, 3)
 
 
-def compare(solution: Solution, published: Published) -> Comparison:
+def compare(solution: Solution, known: Precision, published: Published) -> Comparison:
     """Return the differences between an adjustment and the published one."""
-    cov = solution.variance_factor * solution.inverse
+    cov = known.variance_factor * known.inverse
     sd = np.sqrt(cov.diagonal())
     correlation = cov[:7, :7] / np.outer(sd[:7], sd[:7])
     return Comparison(
         (solution.estimate.cameras[0] - published.values) / published.sd,
         sd[:7] / published.sd,
         float(np.abs(correlation - published.correlation).max()),
-        _SD_MM * float(np.sqrt(solution.variance_factor)),
+        _SD_MM * float(np.sqrt(known.variance_factor)),
         float(np.abs(solution.estimate.points - published.points).max()),
         sd[7:].reshape(-1, 3) / published.point_sd,
     )
@@ -209,7 +211,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     network, start, published = read_network(parser.parse_args().folder)
     solution = adjust(network, start, PLAIN)
-    result = compare(solution, published)
+    known = precision(network, solution)
+    result = compare(solution, known, published)
     discs = len(network.observations.view)
     print(f"{discs} discs, {len(network.view_camera)} photographs, {solution.iterations} steps")
     print(f"s0 {1e3 * result.s0_mm:.4f} µm, published {1e3 * published.s0_mm:.3f} µm")
@@ -220,8 +223,8 @@ def main() -> None:
     print(f"correlations differ by at most {result.correlation_difference:.4f}")
     low, high = np.quantile(result.point_sd_ratio, [0.01, 0.99])
     print(f"points differ by at most {result.points_mm:.4f} mm, sd x {low:.3f}-{high:.3f}")
-    robust = np.sqrt(solution.robust_camera_cov.diagonal())
-    formal = np.sqrt(solution.variance_factor * solution.inverse.diagonal()[:7])
+    robust = np.sqrt(known.camera_cov.diagonal())
+    formal = np.sqrt(known.variance_factor * known.inverse.diagonal()[:7])
     print("clustered over formal sd: " + " ".join(f"{r:.2f}" for r in robust / formal))
 
 

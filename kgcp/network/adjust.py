@@ -9,9 +9,9 @@ import numpy as np
 from scipy import linalg
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.network.covariance import camera_covariance, pose_inverses, redundancy_numbers
 from kgcp.network.equations import (
     ReducedSystem,
+    bordered_by,
     computed,
     inner_constraints,
     moved,
@@ -24,7 +24,10 @@ from kgcp.network.records import Estimate, Network, Solution
 
 _FIRST_DAMPING = 1e-4
 _MOST_DAMPING = 1e12
-_CONVERGED = 1e-10  # relative decrease of the cost
+_CONVERGED = 1e-8  # relative decrease of the cost
+_MOST_STEPS = 100
+_ROUND_STEPS = 2  # between two reweightings, of what changes anyway
+_SETTLED_WEIGHT = 0.05  # change of a weight between two rounds
 _HUBER = 2.0  # in units of the robust deviation of a disc's residual
 _MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
 _LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
@@ -74,25 +77,25 @@ def adjust(network: Network, start: Estimate, robustness: Robustness = ROBUST) -
     count = len(network.observations.view)
     weights, is_used = np.ones(count), np.ones(count, dtype=np.bool_)
     estimate, iterations = start, 0
-    for _ in range(_ROUNDS if robustness != PLAIN else 1):
-        estimate, steps = _minimise(network, estimate, weights)
-        iterations += steps
-        if robustness == PLAIN:
-            break
-        next_weights, next_used = _reweighted(network, estimate, robustness)
-        is_stable = np.array_equal(next_used, is_used) and np.allclose(
-            next_weights, weights, atol=0.02
-        )
-        weights, is_used = next_weights, next_used
-        if is_stable:
-            estimate, steps = _minimise(network, estimate, weights)
+    if robustness != PLAIN:
+        for _ in range(_ROUNDS):
+            estimate, steps = _minimise(network, estimate, weights, _ROUND_STEPS)
             iterations += steps
-            break
-    return _solution(network, estimate, weights, is_used, iterations)
+            next_weights, next_used = _reweighted(network, estimate, robustness)
+            is_stable = np.array_equal(next_used, is_used) and np.allclose(
+                next_weights, weights, atol=_SETTLED_WEIGHT
+            )
+            weights, is_used = next_weights, next_used
+            if is_stable:
+                break
+    estimate, steps = _minimise(network, estimate, weights, _MOST_STEPS)
+    iterations += steps
+    residuals = network.observations.places - computed(network, estimate)
+    return Solution(estimate, residuals, is_used, weights, iterations)
 
 
 def _minimise(
-    network: Network, estimate: Estimate, weights: FloatArray, most_steps: int = 100
+    network: Network, estimate: Estimate, weights: FloatArray, most_steps: int
 ) -> tuple[Estimate, int]:
     """Return the estimate with the least weighted sum of squares, and the steps taken."""
     damping = _FIRST_DAMPING
@@ -131,17 +134,12 @@ def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> Floa
         factor = linalg.cho_factor(scaled)
         return np.asarray(scale * linalg.cho_solve(factor, scale * system.right))
     basis = inner_constraints(network, network.points.nominal) / scale.max()
-    bordered = _bordered(scaled, basis * scale[:, None])
+    bordered = bordered_by(scaled, basis * scale[:, None])
     first = network.cameras.values.size
     shift = (network.points.nominal - estimate.points).ravel()
     right = np.concatenate((scale * system.right, basis[first:].T @ shift))
     solved = linalg.solve(bordered, right, assume_a="sym")
     return np.asarray(scale * solved[: len(scale)])
-
-
-def _bordered(normal: FloatArray, basis: FloatArray) -> FloatArray:
-    corner = np.zeros((basis.shape[1],) * 2)
-    return np.block([[normal, basis], [basis.T, corner]])
 
 
 def _reweighted(
@@ -163,56 +161,3 @@ def _reweighted(
         huber = _HUBER * deviation * math.sqrt(2.0)
         weights *= np.minimum(1.0, huber / np.maximum(sizes, np.finfo(float).tiny))
     return weights, is_used
-
-
-def _solution(
-    network: Network,
-    estimate: Estimate,
-    weights: FloatArray,
-    is_used: BoolArray,
-    iterations: int,
-) -> Solution:
-    equations = view_rows(network, estimate, weights)
-    system = reduce_poses(network, estimate, equations)
-    inverse = _inverse(network, system)
-    residuals = network.observations.places - computed(network, estimate)
-    redundancy = redundancy_numbers(equations, system, inverse, len(weights))
-    squares = float(np.sum(whitened(network, residuals, weights) ** 2))
-    squares += prior_cost(network, estimate)
-    factor = squares / max(_degrees_of_freedom(network, weights, len(inverse)), 1)
-    return Solution(
-        estimate,
-        residuals,
-        is_used,
-        weights,
-        redundancy,
-        factor,
-        inverse,
-        pose_inverses(system, inverse),
-        camera_covariance(network, equations, inverse, factor),
-        iterations,
-    )
-
-
-def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) -> int:
-    """Return observations plus priors minus unknowns."""
-    used = 2 * int(np.count_nonzero(weights))
-    priors = int(np.count_nonzero(np.isfinite(network.cameras.sd))) + len(network.points.bars)
-    if network.points.information is not None:
-        priors += int(np.linalg.matrix_rank(network.points.information).sum())
-    poses = 6 * len(network.view_camera)
-    return used + priors + network.points.datum_defect - unknowns - poses
-
-
-def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
-    """Return the inverse (u, u) of the reduced normal equations, under the inner constraints."""
-    scale = 1.0 / np.sqrt(system.normal.diagonal())
-    scaled = system.normal * np.outer(scale, scale)
-    if network.points.datum_defect == 0:
-        inverse: FloatArray = linalg.cho_solve(linalg.cho_factor(scaled), np.eye(len(scale)))
-    else:
-        basis = inner_constraints(network, network.points.nominal) / scale.max()
-        bordered = _bordered(scaled, basis * scale[:, None])
-        inverse = np.asarray(np.linalg.inv(bordered)[: len(scale), : len(scale)])
-    symmetric = 0.5 * (inverse + inverse.T)
-    return np.asarray(symmetric * np.outer(scale, scale))

@@ -11,15 +11,91 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import linalg
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.network.equations import ReducedSystem, ViewRows, whitened
-from kgcp.network.records import Network, Solution
+from kgcp.network.equations import (
+    ReducedSystem,
+    ViewRows,
+    bordered_by,
+    inner_constraints,
+    prior_cost,
+    reduce_poses,
+    view_rows,
+    whitened,
+)
+from kgcp.network.records import Network, Precision, Solution
 
 _LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, a photograph decides it alone
 
 
-def pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
+def precision(network: Network, solution: Solution) -> Precision:
+    """Return how well an adjusted network determines its unknowns.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If an unknown is not determined at all.
+    """
+    equations = view_rows(network, solution.estimate, solution.weights)
+    system = reduce_poses(network, solution.estimate, equations)
+    inverse = _inverse(network, system)
+    squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
+    squares += prior_cost(network, solution.estimate)
+    factor = squares / max(_degrees_of_freedom(network, solution.weights, len(inverse)), 1)
+    return Precision(
+        factor,
+        inverse,
+        _pose_inverses(system, inverse),
+        _redundancy_numbers(equations, system, inverse, len(solution.weights)),
+        _camera_covariance(network, equations, inverse, factor),
+    )
+
+
+def observation_factor(network: Network, solution: Solution) -> float:
+    """Return the variance factor of the observations alone, whatever priors there are."""
+    equations = view_rows(network, solution.estimate, solution.weights)
+    system = reduce_poses(network, solution.estimate, equations)
+    inverse = _inverse(network, system)
+    squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
+    information = np.zeros_like(inverse)
+    cameras = np.arange(network.cameras.values.size)
+    information[cameras, cameras] = network.cameras.sd.ravel() ** -2.0
+    if network.points.information is not None:
+        index = np.arange(len(network.points.nominal))
+        blocks = information[len(cameras) :, len(cameras) :].reshape(len(index), 3, len(index), 3)
+        blocks[index, :, index, :] = network.points.information
+    from_priors = float(np.sum(inverse * information))
+    used = 2 * int(np.count_nonzero(solution.weights))
+    taken = len(inverse) - from_priors - network.points.datum_defect
+    return squares / max(used - taken - 6 * len(network.view_camera), 1.0)
+
+
+def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) -> int:
+    """Return observations plus priors minus unknowns."""
+    used = 2 * int(np.count_nonzero(weights))
+    priors = int(np.count_nonzero(np.isfinite(network.cameras.sd))) + len(network.points.bars)
+    if network.points.information is not None:
+        priors += int(np.linalg.matrix_rank(network.points.information).sum())
+    poses = 6 * len(network.view_camera)
+    return used + priors + network.points.datum_defect - unknowns - poses
+
+
+def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
+    """Return the inverse (u, u) of the reduced normal equations, under the inner constraints."""
+    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scaled = system.normal * np.outer(scale, scale)
+    if network.points.datum_defect == 0:
+        inverse: FloatArray = linalg.cho_solve(linalg.cho_factor(scaled), np.eye(len(scale)))
+    else:
+        basis = inner_constraints(network, network.points.nominal) / scale.max()
+        bordered = bordered_by(scaled, basis * scale[:, None])
+        inverse = np.asarray(np.linalg.inv(bordered)[: len(scale), : len(scale)], dtype=np.float64)
+    inverse = 0.5 * (inverse + inverse.T)
+    return np.asarray(inverse * np.outer(scale, scale))
+
+
+def _pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
     """Return the cofactors (v, 6, 6) of the poses, cameras and points being unknown too."""
     cofactors = []
     for normal, coupling, columns in zip(
@@ -31,7 +107,7 @@ def pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
     return np.array(cofactors)
 
 
-def redundancy_numbers(
+def _redundancy_numbers(
     equations: Sequence[ViewRows], system: ReducedSystem, inverse: FloatArray, count: int
 ) -> FloatArray:
     """Return the share (n,) of each disc's two coordinates that checks the others, 0…2."""
@@ -45,7 +121,7 @@ def redundancy_numbers(
     return redundancy
 
 
-def camera_covariance(
+def _camera_covariance(
     network: Network, equations: Sequence[ViewRows], inverse: FloatArray, factor: float
 ) -> FloatArray:
     """Return the covariance (c p, c p) of the camera parameters, clustered by photograph.
@@ -64,15 +140,27 @@ def camera_covariance(
 
 
 def _score(view: ViewRows, inverse: FloatArray) -> FloatArray:
-    """Return a photograph's Aᵀ (I - H)⁻¹ r (k,), the pose eliminated."""
+    """Return a photograph's Aᵀ (I - H)⁻¹ r (k,), the pose eliminated.
+
+    By the eigenvalues of H, in whichever space is smaller: that of the observations, or that of the
+    unknowns, where H is LᵀAᵀA L with the Cholesky factor L of the cofactors.
+    """
     projected, residuals = _without_pose(view)
     shared = inverse[np.ix_(view.columns, view.columns)]
-    values, vectors = np.linalg.eigh(np.eye(len(residuals)) - projected @ shared @ projected.T)
-    along = vectors.T @ residuals
-    is_checked = values > _LEAST_REDUNDANCY
-    along[is_checked] /= values[is_checked]
-    along[~is_checked] = 0.0
+    if len(view.columns) < len(residuals):
+        root = np.linalg.cholesky(shared)
+        values, vectors = np.linalg.eigh(root.T @ (projected.T @ projected) @ root)
+        along = vectors.T @ (root.T @ (projected.T @ residuals))
+        return np.asarray(np.linalg.solve(root.T, vectors @ _divided(along, 1.0 - values)))
+    values, vectors = np.linalg.eigh(projected @ shared @ projected.T)
+    along = _divided(vectors.T @ residuals, 1.0 - values)
     return np.asarray(projected.T @ (vectors @ along))
+
+
+def _divided(along: FloatArray, redundancy: FloatArray) -> FloatArray:
+    """Return components over their redundancy, 0 where a photograph decides one alone."""
+    is_checked = redundancy > _LEAST_REDUNDANCY
+    return np.where(is_checked, along / np.where(is_checked, redundancy, 1.0), 0.0)
 
 
 def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
@@ -111,15 +199,19 @@ def tangled(names: Sequence[str], cov: FloatArray, most_inflation: float) -> tup
     )
 
 
-def variance_components(network: Network, solution: Solution, group: IndexArray) -> FloatArray:
+def variance_components(
+    network: Network, solution: Solution, redundancy: FloatArray, group: IndexArray
+) -> FloatArray:
     """Return s₀² (g,) of every group of observations, by residuals over redundancy.
 
     Parameters
     ----------
+    redundancy : (n,) array
+        As `Precision.redundancy`.
     group : (n,) array
         Index of the group of each disc: its photograph, its kind of mark.
     """
     squares = np.sum(whitened(network, solution.residuals, solution.weights) ** 2, axis=1)
     count = int(group.max()) + 1
-    total = np.bincount(group, solution.redundancy, count)
+    total = np.bincount(group, redundancy, count)
     return np.asarray(np.bincount(group, squares, count) / np.maximum(total, 1e-9))

@@ -279,6 +279,12 @@ def inner_constraints(network: Network, points: FloatArray) -> FloatArray:
     return basis
 
 
+def bordered_by(normal: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return normal equations (u, u) with constraints (u, d) on their unknowns."""
+    corner = np.zeros((basis.shape[1],) * 2)
+    return np.block([[normal, basis], [basis.T, corner]])
+
+
 def _cross_matrices(vectors: FloatArray) -> FloatArray:
     """Return the matrices (n, 3, 3) of the products v × ·."""
     x, y, z = vectors.T

@@ -42,7 +42,8 @@ class FrameCameraModel:
         """Return the camera of some unknowns (p,)."""
         fields = dict(zip(self.names, values.tolist(), strict=True))
         if self.is_same_aspect:
-            fields["fy"] = fields["fx"] * self.template.fy / self.template.fx
+            ratio = self.template.fy / self.template.fx  # exactly 1 where they are the same
+            fields["fy"] = fields["fx"] * ratio
         return replace(self.template, **fields)
 
     def places(self, values: FloatArray, normalised: FloatArray) -> FloatArray:

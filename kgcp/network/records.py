@@ -113,20 +113,26 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Outcome of an adjustment.
+    """Outcome of an adjustment."""
+
+    estimate: Estimate
+    residuals: FloatArray  # (n, 2): observed minus computed
+    is_used: BoolArray  # (n,): whether a disc was kept
+    weights: FloatArray  # (n,): robust weights in 0…1; 0 where a disc was rejected
+    iterations: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Precision:
+    """How well a network determines its unknowns.
 
     `inverse` is that of the reduced normal equations: poses eliminated, cameras first, then points
     if they are unknowns. It has the scale of the stated covariances; `variance_factor` multiplies
     it.
     """
 
-    estimate: Estimate
-    residuals: FloatArray  # (n, 2): observed minus computed
-    is_used: BoolArray  # (n,): whether a disc was kept
-    weights: FloatArray  # (n,): robust weights in 0…1; 0 where a disc was rejected
-    redundancy: FloatArray  # (n,): of the two coordinates together, 0…2
     variance_factor: float  # s₀²
     inverse: FloatArray  # (u, u)
     pose_inverses: FloatArray  # (v, 6, 6): translation, left rotation vector; as `inverse`
-    robust_camera_cov: FloatArray  # (c p, c p): clustered by photograph, never below s₀² N⁻¹
-    iterations: int
+    redundancy: FloatArray  # (n,): of the two coordinates together, 0…2
+    camera_cov: FloatArray  # (c p, c p): clustered by photograph, never below s₀² N⁻¹
