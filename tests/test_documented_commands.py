@@ -26,8 +26,14 @@ FRAMES = ("frame_0002.jpg", "frame_0006.jpg", "frame_0011.jpg", "frame_0015.jpg"
 OF_OTHERS = {"--force-gps", "--gcp", "--gps-accuracy", "--tilt", "--wander"}
 HERE = "sample_flight"
 BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
-# Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates.
-READ_ONLY = {"--scheduler", "simulate", "north"}  # tests/cli/test_merging.py merges flights
+# Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates, and
+# tests/cli/test_calibrate.py calibrates.
+READ_ONLY = {
+    "--scheduler",
+    "simulate",
+    "calibrate",
+    "north",
+}  # tests/cli/test_merging.py merges flights
 STORES = ("s3://", "gs://")
 
 

@@ -25,6 +25,7 @@ COMMANDS = {
     "bias-report": "kgcp.cli.bias_report",
     "plan": "kgcp.cli.plan",
     "target": "kgcp.cli.target",
+    "calibrate": "kgcp.cli.calibrate",
     "simulate": "kgcp.cli.simulate",
 }
 

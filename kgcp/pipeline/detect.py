@@ -18,6 +18,7 @@ from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.provenance import detections_provenance, versions, write_run_record
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
+from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
@@ -152,7 +153,8 @@ def detect_flight(
     table = out / DETECTIONS
     builder = SummaryBuilder(_without(times, set(all_frames).difference(frames)))
     not_drawn = 0
-    with Journal(out / ".detections.journal", _making(job), is_new=options.is_restart) as journal:
+    path, is_new = out / ".detections.journal", options.is_restart
+    with Journal(path, _making(job), (FrameResult,), is_new=is_new) as journal:
         with open_pool(
             options.jobs,
             options.frame_timeout_s,
@@ -230,7 +232,9 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
     return ContactSheet(folder)
 
 
-def _stages_s(stopwatch: Stopwatch, journal: Journal, pool: WorkerPool) -> dict[str, float]:
+def _stages_s(
+    stopwatch: Stopwatch, journal: Journal[FrameResult], pool: WorkerPool
+) -> dict[str, float]:
     workers = pool.stages_s.most_common()
     return {
         **stopwatch.stages_s,

@@ -118,7 +118,7 @@ class DetectionRun:
         self,
         job: DetectionJob,
         inputs: Sequence[FrameInput],
-        journal: Journal,
+        journal: Journal[FrameResult],
         pool: WorkerPool,
         listener: ProgressListener,
     ) -> None:

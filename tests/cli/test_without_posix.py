@@ -116,7 +116,7 @@ def test_two_at_once_are_told(windows: dict[str, str], flight: Path, tmp_path: P
         "import sys, time\n"
         "from pathlib import Path\n"
         "from kgcp.pipeline.execution.journal import Journal\n"
-        "with Journal(Path(sys.argv[1]), {}, is_new=False):\n"
+        "with Journal(Path(sys.argv[1]), {}, (), is_new=False):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.readline()\n"
     )

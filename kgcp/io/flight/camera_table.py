@@ -10,6 +10,7 @@ import numpy as np
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
 from kgcp.geometry.camera import Camera, Response, TimeReference
+from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
 from kgcp.settings import require_range
@@ -21,6 +22,12 @@ CAMERA_KEYS = (
     *(*DEVIATION_KEYS, "cov_of", "cov", "plumb_sd_deg"),
     *("response", "readout_s", "motion_sd_deg_s", "time_reference"),
 )
+
+
+OWN_FORMAT = "kgcp"
+"""Of a camera.toml, as `kgcp calibrate` writes it."""
+OWN_KEYS = ("width", "height", *CALIBRATION_PARAMETERS, "response", "cov_of", "cov")
+_FORMATS = (OWN_FORMAT, *FORMATS.names)
 
 
 def read_camera(table: TomlTable, folder: Path) -> Camera:
@@ -37,7 +44,7 @@ def read_camera(table: TomlTable, folder: Path) -> Camera:
     with table.located():
         return replace(
             camera,
-            response=response or Response.UNKNOWN,
+            response=response or camera.response,
             readout_s=table.number("readout_s", 0.0),
             motion_sd_deg_s=table.number("motion_sd_deg_s", camera.motion_sd_deg_s),
             time_reference=moment or TimeReference.MIDDLE,
@@ -60,16 +67,49 @@ def _file_camera(table: TomlTable, folder: Path) -> Camera:
     for key in ("guessed", *CALIBRATION_PARAMETERS):
         if key in table:
             raise table.error(key, "is given beside a calibration file", "delete one of the two")
+    own = _own_table(table, folder)
+    if own is not None:
+        return read_camera(own, folder)
     return read_calibration(
         table.existing_file("file", folder),
         (table.optional("width", table.integer), table.optional("height", table.integer)),
-        table.optional("format", lambda key: table.choice(key, FORMATS.names)),
+        table.optional("format", lambda key: table.choice(key, _FORMATS)),
         table.optional("camera", table.text),
     )
 
 
-def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | None:
-    """Return how well the camera is calibrated; None where the table says nothing about it.
+def _own_table(table: TomlTable, folder: Path) -> TomlTable | None:
+    """Return the [camera] of the camera.toml that a table names; None: it names none."""
+    if "file" not in table:
+        return None
+    path = table.existing_file("file", folder)
+    form = table.optional("format", lambda key: table.choice(key, _FORMATS))
+    if form != OWN_FORMAT and (form is not None or path.suffix != ".toml"):
+        return None
+    for key in ("camera", "width", "height"):
+        if key in table:
+            raise table.error(key, "is given beside a camera.toml", "delete it")
+    whole, _ = read_toml(path, ("camera",), "[camera] file")
+    return whole.table("camera", OWN_KEYS)
+
+
+def read_camera_file(path: Path) -> tuple[Camera, CalibrationCovariance | None]:
+    """Return the camera of a camera.toml, and how well it is known.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, key and remedy.
+    """
+    whole, _ = read_toml(path, ("camera",), "[camera] file")
+    table = whole.table("camera", OWN_KEYS)
+    return read_camera(table, path.parent), read_calibration_covariance(table, path.parent)
+
+
+def read_calibration_covariance(table: TomlTable, folder: Path) -> CalibrationCovariance | None:
+    """Return how well the camera is calibrated; None where nothing is said about it.
+
+    A camera.toml brings its covariance with it. Beside it the table may state another.
 
     Raises
     ------
@@ -87,7 +127,8 @@ def read_calibration_covariance(table: TomlTable) -> CalibrationCovariance | Non
         with table.located():
             return CalibrationCovariance.of(names, cov)
     if not deviations:
-        return None
+        own = _own_table(table, folder)
+        return None if own is None else read_calibration_covariance(own, folder)
     sd = np.array([table.number(key) for key in deviations])
     with table.located():
         for key, value in zip(deviations, sd, strict=True):

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.safe_read import is_file, is_folder, likely_encoding, read_bytes
+from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.flight.camera_table import (
     CAMERA_KEYS,
     read_calibration_covariance,
@@ -19,7 +17,7 @@ from kgcp.io.flight.camera_table import (
     read_plumb_sd_deg,
 )
 from kgcp.io.flight.target_table import read_targets
-from kgcp.io.flight.toml_mistakes import explain
+from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
@@ -31,11 +29,6 @@ REFERENCE_KEYS = ("poses", "format", "crs", "offset")
 
 FLIGHT_KEYS = ("name", "crs", "frames", "camera", "target", "vehicle", "reference")
 FRAMES_KEYS = ("folder", "times", "times_format", "exif_fallback")
-_MOST_BYTES = 1 << 18
-# tomllib takes the square of the number of a key's parts.
-_LONG_KEY = re.compile(
-    r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')[ \t]*+\.[ \t]*+){50}"""
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +94,7 @@ def read_flight(folder: Path | str) -> Flight:
         times file or the calibration file does not exist.
     """
     folder = Path(folder)
-    table, text = _read_toml(folder / "flight.toml")
+    table, text = _read_flight_toml(folder)
     frames_folder, times_file, times_format = _read_frames(table, folder)
     exif_fallback = table.table("frames", FRAMES_KEYS, required=False).boolean(
         "exif_fallback", default=False
@@ -120,7 +113,7 @@ def read_flight(folder: Path | str) -> Flight:
         times_format=times_format,
         may_use_exif_times=times_file is None or exif_fallback,
         camera=read_camera(camera, folder),
-        calibration_covariance=read_calibration_covariance(camera),
+        calibration_covariance=read_calibration_covariance(camera, folder),
         is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
         targets=read_targets(table),
@@ -138,7 +131,7 @@ def read_printed_targets(folder: Path) -> tuple[Target, ...]:
     KgcpError
         As `read_flight`, for what is wrong with the targets.
     """
-    return read_targets(_read_toml(folder / "flight.toml")[0])
+    return read_targets(_read_flight_toml(folder)[0])
 
 
 def read_target_tables(path: Path) -> tuple[Target, ...]:
@@ -149,7 +142,7 @@ def read_target_tables(path: Path) -> tuple[Target, ...]:
     KgcpError
         As `read_flight`, for what is wrong with the targets.
     """
-    return read_targets(_read_toml(path)[0])
+    return read_targets(read_toml(path, FLIGHT_KEYS, "the targets")[0])
 
 
 def read_camera_and_targets(
@@ -162,9 +155,13 @@ def read_camera_and_targets(
     KgcpError
         As `read_flight`, for what is wrong with them.
     """
-    table, _ = _read_toml(folder / "flight.toml")
+    table, _ = _read_flight_toml(folder)
     camera = table.table("camera", CAMERA_KEYS)
-    return read_camera(camera, folder), read_calibration_covariance(camera), read_targets(table)
+    return (
+        read_camera(camera, folder),
+        read_calibration_covariance(camera, folder),
+        read_targets(table),
+    )
 
 
 def _name_of(folder: Path) -> str:
@@ -172,29 +169,14 @@ def _name_of(folder: Path) -> str:
     return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
-def _read_toml(path: Path) -> tuple[TomlTable, str]:
-    """Return the whole file as a table, and as text."""
+def _read_flight_toml(folder: Path) -> tuple[TomlTable, str]:
+    path = folder / "flight.toml"
     if not is_file(path):
         raise KgcpError(
             f"{path}: does not exist; name a flight folder, which has a flight.toml ('kgcp init'"
             " writes one)"
         )
-    try:
-        content = read_bytes(path, "FLIGHT", _MOST_BYTES)
-        text = content.decode("utf-8-sig").replace("\r\n", "\n")
-    except UnicodeDecodeError as error:
-        likely = likely_encoding(content)
-        raise KgcpError(f"{path}: is not UTF-8 but {likely}; save it as UTF-8") from error
-    if _LONG_KEY.search(text):
-        raise KgcpError(f"{path}: has a key of very many parts; delete it")
-    try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        problem, remedy = explain(text, str(error))
-        raise KgcpError(f"{path}: is not TOML: {problem}; {remedy}") from error
-    except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
-        raise KgcpError(f"{path}: is not readable TOML ({error}); rewrite it") from error
-    return TomlTable(f"{path}:", values, FLIGHT_KEYS), text
+    return read_toml(path, FLIGHT_KEYS, "FLIGHT")
 
 
 def _read_frames(flight: TomlTable, folder: Path) -> tuple[Path, Path | None, str | None]:

@@ -27,13 +27,14 @@ from enum import Enum
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.io.files.portable import OPEN_FLAGS, lock
 from kgcp.measurement import records
+from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.records import Considered, FrameResult, Imaging, Miss, TimeSource, ToneBase
 
 # All records that a result may consist of; `records` also imports those of other modules.
@@ -41,10 +42,12 @@ _RECORDS: dict[str, type] = {
     name: record
     for name, record in vars(records).items()
     if isinstance(record, type) and is_dataclass(record)
-}
+} | {record.__name__: record for record in (PhotoDiscs, PhotoMiss)}
 _REASONS: dict[str, Reason] = {reason.value: reason for reason in Reason}
 _TONE_BASES: dict[str, ToneBase] = {base.value: base for base in ToneBase}
 _TIME_SOURCES: dict[str, TimeSource] = {source.value: source for source in TimeSource}
+
+Result = TypeVar("Result")
 
 _MADE_BY = "made-by"  # the key of the first line
 _SHORTEST_S = 1.0  # between two waits for the disk: what a power failure may cost
@@ -60,8 +63,8 @@ def to_text(value: object) -> str:
     return json.dumps(value, default=_plain, separators=(",", ":"))
 
 
-def from_text(text: str | bytes) -> FrameResult:
-    """Return the result of a frame that `to_text` wrote; arrays are of float64, and in C order.
+def from_text(text: str | bytes, kinds: tuple[type[Result], ...]) -> Result:
+    """Return a result of one of these kinds that `to_text` wrote; arrays are of float64.
 
     Raises
     ------
@@ -72,8 +75,8 @@ def from_text(text: str | bytes) -> FrameResult:
         result = json.loads(text, object_hook=_record)
     except (KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"no record: {error}") from error
-    if not isinstance(result, FrameResult):
-        raise ValueError(f"a {type(result).__name__}, and not the result of a frame")
+    if not isinstance(result, kinds):
+        raise ValueError(f"a {type(result).__name__}, and not a result")
     return result
 
 
@@ -110,7 +113,7 @@ def _record(cells: dict[str, Any]) -> object:
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in cells.items()})
 
 
-class Journal:
+class Journal(Generic[Result]):
     """Results of frames by their keys, on disk; only one process at a time has it.
 
     Used in a `with` block, at the end of which, however that is left, all results are kept.
@@ -121,6 +124,8 @@ class Journal:
         The file; it and its folder are made if need be. What was made otherwise is deleted.
     making : mapping of str
         What results are made with: name, for messages, to value.
+    kinds : tuple of type
+        Records that a result may be.
     is_new : bool
         Whether to discard what is there.
 
@@ -138,8 +143,16 @@ class Journal:
         written.
     """
 
-    def __init__(self, path: Path, making: Mapping[str, str], *, is_new: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        making: Mapping[str, str],
+        kinds: tuple[type[Result], ...],
+        *,
+        is_new: bool,
+    ) -> None:
         self._path = path
+        self._kinds = kinds
         self._due_s = time.monotonic() + _SHORTEST_S
         self.seconds = 0.0
         self.changes: tuple[str, ...] = ()
@@ -181,22 +194,22 @@ class Journal:
         """Yield the keys of all results."""
         return (key for key in self._offsets if key != _MADE_BY)
 
-    def get(self, key: str) -> FrameResult | None:
+    def get(self, key: str) -> Result | None:
         """Return the result of a key; None if there is none that can be read."""
         if key not in self._offsets:
             return None
         with self._access(), suppress(ValueError, IndexError):
-            return from_text(self._body(key))
+            return from_text(self._body(key), self._kinds)
         return None
 
-    def read(self, key: str) -> FrameResult:
+    def read(self, key: str) -> Result:
         """Return the result of a key that was there."""
         result = self.get(key)
         if result is None:
             raise KgcpError(f"{self._path}: is damaged; start over", option="restart")
         return result
 
-    def add(self, key: str, result: FrameResult) -> None:
+    def add(self, key: str, result: Result) -> None:
         """Keep a result: at once for other processes, and on the disk within a second or so."""
         with self._access():
             self._append(key, to_text(result))

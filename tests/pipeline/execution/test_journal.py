@@ -115,9 +115,9 @@ def result(frame: str) -> FrameResult:
     return FrameResult(frame, 0.1, ExposureSettings(), (Miss("A", Reason.CUT, "ü\n"),))
 
 
-def open_journal(folder: Path, *, is_new: bool = False, camera: str = "b") -> Journal:
+def open_journal(folder: Path, *, is_new: bool = False, camera: str = "b") -> Journal[FrameResult]:
     making = {"the settings": "a", "the camera": camera}
-    return Journal(folder / "journal", making, is_new=is_new)
+    return Journal(folder / "journal", making, (FrameResult,), is_new=is_new)
 
 
 def fill(folder: Path, count: int) -> None:
@@ -136,13 +136,13 @@ def keys(folder: Path) -> list[str]:
 def test_a_result_comes_back_to_the_last_bit(one: FrameResult) -> None:
     text = to_text(one)
     assert "\n" not in text
-    assert bits(from_text(text)) == bits(one)
+    assert bits(from_text(text, (FrameResult,))) == bits(one)
 
 
 @pytest.mark.parametrize("text", NO_RESULTS, ids=lambda text: text[:30])
 def test_what_is_no_result_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
-        from_text(text)
+        from_text(text, (FrameResult,))
 
 
 def test_a_fingerprint_tells_values_apart() -> None:
@@ -194,7 +194,7 @@ def run(program: str, folder: Path) -> subprocess.Popen[str]:
         "from kgcp.measurement.records import ExposureSettings, FrameResult, Miss",
         "from kgcp.pipeline.execution.journal import Journal",
         "making = {'the settings': 'a', 'the camera': 'b'}",
-        "journal = Journal(Path(sys.argv[1]), making, is_new=False)",
+        "journal = Journal(Path(sys.argv[1]), making, (FrameResult,), is_new=False)",
     )
     return subprocess.Popen(
         [sys.executable, "-c", "\n".join((*lines, program)), str(folder / "journal")],

@@ -1,0 +1,190 @@
+"""`kgcp calibrate`: photographs of a field of targets in, a camera with its covariance out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kgcp.cli.detect_log import log_to_stderr, stopping
+from kgcp.cli.options import json_option
+
+if TYPE_CHECKING:
+    from kgcp.pipeline.calibration.results import CalibrationResults
+
+# Named here, not imported, because the modules that know them take numpy; a test compares.
+POINTS = ("fixed", "stiff", "free")
+LENSES = ("auto", "radial", "brown", "rational")
+OPERATORS = ("model", "gaussian", "centroid")
+RESPONSES = ("linear", "srgb", "unknown")
+FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf")
+
+
+@click.command()
+@click.argument(
+    "photos", metavar="PHOTOS…", type=click.Path(path_type=Path), nargs=-1, required=True
+)
+@click.option(
+    "--field",
+    "field_text",
+    metavar="FIELD",
+    required=True,
+    help="The field: a field.toml, another program's board file, or a shorthand such as"
+    " grid:10x8:25mm:15mm (columns x rows, pitch, diameter; also asymmetric: and hexagonal:, and"
+    " :bright at the end for bright discs).",
+)
+@click.option(
+    "--unit",
+    type=click.Choice(("mm", "cm", "m", "in")),
+    help="Unit of a board file that does not say its unit, as BoofCV's.",
+)
+@click.option(
+    "--out",
+    metavar="FOLDER",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("calibration"),
+    show_default=True,
+    help="Folder for the results.",
+)
+@click.option(
+    "--points",
+    type=click.Choice(POINTS),
+    default="stiff",
+    show_default=True,
+    help="Take the field exactly as stated, let it deviate by what its field.toml allows, or"
+    " estimate its shape.",
+)
+@click.option(
+    "--model",
+    "lens",
+    type=click.Choice(LENSES),
+    default="auto",
+    show_default=True,
+    help="Terms of distortion: k1 and what is significant, k1 k2, k1 k2 p1 p2 k3, or all eight.",
+)
+@click.option(
+    "--same-aspect/--free-aspect",
+    "is_same_aspect",
+    default=True,
+    show_default=True,
+    help="Estimate one focal length, or fx and fy.",
+)
+@click.option(
+    "--response",
+    type=click.Choice(RESPONSES),
+    default="unknown",
+    show_default=True,
+    help="How grey values follow light.",
+)
+@click.option(
+    "--operator",
+    type=click.Choice(OPERATORS),
+    default="model",
+    show_default=True,
+    help="How discs are measured; 'gaussian' and 'centroid' are for comparison.",
+)
+@click.option(
+    "--format",
+    "formats",
+    type=click.Choice(FORMATS),
+    multiple=True,
+    help="Also write the camera for this program; may be repeated.",
+)
+@click.option(
+    "--jobs",
+    type=click.IntRange(0, 256),
+    default=None,
+    help="Number of worker processes; 0 runs in this process.  [default: the usable cores]",
+)
+@click.option(
+    "--restart",
+    "is_restart",
+    is_flag=True,
+    help="Discard the results of an interrupted run and start over.",
+)
+@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
+@json_option
+def command(
+    photos: tuple[Path, ...],
+    field_text: str,
+    unit: str | None,
+    out: Path,
+    points: str,
+    lens: str,
+    response: str,
+    operator: str,
+    formats: tuple[str, ...],
+    jobs: int | None,
+    *,
+    is_same_aspect: bool,
+    is_restart: bool,
+    is_quiet: bool,
+    as_json: bool,
+) -> None:
+    """Calibrate a camera by photographs of a field of discs.
+
+    PHOTOS are images or folders of images. Twelve or more are good: the whole field in each, tilted
+    by 25 to 40 degrees in all directions, two with the camera turned by 90 degrees.
+
+    Writes camera.toml, with the full covariance, which [camera] file in flight.toml reads; tables
+    of all discs, of the field and of the photographs; and calibration.html.
+
+    If a run is interrupted, repeat the command to resume it.
+
+    Example: kgcp calibrate photos --field grid:10x8:25mm:15mm --format opencv
+    """
+    from kgcp.geometry.camera import Response
+    from kgcp.io.flight.field_file import read_field
+    from kgcp.measurement.discs.records import Operator
+    from kgcp.network.calibration_records import CalibrationSettings, LensModel, PointModel
+    from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, find_photos
+    from kgcp.report.plotting import load_matplotlib
+
+    load_matplotlib()  # before the report does
+    from kgcp.pipeline.calibration.results import check_formats, write_results
+
+    field = read_field(field_text, unit)
+    options = CalibrationOptions(
+        CalibrationSettings(PointModel(points), LensModel(lens), is_same_aspect),
+        Response(response),
+        Operator(operator),
+        jobs,
+        is_restart=is_restart,
+    )
+    check_formats(options.settings, formats)
+    found = find_photos(photos)
+    with log_to_stderr(is_quiet=is_quiet, as_json=False) as log, stopping(log):
+        made = calibrate_photos(found, field, out, options, log)
+    results = write_results(made, out, formats)
+    if as_json:
+        import json
+
+        files = [str(path) for path in results.files]
+        click.echo(json.dumps({**results.summary, "files": files}))
+    if not is_quiet:
+        _tell(results)
+
+
+def _tell(results: CalibrationResults) -> None:
+    """Report the verdict, the photographs that were not used, and the files."""
+    from kgcp.pipeline.calibration.run import REASONS
+
+    numbers = results.numbers
+    for row in results.photos:
+        if row.reason:
+            detail = f" ({row.detail})" if row.detail else ""
+            click.echo(
+                f"{row.photo}: not used: {REASONS.get(row.reason, row.reason)}{detail}", err=True
+            )
+    click.echo(
+        f"{numbers.views} photographs, {numbers.discs_used} of {numbers.discs} discs; RMS"
+        f" {numbers.rms_px:.4f} px per point, {numbers.rms_fixed_px:.4f} px with the field as"
+        " stated",
+        err=True,
+    )
+    click.echo(results.verdict.sentence, err=True)
+    for sentence in results.verdict.advice:
+        click.echo(f"advice: {sentence}", err=True)
+    for path in results.files:
+        click.echo(f"wrote {path}", err=True)

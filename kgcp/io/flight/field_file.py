@@ -1,0 +1,186 @@
+"""field.toml, and every other way to say what a field of targets is."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from kgcp.errors import KgcpError, SettingError
+from kgcp.io.files.safe_read import is_file
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.toml_file import read_toml
+from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.formats.fields import FORMATS
+from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
+
+FIELD_KEYS = (
+    *("name", "polarity", "diameter_m", "inner_diameter_m", "flat_sd_m", "grid", "mark", "bar"),
+)
+GRID_KEYS = ("kind", "columns", "rows", "pitch_m")
+MARK_KEYS = ("at", "diameter_m", "inner_diameter_m", "missing")
+BAR_KEYS = ("from", "to", "length_m", "sd_m")
+
+_SHORTHAND = re.compile(
+    r"(grid|square|asymmetric|hexagonal):(\d{1,4})x(\d{1,4}):([^:]+)"
+    r"(?::((?!dark|bright)[^:]+))?(?::(dark|bright))?"
+)
+_LENGTH = re.compile(r"(\d+(?:\.\d+)?|\.\d+)\s*(mm|cm|m|in)")
+_METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
+_USUAL_SHARE = 0.5  # of the pitch: what a diameter is taken for until it is measured
+_EXAMPLE = "grid:10x8:25mm:15mm"
+
+
+def read_field(text: str, unit: str | None = None) -> Field:
+    """Return the field that a shorthand or a file describes.
+
+    Parameters
+    ----------
+    text : str
+        `grid:10x8:25mm:15mm[:bright]`, likewise asymmetric and hexagonal: columns x rows, pitch,
+        diameter. Or the path of a field.toml or of another program's board.
+    unit : str, optional
+        mm, cm, m or in: what a board's file that does not say so counts in.
+
+    Raises
+    ------
+    KgcpError
+        Naming the text, or file and key, and the remedy.
+    """
+    shorthand = _SHORTHAND.fullmatch(text)
+    if shorthand is not None:
+        return _from_shorthand(text, shorthand)
+    path = Path(text)
+    if not is_file(path):
+        raise KgcpError(
+            f"{text}: is neither a field's file nor a shorthand such as {_EXAMPLE}; correct it",
+            option="field",
+        )
+    if path.suffix == ".toml":
+        return _from_toml(path)
+    file = ForeignFile(path, "the field")
+    try:
+        return FORMATS.reader(file)(file, None if unit is None else _METRES[unit])
+    except SettingError as error:
+        raise KgcpError(f"{path}: {error}") from None
+
+
+def _from_shorthand(text: str, match: re.Match[str]) -> Field:
+    kind, columns, rows, pitch, diameter, polarity = match.groups()
+    pitch_m = _length_m(text, pitch)
+    diameter_m = _USUAL_SHARE * pitch_m if diameter is None else _length_m(text, diameter)
+    try:
+        return Field(
+            text,
+            GridKind.SQUARE if kind == "grid" else GridKind(kind),
+            int(columns),
+            int(rows),
+            pitch_m,
+            diameter_m,
+            polarity=FieldPolarity(polarity or "dark"),
+            is_diameter_stated=diameter is not None,
+        )
+    except SettingError as error:
+        raise KgcpError(f"{text}: {error}", option="field") from None
+
+
+def _length_m(text: str, length: str) -> float:
+    match = _LENGTH.fullmatch(length.strip())
+    if match is None:
+        raise KgcpError(
+            f"{text}: {length!r} is no length with a unit; write it like {_EXAMPLE}",
+            option="field",
+        )
+    return float(match[1]) * _METRES[match[2]]
+
+
+def _from_toml(path: Path) -> Field:
+    table, _ = read_toml(path, FIELD_KEYS, "the field")
+    grid = table.table("grid", GRID_KEYS)
+    diameter_m = table.number("diameter_m")
+    values: dict[str, Any] = {}
+    if "flat_sd_m" in table:
+        values["flat_sd_m"] = table.vector("flat_sd_m")
+    polarity = table.optional("polarity", lambda key: table.choice(key, FieldPolarity))
+    with table.located():
+        return Field(
+            table.optional("name", table.name) or path.stem,
+            grid.choice("kind", GridKind),
+            grid.integer("columns"),
+            grid.integer("rows"),
+            grid.number("pitch_m"),
+            diameter_m,
+            table.number("inner_diameter_m", 0.0),
+            polarity or FieldPolarity.DARK,
+            _marks(table, diameter_m),
+            bars=_bars(table),
+            **values,
+        )
+
+
+def _marks(table: TomlTable, diameter_m: float) -> tuple[Mark, ...]:
+    rows = table.tables("mark") if "mark" in table else ()
+    return tuple(_mark(table, row, diameter_m) for row in rows)
+
+
+def _mark(table: TomlTable, values: Mapping[str, object], diameter_m: float) -> Mark:
+    mark = TomlTable(f"{table.where} [[mark]]", values, MARK_KEYS)
+    place = mark.numbers("at", "[2, 2]")
+    if len(place) != 2 or any(value != int(value) for value in place):
+        raise mark.error("at", "is not column and row", "give it as [2, 2]")
+    return Mark(
+        int(place[0]),
+        int(place[1]),
+        mark.number("diameter_m", diameter_m),
+        mark.number("inner_diameter_m", 0.0),
+        mark.boolean("missing", default=False),
+    )
+
+
+def _bars(table: TomlTable) -> tuple[FieldBar, ...]:
+    rows = table.tables("bar") if "bar" in table else ()
+    bars = [TomlTable(f"{table.where} [[bar]]", row, BAR_KEYS) for row in rows]
+    return tuple(
+        FieldBar(bar.text("from"), bar.text("to"), bar.number("length_m"), bar.number("sd_m"))
+        for bar in bars
+    )
+
+
+def field_toml(field: Field) -> str:
+    """Return the text of a field.toml, which `read_field` reads back to the same field."""
+    lines = [
+        f"name = {json.dumps(field.name)}",
+        f'polarity = "{field.polarity.value}"',
+        f"diameter_m = {field.diameter_m!r}",
+    ]
+    if field.inner_diameter_m:
+        lines.append(f"inner_diameter_m = {field.inner_diameter_m!r}")
+    lines += [
+        f"flat_sd_m = {list(field.flat_sd_m)}",
+        "",
+        "[grid]",
+        f'kind = "{field.kind.value}"',
+        f"columns = {field.columns}",
+        f"rows = {field.rows}",
+        f"pitch_m = {field.pitch_m!r}",
+    ]
+    for mark in field.marks:
+        lines += ["", "[[mark]]", f"at = [{mark.column}, {mark.row}]"]
+        if mark.is_missing:
+            lines.append("missing = true")
+            continue
+        lines.append(f"diameter_m = {mark.diameter_m!r}")
+        if mark.inner_diameter_m:
+            lines.append(f"inner_diameter_m = {mark.inner_diameter_m!r}")
+    for bar in field.bars:
+        lines += [
+            "",
+            "[[bar]]",
+            f"from = {json.dumps(bar.first)}",
+            f"to = {json.dumps(bar.second)}",
+            f"length_m = {bar.length_m!r}",
+            f"sd_m = {bar.sd_m!r}",
+        ]
+    return "\n".join(lines) + "\n"

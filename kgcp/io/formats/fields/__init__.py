@@ -1,0 +1,25 @@
+"""Boards of other programs, one module per format.
+
+A module offers `matches(file)`, whether a file's content is of its format, and
+`field(file, unit_m)`, the board in it, and has one line in `FORMATS`. Where a file does not say in
+which unit it counts, `unit_m` must; others ignore it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.fields import boofcv, dice, ros_industrial
+from kgcp.io.formats.registry import Registry
+from kgcp.targets.fields.layout import Field
+
+FORMATS: Registry[Callable[[ForeignFile, float | None], Field]] = Registry(
+    "a field of targets",
+    "describe it in a field.toml",
+    {
+        "boofcv": (boofcv.matches, boofcv.field),
+        "dice": (dice.matches, dice.field),
+        "ros_industrial": (ros_industrial.matches, ros_industrial.field),
+    },
+)

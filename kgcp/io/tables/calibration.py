@@ -1,0 +1,224 @@
+"""Tables of a calibration: what was observed, the field's own shape, and the photographs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, Row, matrix_cell, row_of
+from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
+from kgcp.measurement.discs.records import ellipse_of_moments
+from kgcp.network.calibration_records import CameraCalibration, PointModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedDisc:
+    """One disc in one photograph, as it took part in the adjustment."""
+
+    photo: str
+    point: str
+    vector: FloatArray  # (5,)
+    cov: FloatArray  # (5, 5)
+    appearance: FloatArray  # (5,): as `PhotoDiscs.appearance`
+    is_guided: bool
+    residual: FloatArray  # (2,)
+    redundancy: float
+    weight: float
+    is_used: bool
+    perspective: FloatArray  # (2,)
+    in_marker: FloatArray  # (2,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldDisc:
+    """One disc of the field."""
+
+    name: str
+    nominal: FloatArray  # (3,)
+    adjusted: FloatArray  # (3,)
+    cov: FloatArray | None  # (3, 3); None: the points were fixed
+    rays: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoRow:
+    """What became of one photograph."""
+
+    photo: str
+    reason: str  # empty: it took part
+    detail: str
+    pose: Pose | None
+    cov: FloatArray | None  # (6, 6)
+    discs: int
+    used: int
+    rms_px: float | None
+    tilt_deg: float | None
+
+
+def _angle_deg(vector: FloatArray) -> float:
+    return math.degrees(ellipse_of_moments(vector).angle_rad)
+
+
+def _sd(cov: FloatArray | None, axis: int) -> float | None:
+    return None if cov is None else math.sqrt(cov[axis, axis])
+
+
+def _coordinate(axis: int, disc: FieldDisc) -> float:
+    return float(disc.adjusted[axis])
+
+
+def _sd_coordinate(axis: int, disc: FieldDisc) -> float | None:
+    return _sd(disc.cov, axis)
+
+
+def _change(axis: int, disc: FieldDisc) -> float:
+    return float(disc.adjusted[axis] - disc.nominal[axis])
+
+
+def _shift(axis: int, row: PhotoRow) -> float | None:
+    return None if row.pose is None else float(row.pose.translation_m[axis])
+
+
+OBSERVATION_COLUMNS: tuple[Column[ObservedDisc], ...] = (
+    Column("photo", TEXT, lambda disc: disc.photo),
+    Column("point", TEXT, lambda disc: disc.point),
+    Column("named_by", TEXT, lambda disc: "guided" if disc.is_guided else "lattice"),
+    Column("x_px", NUMBER, lambda disc: float(disc.vector[0])),
+    Column("y_px", NUMBER, lambda disc: float(disc.vector[1])),
+    Column("sd_x_px", NUMBER, lambda disc: math.sqrt(disc.cov[0, 0])),
+    Column("sd_y_px", NUMBER, lambda disc: math.sqrt(disc.cov[1, 1])),
+    Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
+    Column("a_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).a),
+    Column("b_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).b),
+    Column("angle_deg", NUMBER, lambda disc: _angle_deg(disc.vector)),
+    Column("status", TEXT, lambda disc: "used" if disc.is_used else "rejected"),
+    Column("residual_x_px", NUMBER, lambda disc: float(disc.residual[0])),
+    Column("residual_y_px", NUMBER, lambda disc: float(disc.residual[1])),
+    Column("redundancy", NUMBER, lambda disc: disc.redundancy),
+    Column("weight", NUMBER, lambda disc: disc.weight),
+    Column("ecc_x_px", NUMBER, lambda disc: float(disc.perspective[0])),
+    Column("ecc_y_px", NUMBER, lambda disc: float(disc.perspective[1])),
+    Column("ecc_lens_x_px", NUMBER, lambda disc: float(disc.in_marker[0])),
+    Column("ecc_lens_y_px", NUMBER, lambda disc: float(disc.in_marker[1])),
+    Column("inside", NUMBER, lambda disc: float(disc.appearance[0])),
+    Column("outside", NUMBER, lambda disc: float(disc.appearance[1])),
+    Column("blur_px", NUMBER, lambda disc: float(disc.appearance[2])),
+    Column("clipped", NUMBER, lambda disc: float(disc.appearance[3])),
+)
+
+FIELD_COLUMNS: tuple[Column[FieldDisc], ...] = (
+    Column("point", TEXT, lambda disc: disc.name),
+    *(Column(f"{a}_m", NUMBER, partial(_coordinate, i)) for i, a in enumerate("xyz")),
+    *(Column(f"sd_{a}_m", NUMBER, partial(_sd_coordinate, i)) for i, a in enumerate("xyz")),
+    Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
+    *(Column(f"change_{a}_m", NUMBER, partial(_change, i)) for i, a in enumerate("xyz")),
+    Column("rays", INTEGER, lambda disc: disc.rays),
+)
+
+PHOTO_COLUMNS: tuple[Column[PhotoRow], ...] = (
+    Column("photo", TEXT, lambda row: row.photo),
+    Column("status", TEXT, lambda row: "not_used" if row.reason else "used"),
+    Column("reason", TEXT, lambda row: row.reason),
+    Column("detail", TEXT, lambda row: row.detail),
+    Column("discs", INTEGER, lambda row: row.discs),
+    Column("discs_used", INTEGER, lambda row: row.used),
+    Column("rms_px", NUMBER, lambda row: row.rms_px),
+    Column("tilt_deg", NUMBER, lambda row: row.tilt_deg),
+    *(Column(f"t{a}_m", NUMBER, partial(_shift, i)) for i, a in enumerate("xyz")),
+    Column("rotation", NUMBERS, lambda row: matrix_cell(row.pose.rotation) if row.pose else None),
+    Column("pose_cov", NUMBERS, lambda row: matrix_cell(row.cov)),
+)
+
+
+def observation_rows(
+    calibration: CameraCalibration, discs: Mapping[str, PhotoDiscs]
+) -> Iterator[Row]:
+    """Yield a row per disc and photograph."""
+    names = calibration.field.names()
+    solution, known = calibration.solution, calibration.precision
+    row = 0
+    for view in calibration.views:
+        measured = discs[view.photo]
+        for index, point in enumerate(view.point.tolist()):
+            disc = ObservedDisc(
+                view.photo,
+                names[point],
+                view.vectors[index],
+                view.covs[index],
+                measured.appearance[index],
+                bool(measured.is_guided[index]),
+                solution.residuals[row],
+                float(known.redundancy[row]),
+                float(solution.weights[row]),
+                bool(solution.is_used[row]),
+                calibration.eccentricity.perspective_px[row],
+                calibration.eccentricity.in_marker_px[row],
+            )
+            yield row_of(OBSERVATION_COLUMNS, disc)
+            row += 1
+
+
+def field_discs(calibration: CameraCalibration) -> list[FieldDisc]:
+    """Return the discs of the field as they were adjusted."""
+    points, nominal = calibration.solution.estimate.points, calibration.field.points_m()
+    observed = calibration.network.observations.point[calibration.solution.is_used]
+    rays = np.bincount(observed, minlength=len(points)).tolist()
+    first = calibration.network.cameras.values.size
+    inverse = calibration.precision.inverse * calibration.precision.variance_factor
+    discs = []
+    for index, name in enumerate(calibration.field.names()):
+        cov = None
+        if calibration.points_used is not PointModel.FIXED:
+            own = slice(first + 3 * index, first + 3 * index + 3)
+            cov = inverse[own, own]
+        discs.append(FieldDisc(name, nominal[index], points[index], cov, rays[index]))
+    return discs
+
+
+def field_csv(discs: list[FieldDisc]) -> str:
+    """Return the field as text: name, x, y, z and their deviations [m]."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", "x", "y", "z", "sd_x", "sd_y", "sd_z"])
+    for disc in discs:
+        sds = ["" if (sd := _sd(disc.cov, axis)) is None else f"{sd:.9f}" for axis in range(3)]
+        writer.writerow([disc.name, *(f"{value:.9f}" for value in disc.adjusted), *sds])
+    return stream.getvalue()
+
+
+def photo_rows(
+    calibration: CameraCalibration, misses: tuple[PhotoMiss, ...], photos: tuple[str, ...]
+) -> list[PhotoRow]:
+    """Return a row per photograph, in their order."""
+    solution, known = calibration.solution, calibration.precision
+    rows = {
+        miss.photo: PhotoRow(miss.photo, miss.reason, miss.detail, None, None, 0, 0, None, None)
+        for miss in misses
+    }
+    view_of = calibration.network.observations.view
+    for index, view in enumerate(calibration.views):
+        mine = view_of == index
+        used = mine & solution.is_used
+        squares = np.sum(solution.residuals[used] ** 2, axis=1)
+        estimate = solution.estimate
+        pose = Pose(estimate.rotations[index], estimate.translations[index])
+        rows[view.photo] = PhotoRow(
+            view.photo,
+            "",
+            "",
+            pose,
+            known.variance_factor * known.pose_inverses[index],
+            int(np.count_nonzero(mine)),
+            int(np.count_nonzero(used)),
+            float(np.sqrt(squares.mean())),
+            math.degrees(math.acos(min(1.0, abs(float(pose.rotation[2, 2]))))),
+        )
+    return [rows[photo] for photo in photos]

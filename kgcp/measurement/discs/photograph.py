@@ -1,0 +1,181 @@
+"""What is measured of a field of discs in one photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.geometry.camera import Response
+from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
+from kgcp.measurement.discs.records import (
+    Disc,
+    DiscOutline,
+    Operator,
+    Polarity,
+    ellipse_of_moments,
+)
+from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.naming import NamingProblem, SeenDiscs, name_discs
+
+_LEAST_DISCS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoDiscs:
+    """The discs of a field in one photograph: k of them, measured and named."""
+
+    photo: str
+    width: int
+    height: int
+    lens: str  # camera and focal length by EXIF; empty: it does not say
+    outlines: int  # of the field's polarity, whether they have a name or not
+    is_symmetric: bool  # whether the field could lie there turned, too
+    point: FloatArray  # (k,): index of the field's disc
+    vectors: FloatArray  # (k, 5): as `kgcp.measurement.discs.records.MOMENTS`
+    covs: FloatArray  # (k, 5, 5)
+    # (k, 5): levels inside and outside, blur [px], share of clipped pixels, inflation
+    appearance: FloatArray
+    is_guided: FloatArray  # (k,): 1 where it was found in the second pass
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoMiss:
+    """A photograph of which nothing is used, and why."""
+
+    photo: str
+    width: int  # 0 where it could not be read
+    height: int
+    reason: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoTask:
+    """What a worker needs to know to measure any photograph."""
+
+    field: Field
+    response: Response
+    operator: Operator
+
+
+def measure_field(
+    grey: GreyArray, task: PhotoTask, photo: str, lens: str
+) -> PhotoDiscs | PhotoMiss:
+    """Find, name and measure the discs of a field in a photograph."""
+    outlines = find_outlines(grey)
+    height, width = grey.shape
+    own = [
+        index
+        for index, outline in enumerate(outlines)
+        if outline.polarity.value == task.field.polarity.value and not outline.is_hole
+    ]
+    candidates = [outlines[index] for index in own]
+    naming = name_discs(_seen(candidates), task.field)
+    if isinstance(naming, NamingProblem):
+        detail = f"{len(own)} outlines like the field's discs"
+        return PhotoMiss(photo, width, height, naming.value, detail)
+    # holes and others stay in the list as neighbours, whose pixels are left out
+    measured = measure_discs(grey, outlines, response=task.response, operator=task.operator)
+    named = [
+        (point, disc)
+        for disc, point in (
+            (measured[own[index]], point)
+            for index, point in zip(naming.disc.tolist(), naming.point.tolist(), strict=True)
+        )
+        if isinstance(disc, Disc)
+    ]
+    if len(named) < _LEAST_DISCS:
+        detail = f"{len(named)} of {len(naming.disc)} discs could be measured"
+        return PhotoMiss(photo, width, height, NamingProblem.TOO_FEW.value, detail)
+    named.sort(key=lambda pair: pair[0])
+    discs = [disc for _, disc in named]
+    return PhotoDiscs(
+        photo,
+        width,
+        height,
+        lens,
+        len(own),
+        naming.is_symmetric,
+        np.array([point for point, _ in named], dtype=np.float64),
+        *_values(discs),
+        np.zeros(len(discs)),
+    )
+
+
+def measure_more(
+    grey: GreyArray, task: PhotoTask, first: PhotoDiscs, predicted: FloatArray, point: IndexArray
+) -> PhotoDiscs:
+    """Measure discs where they must be.
+
+    Parameters
+    ----------
+    first : PhotoDiscs
+        What the first pass has measured.
+    predicted : (k, 5) array
+        Centroids and moments of discs that it has not.
+    point : (k,) array
+        Which of the field's discs they are.
+    """
+    polarity = Polarity(task.field.polarity.value)
+    from_first = [_predicted(vector, polarity) for vector in first.vectors]
+    guesses = [_predicted(vector, polarity) for vector in predicted]
+    followed = follow_outlines(grey, guesses)
+    is_there = [index for index, outline in enumerate(followed) if outline is not None]
+    if not is_there:
+        return first
+    outlines = [outline for outline in followed if outline is not None]
+    measured = measure_discs(
+        grey, [*outlines, *from_first], response=task.response, operator=task.operator
+    )
+    more = [
+        (int(point[index]), disc)
+        for index, disc in zip(is_there, measured, strict=False)
+        if isinstance(disc, Disc)
+    ]
+    if not more:
+        return first
+    vectors, covs, appearance = _values([disc for _, disc in more])
+    added = np.array([index for index, _ in more], dtype=np.float64)
+    points = np.concatenate((first.point, added))
+    order = np.argsort(points, kind="stable")
+    return PhotoDiscs(
+        first.photo,
+        first.width,
+        first.height,
+        first.lens,
+        first.outlines,
+        first.is_symmetric,
+        points[order],
+        np.concatenate((first.vectors, vectors))[order],
+        np.concatenate((first.covs, covs))[order],
+        np.concatenate((first.appearance, appearance))[order],
+        np.concatenate((first.is_guided, np.ones(len(more))))[order],
+    )
+
+
+def _predicted(vector: FloatArray, polarity: Polarity) -> DiscOutline:
+    return DiscOutline.predicted(ellipse_of_moments(vector), polarity)
+
+
+def _seen(outlines: list[DiscOutline]) -> SeenDiscs:
+    centres = [(outline.ellipse.x, outline.ellipse.y) for outline in outlines]
+    is_hollow: BoolArray = np.array([outline.hole is not None for outline in outlines], dtype=bool)
+    return SeenDiscs(
+        np.array(centres, dtype=np.float64).reshape(-1, 2),
+        np.array([outline.ellipse.stretch for outline in outlines]).reshape(-1, 2, 2),
+        is_hollow,
+    )
+
+
+def _values(discs: list[Disc]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    appearance = [
+        (disc.inside, disc.outside, disc.blur_px, disc.clipped, disc.inflation) for disc in discs
+    ]
+    return (
+        np.array([disc.vector for disc in discs]),
+        np.array([disc.cov for disc in discs]),
+        np.array(appearance),
+    )

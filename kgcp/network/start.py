@@ -1,0 +1,182 @@
+"""Where to begin: focal length and poses from homographies of a planar field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.network.adjust import PLAIN, adjust
+from kgcp.network.equations import whitened
+from kgcp.network.frame_camera import FrameCameraModel
+from kgcp.network.records import (
+    CameraPrior,
+    Estimate,
+    Network,
+    Observations,
+    PointPrior,
+)
+
+_FOCALS = (0.5, 0.8, 1.2, 2.0, 3.2, 5.0, 8.0, 12.0)  # of the longer side of the frame
+_KNOWN = 1e-9  # standard deviation of what is not to change
+
+
+def start_camera_and_poses(
+    observations: Observations, points: FloatArray, size: tuple[int, int]
+) -> tuple[Camera, Estimate]:
+    """Return a camera without distortion and the pose of every photograph.
+
+    The focal length is that of `_FOCALS` or of Zhang's closed form (2000) whose poses fit best,
+    with the principal point in the middle. Every planar pose has a twin, of which the better is
+    taken.
+    """
+    width, height = size
+    centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    count = int(observations.view.max()) + 1
+    homographies = []
+    for view in range(count):
+        mine = observations.view == view
+        flat = points[observations.point[mine], :2]
+        homographies.append(_homography(flat, observations.places[mine] - centre))
+    focals = {share * max(size) for share in _FOCALS}
+    closed = _closed_focal(homographies)
+    if closed is not None:
+        focals.add(min(max(closed, 0.3 * max(size)), 20.0 * max(size)))
+    starts = []
+    for focal in sorted(focals):
+        camera = Camera(width, height, focal, focal, *centre.tolist())
+        poses = [
+            _pose(homography, focal, points[observations.point[observations.view == view]])
+            for view, homography in enumerate(homographies)
+        ]
+        estimate, costs = better_poses(camera, observations, points, poses)
+        # the median of the photographs: one with wrong discs does not decide
+        starts.append((float(np.median(costs)), camera, estimate))
+    _, camera, estimate = min(starts, key=lambda start: start[0])
+    return camera, estimate
+
+
+def better_poses(
+    camera: Camera, observations: Observations, points: FloatArray, poses: list[Pose]
+) -> tuple[Estimate, FloatArray]:
+    """Return the pose of every photograph that fits best, and its weighted sum of squares (v,).
+
+    A planar field has two poses with nearly the same image, mirrored about the viewing ray. Both
+    are refined; one behind the camera does not count.
+    """
+    twins = [
+        _mirrored(pose, points[observations.point[observations.view == view]])
+        for view, pose in enumerate(poses)
+    ]
+    first, first_costs = refined_poses(camera, observations, points, poses)
+    second, second_costs = refined_poses(camera, observations, points, twins)
+    is_second = second_costs < first_costs
+    chosen = Estimate(
+        first.cameras,
+        np.where(is_second[:, None, None], second.rotations, first.rotations),
+        np.where(is_second[:, None], second.translations, first.translations),
+        first.points,
+    )
+    return chosen, np.minimum(first_costs, second_costs)
+
+
+def refined_poses(
+    camera: Camera, observations: Observations, points: FloatArray, poses: list[Pose]
+) -> tuple[Estimate, FloatArray]:
+    """Return poses adjusted to the discs for a known camera, and their sums of squares (v,)."""
+    model = FrameCameraModel(camera, ())
+    values = model.values_of(camera)[None]
+    network = Network(
+        model,
+        np.zeros(len(poses), dtype=np.intp),
+        observations,
+        PointPrior(points, None),
+        CameraPrior(values, np.full_like(values, _KNOWN)),
+    )
+    start = Estimate(
+        values,
+        np.array([pose.rotation for pose in poses]),
+        np.array([pose.translation_m for pose in poses]),
+        points,
+    )
+    solution = adjust(network, start, PLAIN)
+    weights = np.ones(len(observations.view))
+    squares = np.sum(whitened(network, solution.residuals, weights) ** 2, axis=1)
+    costs = np.bincount(observations.view, squares, len(poses))
+    return solution.estimate, np.where(_is_in_front(observations, solution.estimate), costs, np.inf)
+
+
+def _is_in_front(observations: Observations, estimate: Estimate) -> BoolArray:
+    depths = np.einsum(
+        "nj,nj->n", estimate.rotations[observations.view, 2], estimate.points[observations.point]
+    )
+    depths += estimate.translations[observations.view, 2]
+    count = len(estimate.rotations)
+    behind = np.bincount(observations.view[depths <= 0.0], minlength=count)
+    return np.asarray(behind == 0)
+
+
+def _homography(flat: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the homography (3, 3) from a plane to the image, by the normalised DLT."""
+    to_plane, to_image = _normalising(flat), _normalising(places)
+    x, y = (flat @ to_plane[:2, :2] + to_plane[:2, 2]).T
+    u, v = (places @ to_image[:2, :2] + to_image[:2, 2]).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        (
+            np.stack((x, y, one, zero, zero, zero, -u * x, -u * y, -u), axis=1),
+            np.stack((zero, zero, zero, x, y, one, -v * x, -v * y, -v), axis=1),
+        )
+    )
+    solved = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    return np.asarray(np.linalg.inv(to_image) @ solved @ to_plane)
+
+
+def _normalising(points: FloatArray) -> FloatArray:
+    middle = points.mean(axis=0)
+    scale = math.sqrt(2.0) / float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
+    matrix = np.diag([scale, scale, 1.0])
+    matrix[:2, 2] = -scale * middle
+    return matrix
+
+
+def _closed_focal(homographies: list[FloatArray]) -> float | None:
+    """Return the focal length of Zhang's conditions (2000), square pixels, centred; None: none."""
+    rows, right = [], []
+    for homography in homographies:
+        h = homography / np.linalg.norm(homography[:, :2])
+        (a, b), (c, d), (e, f) = h[:, :2].tolist()
+        for flat, upright in (
+            (a * b + c * d, e * f),
+            (a * a + c * c - b * b - d * d, e * e - f * f),
+        ):
+            rows.append(flat)
+            right.append(-upright)
+    by = np.array(rows)
+    inverse_square = float(by @ np.array(right)) / float(by @ by)
+    return 1.0 / math.sqrt(inverse_square) if inverse_square > 0.0 else None
+
+
+def _pose(homography: FloatArray, focal: float, points: FloatArray) -> Pose:
+    """Return the pose of a plane for a homography from it to centred pixels."""
+    columns = homography / np.array([[focal], [focal], [1.0]])
+    columns = columns * 2.0 / np.linalg.norm(columns[:, :2], axis=0).sum()
+    middle = points.mean(axis=0)
+    if columns[2] @ [middle[0], middle[1], 1.0] < 0.0:
+        columns = -columns
+    third = np.cross(columns[:, 0], columns[:, 1])
+    u, _, vt = np.linalg.svd(np.stack((columns[:, 0], columns[:, 1], third), axis=1))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return Pose(rotation, columns[:, 2])
+
+
+def _mirrored(pose: Pose, points: FloatArray) -> Pose:
+    """Return the other pose of a planar field: its normal mirrored about the ray of its middle."""
+    middle = points.mean(axis=0)
+    centre = pose.rotation @ middle + pose.translation_m
+    turned = replace(pose, translation_m=centre).mirrored()
+    return replace(turned, translation_m=centre - turned.rotation @ middle)

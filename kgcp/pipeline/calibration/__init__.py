@@ -1,0 +1,1 @@
+"""Photographs of a field of targets into a camera."""

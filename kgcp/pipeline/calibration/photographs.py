@@ -1,0 +1,80 @@
+"""One photograph of a field: read, searched, measured, and measured again where discs must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError, Reason, Rejection
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.io.images.exif import read_frame_header
+from kgcp.io.images.frames import read_grey
+from kgcp.measurement.discs.photograph import (
+    PhotoDiscs,
+    PhotoMiss,
+    PhotoTask,
+    measure_field,
+    measure_more,
+)
+from kgcp.pipeline.execution.threads import single_threaded
+
+_LARGEST_PX = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """A photograph and its name in all tables."""
+
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SecondLook:
+    """A photograph that is to be searched where discs must be."""
+
+    photo: Photo
+    first: PhotoDiscs
+    predicted: FloatArray  # (k, 5): centroids and moments
+    point: FloatArray  # (k,): which of the field's discs they are
+
+
+@single_threaded()
+def measure_photo(task: PhotoTask, photo: Photo) -> PhotoDiscs | PhotoMiss:
+    """Find, name and measure a field; whatever a photograph can do wrong becomes its result."""
+    try:
+        grey = _read(photo.path)
+    except Rejection as rejection:
+        return PhotoMiss(photo.name, 0, 0, rejection.reason.value, rejection.detail)
+    header = read_frame_header(photo.path, photo.name)
+    focal = f"{header.focal_mm:g} mm" if header.focal_mm else ""
+    lens = " ".join(filter(None, (header.camera, focal)))
+    return measure_field(grey, task, photo.name, lens)
+
+
+@single_threaded()
+def measure_photo_again(task: PhotoTask, look: SecondLook) -> PhotoDiscs | PhotoMiss:
+    """Measure the discs of a photograph that the first pass has not found."""
+    try:
+        grey = _read(look.photo.path)
+    except Rejection as rejection:
+        raise KgcpError(
+            f"{look.photo.path}: could be read, and cannot any more ({rejection.detail}); put it"
+            " back, and the same command goes on"
+        ) from rejection
+    return measure_more(grey, task, look.first, look.predicted, look.point.astype(np.intp))
+
+
+def _read(path: Path) -> GreyArray:
+    """Return the grey values of a photograph of any size."""
+    size = read_frame_header(path, path.name).size_px
+    if size is None:
+        raise Rejection(Reason.DECODE_FAILED, "does not begin like an image")
+    width, height = size
+    if not 2 <= min(size) <= max(size) <= _LARGEST_PX:
+        raise Rejection(Reason.DECODE_FAILED, f"{width} x {height} px")
+    focal = float(max(size))  # any: the reader compares sizes only
+    return read_grey(path, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height))

@@ -1,0 +1,159 @@
+"""The files of a calibration: camera, tables, numbers and report."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp import __version__
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
+from kgcp.geometry.camera import Camera
+from kgcp.io.files.atomic import write_all
+from kgcp.io.flight.camera_file import camera_toml
+from kgcp.io.flight.field_file import field_toml
+from kgcp.io.formats.camera_writers import CalibratedCamera, camera_file
+from kgcp.io.tables.calibration import (
+    FIELD_COLUMNS,
+    OBSERVATION_COLUMNS,
+    PHOTO_COLUMNS,
+    PhotoRow,
+    field_csv,
+    field_discs,
+    observation_rows,
+    photo_rows,
+)
+from kgcp.io.tables.columns import SCHEMA_VERSION, row_of
+from kgcp.io.tables.parquet import write_table
+from kgcp.network.calibration_records import CalibrationSettings, LensModel
+from kgcp.pipeline.calibration.run import PhotoCalibration
+from kgcp.quality.calibration_verdict import (
+    CalibrationNumbers,
+    CalibrationVerdict,
+    calibration_numbers,
+    judge,
+)
+from kgcp.report.calibration.figures import draw_figures
+from kgcp.report.calibration.page import CalibrationPage, render_calibration
+
+CAMERA_FILE = "camera.toml"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResults:
+    """What was written, and what it says."""
+
+    files: tuple[Path, ...]
+    numbers: CalibrationNumbers
+    verdict: CalibrationVerdict
+    photos: tuple[PhotoRow, ...]
+    summary: dict[str, object]  # calibration.json
+
+
+def check_formats(settings: CalibrationSettings, formats: Sequence[str]) -> None:
+    """Refuse formats that cannot hold what is to be estimated, before anything is measured.
+
+    Raises
+    ------
+    KgcpError
+        Naming the terms.
+    """
+    aspect = 1.0 if settings.is_same_aspect else 1.01
+    k4 = 0.01 if settings.lens is LensModel.RATIONAL else 0.0
+    camera = Camera(100, 100, 100.0, 100.0 * aspect, 50.0, 50.0, k4=k4)
+    size = len(CALIBRATION_PARAMETERS)
+    for form in formats:
+        camera_file(CalibratedCamera(camera, np.eye(size), 0.0), form)
+
+
+def write_results(made: PhotoCalibration, out: Path, formats: Sequence[str]) -> CalibrationResults:
+    """Write all files of a calibration into a folder.
+
+    Parameters
+    ----------
+    formats : sequence of str
+        Of `kgcp.io.formats.camera_writers.CAMERA_FORMATS`.
+
+    Raises
+    ------
+    KgcpError
+        If a format cannot hold the camera, or a file cannot be written.
+    """
+    calibration = made.calibration
+    numbers = calibration_numbers(calibration)
+    verdict = judge(calibration, numbers)
+    exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
+    texts = dict(camera_file(exported, form) for form in formats)
+    texts[CAMERA_FILE] = camera_toml(calibration.camera, calibration.covariance)
+    texts["field.toml"] = field_toml(calibration.field)
+    discs = field_discs(calibration)
+    texts["field.csv"] = field_csv(discs)
+    photos = photo_rows(calibration, made.misses, made.photos)
+    summary = _summary(made, numbers, verdict, photos)
+    texts["calibration.json"] = json.dumps(summary, indent=1) + "\n"
+    tables = (
+        ("observations.parquet", OBSERVATION_COLUMNS, observation_rows(calibration, made.discs)),
+        ("field.parquet", FIELD_COLUMNS, (row_of(FIELD_COLUMNS, disc) for disc in discs)),
+        ("photos.parquet", PHOTO_COLUMNS, (row_of(PHOTO_COLUMNS, row) for row in photos)),
+    )
+    names = sorted([*texts, *(name for name, _, _ in tables), "calibration.html"])
+    page = CalibrationPage(
+        calibration, numbers, verdict, photos, draw_figures(calibration, numbers), names
+    )
+    texts["calibration.html"] = render_calibration(page)
+    about = {"schema_version": SCHEMA_VERSION, "kgcp_version": __version__}
+    for name, columns, rows in tables:
+        write_table(out / name, columns, rows, about)
+    write_all({out / name: text.encode() for name, text in texts.items()})
+    files = tuple(out / name for name in names)
+    return CalibrationResults(files, numbers, verdict, tuple(photos), summary)
+
+
+def _summary(
+    made: PhotoCalibration,
+    numbers: CalibrationNumbers,
+    verdict: CalibrationVerdict,
+    photos: Sequence[PhotoRow],
+) -> dict[str, object]:
+    calibration = made.calibration
+    camera = calibration.camera
+    return {
+        "kgcp_version": __version__,
+        "verdict": verdict.grade.value,
+        "reasons": verdict.reasons,
+        "advice": verdict.advice,
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            **{name: getattr(camera, name) for name in CALIBRATION_PARAMETERS},
+        },
+        "sd": dict(zip(CALIBRATION_PARAMETERS, numbers.sd.tolist(), strict=True)),
+        "cov_of": CALIBRATION_PARAMETERS,
+        "cov": calibration.covariance.cov.tolist(),
+        "estimated": calibration.network.model.names,
+        "undetermined": calibration.undetermined,
+        "tangled": calibration.tangled,
+        "photographs": len(photos),
+        "photographs_used": numbers.views,
+        "discs": numbers.discs,
+        "discs_used": numbers.discs_used,
+        "rms_fixed_px": numbers.rms_fixed_px,
+        "rms_px": numbers.rms_px,
+        "operator_sd_px": numbers.operator_sd_px,
+        "variance_factor": calibration.precision.variance_factor,
+        "points": calibration.points_used.value,
+        "coverage": numbers.coverage,
+        "largest_angle_deg": numbers.normals_deg,
+        "radius_scale": calibration.radius_scale,
+        "flatness_m": numbers.flatness_m,
+        "not_used": {row.photo: row.reason for row in photos if row.reason},
+        "photo_rms_px": {
+            row.photo: row.rms_px
+            for row in photos
+            if row.rms_px is not None and math.isfinite(row.rms_px)
+        },
+    }

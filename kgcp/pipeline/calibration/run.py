@@ -1,0 +1,342 @@
+"""Photographs of a field of targets into a camera: `kgcp calibrate`."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.camera import Response
+from kgcp.io.files.safe_read import is_file, is_folder
+from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
+from kgcp.io.images.remote import stamps_of
+from kgcp.io.tables.provenance import versions
+from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
+from kgcp.measurement.discs.records import Operator
+from kgcp.network.calibration import LEAST_VIEWS, calibrate_camera, missing_discs
+from kgcp.network.calibration_records import (
+    CalibrationSettings,
+    CameraCalibration,
+    LensModel,
+    NamedView,
+    PointModel,
+)
+from kgcp.pipeline.calibration.photographs import (
+    Photo,
+    SecondLook,
+    measure_photo,
+    measure_photo_again,
+)
+from kgcp.pipeline.detection_run import ProgressListener
+from kgcp.pipeline.execution.executor import WorkerPool, open_pool
+from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
+from kgcp.pipeline.execution.resilient_map import TaskFailure
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.targets.fields.layout import Field
+
+_LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
+_DIGITS = re.compile(r"(\d+)")
+
+OTHER_SIZE = "other_size"
+UNLIKE_FIELD = "unlike_field"
+REASONS: Mapping[str, str] = {
+    Reason.DECODE_FAILED.value: "the file is not an image, or is damaged",
+    Reason.WORKER_DIED.value: Reason.WORKER_DIED.description,
+    Reason.TIMED_OUT.value: Reason.TIMED_OUT.description,
+    "too_few": "fewer than six discs like the field's",
+    "no_lattice": "the discs do not lie like the field's",
+    "two_fields": "two fields in one photograph",
+    "ambiguous": "a part of the field that could be another part; show all of it, or a mark",
+    OTHER_SIZE: "the photograph has another size than most",
+    UNLIKE_FIELD: "most discs do not fit the camera and the field of the other photographs",
+}
+"""Why a photograph is not used: the words of the `reason` column."""
+
+_Item = TypeVar("_Item", Photo, SecondLook)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """How photographs are worked on.
+
+    Attributes
+    ----------
+    settings : CalibrationSettings
+        What is estimated.
+    response : Response
+        How grey values follow light.
+    operator : Operator
+        How discs are measured.
+    jobs : int or None
+        Worker processes; 0 works in this one; None: as many as there are cores.
+    photo_timeout_s : float
+        Time for one look at one photograph [s].
+    is_restart : bool
+        Whether to begin anew, whatever an interrupted run has left.
+    """
+
+    settings: CalibrationSettings
+    response: Response = Response.UNKNOWN
+    operator: Operator = Operator.MODEL
+    jobs: int | None = None
+    photo_timeout_s: float = 300.0
+    is_restart: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoCalibration:
+    """A calibrated camera, and what became of every photograph."""
+
+    field: Field
+    options: CalibrationOptions
+    calibration: CameraCalibration
+    discs: Mapping[str, PhotoDiscs]  # of the photographs that took part
+    misses: tuple[PhotoMiss, ...]  # the others
+    photos: tuple[str, ...]  # all, in order
+
+
+def find_photos(places: Sequence[Path]) -> list[Photo]:
+    """Return the photographs that files and folders name, in the order of their names.
+
+    Raises
+    ------
+    KgcpError
+        If a place does not exist, holds no photographs, or two have one name.
+    """
+    photos: list[Photo] = []
+    for place in places:
+        if is_folder(place):
+            names = list_frames(place)
+            prefix = f"{place.name}/" if len(places) > 1 else ""
+            photos += [Photo(f"{prefix}{name}", place / name) for name in names]
+        elif is_file(place) and place.suffix.lower() in FRAME_SUFFIXES:
+            photos.append(Photo(place.name, place))
+        else:
+            raise KgcpError(f"{place}: is neither an image nor a folder of images; correct it")
+    counts = Counter(photo.name for photo in photos)
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        raise KgcpError(f"{twice[0]}: two photographs have this name; name their folder instead")
+    return sorted(photos, key=lambda photo: _in_reading_order(photo.name))
+
+
+def _in_reading_order(name: str) -> list[tuple[int, str]]:
+    """Return what sorts 2.png before 10.png."""
+    parts = _DIGITS.split(name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+@single_threaded()
+def calibrate_photos(
+    photos: Sequence[Photo],
+    field: Field,
+    out: Path,
+    options: CalibrationOptions,
+    listener: ProgressListener,
+) -> PhotoCalibration:
+    """Calibrate the camera that took photographs of a field.
+
+    However the work is interrupted, what was measured is kept in a journal in `out`, and the same
+    call goes on from there. The journal stays until the caller has written its results.
+
+    Raises
+    ------
+    KgcpError
+        If the photographs are by several cameras, or fewer than three can be used.
+    """
+    task = PhotoTask(field, options.response, options.operator)
+    making = {
+        "the version of kgcp or of a library": to_text(versions()),
+        "the field": fingerprint(field),
+        "the operator or the response": fingerprint(options.response, options.operator),
+    }
+    kinds: tuple[type[PhotoDiscs | PhotoMiss], ...] = (PhotoDiscs, PhotoMiss)
+    path, is_new = out / ".calibration.journal", options.is_restart
+    with (
+        Journal(path, making, kinds, is_new=is_new) as journal,
+        open_pool(options.jobs, options.photo_timeout_s, None, out) as pool,
+    ):
+        looks = _Looks(journal, pool, listener)
+        first = looks.through(
+            "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
+        )
+        results = _of_one_camera(first)
+        views = _views(results)
+        start = calibrate_camera(
+            views,
+            field,
+            _size(results),
+            replace(options.settings, points=PointModel.FIXED, lens=LensModel.RADIAL),
+        )
+        results = _second_pass(looks, task, photos, results, start)
+        journal.remove()
+    final = calibrate_camera(_views(results), field, _size(results), options.settings, start)
+    camera = replace(final.camera, response=options.response)
+    calibration = replace(final, camera=camera)
+    return _outcome(photos, field, options, results, calibration)
+
+
+class _Looks:
+    """Work on photographs by a pool, with results that a journal keeps."""
+
+    def __init__(
+        self,
+        journal: Journal[PhotoDiscs | PhotoMiss],
+        pool: WorkerPool,
+        listener: ProgressListener,
+    ) -> None:
+        self._journal, self._pool, self._listener = journal, pool, listener
+
+    def through(
+        self,
+        stage: str,
+        items: Sequence[_Item],
+        names: Sequence[str],
+        function: Callable[[_Item], PhotoDiscs | PhotoMiss],
+    ) -> list[PhotoDiscs | PhotoMiss]:
+        """Return the results of all items, in their order."""
+        keys = [fingerprint(stage, _stamp(item), item) for item in items]
+        row_of = {id(item): row for row, item in enumerate(items)}
+        results: dict[int, PhotoDiscs | PhotoMiss] = {}
+        for row, key in enumerate(keys):
+            kept = self._journal.get(key)
+            if kept is not None:
+                results[row] = kept
+        measured = sum(isinstance(result, PhotoDiscs) for result in results.values())
+        self._listener.progress(stage, len(results), len(items), measured)
+        remaining = (item for row, item in enumerate(items) if row not in results)
+        with closing(self._pool.map(function, remaining)) as outcomes:
+            for item, outcome in outcomes:
+                row = row_of[id(item)]
+                if isinstance(outcome, TaskFailure):
+                    result: PhotoDiscs | PhotoMiss = PhotoMiss(
+                        names[row], 0, 0, _LOSSES[outcome].value, ""
+                    )
+                else:
+                    result = outcome
+                    self._journal.add(keys[row], result)
+                results[row] = result
+                measured += isinstance(result, PhotoDiscs)
+                self._listener.progress(stage, len(results), len(items), measured)
+        return [results[row] for row in range(len(items))]
+
+
+def _stamp(item: Photo | SecondLook) -> tuple[int, int] | None:
+    path = item.path if isinstance(item, Photo) else item.photo.path
+    (stamp,) = stamps_of(path.parent, [path.name])
+    return stamp
+
+
+def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs | PhotoMiss]:
+    """Return the results with photographs of another size than most left out.
+
+    Raises
+    ------
+    KgcpError
+        If EXIF names several cameras or focal lengths.
+    """
+    found = [result for result in results if isinstance(result, PhotoDiscs)]
+    lenses = Counter(result.lens for result in found if result.lens)
+    if len(lenses) > 1:
+        (first, first_count), (second, second_count) = lenses.most_common(2)
+        raise KgcpError(
+            f"the photographs are by several cameras or focal lengths: {first_count} by {first},"
+            f" {second_count} by {second}; calibrate them apart"
+        )
+    sizes = Counter((result.width, result.height) for result in found)
+    if not sizes:
+        return list(results)
+    usual = max(sizes, key=lambda size: (sizes[size], size))
+    return [
+        result
+        if isinstance(result, PhotoMiss) or (result.width, result.height) == usual
+        else PhotoMiss(
+            result.photo,
+            result.width,
+            result.height,
+            OTHER_SIZE,
+            f"{result.width} x {result.height} px, most have {usual[0]} x {usual[1]}"
+            + (", which is transposed" if (result.height, result.width) == usual else ""),
+        )
+        for result in results
+    ]
+
+
+def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
+    found = [result for result in results if isinstance(result, PhotoDiscs)]
+    if len(found) < LEAST_VIEWS:
+        reasons = Counter(result.reason for result in results if isinstance(result, PhotoMiss))
+        why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        raise KgcpError(
+            f"the field is found in {len(found)} of {len(results)} photographs"
+            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; correct what describes"
+            " the field, or take more photographs"
+        )
+    return [
+        NamedView(
+            result.photo,
+            result.point.astype(np.intp),
+            result.vectors,
+            result.covs,
+            result.is_symmetric,
+        )
+        for result in found
+    ]
+
+
+def _size(results: Sequence[PhotoDiscs | PhotoMiss]) -> tuple[int, int]:
+    first = next(result for result in results if isinstance(result, PhotoDiscs))
+    return first.width, first.height
+
+
+def _second_pass(
+    looks: _Looks,
+    task: PhotoTask,
+    photos: Sequence[Photo],
+    results: Sequence[PhotoDiscs | PhotoMiss],
+    start: CameraCalibration,
+) -> list[PhotoDiscs | PhotoMiss]:
+    """Look for the discs that the first pass has not found, where they must be."""
+    places = {photo.name: photo for photo in photos}
+    by_name = {result.photo: result for result in results}
+    second = []
+    for name, (point, predicted) in missing_discs(start).items():
+        first = by_name[name]
+        if isinstance(first, PhotoDiscs) and len(point):
+            second.append(SecondLook(places[name], first, predicted, point.astype(np.float64)))
+    if second:
+        names = [look.photo.name for look in second]
+        function = partial(measure_photo_again, task)
+        for result in looks.through("second pass", second, names, function):
+            if isinstance(result, PhotoDiscs):  # a loss leaves what the first pass has found
+                by_name[result.photo] = result
+    return [by_name[result.photo] for result in results]
+
+
+def _outcome(
+    photos: Sequence[Photo],
+    field: Field,
+    options: CalibrationOptions,
+    results: Sequence[PhotoDiscs | PhotoMiss],
+    calibration: CameraCalibration,
+) -> PhotoCalibration:
+    used = {view.photo for view in calibration.views}
+    discs, misses = {}, []
+    for result in results:
+        if isinstance(result, PhotoMiss):
+            misses.append(result)
+        elif result.photo in used:
+            discs[result.photo] = result
+        else:
+            size = (result.width, result.height)
+            misses.append(PhotoMiss(result.photo, *size, UNLIKE_FIELD, ""))
+    names = tuple(photo.name for photo in photos)
+    return PhotoCalibration(field, options, calibration, discs, tuple(misses), names)

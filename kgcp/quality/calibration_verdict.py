@@ -1,0 +1,212 @@
+"""What a calibration is good for, and which photographs would make it better."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.network.calibration_records import CameraCalibration, PointModel
+
+_CELLS = (8, 6)  # of the frame, that discs cover or do not
+_LEAST_VIEWS = 4
+_LEAST_DISCS = 6  # per photograph
+_FOCAL_SHARE = 0.01
+_OPERATOR_RATIO = 3.0
+_FIELD_RATIO = 3.0
+_COVERAGE = 0.7
+_NORMALS_DEG = 15.0
+_RADIUS_SHARE = 0.03
+_WIDE_DEG = 100.0  # of the field of view, beyond which lenses are fisheyes
+_GRID = 25  # points along the longer side of the frame, for the map of uncertainty
+
+
+class Grade(StrEnum):
+    """What a calibration may be used for."""
+
+    GOOD = "good"
+    LOOK = "to be looked at"
+    UNUSABLE = "unusable"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationNumbers:
+    """What the verdict depends on."""
+
+    views: int
+    discs: int
+    discs_used: int
+    rms_fixed_px: float
+    rms_px: float
+    operator_sd_px: float
+    sd: FloatArray  # (12,): of `CALIBRATION_PARAMETERS`
+    coverage: float  # share of the frame's cells that have a disc
+    tilts_deg: FloatArray  # (v,): of the field against the optical axis
+    normals_deg: float  # largest angle between two normals
+    turns_deg: FloatArray  # (v,): of the field about the optical axis
+    field_of_view_deg: float  # across the diagonal
+    # (h, w): standard deviation of a pixel's ray, with turns of the camera taken out [px]
+    ray_sd_px: FloatArray
+    flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationVerdict:
+    """The grade, its reasons, and what to do."""
+
+    grade: Grade
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one line."""
+        first = f"The calibration is {self.grade.value}"
+        return f"{first}: {'; '.join(self.reasons)}." if self.reasons else f"{first}."
+
+
+def calibration_numbers(calibration: CameraCalibration) -> CalibrationNumbers:
+    """Return what the verdict and the report need."""
+    camera, estimate = calibration.camera, calibration.solution.estimate
+    places = np.concatenate([view.vectors[:, :2] for view in calibration.views])
+    size = np.array([camera.width, camera.height])
+    cells = np.clip((places / size * _CELLS).astype(int), 0, np.array(_CELLS) - 1)
+    normals = estimate.rotations[:, :, 2]
+    between = np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)))
+    diagonal = math.hypot(camera.width, camera.height) / camera.mean_focal_px
+    axes = estimate.rotations[:, :2, 0]
+    heights = estimate.points[:, 2]
+    return CalibrationNumbers(
+        len(calibration.views),
+        len(places),
+        int(np.count_nonzero(calibration.solution.is_used)),
+        calibration.rms_fixed_px,
+        calibration.rms_px,
+        calibration.operator_sd_px,
+        np.sqrt(calibration.covariance.cov.diagonal()),
+        len({(x, y) for x, y in cells.tolist()}) / (_CELLS[0] * _CELLS[1]),
+        np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0))),
+        float(between.max()),
+        np.degrees(np.arctan2(axes[:, 1], axes[:, 0])),
+        math.degrees(2.0 * math.atan(0.5 * diagonal)),
+        _ray_sd_px(calibration),
+        None
+        if calibration.points_used is PointModel.FIXED
+        else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
+    )
+
+
+def _ray_sd_px(calibration: CameraCalibration) -> FloatArray:
+    """Return the deviation of every pixel's ray as no turn of the camera could take it away [px].
+
+    A shift of the principal point and a turn of the camera look nearly the same. What a user of the
+    camera meets is what is left after the best turn.
+    """
+    camera = calibration.camera
+    columns = _GRID
+    rows = max(2, round(_GRID * camera.height / camera.width))
+    x, y = np.meshgrid(
+        np.linspace(0.0, camera.width - 1.0, columns), np.linspace(0.0, camera.height - 1.0, rows)
+    )
+    pixels = np.column_stack((x.ravel(), y.ravel()))
+    normalised = camera.undistort(pixels)
+    reachable = np.all(np.isfinite(normalised), axis=1)
+    normalised = np.where(reachable[:, None], normalised, 0.0)
+    by_camera = image_by_calibration(camera, normalised).reshape(-1, len(CALIBRATION_PARAMETERS))
+    u, v = normalised.T
+    one = np.ones_like(u)
+    turns = np.stack((u * v, -(1.0 + u * u), v, 1.0 + v * v, -u * v, -u), axis=1).reshape(-1, 2, 3)
+    by_turn = (camera.distort_jacobian(normalised) @ turns).reshape(-1, 3)
+    kept = np.repeat(reachable, 2)
+    basis = np.linalg.qr(by_turn[kept])[0]
+    left = np.zeros_like(by_camera)
+    left[kept] = by_camera[kept] - basis @ (basis.T @ by_camera[kept])
+    variances = np.einsum("ij,jk,ik->i", left, calibration.covariance.cov, left)
+    sd = np.sqrt(np.maximum(variances, 0.0).reshape(-1, 2).sum(axis=1))
+    return np.asarray(np.where(reachable, sd, np.nan * one).reshape(rows, columns))
+
+
+def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> CalibrationVerdict:
+    """Return what a calibration is good for, why, and what would make it better."""
+    unusable = _unusable(calibration, numbers)
+    doubts = _doubts(calibration, numbers)
+    grade = Grade.UNUSABLE if unusable else Grade.LOOK if doubts else Grade.GOOD
+    return CalibrationVerdict(grade, (*unusable, *doubts), _advice(calibration, numbers))
+
+
+def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
+    reasons = []
+    if numbers.views < _LEAST_VIEWS:
+        reasons.append(f"{numbers.views} photographs are fewer than {_LEAST_VIEWS}")
+    if numbers.discs_used < _LEAST_DISCS * numbers.views:
+        reasons.append("there are fewer than 6 discs per photograph")
+    share = numbers.sd[0] / calibration.camera.fx
+    if share > _FOCAL_SHARE:
+        reasons.append(f"the focal length is known to {100.0 * share:.1f} % only")
+    if {"cx", "cy"} & set(calibration.undetermined):
+        reasons.append("the principal point is not determined")
+    if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > _far_off(numbers):
+        reasons.append("the lens looks like a fisheye, which kgcp's camera is not")
+    return reasons
+
+
+def _far_off(numbers: CalibrationNumbers) -> float:
+    return 10.0 * _OPERATOR_RATIO * numbers.operator_sd_px
+
+
+def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
+    doubts = []
+    if numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px:
+        ratio = numbers.rms_px / numbers.operator_sd_px
+        doubts.append(
+            f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
+        )
+    is_estimated = calibration.points_used is not PointModel.FIXED
+    if is_estimated and numbers.rms_fixed_px > _FIELD_RATIO * numbers.rms_px:
+        doubts.append(
+            f"the field is not what it is said to be: {numbers.rms_fixed_px:.2f} px as stated,"
+            f" {numbers.rms_px:.3f} px in its own shape"
+        )
+    if numbers.coverage < _COVERAGE:
+        doubts.append(f"discs cover {100.0 * numbers.coverage:.0f} % of the frame")
+    if numbers.normals_deg < _NORMALS_DEG:
+        doubts.append(f"all photographs look from within {numbers.normals_deg:.0f}°")
+    off = calibration.radius_scale - 1.0
+    if calibration.field.is_diameter_stated and abs(off) > _RADIUS_SHARE:
+        doubts.append(f"discs are {100.0 * abs(off):.0f} % {_larger(off)} than stated")
+    if calibration.is_turn_unclear:
+        doubts.append(
+            "the field looks the same when it is turned, so that its own errors cannot be estimated"
+        )
+    if calibration.dropped:
+        doubts.append(f"{len(calibration.dropped)} photographs do not fit the others")
+    return doubts
+
+
+def _larger(off: float) -> str:
+    return "larger" if off > 0.0 else "smaller"
+
+
+def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tuple[str, ...]:
+    advice = []
+    if numbers.normals_deg < 2.0 * _NORMALS_DEG or np.median(numbers.tilts_deg) < _NORMALS_DEG:
+        advice.append("Tilt the field by 25° to 40° about both axes, in all four directions.")
+    turns = np.radians(numbers.turns_deg)
+    # how much of the directions lies along one axis: 1 where all photographs are held alike
+    alike = float(np.abs(np.mean(np.exp(2j * turns))))
+    if alike > 0.9:
+        advice.append("Turn the camera by 90° in at least two photographs.")
+    if numbers.coverage < _COVERAGE:
+        advice.append("Bring the field into the corners of the frame.")
+    if numbers.views < 12:
+        advice.append("Take 12 photographs or more.")
+    if calibration.undetermined:
+        names = ", ".join(calibration.undetermined)
+        advice.append(f"Not determined by these photographs: {names}; come nearer, and tilt more.")
+    if calibration.is_turn_unclear:
+        advice.append("Give the field a mark: one disc that is hollow, larger or missing.")
+    return tuple(advice)

@@ -1,0 +1,156 @@
+"""Figures of the calibration report."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.network.calibration_records import CameraCalibration, PointModel
+from kgcp.quality.calibration_verdict import CalibrationNumbers
+from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
+
+_ARROW_SHARE = 0.04  # of the frame's width, that a typical residual is drawn long
+_RADII = 60
+_MM = 1e3
+
+
+def draw_figures(calibration: CameraCalibration, numbers: CalibrationNumbers) -> dict[str, bytes]:
+    """Return the figures of the page by their names, as PNG."""
+    figures = {
+        "residuals": _residuals(calibration),
+        "photographs": _photographs(calibration),
+        "rays": _rays(calibration, numbers),
+        "distortion": _distortion(calibration),
+    }
+    if calibration.points_used is not PointModel.FIXED:
+        figures["field"] = _field(calibration)
+    return {name: figure.png for name, figure in figures.items()}
+
+
+def _residuals(calibration: CameraCalibration) -> Picture:
+    camera, solution = calibration.camera, calibration.solution
+    used = solution.is_used
+    places = np.concatenate([view.vectors[:, :2] for view in calibration.views])
+    residuals = solution.residuals
+    typical = float(np.median(np.linalg.norm(residuals[used], axis=1)))
+    scale = max(typical, 1e-9) / (_ARROW_SHARE * camera.width)
+    with sheet(5.6) as figure:
+        axes = figure.subplots()
+        _frame(axes, camera.width, camera.height)
+        _arrows(axes, places[used], residuals[used], scale, BLUE)
+        axes.plot(*places[~used].T, "x", color=VERMILION, markersize=5.0, label="rejected")
+        length = _ARROW_SHARE * camera.width
+        axes.set_xlabel(f"x [px]   (an arrow of {length:.0f} px is a residual of {typical:.3f} px)")
+        axes.set_ylabel("y [px]")
+        if not used.all():
+            axes.legend(loc="upper right")
+        return picture(figure)
+
+
+def _photographs(calibration: CameraCalibration) -> Picture:
+    solution = calibration.solution
+    view = calibration.network.observations.view
+    count = len(calibration.views)
+    used = solution.is_used
+    squares = np.bincount(view[used], np.sum(solution.residuals[used] ** 2, axis=1), count)
+    rms = np.sqrt(squares / np.maximum(np.bincount(view[used], minlength=count), 1))
+    with sheet(3.6) as figure:
+        axes = figure.subplots()
+        axes.bar(np.arange(1, count + 1), rms, color=BLUE)
+        axes.axhline(calibration.operator_sd_px, color=VERMILION, label="stated by the operator")
+        axes.set_xlabel("photograph, in the order of the table")
+        axes.set_ylabel("RMS per point [px]")
+        axes.legend()
+        return picture(figure)
+
+
+def _rays(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Picture:
+    camera = calibration.camera
+    with sheet(5.2) as figure:
+        axes = figure.subplots()
+        _frame(axes, camera.width, camera.height)
+        image = axes.imshow(
+            numbers.ray_sd_px,
+            extent=(0.0, camera.width, camera.height, 0.0),
+            cmap="viridis",
+            interpolation="bilinear",
+        )
+        figure.colorbar(image, ax=axes, label="standard deviation of a ray [px]")
+        axes.set_xlabel("x [px]")
+        axes.set_ylabel("y [px]")
+        axes.grid(visible=False)
+        return picture(figure)
+
+
+def _distortion(calibration: CameraCalibration) -> Picture:
+    """Draw the radial distortion, with a band of two standard deviations."""
+    camera = calibration.camera
+    corners = np.array([[0.0, 0.0], [camera.width - 1.0, camera.height - 1.0]])
+    reach = np.linalg.norm((corners - [camera.cx, camera.cy]) / camera.mean_focal_px, axis=1).max()
+    radius = np.linspace(1e-6, reach, _RADII)
+    along = np.column_stack((radius, np.zeros(_RADII)))
+    ideal = radius * camera.fx
+    displaced = camera.distort(along)[:, 0] - camera.cx - ideal
+    terms = [CALIBRATION_PARAMETERS.index(name) for name in ("k1", "k2", "k3", "k4", "k5", "k6")]
+    slopes = image_by_calibration(camera, along)[:, 0][:, terms]
+    cov = calibration.covariance.cov[np.ix_(terms, terms)]
+    sd = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, cov, slopes), 0.0))
+    with sheet(3.8) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        low, high = displaced - 2.0 * sd, displaced + 2.0 * sd
+        axes.fill_between(ideal, low, high, color=BLUE, alpha=0.2, label="± 2 sd")
+        axes.plot(ideal, displaced, color=BLUE, label="radial distortion")
+        axes.set_xlabel("distance from the principal point [px]")
+        axes.set_ylabel("displacement [px]")
+        axes.legend()
+        return picture(figure)
+
+
+def _field(calibration: CameraCalibration) -> Picture:
+    """Draw how the field differs from what it is meant to be, in its plane and in height."""
+    nominal = calibration.field.points_m()
+    change = _MM * (calibration.solution.estimate.points - nominal)
+    reach = float(np.ptp(nominal[:, 0]))
+    largest = float(np.linalg.norm(change[:, :2], axis=1).max())
+    scale = max(largest, 1e-9) / (2.0 * _ARROW_SHARE * _MM * reach)
+    bound = max(float(np.abs(change[:, 2]).max()), 1e-9)
+    with sheet(5.4) as figure:
+        axes = figure.subplots()
+        x, y = (_MM * nominal[:, :2]).T
+        heights = axes.scatter(
+            x, y, c=-change[:, 2], cmap="PuOr", vmin=-bound, vmax=bound, s=60.0, edgecolor=GREY
+        )
+        _arrows(axes, _MM * nominal[:, :2], change[:, :2], scale, "black")
+        axes.invert_yaxis()
+        axes.set_aspect("equal")
+        figure.colorbar(heights, ax=axes, label="towards the camera [mm]")
+        axes.set_xlabel(f"x [mm]   (the longest arrow is {largest:.3f} mm)")
+        axes.set_ylabel("y [mm]")
+        return picture(figure)
+
+
+def _arrows(axes: Axes, places: FloatArray, vectors: FloatArray, scale: float, colour: str) -> None:
+    axes.quiver(
+        *places.T,
+        *vectors.T,
+        color=colour,
+        angles="xy",
+        scale_units="xy",
+        scale=scale,
+        width=0.002,
+    )
+
+
+def _frame(axes: Axes, width: int, height: int) -> None:
+    axes.set_xlim(0.0, width)
+    axes.set_ylim(height, 0.0)
+    axes.set_aspect("equal")
+
+
+def ellipse_sizes(vectors: FloatArray) -> FloatArray:
+    """Return the mean radii (k,) of discs by their moments [px]."""
+    determinant = vectors[:, 2] * vectors[:, 4] - vectors[:, 3] ** 2
+    return np.asarray(2.0 * determinant**0.25)

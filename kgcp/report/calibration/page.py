@@ -1,0 +1,127 @@
+"""The calibration report as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
+from kgcp.io.tables.calibration import PhotoRow
+from kgcp.network.calibration_records import CameraCalibration
+from kgcp.quality.calibration_verdict import CalibrationNumbers, CalibrationVerdict, Grade
+from kgcp.quality.number_text import minus
+from kgcp.report.calibration.figures import ellipse_sizes
+
+_PIXELS = 4  # the first parameters are lengths in pixels
+_CLASSES = {Grade.GOOD: "good", Grade.LOOK: "look", Grade.UNUSABLE: "unusable"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationPage:
+    """All that the page shows."""
+
+    calibration: CameraCalibration
+    numbers: CalibrationNumbers
+    verdict: CalibrationVerdict
+    photos: Sequence[PhotoRow]
+    figures: Mapping[str, bytes]  # PNG, by name
+    files: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRow:
+    """A line of the camera's table, in words."""
+
+    name: str
+    value: str
+    sd: str
+    note: str
+
+
+def render_calibration(page: CalibrationPage) -> str:
+    """Return the page."""
+    environment = Environment(
+        # the shell is that of the bias report
+        loader=ChoiceLoader(
+            [PackageLoader("kgcp.report.calibration"), PackageLoader("kgcp.report.bias")]
+        ),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["fixed"] = lambda value, digits: minus(f"{value:.{digits}f}")
+    return environment.get_template("calibration.html").render(
+        page=page,
+        calibration=page.calibration,
+        numbers=page.numbers,
+        verdict=page.verdict,
+        verdict_class=_CLASSES[page.verdict.grade],
+        parameters=parameter_rows(page.calibration),
+        correlations=_correlations(page.calibration),
+        eccentricity=_eccentricity(page.calibration),
+        images={
+            name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
+            for name, png in page.figures.items()
+        },
+    )
+
+
+def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
+    """Return name, value, deviation and remarks of every parameter that is not zero."""
+    sd = np.sqrt(calibration.covariance.cov.diagonal())
+    rows = []
+    for index, name in enumerate(CALIBRATION_PARAMETERS):
+        value = float(getattr(calibration.camera, name))
+        if value == 0.0 and sd[index] == 0.0:
+            continue
+        digits = 3 if index < _PIXELS else 6
+        notes = []
+        if name in calibration.undetermined:
+            notes.append("not determined")
+        if name in calibration.tangled:
+            others = [other for other in calibration.tangled if other != name]
+            notes.append(f"not told apart from {', '.join(others)}")
+        unit = " px" if index < _PIXELS else ""
+        rows.append(
+            ParameterRow(
+                name,
+                minus(f"{value:.{digits}f}") + unit,
+                f"{sd[index]:.{digits}f}{unit}",
+                "; ".join(notes),
+            )
+        )
+    return rows
+
+
+def _correlations(calibration: CameraCalibration) -> tuple[list[str], list[list[str]]]:
+    """Return names and the lower triangle of the correlations, as text."""
+    cov = calibration.covariance.cov
+    known = [index for index in range(len(cov)) if cov[index, index] > 0.0]
+    sd = np.sqrt(cov.diagonal()[known])
+    correlation = cov[np.ix_(known, known)] / np.outer(sd, sd)
+    texts = [
+        [minus(f"{correlation[row, column]:.2f}") for column in range(row + 1)]
+        for row in range(len(known))
+    ]
+    return [CALIBRATION_PARAMETERS[index] for index in known], texts
+
+
+def _eccentricity(calibration: CameraCalibration) -> dict[str, float]:
+    """Return how far centroids are from centres, and how large discs are, median and largest."""
+    perspective = np.linalg.norm(calibration.eccentricity.perspective_px, axis=1)
+    in_marker = np.linalg.norm(calibration.eccentricity.in_marker_px, axis=1)
+    radius = ellipse_sizes(np.concatenate([view.vectors for view in calibration.views]))
+    return {
+        f"{name}_{kind}": float(value)
+        for name, values in (
+            ("perspective", perspective),
+            ("in_marker", in_marker),
+            ("radius", radius),
+        )
+        for kind, value in (("median", np.nanmedian(values)), ("max", np.nanmax(values)))
+    }

@@ -1,0 +1,1 @@
+"""Fields of plain discs and rings: their geometry, and who is who in a photograph."""

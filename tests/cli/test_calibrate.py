@@ -1,0 +1,238 @@
+"""kgcp calibrate, from rendered photographs to the camera that took them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from kgcp.cli.calibrate import FORMATS, LENSES, OPERATORS, POINTS, RESPONSES
+from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.io.flight.camera_table import read_camera_file
+from kgcp.io.flight.flight import read_camera_and_targets
+from kgcp.io.formats.camera_writers import CAMERA_FORMATS
+from kgcp.measurement.discs.records import Operator
+from kgcp.network.calibration_records import LensModel, PointModel
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.targets.fields.layout import Field, GridKind, Mark
+
+CAMERA = Camera(400, 300, 390.0, 390.0, 204.2, 146.5, -0.08, response=Response.LINEAR)
+FIELD = Field("f", GridKind.SQUARE, 5, 4, 0.03, 0.016, marks=(Mark(1, 1, 0.016, 0.007),))
+FIELD_TOML = """\
+diameter_m = 0.016
+[grid]
+kind = "square"
+columns = 5
+rows = 4
+pitch_m = 0.03
+[[mark]]
+at = [1, 1]
+inner_diameter_m = 0.007
+"""
+TARGET_TOML = """\
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.64
+dot_diameter_m = 0.13
+code_deg = [0, 43, 78, 180]
+"""
+TILTS = ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.1), (0.1, -0.5), (0.35, 0.35))
+QUIET = ("--jobs", "0", "--response", "linear", "--quiet")
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["calibrate", *map(str, arguments)], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five photographs of a field, one of nothing, and one file that is none."""
+    folder = tmp_path_factory.mktemp("photos")
+    rng = np.random.default_rng(18)
+    discs = tuple(
+        FieldDisc(tuple(point), 2.0 * radius, 2.0 * inner)
+        for point, radius, inner in zip(
+            FIELD.points_m().tolist(),
+            FIELD.radii_m().tolist(),
+            FIELD.inner_radii_m().tolist(),
+            strict=True,
+        )
+    )
+    scene = FieldScene(discs)
+    middle = FIELD.points_m().mean(axis=0)
+    sensor = Sensor()
+    for index, tilt in enumerate(TILTS):
+        turn = rotation_about(np.array([0.0, 0.0, 0.5 * np.pi * (index % 2)]))
+        rotation = rotation_about(np.array([*tilt, 0.0])) @ turn
+        shift = np.array([0.01 * (index - 2), 0.004 * index, 0.21])
+        grey = photograph(
+            CAMERA, Pose(rotation, shift - rotation @ middle), scene, Optics(0.6), sensor, rng
+        )
+        cv2.imwrite(str(folder / f"photo{index + 1}.png"), grey)
+    cv2.imwrite(str(folder / "photo10.png"), np.full((300, 400), 180, dtype=np.uint8))
+    (folder / "photo11.png").write_bytes(b"nothing")
+    (folder / "field.toml").write_text(FIELD_TOML)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibration(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """The results, and what was printed."""
+    out = tmp_path_factory.mktemp("out")
+    formats = [word for form in FORMATS for word in ("--format", form)]
+    field = photos / "field.toml"
+    result = run(photos, "--field", field, "--out", out, *QUIET, "--json", *formats)
+    assert result.exit_code == 0, result.output
+    return out, result
+
+
+def test_the_camera_is_the_one_that_took_the_photographs(
+    calibration: tuple[Path, Result],
+) -> None:
+    camera, covariance = read_camera_file(calibration[0] / "camera.toml")
+    assert covariance is not None
+    sd = np.sqrt(covariance.cov.diagonal())
+    errors = np.array([camera.fx - 390.0, camera.fy - 390.0, camera.cx - 204.2, camera.cy - 146.5])
+    assert np.all(np.abs(errors) < 4.0 * sd[:4])
+    assert np.all(sd[:4] < [2.0, 2.0, 2.0, 2.0])
+    assert camera.k1 == pytest.approx(-0.08, abs=0.03)
+
+
+def test_every_photograph_has_its_row(calibration: tuple[Path, Result]) -> None:
+    summary = json.loads(calibration[1].stdout)
+    assert summary["photographs"] == 7
+    assert summary["photographs_used"] == 5
+    assert summary["not_used"] == {"photo10.png": "too_few", "photo11.png": "decode_failed"}
+    assert list(summary["photo_rms_px"]) == [f"photo{i}.png" for i in range(1, 6)]
+    assert 0.001 < summary["rms_px"] < 0.2
+    assert {Path(name).name for name in summary["files"]} >= {
+        *("camera.toml", "field.toml", "field.csv", "calibration.json", "calibration.html"),
+        *("observations.parquet", "field.parquet", "photos.parquet", "opencv.yml"),
+    }
+
+
+def test_the_page_is_self_contained_and_complete(calibration: tuple[Path, Result]) -> None:
+    page = (calibration[0] / "calibration.html").read_text(encoding="utf-8")
+    assert "http" not in page.replace("http://www.w3.org", "")
+    for name in ("The camera", "How well it fits", "Eccentricity", "photo11.png", "decode_failed"):
+        assert name in page
+
+
+@pytest.mark.parametrize("form", ['format = "kgcp"', ""], ids=["named", "by suffix"])
+def test_flight_toml_takes_the_camera_with_its_covariance(
+    calibration: tuple[Path, Result], tmp_path: Path, form: str
+) -> None:
+    out, _ = calibration
+    shutil.copy(out / "camera.toml", tmp_path)
+    toml = f'[camera]\nfile = "camera.toml"\n{form}\n{TARGET_TOML}'
+    (tmp_path / "flight.toml").write_text(toml)
+    camera, covariance, _ = read_camera_and_targets(tmp_path)
+    own_camera, own_covariance = read_camera_file(out / "camera.toml")
+    assert camera == own_camera
+    assert camera.response is Response.LINEAR
+    assert covariance is not None
+    assert own_covariance is not None
+    assert np.array_equal(covariance.cov, own_covariance.cov)
+    (tmp_path / "flight.toml").write_text(toml.replace("[camera]", "[camera]\nwidth = 400"))
+    with pytest.raises(KgcpError, match="width: is given beside a camera"):
+        read_camera_and_targets(tmp_path)
+
+
+def test_the_same_photographs_give_the_same_bytes(
+    photos: Path, calibration: tuple[Path, Result], tmp_path: Path
+) -> None:
+    result = run(photos, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    assert result.exit_code == 0, result.output
+    for name in ("camera.toml", "calibration.json", "observations.parquet", "field.csv"):
+        assert (tmp_path / name).read_bytes() == (calibration[0] / name).read_bytes(), name
+    assert not list(tmp_path.glob(".*"))  # no journal is left
+
+
+def test_the_field_may_be_free_and_the_lens_chosen(photos: Path, tmp_path: Path) -> None:
+    chosen = ("--points", "free", "--model", "radial", "--operator", "centroid")
+    field = photos / "field.toml"
+    result = run(photos, "--field", field, "--out", tmp_path, *QUIET, *chosen, "--json")
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert summary["points"] == "free"
+    assert summary["estimated"] == ["fx", "cx", "cy", "k1", "k2"]
+    assert summary["flatness_m"] < 0.001
+    assert summary["camera"]["fx"] == pytest.approx(390.0, abs=3.0)
+
+
+def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
+    files = [photos / "photo1.png", photos / "photo2.png", photos / "photo10.png"]
+    result = run(*files, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
+    assert result.exit_code == 1
+    assert "the field is found in 2 of 3 photographs (1 too_few), and 3 are needed" in result.stderr
+    assert not (tmp_path / "camera.toml").exists()
+
+
+def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder)
+    grey = cv2.imread(str(folder / "photo1.png"), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    cv2.imwrite(str(folder / "photo1.png"), np.rot90(grey))
+    out = tmp_path / "out"
+    result = run(folder, "--field", folder / "field.toml", "--out", out, *QUIET, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["not_used"]["photo1.png"] == "other_size"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--field", "grid:5x4:30mm:40mm"), "overlap"),
+        (("--field", "field.json"), "is neither a field's file nor a shorthand"),
+        (("--field", "grid:5x4:30mm:16mm", "--format", "opf", "--free-aspect"), "fx and fy differ"),
+        (("--field", "grid:5x4:30mm:16mm", "--format", "opensfm", "--model", "rational"), "k4"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_measured(
+    photos: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    result = run(photos, *arguments, "--out", tmp_path / "out", *QUIET)
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> None:
+    board = tmp_path / "calibration_target.yaml"
+    key = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget"
+    grid = "{numRows: 4, numCols: 5, shapeDistance: 3.0, shapeSize: 1.6}"
+    board.write_text(f"# BoofCV\n{key}:\n  grid: {grid}\n  type: CIRCLE_GRID\n")
+    out = tmp_path / "out"
+    result = run(photos, "--field", board, "--out", out, *QUIET)
+    assert result.exit_code == 1
+    assert "does not say its unit" in result.stderr
+    assert "(--unit)" in result.stderr
+    files = (photos / "photo1.png", photos / "photo2.png")
+    result = run(*files, "--field", board, "--unit", "cm", "--out", out, *QUIET)
+    assert "the field is found in 2 of 2 photographs, and 3 are needed" in result.stderr
+
+
+def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    result = run(tmp_path / "none", "--field", "grid:5x4:30mm:16mm", *QUIET)
+    assert result.exit_code == 1
+    assert "is neither an image nor a folder of images" in result.stderr
+
+
+def test_the_choices_are_those_of_the_library() -> None:
+    assert list(PointModel) == list(POINTS)
+    assert list(LensModel) == list(LENSES)
+    assert list(Operator) == list(OPERATORS)
+    assert list(Response) == list(RESPONSES)
+    assert CAMERA_FORMATS == FORMATS

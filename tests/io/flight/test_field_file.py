@@ -1,0 +1,173 @@
+"""Fields from field.toml, shorthands, and the boards of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.io.flight.field_file import field_toml, read_field
+from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
+
+BOOFCV = """\
+# Serialized boofcv.alg.fiducial.calib.ConfigCalibrationTarget
+BoofCV.GIT_SHA: a9ab9041d1703a9c09c31999043382e870554729
+boofcv.alg.fiducial.calib.ConfigCalibrationTarget:
+  grid:
+    numRows: 24
+    shapeDistance: 1.2
+    shapeSize: 1.0
+    numCols: 28
+  type: CIRCLE_HEXAGONAL
+"""
+DICE = """\
+<?xml version="1.0" encoding="utf-8"?>
+<ParameterList>
+  <Parameter name="xml_file_format" type="string" value="DICe_xml_calibration_file"/>
+  <Parameter name="cal_target_type" type="string" value="WHITE_ON_BLACK_W_DONUT_DOTS"/>
+  <Parameter name="num_cal_fiducials_x" type="int" value="14"/>
+  <Parameter name="num_cal_fiducials_y" type="int" value="10"/>
+  <Parameter name="num_cal_fiducials_origin_to_x_marker" type="int" value="10"/>
+  <Parameter name="num_cal_fiducials_origin_to_y_marker" type="int" value="6"/>
+  <Parameter name="cal_origin_x" type="int" value="2"/>
+  <Parameter name="cal_origin_y" type="int" value="2"/>
+  <Parameter name="cal_target_spacing_size" type="double" value="7.0"/>
+</ParameterList>
+"""
+ROS = """\
+target_finder:
+  type: ModifiedCircleGridTargetFinder
+  rows: 10
+  cols: 7
+  spacing: 0.0254
+"""
+TOML = """\
+name = "panel"
+diameter_m = 0.015
+[grid]
+kind = "square"
+columns = 10
+rows = 8
+pitch_m = 0.025
+[[mark]]
+at = [2, 2]
+inner_diameter_m = 0.006
+"""
+
+
+def write(folder: Path, name: str, text: str) -> str:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_field_toml_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    field = Field(
+        'a "name"',
+        GridKind.HEXAGONAL,
+        12,
+        8,
+        0.025,
+        0.0151,
+        0.004,
+        FieldPolarity.BRIGHT,
+        (Mark(2, 3, 0.01, 0.003), Mark(0, 0, 0.0151, is_missing=True)),
+        (1e-5, 2e-5, 3e-4),
+        (FieldBar("r0c1", "r7c5", 0.2, 1e-5),),
+    )
+    assert read_field(write(tmp_path, "field.toml", field_toml(field))) == field
+
+
+def test_marks_take_the_diameter_of_all(tmp_path: Path) -> None:
+    field = read_field(write(tmp_path, "field.toml", TOML))
+    assert field.marks == (Mark(2, 2, 0.015, 0.006),)
+    assert field.flat_sd_m == (0.00005, 0.00005, 0.0003)
+
+
+def test_shorthands() -> None:
+    grid = read_field("grid:10x8:25mm:15mm")
+    assert (grid.kind, grid.columns, grid.rows) == (GridKind.SQUARE, 10, 8)
+    assert [grid.pitch_m, grid.diameter_m] == pytest.approx([0.025, 0.015])
+    bright = read_field("asymmetric:4x11:2cm:bright")
+    assert (bright.kind, bright.polarity) == (GridKind.ASYMMETRIC, FieldPolarity.BRIGHT)
+    assert grid.is_diameter_stated
+    assert not bright.is_diameter_stated
+
+
+def test_boofcv_does_not_say_its_unit(tmp_path: Path) -> None:
+    path = write(tmp_path, "calibration_target.yaml", BOOFCV)
+    with pytest.raises(KgcpError, match="does not say its unit") as caught:
+        read_field(path)
+    assert caught.value.option == "unit"
+    field = read_field(path, "cm")
+    assert (field.kind, field.columns, field.rows) == (GridKind.HEXAGONAL, 28, 24)
+    assert [field.pitch_m, field.diameter_m] == pytest.approx([0.012, 0.01])
+
+
+def test_dice_counts_from_below_and_both_ends(tmp_path: Path) -> None:
+    field = read_field(write(tmp_path, "input.xml", DICE))
+    assert field.polarity is FieldPolarity.BRIGHT
+    assert {(mark.column, mark.row) for mark in field.marks} == {(2, 7), (11, 7), (2, 2)}
+    assert not field.is_diameter_stated
+
+
+def test_ros_has_one_larger_dot(tmp_path: Path) -> None:
+    field = read_field(write(tmp_path, "cal_data.yaml", ROS))
+    assert (field.columns, field.rows, field.pitch_m) == (7, 10, 0.0254)
+    (mark,) = field.marks
+    assert (mark.column, mark.row) == (0, 9)
+    assert mark.diameter_m > field.diameter_m
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("grid:10x8:25:15mm", "'25' is no length with a unit"),
+        ("grid:10x8:25mm:30mm", "discs of 30 mm overlap"),
+        ("grid:1x8:25mm:5mm", "columns: 1 is"),
+        ("nothing.toml", "is neither a field's file nor a shorthand"),
+    ],
+)
+def test_wrong_shorthands(text: str, message: str) -> None:
+    with pytest.raises(KgcpError, match=message):
+        read_field(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kind = "square"', 'kind = "round"', "'round' is not known"),
+        ("pitch_m = 0.025", "pitch = 0.025", "nearest known key is 'pitch_m'"),
+        ("pitch_m = 0.025", "pitch_m = 0.01", "overlap"),
+        ("at = [2, 2]", "at = [2.5, 2]", "is not column and row"),
+        ("at = [2, 2]", "at = [20, 2]", "is no disc of the grid"),
+        ("diameter_m = 0.015\n", "", "diameter_m: is missing"),
+        ("[grid]", "[code]\nbits = 14\n[grid]", "code: is not a known key"),
+    ],
+)
+def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = write(tmp_path, "field.toml", TOML.replace(old, new, 1))
+    with pytest.raises(KgcpError, match=message) as caught:
+        read_field(path)
+    assert "field.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new"),
+    [
+        (BOOFCV, "CIRCLE_HEXAGONAL", "CHESSBOARD"),
+        (BOOFCV, "numRows: 24", "numRows: many"),
+        (BOOFCV, "numRows: 24", "numRows: .inf"),
+        (BOOFCV, "1.2", "1e999"),
+        (DICE, 'value="7.0"', 'value="nan"'),
+        (DICE, "WHITE_ON_BLACK_W_DONUT_DOTS", "CHECKER_BOARD"),
+        (DICE, "cal_origin_x", "origin"),
+        (ROS, "spacing: 0.0254", "spacing: []"),
+        (ROS, "rows: 10", "rows: 1e300"),
+        (ROS, "rows: 10", "rows: -3"),
+    ],
+)
+def test_damaged_boards_are_one_line(tmp_path: Path, text: str, old: str, new: str) -> None:
+    with pytest.raises(KgcpError, match="board"):
+        read_field(write(tmp_path, "board", text.replace(old, new, 1)), "mm")
