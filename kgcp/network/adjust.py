@@ -11,6 +11,7 @@ from scipy import linalg
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.network.equations import (
     ReducedSystem,
+    ViewRows,
     bordered_by,
     computed,
     inner_constraints,
@@ -19,6 +20,11 @@ from kgcp.network.equations import (
     reduce_poses,
     view_rows,
     whitened,
+)
+from kgcp.network.point_elimination import (
+    can_eliminate_points,
+    moved_by_points,
+    reduce_points,
 )
 from kgcp.network.records import Estimate, Network, Solution
 
@@ -103,8 +109,7 @@ def _minimise(
     for step in range(most_steps):
         equations = view_rows(network, estimate, weights)
         while True:
-            system = reduce_poses(network, estimate, equations, damping)
-            trial = moved(network, estimate, system, _solved(network, estimate, system))
+            trial = _stepped(network, estimate, equations, damping)
             trial_cost = _cost(network, trial, weights)
             if trial_cost <= cost or damping > _MOST_DAMPING:
                 break
@@ -117,6 +122,16 @@ def _minimise(
         if is_done:
             return estimate, step + 1
     return estimate, most_steps
+
+
+def _stepped(
+    network: Network, estimate: Estimate, equations: list[ViewRows], damping: float
+) -> Estimate:
+    if can_eliminate_points(network):
+        by_points = reduce_points(network, estimate, equations, damping)
+        return moved_by_points(network, estimate, by_points)
+    system = reduce_poses(network, estimate, equations, damping)
+    return moved(network, estimate, system, _solved(network, estimate, system))
 
 
 def _cost(network: Network, estimate: Estimate, weights: FloatArray) -> float:

@@ -24,6 +24,11 @@ from kgcp.network.equations import (
     view_rows,
     whitened,
 )
+from kgcp.network.point_elimination import (
+    can_eliminate_points,
+    determined_by_priors,
+    reduce_points,
+)
 from kgcp.network.records import Network, Precision, Solution
 
 _LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, a photograph decides it alone
@@ -54,10 +59,25 @@ def precision(network: Network, solution: Solution) -> Precision:
 
 def observation_factor(network: Network, solution: Solution) -> float:
     """Return the variance factor of the observations alone, whatever priors there are."""
+    squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
+    used = 2 * int(np.count_nonzero(solution.weights))
+    taken = _unknowns(network) - _determined_by_priors(network, solution)
+    return squares / max(used - taken - 6 * len(network.view_camera), 1.0)
+
+
+def _unknowns(network: Network) -> int:
+    """Return the number of unknowns besides the poses."""
+    points = 0 if network.points.is_fixed else network.points.nominal.size
+    return network.cameras.values.size + points
+
+
+def _determined_by_priors(network: Network, solution: Solution) -> float:
+    """Return how many unknowns priors and inner constraints determine, as a sum of shares."""
     equations = view_rows(network, solution.estimate, solution.weights)
+    if can_eliminate_points(network):
+        return determined_by_priors(network, reduce_points(network, solution.estimate, equations))
     system = reduce_poses(network, solution.estimate, equations)
     inverse = _inverse(network, system)
-    squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
     information = np.zeros_like(inverse)
     cameras = np.arange(network.cameras.values.size)
     information[cameras, cameras] = network.cameras.sd.ravel() ** -2.0
@@ -65,10 +85,7 @@ def observation_factor(network: Network, solution: Solution) -> float:
         index = np.arange(len(network.points.nominal))
         blocks = information[len(cameras) :, len(cameras) :].reshape(len(index), 3, len(index), 3)
         blocks[index, :, index, :] = network.points.information
-    from_priors = float(np.sum(inverse * information))
-    used = 2 * int(np.count_nonzero(solution.weights))
-    taken = len(inverse) - from_priors - network.points.datum_defect
-    return squares / max(used - taken - 6 * len(network.view_camera), 1.0)
+    return float(np.sum(inverse * information)) + network.points.datum_defect
 
 
 def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) -> int:

@@ -93,6 +93,7 @@ def facts_of(inputs: FlightInputs) -> dict[str, str]:
     facts = {
         "frames": _frames_text(inputs),
         "camera": _camera_text(inputs.flight.camera),
+        "calibration": _calibration_text(inputs.flight),
         "targets": _targets_text(inputs.flight),
         "times": _times_text(inputs),
         "trajectory": _trajectory_text(inputs),
@@ -129,6 +130,18 @@ def _camera_text(camera: Camera) -> str:
         f" {angles[1]:.0f}°), principal point {_signed(shift[0])}, {_signed(shift[1])} px from the"
         f" centre{shutter}"
     )
+
+
+def _calibration_text(flight: Flight) -> str:
+    """Return how well the focal length is known, which scales every distance."""
+    if flight.calibration_covariance is None:
+        return (
+            "accuracy not stated, so that reported accuracies leave it out; kgcp calibrate computes"
+            " a camera with its covariance"
+        )
+    sd_px = float(np.sqrt(flight.calibration_covariance.cov[:2, :2].diagonal().mean()))
+    share = f", {100.0 * sd_px / flight.camera.mean_focal_px:.2g} % of every distance"
+    return f"focal length known to {sd_px:.2g} px{share}" if sd_px else "focal length free of error"
 
 
 def _signed(value: float) -> str:

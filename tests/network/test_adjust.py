@@ -17,7 +17,19 @@ from kgcp.network.covariance import (
     tangled,
     variance_components,
 )
-from kgcp.network.equations import computed, inner_constraints, view_rows
+from kgcp.network.equations import (
+    computed,
+    inner_constraints,
+    moved,
+    reduce_poses,
+    view_rows,
+)
+from kgcp.network.point_elimination import (
+    can_eliminate_points,
+    determined_by_priors,
+    moved_by_points,
+    reduce_points,
+)
 from kgcp.network.records import Estimate, PointPrior, ScaleBar
 from tests.network.conftest import SD_PX, simulated
 
@@ -184,3 +196,28 @@ def test_a_published_adjustment_is_reproduced() -> None:
     assert result.correlation_difference < 0.02
     assert result.s0_mm == pytest.approx(0.000405, abs=0.000005)
     assert result.points_mm < 0.0005
+
+
+def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> None:
+    """Both ways lead to the same step, and to the same share of the priors."""
+    bend = 0.0002 * rng.standard_normal((35, 3))
+    nominal = simulated().network.points.nominal
+    information = np.broadcast_to(np.diag([1.0, 2.0, 0.5]) / 0.0002**2, (35, 3, 3))
+    made = simulated(points=PointPrior(nominal, information), displaced_m=bend).observed(rng)
+    network, start = made.network, made.start(rng)
+    weights = rng.uniform(0.2, 1.0, len(network.observations.view))
+    equations = view_rows(network, start, weights)
+    assert can_eliminate_points(network)
+    by_points = moved_by_points(network, start, reduce_points(network, start, equations, 0.0))
+    system = reduce_poses(network, start, equations)
+    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    step = scale * np.linalg.solve(system.normal * np.outer(scale, scale), scale * system.right)
+    by_poses = moved(network, start, system, step)
+    assert np.allclose(by_points.cameras, by_poses.cameras, rtol=1e-9, atol=1e-9)
+    assert np.allclose(by_points.points, by_poses.points, atol=1e-12)
+    assert np.allclose(by_points.translations, by_poses.translations, atol=1e-12)
+    assert np.allclose(by_points.rotations, by_poses.rotations, atol=1e-11)
+    shares = determined_by_priors(network, reduce_points(network, start, equations))
+    inverse = np.linalg.inv(system.normal)
+    blocks = inverse[5:, 5:].reshape(35, 3, 35, 3)[np.arange(35), :, np.arange(35), :]
+    assert shares == pytest.approx(float(np.sum(blocks * information)), rel=1e-6)

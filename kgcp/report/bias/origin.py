@@ -99,7 +99,8 @@ def _camera(flight: Flight) -> str:
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     terms = [f"{name} {minus(f'{value:g}')}" for name in names if (value := getattr(camera, name))]
     shutter = f"; readout {1000.0 * camera.readout_s:g} ms" if camera.readout_s else ""
-    stated = "stated" if flight.calibration_covariance is not None else "not stated"
+    is_stated = flight.calibration_covariance is not None
+    stated = "stated" if is_stated else "not stated (kgcp calibrate states it)"
     return (
         f"{camera.width} × {camera.height} px; fx {camera.fx:g}, fy {camera.fy:g},"
         f" cx {camera.cx:g}, cy {camera.cy:g} px; {', '.join(terms) or 'no distortion'};"

@@ -37,7 +37,8 @@ def test_every_part_is_named(flight: Flight) -> None:
         "Frames": "24: 21 measured, 3 out of view",
         "Time of the frames": "2026-06-16 08:15:05 to 2026-06-16 08:15:39 UTC",
         "Camera": "1200 × 900 px; fx 1903, fy 1901, cx 606.2, cy 446.1 px; k1 −0.081, k2 0.064,"
-        " p1 0.0003, p2 0.0005; response linear; accuracy of the calibration not stated",
+        " p1 0.0003, p2 0.0005; response linear; accuracy of the calibration not stated"
+        " (kgcp calibrate states it)",
         "Target": "A: 0.9 m across, inner circle 0.45 m, dots at 0, 43, 78, 180°; with A-inner;"
         " accuracy of the print not stated",
         "CRS": "EPSG:25832",

@@ -1,0 +1,233 @@
+"""Calibrations from other people's photographs: python -m benchmarks.calibrate.sets --sets DIR.
+
+DIR holds one folder per set, as they are published:
+
+- boof_regular, boof_hexagonal: BoofCV-Data, example/calibration/mono
+- abhijit_symmetric, abhijit_asymmetric: Abhijit-2592/camera_calibration_API
+- ros10: ros-industrial/industrial_calibration
+- dice_sim: dicengine/dice, tests/component, with dot_*_0 and white_dot_*
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.camera import Response
+from kgcp.io.flight.field_file import read_field
+from kgcp.measurement.discs.records import Operator
+from kgcp.network.calibration import calibrate_camera
+from kgcp.network.calibration_records import (
+    CalibrationSettings,
+    CameraCalibration,
+    LensModel,
+    PointModel,
+)
+from kgcp.pipeline.calibration.photographs import Photo
+from kgcp.pipeline.calibration.run import (
+    CalibrationOptions,
+    PhotoCalibration,
+    calibrate_photos,
+    find_photos,
+)
+from kgcp.pipeline.detect import NoProgress
+from kgcp.quality.calibration_verdict import calibration_numbers, judge
+
+_HALVES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Set:
+    """One set of photographs, and what must come out."""
+
+    name: str
+    folder: str
+    pattern: str  # of the photographs
+    field: str  # a shorthand, or a file of the folder
+    unit: str | None
+    views: int
+    least_discs: int
+    fixed_px: float  # largest RMS per point
+    free_px: float | None
+    peer: str
+    focal: tuple[float, float] | None = None  # truth and largest error [px]
+    centre: tuple[float, float, float] | None = None  # truth and largest error [px]
+    is_centre_unknown: bool = False  # the principal point must not be claimed
+
+
+SETS = (
+    Set(
+        "boof_regular", "boof_regular", "image*.jpg", "calibration_target.yaml", "cm",
+        6, 470, 0.475, 0.040, "OpenCV 0.476",
+    ),
+    Set(
+        "boof_hexagonal", "boof_hexagonal", "image*.jpg", "calibration_target.yaml", "cm",
+        7, 2340, 0.21, None, "OpenCV none",
+    ),
+    Set(
+        "abhijit_symmetric", "abhijit_symmetric", "*.png", "grid:5x6:10mm", None,
+        25, 700, 0.47, None, "OpenCV 0.460", is_centre_unknown=True,
+    ),
+    Set(
+        "abhijit_asymmetric", "abhijit_asymmetric", "*.png", "asymmetric:4x11:10mm", None,
+        10, 420, 0.49, None, "OpenCV 0.475", is_centre_unknown=True,
+    ),
+    Set("ros10", "ros10", "*.png", "cal_data.yaml", None, 15, 1400, 0.170, 0.085, "OpenCV 0.186"),
+    Set(
+        "dice_dark", "dice_sim", "dot_*.jpeg", "sim_dot_input.xml", None,
+        21, 2600, 0.006, 0.0046, "OpenCV none", (6673.3159, 1.0), (872.1577, 579.955, 0.15),
+    ),
+    Set(
+        "dice_white", "dice_sim", "white_dot_*.jpeg", "sim_white_dot_input.xml", None,
+        11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5), None,
+    ),
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a line per set, and what fails its acceptance."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--only", metavar="ID", choices=[each.name for each in SETS])
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--halves", type=int, default=_HALVES, help="random halves; 0: none")
+    parser.add_argument("--operator", type=Operator, default=Operator.MODEL, choices=[*Operator])
+    options = parser.parse_args(arguments)
+    print(
+        "set                 views  discs        RMS fixed/stiff/free  op.sd  f ± sd             "
+        "halves z  ecc max  s     verdict, against"
+    )
+    failures = 0
+    for each in SETS:
+        if options.only in (None, each.name):
+            failures += _run(each, options.sets, options.jobs, options.halves, options.operator)
+    sys.exit(1 if failures else 0)
+
+
+def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) -> int:
+    folder = sets / chosen.folder
+    photos = [photo for photo in find_photos([folder]) if photo.path.match(chosen.pattern)]
+    is_file = (folder / chosen.field).is_file()
+    field = read_field(str(folder / chosen.field) if is_file else chosen.field, chosen.unit)
+    began_s = time.perf_counter()
+    with tempfile.TemporaryDirectory() as out:
+        settings = CalibrationSettings(PointModel.STIFF, LensModel.AUTO)
+        options = CalibrationOptions(settings, Response.UNKNOWN, operator, jobs)
+        made = calibrate_photos(photos, field, Path(out), options, NoProgress())
+    seconds = time.perf_counter() - began_s
+    stiff = made.calibration
+    free = _again(made, replace(settings, points=PointModel.FREE))
+    # what the peers estimate: all terms, fx and fy, and the field as it is stated
+    fixed = _again(
+        made, CalibrationSettings(PointModel.FIXED, LensModel.BROWN, is_same_aspect=False)
+    )
+    numbers = calibration_numbers(stiff)
+    z = _halves_z(made, halves) if halves else float("nan")
+    camera = stiff.camera
+    eccentricity = np.linalg.norm(stiff.eccentricity.total_px, axis=1)
+    verdict = judge(stiff, numbers).grade.value
+    print(
+        f"{chosen.name:19} {numbers.views:2}/{len(photos):2}"
+        f"  {numbers.discs_used:4}/{numbers.discs:4}    {fixed.rms_px:.4f} {stiff.rms_px:.4f} {free.rms_px:.4f}  "
+        f"{numbers.operator_sd_px:.4f} {camera.fx:8.2f} {numbers.sd[0]:5.2f}"
+        f"  c {camera.cx:.2f} {camera.cy:.2f}  {z:5.2f}  {np.nanmax(eccentricity):.3f}"
+        f"  {seconds:5.1f}  {verdict}, {chosen.peer}",
+        flush=True,
+    )
+    failures = _failures(chosen, fixed, stiff, free, photos)
+    for failure in failures:
+        print(f"    {failure}")
+    return len(failures)
+
+
+def _again(made: PhotoCalibration, settings: CalibrationSettings) -> CameraCalibration:
+    first = made.calibration
+    size = (first.camera.width, first.camera.height)
+    return calibrate_camera(first.views, first.field, size, settings, first)
+
+
+def _failures(
+    chosen: Set,
+    fixed: CameraCalibration,
+    stiff: CameraCalibration,
+    free: CameraCalibration,
+    photos: Sequence[Photo],
+) -> list[str]:
+    """Return what does not meet the acceptance."""
+    camera, measured = stiff.camera, len(stiff.network.observations.view)
+    checks = [
+        (len(stiff.views) == len(photos) == chosen.views, f"views: {len(stiff.views)}"),
+        (measured >= chosen.least_discs, f"discs: {measured} < {chosen.least_discs}"),
+        (fixed.rms_px <= chosen.fixed_px, f"fixed: {fixed.rms_px:.4f} px"),
+    ]
+    if chosen.free_px is not None:
+        checks.append((free.rms_px <= chosen.free_px, f"free: {free.rms_px:.4f} px"))
+    if chosen.focal is not None:
+        error = camera.fx - chosen.focal[0]
+        checks.append((abs(error) <= chosen.focal[1], f"focal length: {error:+.2f} px"))
+    if chosen.centre is not None:
+        x, y, limit = chosen.centre
+        off = max(abs(camera.cx - x), abs(camera.cy - y))
+        checks.append((off <= limit, f"principal point: {off:.2f} px"))
+    if chosen.is_centre_unknown:
+        checks.append((bool({"cx", "cy"} & {*stiff.undetermined}), "claims a principal point"))
+    return [text for is_met, text in checks if not is_met]
+
+
+def _halves_z(made: PhotoCalibration, count: int) -> float:
+    """Return differences of the cameras of random halves over their deviations, RMS.
+
+    The lens model is that of the whole set, so that both halves estimate the same parameters.
+    """
+    whole = made.calibration
+    size = (whole.camera.width, whole.camera.height)
+    rng = np.random.default_rng(18)
+    ratios: list[FloatArray] = []
+    for _ in range(count):
+        order = rng.permutation(len(whole.views))
+        middle = len(order) // 2
+        cameras = []
+        for part in (np.sort(order[:middle]), np.sort(order[middle:])):
+            views = [whole.views[index] for index in part.tolist()]
+            terms = whole.network.model.names
+            lens = LensModel.BROWN if "k3" in terms else LensModel.RADIAL
+            cameras.append(
+                calibrate_camera(
+                    views,
+                    whole.field,
+                    size,
+                    CalibrationSettings(whole.points_used, lens),
+                    part_of(whole, part),
+                )
+            )
+        values = [
+            np.array([getattr(each.camera, name) for name in ("fx", "cx", "cy", "k1")])
+            for each in cameras
+        ]
+        variance = sum(each.covariance.cov.diagonal()[[0, 2, 3, 4]] for each in cameras)
+        ratios.append((values[0] - values[1]) / np.sqrt(variance))
+    return float(np.sqrt(np.mean(np.square(ratios))))
+
+
+def part_of(whole: CameraCalibration, part: IndexArray) -> CameraCalibration:
+    """Return a calibration as the start for some of its photographs."""
+    estimate = whole.solution.estimate
+    own = replace(
+        estimate,
+        rotations=estimate.rotations[part],
+        translations=estimate.translations[part],
+        points=whole.field.points_m(),
+    )
+    return replace(whole, solution=replace(whole.solution, estimate=own))
+
+
+if __name__ == "__main__":
+    main()
