@@ -43,6 +43,7 @@ from kgcp.io.images.frames import read_grey
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.execution.journal import from_text
 from kgcp.pipeline.init import draft_flight
 from kgcp.pipeline.init_records import InitOptions
@@ -177,7 +178,7 @@ def discs(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
 def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
     """Read the result of a frame that an interrupted run has left in the flight's folder."""
     try:
-        from_text(data)
+        from_text(data, (FrameResult,))
     except ValueError as error:  # what `Journal.read` makes a `KgcpError` of
         raise KgcpError(" ".join(str(error).split())) from error
 

@@ -136,7 +136,8 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     verdict = judge(stiff, numbers).grade.value
     print(
         f"{chosen.name:19} {numbers.views:2}/{len(photos):2}"
-        f"  {numbers.discs_used:4}/{numbers.discs:4}    {fixed.rms_px:.4f} {stiff.rms_px:.4f} {free.rms_px:.4f}  "
+        f"  {numbers.discs_used:4}/{numbers.discs:4}  "
+        f"  {fixed.rms_px:.4f} {stiff.rms_px:.4f} {free.rms_px:.4f}  "
         f"{numbers.operator_sd_px:.4f} {camera.fx:8.2f} {numbers.sd[0]:5.2f}"
         f"  c {camera.cx:.2f} {camera.cy:.2f}  {z:5.2f}  {np.nanmax(eccentricity):.3f}"
         f"  {seconds:5.1f}  {verdict}, {chosen.peer}",
