@@ -226,7 +226,7 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
     if place.is_relative_to(flight.frames_folder.resolve()) and not is_result:
         raise KgcpError(
             f"{folder}: is among the frames, where pictures would be taken for frames;"
-            " choose another folder of pictures",
+            f" choose another folder of pictures, such as {flight.folder / RESULTS_NAME / 'sheet'}",
             option="overlay",
         )
     return ContactSheet(folder)

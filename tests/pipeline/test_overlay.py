@@ -169,6 +169,7 @@ def test_pictures_do_not_go_among_the_frames(flight: Path) -> None:
     result = detect(flight, flight / "frames" / "sheet")
     assert result.exit_code == 1
     assert "is among the frames" in result.stderr
+    assert f"such as {flight / 'kgcp' / 'sheet'} (--overlay)" in result.stderr
     assert not (flight / "frames" / "sheet").exists()
 
 
