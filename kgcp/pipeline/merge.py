@@ -21,8 +21,8 @@ from kgcp.io.tables.parquet import write_table
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import GcpSet, write_formats
 
-OF_ONE_CAMERA = frozenset({"metashape", "itwin", "opensfm"})
-"""Formats whose files hold the camera, or depend on its frames' size."""
+OF_ONE_CAMERA = frozenset({"itwin", "opensfm"})
+"""Formats whose files hold the camera, or depend on its frames' size, and that need it."""
 
 _SAME_PLACE = 1e-9  # relative: a millimetre or two of a northing
 
@@ -155,6 +155,7 @@ def export_merged(
         merged.camera_priors,
         mark_floor_px,
         image_extensions,
+        merged.has_one_camera,
     )
     return write_formats(points, formats, folder)
 

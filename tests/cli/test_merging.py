@@ -175,6 +175,22 @@ def test_a_static_target_of_two_flights_is_one_point(
     assert f"target 'A' stands at different places in north/{FRAMES[0]} and south_bank/" in line
 
 
+def test_flights_of_two_cameras_are_merged_where_files_hold_none(
+    two: tuple[SampleFlight, SampleFlight], tmp_path: Path
+) -> None:
+    north, south = two
+    places, block = (north.path, south.path), tmp_path / "block"
+    toml = (south.path / "flight.toml").read_text(encoding="utf-8")
+    (south.path / "flight.toml").write_text(toml.replace("fx = 1903.0", "fx = 1903.5"), "utf-8")
+    assert south.run("detect", "--jobs", "0").exit_code == 0
+    line = error_of(*places, "--out", block, "--format", "opensfm")
+    assert "opensfm: holds one camera, and the flights have several; " in line
+    result = export(*places, "--out", block, "--format", "metashape")
+    assert result.exit_code == 0, result.stderr
+    assert (block / "metashape" / "marks.csv").exists()
+    assert not (block / "metashape" / "markers.xml").exists()
+
+
 def test_formats_of_one_camera_are_known(
     two: tuple[SampleFlight, SampleFlight], tmp_path: Path
 ) -> None:
@@ -192,7 +208,7 @@ def test_formats_of_one_camera_are_known(
     for name in FORMATS:
         written = []
         for number, each in enumerate((camera, other)):
-            points = MapPoints(made.crs, made.gcps, each, made.camera_priors)
+            points = MapPoints(made.crs, made.gcps, each, made.camera_priors, is_one_camera=False)
             files = export_points(points, name, tmp_path / str(number))
             written.append([path.read_bytes() for path in files])
         assert (written[0] != written[1]) == (name in OF_ONE_CAMERA), name

@@ -55,7 +55,8 @@ Agisoft Metashape (Professional)
 Every scale bar has the weight of its own accuracy. Metashape ignores correlations.
 
 Without scripts: File > Import > Import Markers: markers.xml (kgcp export-gcp --image-names writes
-labels like the chunk's; where images in several folders have the same name, there is no such file);
+labels like the chunk's; where images in several folders have the same name, or flights different
+cameras, there is no such file);
 then Reference > Import Reference: markers.csv, for the accuracies; comma, first row 2, columns
 label, x, y, z and three accuracies, coordinate system as above. Scale bars to cameras can only be
 set by the script.
@@ -85,7 +86,11 @@ def files(points: MapPoints) -> Mapping[str, str]:
             focal_length=focal_length_note(points.controls),
         ),
         "markers.csv": _markers(points, label),
-        **({"markers.xml": _markers_xml(points, names, label)} if are_labels else {}),
+        **(
+            {"markers.xml": _markers_xml(points, names, label)}
+            if are_labels and points.is_one_camera
+            else {}
+        ),
         "scale_bars.csv": _scale_bars(points.controls, names, label),
         "marks.csv": _marks(points.gcps, names, label),
         "import_into_metashape.py": _script(points, mark_px),

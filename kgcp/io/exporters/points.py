@@ -42,6 +42,7 @@ class MapPoints:
     mark_floor_px: float = MARK_FLOOR_PX
     # whether names of images end in their extension, for formats whose users may have removed it
     image_extensions: bool = True
+    is_one_camera: bool = True  # whether `camera` has seen all points, not only those of a flight
 
     @property
     def parsed_crs(self) -> CRS:
