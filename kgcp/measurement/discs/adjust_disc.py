@@ -40,7 +40,8 @@ _SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
 _FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
 _MUCH_CLIPPED = 0.05  # share of the window's pixels
 _LEAST_CONTRAST_COUNTS = 4.0
-_MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the fit may be from the outline: pixels, of the radius
+_MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the centre may be from the outline's: pixels, radii
+_MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it by more than a pixel
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.15, 0.3  # as of coded targets: of the contrast; share
 _FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
 
@@ -202,6 +203,8 @@ def check_fit(fit: DiscFit, outline: DiscOutline) -> None:
     if not residual < _MAX_EDGE_NOISE * (white - black) or outlying > _MAX_OUTLIERS:
         share = residual / (white - black)
         raise DiscRejection(DiscReason.POOR_FIT, f"residuals {share:.0%} of the contrast")
-    off_px = np.abs(fit.state.geometry - outline_geometry(outline)).max()
-    if off_px > max(_MAX_OFF_PX, _MAX_OFF * outline.ellipse.mean_radius):
-        raise DiscRejection(DiscReason.POOR_FIT, f"{off_px:.1f} px from its outline")
+    off = np.abs(fit.state.geometry - outline_geometry(outline))
+    radius_px, off_px, grown_px = outline.ellipse.mean_radius, off[:2].max(), off[2:].max()
+    is_near = off_px <= max(_MAX_OFF_PX, _MAX_OFF * radius_px)
+    if not is_near or grown_px > max(_MAX_GROWN_PX, _MAX_GROWN * radius_px):
+        raise DiscRejection(DiscReason.POOR_FIT, f"{max(off_px, grown_px):.1f} px from its outline")

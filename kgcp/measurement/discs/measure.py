@@ -94,25 +94,24 @@ def _measured(
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
         return [_certain(measure(task)) for task in tasks]
     camera = learn_tone(tasks, response)
-    fits = [_fitted(task, camera) for task in tasks]
-    scatters = [scatter_of(fit) for fit in fits if isinstance(fit, DiscFit)]
-    parts = iter(zip(scatters, inflations(scatters).tolist(), strict=True))
+    outcomes = [_fitted(task, camera) for task in tasks]
+    fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
+    found = iter(inflations([scatter for _, scatter in fits]).tolist())
     return [
-        _certain(_disc(fit, task.outline, *next(parts))) if isinstance(fit, DiscFit) else fit
-        for task, fit in zip(tasks, fits, strict=True)
+        each if isinstance(each, DiscMiss) else _certain(_disc(*each, task.outline, next(found)))
+        for task, each in zip(tasks, outcomes, strict=True)
     ]
 
 
-def _fitted(task: DiscTask, camera: CameraTone) -> DiscFit | DiscMiss:
+def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] | DiscMiss:
     try:
         fit = adjust_disc(task, parameters_of(task, camera))
         check_fit(fit, task.outline)
-        np.linalg.cholesky(fit.normal)  # what follows needs its inverse
+        return fit, scatter_of(fit)
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
-    return fit
 
 
 def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
@@ -167,7 +166,7 @@ def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
     return near
 
 
-def _disc(fit: DiscFit, outline: DiscOutline, scatter: DiscScatter, inflation: float) -> Disc:
+def _disc(fit: DiscFit, scatter: DiscScatter, outline: DiscOutline, inflation: float) -> Disc:
     x, y, xx, xy, yy = fit.state.geometry.tolist()
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
     light, blur, clips = fit.state.light, fit.state.blur, fit.sample.censoring
