@@ -12,6 +12,7 @@ from kgcp.cli.options import json_option
 
 if TYPE_CHECKING:
     from kgcp.targets.layout import Target
+    from kgcp.targets.sheets import Paper
 
 # Named here, not imported, because the modules that know them take numpy; a test compares.
 FORMATS = ("pdf", "svg", "dxf", "png")
@@ -32,6 +33,13 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "new_count",
     type=click.IntRange(1, 50),
     help="Propose this number of new targets, with codes as far apart as possible.",
+)
+@click.option(
+    "--field",
+    "field_text",
+    metavar="FIELD",
+    help="Draw a field of discs for 'kgcp calibrate' instead, and write its field.toml: FIELD is a"
+    " field.toml or a shorthand, grid:9x6:25mm:15mm.",
 )
 @click.option(
     "--code",
@@ -109,6 +117,7 @@ def command(
     names: tuple[str, ...],
     *,
     new_count: int | None,
+    field_text: str | None,
     codes: tuple[str, ...],
     diameter_m: float | None,
     dots: int,
@@ -132,6 +141,7 @@ def command(
     Examples:
       kgcp target sample_flight --format pdf --format dxf --plate 1.2 --holes 8
       kgcp target --new 6 --diameter 0.15 --sheet A4
+      kgcp target --field grid:9x6:25mm:15mm --sheet A4
     """  # noqa: D301 - \b is click's mark for lines that stay
     from kgcp.report.plotting import load_matplotlib
 
@@ -145,6 +155,11 @@ def command(
     from kgcp.targets.code_design import chosen_targets, new_targets
     from kgcp.targets.sheets import Paper, lay_out
 
+    if field_text is not None:
+        if names or new_count or codes or plate_m is not None or flight is not None:
+            raise SettingError("field", "is drawn alone", "leave out FLIGHT and other targets")
+        _draw_field(field_text, formats, Paper(paper), dpi, out, is_tiled=is_tiled, as_json=as_json)
+        return
     is_new = bool(new_count or codes)
     if names and is_new:
         raise SettingError("target", "cannot be combined with --new or --code", "give one of them")
@@ -174,6 +189,47 @@ def command(
     files.append(write_target_tables(targets, folder))
     sheets_of = {target.name: len(sheets) for target, sheets in zip(targets, layouts, strict=True)}
     _tell(targets, known, sheets_of, files, as_json=as_json)
+
+
+def _draw_field(
+    text: str,
+    formats: Sequence[str],
+    paper: Paper,
+    dpi: int,
+    out: Path | None,
+    *,
+    is_tiled: bool,
+    as_json: bool,
+) -> None:
+    """Write the sheets of a field and its field.toml."""
+    import json
+    import warnings
+
+    from kgcp.errors import KgcpWarning
+    from kgcp.io.files.atomic import write_bytes
+    from kgcp.io.flight.field_file import field_toml, read_field
+    from kgcp.io.print.write import write_sheets
+    from kgcp.targets.fields.artwork import draw_field
+    from kgcp.targets.sheets import lay_out
+
+    field = read_field(text)
+    sheets = lay_out(draw_field(field), "the field", paper, is_tiled=is_tiled)
+    folder = out or Path("targets")
+    files = write_sheets(sheets, "field", folder, formats, dpi)
+    files.append(folder / "field.toml")
+    write_bytes(files[-1], field_toml(field).encode())
+    if as_json:
+        told = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}
+        click.echo(json.dumps({**told, "files": [str(path) for path in files]}))
+    if field.symmetries():
+        warnings.warn(
+            "the field looks the same when it is turned; a [[mark]] in its field.toml, one hollow"
+            " disc, gives it one way up",
+            KgcpWarning,
+            stacklevel=2,
+        )
+    for path in files:
+        click.echo(f"wrote {path}", err=True)
 
 
 def _tell(

@@ -127,7 +127,8 @@ def calibrate_camera(
             state = work.with_terms(state, terms)
     else:
         work = replace(work, views=tuple(v for v in work.views if v.photo not in start.dropped))
-        state = work.adjusted(start.camera, start.solution.estimate, unknowns)
+        estimate = replace(start.solution.estimate, points=points)  # as they are meant to be
+        state = work.adjusted(start.camera, estimate, unknowns)
     state = work.with_better_twins(state)
     if not field.is_diameter_stated and start is None:
         work = replace(work, field=field.with_diameters(work.radius_scale(state)))

@@ -4,13 +4,19 @@ import json
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 from kgcp.cli.target import FORMATS, PAPERS
+from kgcp.geometry.camera import Response
+from kgcp.io.flight.field_file import read_field
 from kgcp.io.flight.flight import read_printed_targets
 from kgcp.io.print import write
+from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoTask, measure_field
+from kgcp.measurement.discs.records import Operator
 from kgcp.targets.code_design import LEAST_DISTANCE
 from kgcp.targets.layout import Target
 from kgcp.targets.sheets import Paper
@@ -155,3 +161,28 @@ def test_the_examples_of_the_manual_work(tmp_path: Path, monkeypatch: pytest.Mon
         *("plan.png", "targets/target_T6.pdf", "targets/targets.toml"),
         *("sample_flight/kgcp/targets/target_A.pdf", "sample_flight/kgcp/targets/target_A.dxf"),
     } <= written
+
+
+def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
+    arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--sheet", "A4", "--format", "png"]
+    options = ["--dpi", "100", "--out", str(tmp_path), "--json"]
+    result = CliRunner().invoke(main, [*arguments, *options], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "looks the same when it is turned" in result.stderr
+    assert json.loads(result.stdout)["discs"] == 54
+    field = read_field(str(tmp_path / "field.toml"))
+    assert (field.columns, field.rows) == (9, 6)
+    grey = cv2.imread(str(tmp_path / "target_field.png"), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    naming = measure_field(grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", "")
+    assert isinstance(naming, PhotoDiscs)
+    assert len(naming.point) == 54
+    steps = np.linalg.norm(np.diff(naming.vectors[:9, :2], axis=0), axis=1)
+    assert steps == pytest.approx(25.0 / 25.4 * 100.0, abs=0.3)
+
+
+def test_a_field_is_drawn_alone(tmp_path: Path) -> None:
+    arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--new", "2", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "field: is drawn alone" in result.stderr
