@@ -122,7 +122,7 @@ def detect_flight(
     ------
     KgcpError
         If there are no frames, a pattern matches none, the times file or that of the reference
-        poses is bad, `out` cannot be written or is another process's, the scheduler is of no use,
+        poses is bad, `out` cannot be written or is another process's, the scheduler cannot be used,
         or the frames vanish.
     """
     stopwatch = Stopwatch()

@@ -69,7 +69,7 @@ def predict_missing(
     expected : dict of dict
         By the frame's row and the target's name; rows of which nothing is expected are left out.
     problem : str or None
-        What is wrong with reference poses or trajectory. To detect needs neither: it is no error.
+        What is wrong with reference poses or trajectory. Detection needs neither: not an error.
     """
     predictions: dict[int, dict[str, Prediction]] = {}
     problem = None

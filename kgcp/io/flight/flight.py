@@ -58,7 +58,7 @@ class Flight:
     calibration_covariance : CalibrationCovariance or None
         How well the camera is calibrated; None: flight.toml does not say.
     is_camera_guessed : bool
-        Whether the camera is no calibration but a guess, as `kgcp init` makes from EXIF.
+        Whether the camera is only a guess, as `kgcp init` makes it from EXIF.
     plumb_sd_deg : float or None
         Standard deviation of the camera's optical axis against the vertical, about either
         horizontal axis, in frames without reference attitude [deg]; None: not known.

@@ -1,6 +1,6 @@
 """Frame times that stand in the frames' names, as machine-vision recorders write them.
 
-Names of drones and phones hold local time in whole seconds, which is no use for a moving target.
+Names of drones and phones hold local time in whole seconds: too coarse for a moving target.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ class PointTable:
 
     @property
     def first_xy(self) -> tuple[float, float] | None:
-        """The place of the first point; None where that is no numbers."""
+        """The place of the first point; None where these are not numbers."""
         x, y = self.table.number("x"), self.table.number("y")
         return None if x is None or y is None else (x, y)
 

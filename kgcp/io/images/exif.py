@@ -156,7 +156,7 @@ def _size_px(path: Path) -> tuple[int, int] | None:
 def _angle_deg(
     gps: Mapping[int, Any], tag: GPS, reference: GPS, negative: str, limit: float
 ) -> float | None:
-    """Return a longitude or latitude of degrees, minutes and seconds; 0, 0 is no fix."""
+    """Return a longitude or latitude of degrees, minutes and seconds; 0, 0 is a missing fix."""
     parts = gps.get(tag)
     if not isinstance(parts, tuple) or len(parts) != 3:
         return None

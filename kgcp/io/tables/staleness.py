@@ -206,7 +206,7 @@ def _changed_frames(
     digests: Mapping[str, object],
     today: list[str] | None,
 ) -> Iterator[str]:
-    """Yield what is new in the frames' folder; frames that are not there any more are no change."""
+    """Yield what is new in the frames' folder; frames that are gone do not count as a change."""
     if today is None:
         return
     known = set(table["frame"])

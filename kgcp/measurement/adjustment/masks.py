@@ -39,7 +39,7 @@ _NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side stil
 _NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
 _HIDDEN_SIGMAS = 4.0  # from there through the next edge
 _SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
-_MAX_HIDDEN = 0.5  # of all that is looked at; more is no plate, or in another light
+_MAX_HIDDEN = 0.5  # of all that is looked at; more: it is not a plate, or in another light
 _DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
 _SCALE_PIXELS = 100  # enough to see how the plate's scale varies
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
@@ -253,7 +253,7 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
 
 
 def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
-    """Leave out what may be a dot too many or too few: it lies in the ring, and is no larger.
+    """Leave out what may be a dot too many or too few: it lies in the ring and is not larger.
 
     Such a patch is evidence of another code. Masked, it would not count against the target.
     """

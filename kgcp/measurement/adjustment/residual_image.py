@@ -50,8 +50,8 @@ def residual_image_of(
 ) -> ResidualImage:
     """Return what the image of a target at this pose leaves of the grey values.
 
-    Blur and light are adjusted, the pose is not, whoever measured it. Uneven light is that of a
-    fit in which the pose is free.
+    Blur and light are adjusted; the pose is not, by whichever method it was measured. Uneven light
+    is that of a fit in which the pose is free.
 
     Parameters
     ----------

@@ -28,7 +28,8 @@ _PRIOR_SD = {
     Param.TONE_3: 0.5,
     Param.SHARPENING: 0.7,
 }
-_WHITE, _WHITE_SD = 1.0, 0.4  # burnt plates of unknown tone: lest white and tone drift together
+# Of burnt plates of unknown tone: without a prior, white and tone would drift together.
+_WHITE, _WHITE_SD = 1.0, 0.4
 _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y]
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]

@@ -80,7 +80,7 @@ def _better(known: _Trial | None, other: _Trial | None, gain: float) -> _Trial |
 
 
 def _trial(undoing: tuple[Slip, ...], encounters: Encounters) -> _Trial:
-    with np.errstate(all="ignore"):  # places that nobody has been at
+    with np.errstate(all="ignore"):  # places far from the trajectory
         for slip in undoing:
             encounters = slip.undone(encounters)
         return _Trial(undoing, encounters, encounters.misfit)

@@ -38,7 +38,7 @@ class Course:
 def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
     """Return course and attitude while the vehicle moves; None where it hardly does.
 
-    `attitude_deg` (n, 3) is the trajectory's own: whoever makes rotations of angles in gon loses
+    `attitude_deg` (n, 3) is the trajectory's own: making rotations of angles in gon loses
     whole turns.
     """
     motion = vehicle.motion

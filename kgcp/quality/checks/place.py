@@ -105,7 +105,7 @@ def _angular_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess | 
     if np.any(np.abs(xy) > _DEGREES):
         return (
             Cause.CRS,
-            "these are no degrees but seem to be metres",
+            "these are not degrees; they seem to be metres",
             "give the projected CRS of the coordinates, for example EPSG:25832",
         )
     return None
