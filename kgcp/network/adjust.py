@@ -38,7 +38,8 @@ _HUBER = 2.0  # in units of the robust deviation of a disc's residual
 _MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
 _LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
 _ROUNDS = 12
-_LEAST_DISCS = 4  # of a photograph: fewer determine no pose
+_LEAST_DISCS = 6  # of a photograph: fewer, or all in one row, determine no pose
+_LEAST_SHARE = 1.0 / 3.0  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> Floa
 def _reweighted(
     network: Network, estimate: Estimate, robustness: Robustness
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the weight of every disc, and which are kept: a photograph keeps its best four."""
+    """Return the weight of every disc, and which are kept: of a photograph always the best."""
     observations = network.observations
     residuals = observations.places - computed(network, estimate)
     sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
@@ -169,7 +170,8 @@ def _reweighted(
     is_used = sizes <= limit
     for view in range(len(network.view_camera)):
         mine = np.flatnonzero(observations.view == view)
-        best = mine[np.argsort(sizes[mine], kind="stable")[:_LEAST_DISCS]]
+        count = max(_LEAST_DISCS, math.ceil(_LEAST_SHARE * len(mine)))
+        best = mine[np.argsort(sizes[mine], kind="stable")[:count]]
         is_used[best] = True
     weights = is_used.astype(np.float64)
     if robustness.is_huber:

@@ -36,7 +36,12 @@ from kgcp.network.records import (
     ScaleBar,
     Solution,
 )
-from kgcp.network.start import better_poses, refined_poses, start_camera_and_poses
+from kgcp.network.start import (
+    better_poses,
+    homography_misfits,
+    refined_poses,
+    start_camera_and_poses,
+)
 from kgcp.targets.fields.layout import Field
 
 LEAST_VIEWS = 3
@@ -51,6 +56,7 @@ _FOLDS = 5
 _LEAST_SHARE = 0.6  # of a photograph's discs that must fit
 _SCALINGS = 10  # of the covariances, and new eccentricities, at most
 _MARGIN_PX = 2.0  # within the frame, where a disc is to be found
+_MOST_MISFIT = 0.1  # of a photograph's homography, over the spread of its discs
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
 
 
@@ -117,8 +123,12 @@ def calibrate_camera(
     work = _Work(tuple(views), field, size, settings)
     if start is not None:
         work = replace(work, field=start.field)
-    observations = work.observations()
     points = field.points_m()
+    # what a former calibration has dropped is all that is dropped now
+    disordered = () if start is not None else work.disordered()
+    work = replace(work, views=tuple(view for view in views if view.photo not in disordered))
+    _require_views(work.views)
+    observations = work.observations()
     unknowns = _Unknowns(PointModel.FIXED, ("k1", "k2"), settings.is_same_aspect)
     if start is None:
         camera, estimate = start_camera_and_poses(observations, points, size)
@@ -134,7 +144,8 @@ def calibrate_camera(
         work = replace(work, field=field.with_diameters(work.radius_scale(state)))
         state = work.with_estimate(state, state.estimate)
     work, state, misfits = work.without_misfits(state)
-    dropped = (*(() if start is None else start.dropped), *misfits)
+    dropped = (*disordered, *(() if start is None else start.dropped), *misfits)
+    dropped = tuple(dict.fromkeys(dropped))
     _require_views(work.views)
     fixed = work.with_terms(state, _chosen_terms(work, state))
     points_used, is_turn_unclear = settings.points, False
@@ -211,6 +222,15 @@ class _Work:
             np.concatenate([view.point for view in self.views]),
             np.concatenate([view.vectors[:, :2] for view in self.views]),
             np.concatenate([view.covs[:, :2, :2] for view in self.views]),
+        )
+
+    def disordered(self) -> tuple[str, ...]:
+        """Return the photographs whose discs do not lie like those of a plane, with these names."""
+        misfits = homography_misfits(self.observations(), self.field.points_m())
+        return tuple(
+            view.photo
+            for view, misfit in zip(self.views, misfits, strict=True)
+            if misfit > _MOST_MISFIT
         )
 
     def with_terms(self, state: _State, terms: tuple[str, ...]) -> _State:

@@ -60,6 +60,23 @@ def start_camera_and_poses(
     return camera, estimate
 
 
+def homography_misfits(observations: Observations, points: FloatArray) -> FloatArray:
+    """Return how badly each photograph (v,) is a perspective view of a plane.
+
+    The residuals' RMS over the spread of the discs: some thousandths for a lens with distortion,
+    about one if the discs have wrong names.
+    """
+    misfits = []
+    for view in range(int(observations.view.max()) + 1):
+        mine = observations.view == view
+        flat, places = points[observations.point[mine], :2], observations.places[mine]
+        mapped = np.column_stack((flat, np.ones(len(flat)))) @ _homography(flat, places).T
+        gaps = places - mapped[:, :2] / mapped[:, 2:]
+        spread = np.sum((places - places.mean(axis=0)) ** 2)
+        misfits.append(math.sqrt(float(np.sum(gaps**2) / spread)))
+    return np.array(misfits)
+
+
 def better_poses(
     camera: Camera, observations: Observations, points: FloatArray, poses: list[Pose]
 ) -> tuple[Estimate, FloatArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -11,6 +11,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
 from kgcp.network.calibration_records import CameraCalibration, PointModel
+from kgcp.network.equations import view_rows, whitened
+from kgcp.network.records import PointPrior
+from kgcp.quality.eccentricity import parameters_if_neglected
 
 _CELLS = (8, 6)  # of the frame, that discs cover or do not
 _LEAST_VIEWS = 4
@@ -128,6 +131,32 @@ def _ray_sd_px(calibration: CameraCalibration) -> FloatArray:
     variances = np.einsum("ij,jk,ik->i", left, calibration.covariance.cov, left)
     sd = np.sqrt(np.maximum(variances, 0.0).reshape(-1, 2).sum(axis=1))
     return np.asarray(np.where(reachable, sd, np.nan * one).reshape(rows, columns))
+
+
+def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
+    """Return by how much each camera parameter is wrong if eccentricities are neglected.
+
+    One linear step of the adjustment of cameras and poses, the field as it is.
+    """
+    network, solution = calibration.network, calibration.solution
+    fixed = replace(network, points=PointPrior(solution.estimate.points, None))
+    weights = solution.is_used.astype(np.float64)
+    equations = view_rows(fixed, solution.estimate, weights)
+    shifts = whitened(fixed, calibration.eccentricity.total_px, weights)
+    parameters = len(network.model.names)
+    rows = sum(len(view.residuals) for view in equations)
+    jacobian = np.zeros((rows, parameters + 6 * len(equations)))
+    right = np.zeros(rows)
+    first = 0
+    for index, view in enumerate(equations):
+        own = slice(first, first + len(view.residuals))
+        pose = parameters + 6 * index
+        jacobian[own, :parameters] = view.by_camera
+        jacobian[own, pose : pose + 6] = view.by_pose
+        right[own] = shifts[view.rows].ravel()
+        first = own.stop
+    change = parameters_if_neglected(jacobian, np.ones(rows), np.nan_to_num(right))
+    return dict(zip(network.model.names, change[:parameters].tolist(), strict=True))
 
 
 def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> CalibrationVerdict:

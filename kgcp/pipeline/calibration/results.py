@@ -35,6 +35,7 @@ from kgcp.quality.calibration_verdict import (
     CalibrationNumbers,
     CalibrationVerdict,
     calibration_numbers,
+    change_if_neglected,
     judge,
 )
 from kgcp.report.calibration.figures import draw_figures
@@ -150,6 +151,7 @@ def _summary(
         "largest_angle_deg": numbers.normals_deg,
         "radius_scale": calibration.radius_scale,
         "flatness_m": numbers.flatness_m,
+        "change_if_eccentricity_neglected": change_if_neglected(calibration),
         "not_used": {row.photo: row.reason for row in photos if row.reason},
         "photo_rms_px": {
             row.photo: row.rms_px

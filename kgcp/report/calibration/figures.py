@@ -9,6 +9,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.quality.calibration_verdict import CalibrationNumbers
+from kgcp.report.eccentricity_figure import draw_eccentricity
 from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
 
 _ARROW_SHARE = 0.04  # of the frame's width, that a typical residual is drawn long
@@ -24,6 +25,10 @@ def draw_figures(calibration: CameraCalibration, numbers: CalibrationNumbers) ->
         "rays": _rays(calibration, numbers),
         "distortion": _distortion(calibration),
     }
+    radii = ellipse_sizes(np.concatenate([view.vectors for view in calibration.views]))
+    figures["eccentricity"] = draw_eccentricity(
+        calibration.camera, np.quantile(radii, [0.0, 0.5, 1.0]).tolist()
+    )
     if calibration.points_used is not PointModel.FIXED:
         figures["field"] = _field(calibration)
     return {name: figure.png for name, figure in figures.items()}

@@ -12,7 +12,12 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
-from kgcp.quality.calibration_verdict import CalibrationNumbers, CalibrationVerdict, Grade
+from kgcp.quality.calibration_verdict import (
+    CalibrationNumbers,
+    CalibrationVerdict,
+    Grade,
+    change_if_neglected,
+)
 from kgcp.quality.number_text import minus
 from kgcp.report.calibration.figures import ellipse_sizes
 
@@ -64,6 +69,7 @@ def render_calibration(page: CalibrationPage) -> str:
         parameters=parameter_rows(page.calibration),
         correlations=_correlations(page.calibration),
         eccentricity=_eccentricity(page.calibration),
+        neglected=neglected_words(page.calibration),
         images={
             name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
             for name, png in page.figures.items()
@@ -96,6 +102,22 @@ def parameter_rows(calibration: CameraCalibration) -> list[ParameterRow]:
             )
         )
     return rows
+
+
+def neglected_words(calibration: CameraCalibration) -> str:
+    """Return how wrong the camera would be without the eccentricities, in words."""
+    change = change_if_neglected(calibration)
+    focal = change["fx"] / calibration.camera.fx
+    fx, share, cx, cy = (
+        minus(text)
+        for text in (
+            f"{change['fx']:+.3f}",
+            f"{100.0 * focal:+.4f}",
+            f"{change['cx']:+.3f}",
+            f"{change['cy']:+.3f}",
+        )
+    )
+    return f"{fx} px in fx ({share} %), {cx} and {cy} px in the principal point"
 
 
 def _correlations(calibration: CameraCalibration) -> tuple[list[str], list[list[str]]]:

@@ -1,0 +1,136 @@
+"""What is said of a calibration, by photographs of which only the places of discs are simulated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D, circle_images
+from kgcp.geometry.pose import rotation_about
+from kgcp.network.calibration import calibrate_camera, missing_discs
+from kgcp.network.calibration_records import (
+    CalibrationSettings,
+    CameraCalibration,
+    LensModel,
+    NamedView,
+    PointModel,
+)
+from kgcp.quality.calibration_verdict import (
+    Grade,
+    calibration_numbers,
+    change_if_neglected,
+    judge,
+)
+from kgcp.targets.fields.layout import Field, GridKind, Mark
+
+CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
+FIELD = Field("f", GridKind.SQUARE, 6, 5, 0.04, 0.024, marks=(Mark(1, 1, 0.024, 0.01),))
+SD_PX = 0.01
+TURNS = (0.0, 1.6, 0.2, 3.0, 1.5, 0.1)
+
+
+def views(
+    tilt: float = 0.5, bend_m: FloatArray | None = None, noise_px: float = SD_PX
+) -> list[NamedView]:
+    """Photographs of the field from six sides, with exact moments and noise."""
+    rng = np.random.default_rng(18)
+    points = FIELD.points_m() if bend_m is None else FIELD.points_m() + bend_m
+    made = []
+    for index, turn in enumerate(TURNS):
+        angle = 2.0 * np.pi * index / len(TURNS)
+        about = np.array([np.cos(angle), np.sin(angle), 0.0])
+        rotation = rotation_about(tilt * about) @ rotation_about(np.array([0.0, 0.0, turn]))
+        middle = [0.03 * np.cos(angle), 0.02 * np.sin(angle), 0.33]
+        centres = (points - points.mean(axis=0)) @ rotation.T + middle
+        axes = np.broadcast_to(rotation[:, :2], (len(centres), 3, 2))
+        circles = Circles3D(centres, axes, FIELD.radii_m())
+        vectors = circle_images(CAMERA, circles).moments
+        vectors[:, :2] += noise_px * rng.standard_normal((len(vectors), 2))
+        cov = np.diag([SD_PX**2, SD_PX**2, 1.0, 1.0, 1.0])
+        covs = np.broadcast_to(cov, (len(vectors), 5, 5))
+        point = np.arange(len(vectors))
+        made.append(NamedView(f"p{index}", point, vectors, covs, is_symmetric=False))
+    return made
+
+
+def calibrated(
+    made: list[NamedView], points: PointModel = PointModel.FIXED, lens: LensModel = LensModel.RADIAL
+) -> CameraCalibration:
+    return calibrate_camera(made, FIELD, (1600, 1200), CalibrationSettings(points, lens))
+
+
+def test_a_good_calibration_is_called_good() -> None:
+    """The eccentricity of large discs leaves nothing in focal length and principal point."""
+    result = calibrated(views(), lens=LensModel.AUTO)
+    numbers = calibration_numbers(result)
+    verdict = judge(result, numbers)
+    assert verdict.grade is Grade.GOOD, verdict.sentence
+    errors = [result.camera.fx - 1500.0, result.camera.cx - 811.0, result.camera.cy - 583.0]
+    sd = numbers.sd[[0, 2, 3]]
+    assert np.all(np.abs(errors) < 4.0 * sd)
+    assert np.all(sd < 0.5)
+    assert result.camera.k1 == pytest.approx(-0.11, abs=0.002)
+    assert result.radius_scale == pytest.approx(1.0, abs=0.001)
+    assert 0.0 < np.nanmin(numbers.ray_sd_px) < np.nanmax(numbers.ray_sd_px) < 1.0
+
+
+def test_what_neglected_eccentricity_costs_is_what_an_adjustment_loses() -> None:
+    made = views(noise_px=0.0)
+    told = change_if_neglected(calibrated(made))
+    tiny = replace(FIELD, diameter_m=1e-5, marks=())  # whose centroids count as centres
+    radial = CalibrationSettings(PointModel.FIXED, LensModel.RADIAL)
+    lost = calibrate_camera(made, tiny, (1600, 1200), radial)
+    assert abs(told["fx"]) > 0.05
+    assert told["fx"] == pytest.approx(lost.camera.fx - 1500.0, rel=0.25)
+
+
+def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
+    rng = np.random.default_rng(7)
+    bend_m = 0.0002 * rng.standard_normal((len(FIELD.names()), 3))
+    result = calibrated(views(bend_m=bend_m), PointModel.FREE)
+    numbers = calibration_numbers(result)
+    verdict = judge(result, numbers)
+    assert verdict.grade is Grade.LOOK
+    assert "the field is not what it is said to be" in verdict.sentence
+    assert 0.005 < numbers.rms_px < 0.03
+    assert 0.1 < numbers.rms_fixed_px < 3.0
+    assert numbers.flatness_m == pytest.approx(0.0002, rel=0.4)
+    assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0]
+
+
+def test_frontal_photographs_determine_little_and_say_so() -> None:
+    result = calibrated(views(tilt=0.005))
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is Grade.UNUSABLE
+    assert any("Tilt the field" in sentence for sentence in verdict.advice)
+    assert 0.0 < result.camera.cx < 1600.0
+    assert 0.0 < result.camera.cy < 1200.0
+
+
+def test_a_photograph_with_wrong_names_is_left_out() -> None:
+    made = views()
+    wrong = np.random.default_rng(1).permutation(made[3].point)
+    result = calibrated([*made[:3], replace(made[3], point=wrong), *made[4:]])
+    assert result.dropped == ("p3",)
+    assert result.camera.fx == pytest.approx(1500.0, abs=1.0)
+
+
+def test_discs_that_were_not_measured_are_expected_where_they_are() -> None:
+    made = views()
+    part = replace(
+        made[0], point=made[0].point[4:], vectors=made[0].vectors[4:], covs=made[0].covs[4:]
+    )
+    point, vectors = missing_discs(calibrated([part, *made[1:]]))["p0"]
+    assert point.tolist() == [0, 1, 2, 3]
+    assert np.abs(vectors[:, :2] - made[0].vectors[:4, :2]).max() < 0.1
+    assert vectors[:, 2:] == pytest.approx(made[0].vectors[:4, 2:], rel=0.01)
+
+
+def test_two_photographs_are_too_few() -> None:
+    with pytest.raises(KgcpError, match="2 of the photographs show the field, and 3 are needed"):
+        calibrated(views()[:2])
