@@ -154,7 +154,7 @@ def command(
     )
     check_formats(options.settings, formats)
     found = find_photos(photos)
-    with log_to_stderr(is_quiet=is_quiet, as_json=False) as log, stopping(log):
+    with log_to_stderr(is_quiet=is_quiet, as_json=False, unit="photo") as log, stopping(log):
         made = calibrate_photos(found, field, out, options, log)
     results = write_results(made, out, formats)
     if as_json:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 _EXIT_SIGNAL = 128  # plus the signal's number, as shells count
 _JSON_PROGRESS_S = 1.0  # between two lines of progress
-_ROUNDS = {"first look": 0, "overlay": 1}  # stages of all frames, and the rounds before them
+# Stages of all frames or photographs, and the rounds before them.
+_ROUNDS = {"first look": 0, "photographs": 0, "overlay": 1}
 _PATIENCE_S = 10.0  # without progress at the start before the wait is explained
 _SHORTEST_STAGE_S = 0.0005  # shorter ones would print as 0.000
 
@@ -119,11 +120,13 @@ class Log:
 
 
 @contextmanager
-def log_to_stderr(*, is_quiet: bool, as_json: bool, rounds: int = 1) -> Iterator[Log]:
-    """Show progress until the block ends."""
+def log_to_stderr(
+    *, is_quiet: bool, as_json: bool, rounds: int = 1, unit: str = "frame"
+) -> Iterator[Log]:
+    """Show progress until the block ends, in frames or whatever `unit` says."""
     from tqdm import tqdm
 
-    with tqdm(unit="frame", disable=is_quiet or as_json) as bar:
+    with tqdm(unit=unit, disable=is_quiet or as_json) as bar:
         log = Log(bar, is_quiet=is_quiet, as_json=as_json, rounds=rounds)
         patience = Timer(_PATIENCE_S, log.explain_wait)
         if sys.stderr.isatty():  # a person may be waiting
