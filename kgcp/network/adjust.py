@@ -39,6 +39,7 @@ _MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard n
 _LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
 _ROUNDS = 12
 _LEAST_DISCS = 6  # of a photograph: fewer, or all in one row, determine no pose
+_WORST_PHOTOGRAPH = 10.0  # deviation of its discs over that of all
 _LEAST_SHARE = 1.0 / 3.0  # likewise
 
 
@@ -165,7 +166,13 @@ def _reweighted(
     observations = network.observations
     residuals = observations.places - computed(network, estimate)
     sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
-    deviation = max(float(np.median(sizes)) / _MEDIAN_OF_TWO, _LEAST_DEVIATION)
+    # photographs fit differently well; the discs of one are compared with each other, too
+    overall = max(float(np.median(sizes)) / _MEDIAN_OF_TWO, _LEAST_DEVIATION)
+    own = [
+        float(np.median(sizes[observations.view == view])) / _MEDIAN_OF_TWO
+        for view in range(len(network.view_camera))
+    ]
+    deviation = np.clip(own, overall, _WORST_PHOTOGRAPH * overall)[observations.view]
     limit = robustness.rejection * deviation
     is_used = sizes <= limit
     for view in range(len(network.view_camera)):
