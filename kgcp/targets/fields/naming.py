@@ -98,7 +98,8 @@ def _largest_lattice(seen: SeenDiscs, field: Field, is_free: BoolArray) -> _Latt
     distances = np.linalg.norm(steps, axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = float(np.median(distances.min(axis=1)))
-    for expected in (2.0 * field.neighbour_m / field.diameter_m, nearest):
+    stated = (2.0 * field.neighbour_m / field.diameter_m,) if field.is_diameter_stated else ()
+    for expected in (*stated, nearest):
         is_near = (distances > _NEIGHBOUR[0] * expected) & (distances < _NEIGHBOUR[1] * expected)
         lonely = np.abs(is_near.sum(axis=1) - field.turns)
         middle = np.linalg.norm(seen.centres[free] - np.median(seen.centres[free], axis=0), axis=1)
