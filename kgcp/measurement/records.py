@@ -59,8 +59,8 @@ class Imaging:
         Light of ink and plate, as grey values that the base would give.
     tone : tuple of float
         Three numbers that shape the curve between them; as in `photometry.Light`.
-    sharpening, sd_sharpening : float
-        Strength of the unsharp mask, and its standard deviation.
+    sharpening : float
+        Strength of the unsharp mask.
     noise_black, noise_white : float
         Standard deviation of the grey values of ink and plate.
     """
@@ -70,7 +70,6 @@ class Imaging:
     white: float
     tone: tuple[float, float, float]
     sharpening: float
-    sd_sharpening: float
     noise_black: float
     noise_white: float
 

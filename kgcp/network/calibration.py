@@ -58,7 +58,7 @@ _SCALINGS = 10  # of the covariances, and new eccentricities, at most
 _MARGIN_PX = 2.0  # within the frame, where a disc is to be found
 _MOST_MISFIT = 0.1  # of a photograph's homography, over the spread of its discs
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
-
+_CLEAR_TURN = 1.5  # times the sum of squares: the field's own shape tells its ends apart
 
 _TERMS: dict[LensModel, tuple[str, ...]] = {
     LensModel.RADIAL: ("k1", "k2"),
@@ -447,9 +447,6 @@ class _Work:
         usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
         ratio = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
         return float(np.median(ratio))
-
-
-_CLEAR_TURN = 1.5  # times the sum of squares: the field's own shape tells its ends apart
 
 
 def _determinant(moments: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ def make_gcps(
 ) -> GcpSet:
     """Make ground control points of a flight's detections and its vehicle's trajectory.
 
-    Reference poses are mostly made after the points: a file that is not there yet is no mistake.
+    Reference poses are mostly made after the points: a file that is not there yet is not an error.
 
     Parameters
     ----------

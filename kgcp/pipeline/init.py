@@ -267,7 +267,9 @@ def _targets_section(
         for each in targets
         if each.name not in places and each.position_m is None and not is_carried
     ]
-    blocks = tuple(_block(each, places.get(each.name), each.name in lost) for each in targets)
+    blocks = tuple(
+        _block(each, places.get(each.name), is_lost=each.name in lost) for each in targets
+    )
     gap = Gap(
         "positions",
         f"nothing says where {', '.join(lost)} {'is' if len(lost) == 1 else 'are'}: there is no"
@@ -279,9 +281,7 @@ def _targets_section(
 
 
 def _block(
-    target: Target,
-    position_m: tuple[float, float, float] | None,
-    is_lost: bool,  # noqa: FBT001
+    target: Target, position_m: tuple[float, float, float] | None, *, is_lost: bool
 ) -> DraftText:
     """Return the tables of a target, with its position in the first of them."""
     placed = target if position_m is None else replace(target, position_m=position_m)

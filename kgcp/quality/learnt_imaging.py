@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
 from kgcp.measurement.image_model.photometry import Light, Tone, decoded, encoded, toned
 from kgcp.measurement.records import FrameResult, Imaging, Measurement, ToneBase
 
@@ -25,7 +26,6 @@ _STEPS = 64  # of the curve, over the whole range of grey values
 _ROUNDS = 3
 _BAND = (16.0, 50.0, 84.0)  # percentiles: ±1σ
 _FEWEST = 3  # measurements at a grey value
-_TONES = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LINE}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ def _advantages(measurements: Sequence[Measurement]) -> dict[ToneBase, float]:
 
 
 def _noise_of(imaging: Imaging) -> FloatArray:
-    levels = encoded(np.array((imaging.black, imaging.white)), _TONES[imaging.base])
+    levels = encoded(np.array((imaging.black, imaging.white)), TONE_OF_BASE[imaging.base])
     noise = np.stack((levels, (imaging.noise_black, imaging.noise_white)), axis=1)
     return np.asarray(noise[levels < 1.0])  # of a plate burnt white none is seen
 
@@ -155,7 +155,7 @@ def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
     """Return the light (n,) of grey values, 0 of ink and 1 of plate; NaN beyond them."""
     share = np.linspace(0.0, 1.0, 4 * _STEPS + 1)
     light = Light(imaging.black, imaging.white, 0.0, 0.0, *imaging.tone)
-    levels = np.maximum.accumulate(encoded(toned(share, light.values), _TONES[imaging.base]))
+    levels = np.maximum.accumulate(encoded(toned(share, light.values), TONE_OF_BASE[imaging.base]))
     return np.interp(grey, levels, share, left=np.nan, right=np.nan)
 
 

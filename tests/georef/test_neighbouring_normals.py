@@ -33,12 +33,16 @@ def plate(number: int, *, is_sure: bool, is_turned: bool = False) -> FrameResult
     true = Pose(Rotation.from_rotvec(tilt).as_matrix(), np.array([3.0, -2.0, 40.0]))
     pose, other = (true.mirrored(), true) if is_turned else (true, true.mirrored())
     measurement = Measurement(
-        *("A", "A", 0, 0.9, pose, CAMERA.project(pose.translation_m[None])[0], 0.0),
-        *(
-            Appearance(20.0, 0.05, 0.8, 0.0),
-            Alternative(other, 60.0 if is_sure else 1.2, OTHER_COV),
-        ),
-        Uncertainty(COV, np.diag([1e-4, 1e-4]), 0.02, 1.0, 1.0, 0.2),
+        target="A",
+        ring="A",
+        instance=0,
+        score=0.9,
+        pose=pose,
+        centre_px=CAMERA.project(pose.translation_m[None])[0],
+        heading_deg=0.0,
+        appearance=Appearance(20.0, 0.05, 0.8, 0.0),
+        alternative=Alternative(other, 60.0 if is_sure else 1.2, OTHER_COV),
+        uncertainty=Uncertainty(COV, np.diag([1e-4, 1e-4]), 0.02, 1.0, 1.0, 0.2),
     )
     return FrameResult(f"f{number:02d}.jpg", 100.0 + number, ExposureSettings(), (measurement,))
 

@@ -27,14 +27,22 @@ SRGB, LINE = ToneBase.SRGB, ToneBase.LINE
 
 
 def imaging(base: ToneBase, white: float) -> Imaging:
-    return Imaging(base, 0.05 * white, white, (0.0, 0.0, 0.0), 0.4, 0.02, 0.004, 0.006)
+    return Imaging(base, 0.05 * white, white, (0.0, 0.0, 0.0), 0.4, 0.004, 0.006)
 
 
 def frame(name: str, base: ToneBase, advantage: float, white: float = 0.8) -> FrameResult:
     """A target 10 m away by the likelier base, and 11 m away by the other."""
     plate = Measurement(
-        *("A", "A", 0, 0.9, Pose(np.eye(3), np.array([0.0, 0.0, 10.0])), np.zeros(2), 0.0),
-        *(Appearance(30.0, 0.05, 0.8, 0.0), None, None),
+        target="A",
+        ring="A",
+        instance=0,
+        score=0.9,
+        pose=Pose(np.eye(3), np.array([0.0, 0.0, 10.0])),
+        centre_px=np.zeros(2),
+        heading_deg=0.0,
+        appearance=Appearance(30.0, 0.05, 0.8, 0.0),
+        alternative=None,
+        uncertainty=None,
         imaging=imaging(base, white),
     )
     other = replace(

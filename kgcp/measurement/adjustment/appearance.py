@@ -8,15 +8,16 @@ import numpy as np
 from scipy.special import ndtri
 
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.blur import variance_in_pixels
-from kgcp.measurement.image_model.photometry import Param, Tone, plateau_levels, share_at
+from kgcp.measurement.image_model.photometry import Tone, plateau_levels, share_at
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
 from kgcp.measurement.records import Appearance, Imaging, ToneBase
 from kgcp.targets.layout import Target
 
-_BASES = {Tone.UNKNOWN: ToneBase.SRGB, Tone.UNKNOWN_FROM_LINE: ToneBase.LINE}
+TONE_OF_BASE = {ToneBase.SRGB: Tone.UNKNOWN, ToneBase.LINE: Tone.UNKNOWN_FROM_LINE}
+"""The tone of a fit, by the base that it departs from."""
+_BASE_OF_TONE = {tone: base for base, tone in TONE_OF_BASE.items()}
 
 
 def appearance_of(camera: Camera, target: Target, fit: TargetFit) -> Appearance:
@@ -56,20 +57,16 @@ def _edge_shift_px(fit: TargetFit) -> float:
 def imaging_of(fit: TargetFit) -> Imaging | None:
     """Return what a fit says of the camera; None if the camera's tone is known, or of bins."""
     problem, light = fit.sample.problem, fit.parameters.light
-    if problem.tone not in _BASES:
+    if problem.tone not in _BASE_OF_TONE:
         return None
     noise = noise_of(fit.sample, fit.prediction)
     ink, plate = (int(reach(fit.prediction.share)) for reach in (np.argmin, np.argmax))
-    free = fit.unknowns.free.tolist()
-    covariance = np.linalg.inv(normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns))
-    at = free.index(int(Param.SHARPENING))
     return Imaging(
-        base=_BASES[problem.tone],
+        base=_BASE_OF_TONE[problem.tone],
         black=light.black,
         white=light.white,
         tone=(light.tone_1, light.tone_2, light.tone_3),
         sharpening=light.sharpening,
-        sd_sharpening=math.sqrt(covariance[at, at]),
         noise_black=float(noise.plateau_sd[ink]),
         noise_white=float(noise.plateau_sd[plate]),
     )

@@ -120,7 +120,7 @@ def find_photos(places: Sequence[Path]) -> list[Photo]:
         elif is_file(place) and place.suffix.lower() in FRAME_SUFFIXES:
             photos.append(Photo(place.name, place))
         else:
-            raise KgcpError(f"{place}: is neither an image nor a folder of images; correct it")
+            raise KgcpError(f"{place}: is neither an image nor a folder; name one of them")
     counts = Counter(photo.name for photo in photos)
     twice = [name for name, count in counts.items() if count > 1]
     if twice:
@@ -145,7 +145,7 @@ def calibrate_photos(
     """Calibrate the camera that took photographs of a field.
 
     However the work is interrupted, what was measured is kept in a journal in `out`, and the same
-    call goes on from there. The journal stays until the caller has written its results.
+    call goes on from there. The journal is deleted once the camera is calibrated.
 
     Raises
     ------
@@ -177,8 +177,8 @@ def calibrate_photos(
             replace(options.settings, points=PointModel.FIXED, lens=LensModel.RADIAL),
         )
         results = _second_pass(looks, task, photos, results, start)
+        final = calibrate_camera(_views(results), field, _size(results), options.settings, start)
         journal.remove()
-    final = calibrate_camera(_views(results), field, _size(results), options.settings, start)
     camera = replace(final.camera, response=options.response)
     calibration = replace(final, camera=camera)
     return _outcome(photos, field, options, results, calibration)

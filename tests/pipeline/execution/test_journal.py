@@ -71,8 +71,8 @@ observations = st.builds(
     | st.builds(
         Imaging,
         st.sampled_from(ToneBase),
-        *(numbers, numbers, st.tuples(numbers, numbers, numbers), numbers, numbers),
-        *(numbers, numbers),
+        *(numbers, numbers, st.tuples(numbers, numbers, numbers)),
+        *(numbers, numbers, numbers),
     ),
 )
 with_rivals = st.builds(
