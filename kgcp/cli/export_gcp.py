@@ -135,7 +135,9 @@ def command(
     from kgcp.io.formats.exclusions import read_exclusions
 
     files = FileOptions(
-        *(options.pop(name) for name in ("formats", "mark_floor_px", "image_names"))
+        formats=options.pop("formats"),
+        mark_floor_px=options.pop("mark_floor_px"),
+        image_names=options.pop("image_names"),
     )
     exclusions = tuple(line for file in exclude_files for line in read_exclusions(file))
     choice = PointChoice(Selection(**options), exclusions, crs)

@@ -227,7 +227,7 @@ def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> Non
 def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     result = run(tmp_path / "none", "--field", "grid:5x4:30mm:16mm", *QUIET)
     assert result.exit_code == 1
-    assert "is neither an image nor a folder of images" in result.stderr
+    assert "none: is neither an image nor a folder; name one of them" in result.stderr
 
 
 def test_the_choices_are_those_of_the_library() -> None:
