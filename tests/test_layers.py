@@ -6,11 +6,10 @@ import ast
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
-
-import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "kgcp"
 
@@ -107,8 +106,19 @@ class Import:
     is_hidden: bool
 
 
+@cache
 def modules() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
+
+
+@cache
+def module_names() -> set[str]:
+    return {f"kgcp.{dotted(path)}".rstrip(".") for path in modules()}
+
+
+@cache
+def syntax(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def dotted(path: Path) -> str:
@@ -126,6 +136,7 @@ def member(module: str) -> str:
     raise AssertionError(f"{module or 'kgcp/__init__.py'}: has no layer")
 
 
+@cache
 def imports(path: Path) -> list[Import]:
     """All imports of a file, wherever in it."""
     found: list[Import] = []
@@ -136,25 +147,27 @@ def imports(path: Path) -> list[Import]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             assert node.module is not None
-            names = {f"{node.module}.{alias.name}" for alias in node.names} & MODULES
+            names = {f"{node.module}.{alias.name}" for alias in node.names} & module_names()
             found.extend(Import(name, is_hidden) for name in names or {node.module})
         for child in ast.iter_child_nodes(node):
             defers = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.If)
             visit(child, is_hidden=is_hidden or defers)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")), is_hidden=False)
+    visit(syntax(path), is_hidden=False)
     return found
 
 
-MODULES = {f"kgcp.{dotted(path)}" for path in modules() if dotted(path)} | {"kgcp"}
-INTERNAL = {
-    dotted(path): [
-        Import(each.name.removeprefix("kgcp").removeprefix("."), each.is_hidden)
-        for each in imports(path)
-        if each.name.partition(".")[0] == "kgcp"
-    ]
-    for path in modules()
-}
+@cache
+def internal() -> dict[str, list[Import]]:
+    """What each module imports from this package, by dotted names below `kgcp`."""
+    return {
+        dotted(path): [
+            Import(each.name.removeprefix("kgcp").removeprefix("."), each.is_hidden)
+            for each in imports(path)
+            if each.name.partition(".")[0] == "kgcp"
+        ]
+        for path in modules()
+    }
 
 
 def names(path: Path) -> str:
@@ -168,42 +181,53 @@ def test_every_module_has_its_layer() -> None:
     assert set(LIBRARIES) == set(LEVEL)
 
 
-@pytest.mark.parametrize("path", modules(), ids=names)
-def test_imports_point_downwards(path: Path) -> None:
-    own = dotted(path)
-    if own in {"", "io"}:  # no room of its own: it imports nothing, or lazily
-        assert not [each for each in INTERNAL[own] if not each.is_hidden]
-        return
-    level = LEVEL[member(own)]
-    for each in INTERNAL[own]:
-        if not each.name or member(each.name) == member(own):
+def test_imports_point_downwards() -> None:
+    upwards = []
+    for own, imported in internal().items():
+        if own in {"", "io"}:  # no room of its own: it imports nothing, or lazily
+            assert not [each for each in imported if not each.is_hidden]
             continue
-        assert LEVEL[member(each.name)] < level, f"{own} imports {each.name}"
+        upwards += [
+            f"{own} imports {each.name}"
+            for each in imported
+            if each.name
+            and member(each.name) != member(own)
+            and LEVEL[member(each.name)] >= LEVEL[member(own)]
+        ]
+    assert upwards == []
 
 
-@pytest.mark.parametrize("path", modules(), ids=names)
-def test_members_use_only_the_libraries_of_their_layer(path: Path) -> None:
-    packages = {each.name.partition(".")[0] for each in imports(path)}
-    foreign = packages - sys.stdlib_module_names - {"kgcp"}
-    own = dotted(path)
-    assert foreign <= (frozenset() if own in {"", "io"} else LIBRARIES[member(own)])
+def test_members_use_only_the_libraries_of_their_layer() -> None:
+    strangers = []
+    for path in modules():
+        packages = {each.name.partition(".")[0] for each in imports(path)}
+        own = dotted(path)
+        allowed = frozenset() if own in {"", "io"} else LIBRARIES[member(own)]
+        strange = packages - sys.stdlib_module_names - {"kgcp"} - allowed
+        strangers += [f"{names(path)} imports {name}" for name in sorted(strange)]
+    assert strangers == []
 
 
-@pytest.mark.parametrize(
-    "path",
-    [path for path in modules() if dotted(path).split(".")[0] not in FILE_ROOMS],
-    ids=names,
-)
-def test_nothing_below_io_knows_files(path: Path) -> None:
-    assert not FILE_MODULES & {each.name.partition(".")[0] for each in imports(path)}
+def test_nothing_below_io_knows_files() -> None:
+    knowing = [
+        names(path)
+        for path in modules()
+        if dotted(path).split(".")[0] not in FILE_ROOMS
+        and FILE_MODULES & {each.name.partition(".")[0] for each in imports(path)}
+    ]
+    assert knowing == []
 
 
-@pytest.mark.parametrize("path", modules(), ids=names)
-def test_no_import_is_hidden(path: Path) -> None:
+def test_no_import_is_hidden() -> None:
     """Inside a function or under TYPE_CHECKING it would hide what the house is built like."""
-    own = dotted(path)
-    if own.split(".")[0] not in LAZY:
-        assert [each.name for each in INTERNAL[own] if each.is_hidden] == []
+    hidden = [
+        f"{own} imports {each.name}"
+        for own, imported in internal().items()
+        if own.split(".", maxsplit=1)[0] not in LAZY
+        for each in imported
+        if each.is_hidden
+    ]
+    assert hidden == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
@@ -216,7 +240,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         assert state.get(module) != "open", f"circle: {way[way.index(module) :]}"
         state[module] = "open"
         way.append(module)
-        for each in INTERNAL.get(module, []):
+        for each in internal().get(module, []):
             if each.name != module and not (
                 each.is_hidden and module.split(".", maxsplit=1)[0] in LAZY
             ):
@@ -224,7 +248,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         way.pop()
         state[module] = "done"
 
-    for module in INTERNAL:
+    for module in internal():
         visit(module)
 
 
@@ -243,7 +267,7 @@ def test_rooms_stay_small_enough_to_see_at_a_glance() -> None:
 def functions() -> Iterator[tuple[str, int]]:
     """Name a function by file and line, and count the lines below its signature and docstring."""
     for path in modules():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(syntax(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = node.body[1:] if ast.get_docstring(node) else node.body
                 last = body[-1].end_lineno if body else None
