@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from kgcp.cli import main
 
-FRAMES, FEW = 240, 4
+FRAMES, FEW = 160, 4
 TELLING_ALL = """\
 from kgcp.cli import detect_log, main
 detect_log._JSON_PROGRESS_S = 0.0

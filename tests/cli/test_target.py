@@ -143,26 +143,6 @@ def test_impossible_inputs_are_one_line(flight: Path, arguments: list[str], word
     assert result.stderr.count("\n") == 1
 
 
-def test_the_examples_of_the_manual_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = Path(__file__).resolve().parents[2]
-    manual = (root / "docs" / "target.md").read_text(encoding="utf-8")
-    lines = [line.split() for line in manual.splitlines() if line.startswith("    kgcp ")]
-    assert {line[1] for line in lines} == {"target", "plan"}
-    flight = tmp_path / "sample_flight"
-    flight.mkdir()
-    text = (root / "sample_flight" / "flight.toml").read_bytes()
-    (flight / "flight.toml").write_bytes(text)
-    monkeypatch.chdir(tmp_path)
-    for line in lines:
-        result = CliRunner().invoke(main, line[1:])
-        assert result.exit_code == 0, (line, result.output)
-    written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
-    assert {
-        *("plan.png", "targets/target_T6.pdf", "targets/targets.toml"),
-        *("sample_flight/kgcp/targets/target_A.pdf", "sample_flight/kgcp/targets/target_A.dxf"),
-    } <= written
-
-
 def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--sheet", "A4", "--format", "png"]
     options = ["--dpi", "100", "--out", str(tmp_path), "--json"]

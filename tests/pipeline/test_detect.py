@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +76,36 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@dataclass(frozen=True)
+class GuidedRuns:
+    """Three runs over the same frames: the second shows all candidates, the third has two jobs."""
+
+    outs: tuple[Path, ...]
+    sheets: tuple[Path, ...]
+    summary: DetectionSummary  # of the first
+
+    @property
+    def tables(self) -> list[bytes]:
+        return [(out / "detections.parquet").read_bytes() for out in self.outs]
+
+
+@pytest.fixture(scope="module")
+def guided(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> GuidedRuns:
+    folder = tmp_path_factory.mktemp("guided")
+    outs, sheets = (tuple(folder / f"{name}{k}" for k in range(3)) for name in ("out", "sheet"))
+    summaries = [
+        detect_flight(
+            read_flight(tiny),
+            out=out,
+            options=RunOptions(jobs=jobs, overlay=sheet, all_candidates=all_candidates),
+        )
+        for out, sheet, (jobs, all_candidates) in zip(
+            outs, sheets, ((0, False), (0, True), (2, True)), strict=True
+        )
+    ]
+    return GuidedRuns(outs, sheets, summaries[0])
+
+
 def measured(out: Path) -> pd.DataFrame:
     table = read_table(out / "detections.parquet", DETECTION_COLUMNS)
     return table[table["status"] == "measured"].set_index("frame")
@@ -130,27 +160,19 @@ def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_
     assert tables[0] == tables[1]
 
 
-def test_a_second_look_finds_what_the_reference_promises(tiny: Path, tmp_path: Path) -> None:
-    flight = read_flight(tiny)
-    summaries = {
-        (is_guided, jobs): detect_flight(
-            flight,
-            DetectSettings(is_guided=is_guided),
-            out=tmp_path / f"{is_guided}{jobs}",
-            options=RunOptions(jobs=jobs),
-        )
-        for is_guided, jobs in ((False, 0), (True, 0), (True, 2))
-    }
-    first, second = (measured(tmp_path / name) for name in ("False0", "True0"))
+def test_a_second_look_finds_what_the_reference_promises(
+    tiny: Path, guided: GuidedRuns, tmp_path: Path
+) -> None:
+    alone = DetectSettings(is_guided=False)
+    detect_flight(read_flight(tiny), alone, out=tmp_path, options=RunOptions(jobs=0))
+    first, second = measured(tmp_path), measured(guided.outs[0])
     assert not first["guided"].any()
-    assert summaries[True, 0].guided == second["guided"].sum() == len(second) - len(first) >= 2
+    assert guided.summary.guided == second["guided"].sum() == len(second) - len(first) >= 2
     truth = pd.read_csv(tiny / "truth.csv", index_col="frame")
     assert set(second.index) == set(truth.index[truth["present"] == 1])
     off_px = second[["x_px", "y_px"]].to_numpy() - truth.loc[second.index, ["x", "y"]].to_numpy()
     assert np.abs(off_px).max() < 0.2
-    tables = [(tmp_path / name / "detections.parquet").read_bytes() for name in ("True0", "True2")]
-    assert tables[0] == tables[1]
-    rows = read_table(tmp_path / "True0" / "detections.parquet", DETECTION_COLUMNS)
+    rows = read_table(guided.outs[0] / "detections.parquet", DETECTION_COLUMNS)
     details = rows.loc[rows["status"] != "measured", "detail"]
     assert details.str.contains("expected by the reference at").all()
 
@@ -165,17 +187,10 @@ def test_a_reference_that_cannot_guide_is_told_and_no_error(tiny: Path, tmp_path
     assert detect(tiny, tmp_path / "out", missing).guide_problem is None
 
 
-def test_dropped_rings_are_further_cards_of_the_sheet(tiny: Path, tmp_path: Path) -> None:
-    pages: list[str] = []
-    for jobs, all_candidates in ((0, False), (0, True), (2, True)):
-        sheet = tmp_path / f"sheet{len(pages)}"
-        detect_flight(
-            read_flight(tiny),
-            out=tmp_path / f"out{len(pages)}",
-            options=RunOptions(jobs=jobs, overlay=sheet, all_candidates=all_candidates),
-        )
-        pages.append((sheet / "index.html").read_text(encoding="utf-8"))
-    outcomes, serial, parallel = pages
+def test_dropped_rings_are_further_cards_of_the_sheet(guided: GuidedRuns) -> None:
+    outcomes, serial, parallel = (
+        (sheet / "index.html").read_text(encoding="utf-8") for sheet in guided.sheets
+    )
     assert 'class="candidate"' not in outcomes
     assert serial.count('class="candidate"') >= 3
     assert re.search(r"compared with A(-inner)? · ring at \(\d+, \d+\), radius", serial)
@@ -183,13 +198,16 @@ def test_dropped_rings_are_further_cards_of_the_sheet(tiny: Path, tmp_path: Path
     for kind in ("measured", "rejected", "not_found"):
         assert serial.count(f'class="{kind}"') == outcomes.count(f'class="{kind}"')
     pictures = [
-        {path.name: path.read_bytes() for path in (tmp_path / name / "pictures").iterdir()}
-        for name in ("sheet1", "sheet2")
+        {path.name: path.read_bytes() for path in (sheet / "pictures").iterdir()}
+        for sheet in guided.sheets[1:]
     ]
     assert pictures[0] == pictures[1]
     assert len(pictures[0]) == serial.count("<img ")
-    tables = [(tmp_path / f"out{run}" / "detections.parquet").read_bytes() for run in range(3)]
-    assert tables[0] == tables[1] == tables[2]
+
+
+def test_jobs_and_pictures_leave_guided_tables_as_they_are(guided: GuidedRuns) -> None:
+    first, with_candidates, with_jobs = guided.tables
+    assert first == with_candidates == with_jobs
 
 
 def test_without_reference_poses_the_camera_is_plumb_or_unknown(

@@ -137,7 +137,7 @@ def test_too_many_codes_are_refused() -> None:
         propose_codes(ring(0), 40, 3)
 
 
-@pytest.mark.parametrize(("count", "dots"), [(10, 4), (12, 4), (18, 4), (20, 5)])
+@pytest.mark.parametrize(("count", "dots"), [(10, 4), (18, 4), (12, 5)])
 def test_many_proposed_codes_pass_too(count: int, dots: int) -> None:
     """Codes that differ by two dots may coincide if all their dots are off by half a dot."""
     proposed = named(propose_codes(ring(0), count, dots))
