@@ -3,6 +3,10 @@
 Every process has a pipe of its own. With a queue that processes share, one that is killed while it
 holds the queue's lock stops all others: that ruled out `ProcessPoolExecutor`, which ends all work
 then, and `pebble.ProcessPool`, which waits for ever (seen after six kills in the midst of results).
+
+Under Linux, processes are forked from a server, a process without threads that has loaded what they
+need: once, and while this process loads what it needs itself. Elsewhere, forks are not safe with
+the system's libraries, and each process loads everything.
 """
 
 from __future__ import annotations
@@ -11,10 +15,12 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -23,10 +29,26 @@ from kgcp.pipeline.execution.resilient_map import Lost, TaskFailure
 from kgcp.pipeline.execution.signals import defer_interrupts
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
-_SPAWN = multiprocessing.get_context("spawn")  # forking a threaded parent may deadlock
+# forking this process, which has threads, might deadlock
+if sys.platform == "linux":
+    _CONTEXT = multiprocessing.get_context("forkserver")
+else:
+    _CONTEXT = multiprocessing.get_context("spawn")
 _Connection = Any  # of multiprocessing: `Connection`, or `PipeConnection` on Windows
 _STARTS = 3  # of a process, before it counts as impossible
 _LONGEST_WAIT_S = 1e6  # that the kernel can be asked for
+
+
+def start_server(*modules: str) -> None:
+    """Let the server of new processes start to load these modules, and return at once.
+
+    Nothing is done where there is no server, or where it runs already.
+    """
+    if sys.platform == "linux":
+        use_one_thread_each()
+        forkserver.set_forkserver_preload(list(modules))
+        with defer_interrupts():  # which the server inherits: Ctrl-C is for this process
+            forkserver.ensure_running()
 
 
 class WorkerProcess:
@@ -86,13 +108,13 @@ class WorkerProcess:
 
     def _start(self) -> _Connection:
         for _ in range(_STARTS):
-            own, other = _SPAWN.Pipe()
+            own, other = _CONTEXT.Pipe()
             try:
                 with self._lock:
                     if self._is_over:
                         raise Lost(TaskFailure.CRASHED)
                     use_one_thread_each()
-                    self._process = _SPAWN.Process(target=_serve, args=(other,), daemon=True)
+                    self._process = _CONTEXT.Process(target=_serve, args=(other,), daemon=True)
                     self._process.start()
                 other.close()
                 own.recv()  # it is there: its start is not counted as work
