@@ -1,0 +1,154 @@
+"""A session of photographs of a field of targets: printed, lit and photographed from all sides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.targets.fields.layout import Field, FieldPolarity
+
+_BORDER = 0.6  # of the pitch, from the outer discs' edges to that of the board
+_PAPER, _INK = 0.8, 0.06  # radiance
+_TILT_DEG = (15.0, 40.0)
+_FARTHER = (1.03, 1.45)  # than where the board would fill the frame
+_TURN_SD_DEG = 6.0
+_EVERY_TURNED = 3  # photograph, by 90°
+_ROUNDS = 60  # in which place and distance are found
+_MARGIN_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSession:
+    """What is photographed, with what, and how often.
+
+    Attributes
+    ----------
+    camera : Camera
+        The truth that a calibration is to find.
+    field : Field
+        What is meant to be printed. The discs are printed off by its `flat_sd_m`, at random.
+    photographs : int
+    optics : Optics
+    sensor : Sensor
+    gain : float
+        Exposure relative to the one at which radiance 1 fills the well.
+    fall : float
+        By how much the light falls off across half the frame's width, in random directions.
+    """
+
+    camera: Camera
+    field: Field
+    photographs: int = 14
+    optics: Optics = field(default_factory=lambda: Optics(0.7))
+    sensor: Sensor = field(default_factory=Sensor)
+    gain: float = 1.0
+    fall: float = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldPhotograph:
+    """One photograph with its truth."""
+
+    grey: GreyArray
+    pose: Pose  # field → camera
+
+
+def printed_points(session: FieldSession, rng: np.random.Generator) -> FloatArray:
+    """Return where the discs are on the board (m, 3), in the field's frame [m]."""
+    meant = session.field.points_m()
+    return np.asarray(meant + session.field.flat_sd_m * rng.standard_normal(meant.shape))
+
+
+def field_photographs(
+    session: FieldSession, points_m: FloatArray, rng: np.random.Generator
+) -> Iterator[FieldPhotograph]:
+    """Photograph a field whose discs are at `points_m` (m, 3) from all sides, one after another."""
+    radii, inner = session.field.radii_m().tolist(), session.field.inner_radii_m().tolist()
+    discs = tuple(
+        FieldDisc((x, y, z), 2.0 * outer, 2.0 * hole)
+        for (x, y, z), outer, hole in zip(points_m.tolist(), radii, inner, strict=True)
+    )
+    is_dark = session.field.polarity is FieldPolarity.DARK
+    ground, ink = (_PAPER, _INK) if is_dark else (_INK, _PAPER)
+    board_m = _board_m(session.field)
+    for number in range(session.photographs):
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        fall_per_px = session.fall * rng.uniform() / (0.5 * session.camera.width)
+        gradient = (fall_per_px * math.cos(turn), fall_per_px * math.sin(turn))
+        scene = FieldScene(discs, ground, ink, gradient, board_m)
+        pose = _pose(session.camera, board_m, number, rng)
+        grey = photograph(
+            session.camera, pose, scene, session.optics, session.sensor, rng, session.gain
+        )
+        yield FieldPhotograph(grey, pose)
+
+
+def _board_m(board: Field) -> tuple[float, float, float, float]:
+    """Return the edges of the board: x and y of one corner and of the opposite one [m]."""
+    points, radii = board.points_m()[:, :2], board.radii_m()[:, None]
+    border_m = _BORDER * board.pitch_m
+    left, top = (points - radii).min(axis=0) - border_m
+    right, bottom = (points + radii).max(axis=0) + border_m
+    return float(left), float(top), float(right), float(bottom)
+
+
+def _pose(
+    camera: Camera,
+    board_m: tuple[float, float, float, float],
+    number: int,
+    rng: np.random.Generator,
+) -> Pose:
+    """Return a pose that shows the whole board, tilted, somewhere in the frame."""
+    left, top, right, bottom = board_m
+    corners = np.array([(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0)])
+    corners = np.vstack((corners, (left, bottom, 0.0)))
+    middle = corners.mean(axis=0)
+    quarter = 90.0 if number % _EVERY_TURNED == _EVERY_TURNED - 1 else 0.0
+    turn = math.radians(quarter + _TURN_SD_DEG * rng.standard_normal())
+    tilt, about = math.radians(rng.uniform(*_TILT_DEG)), rng.uniform(0.0, 2.0 * math.pi)
+    axis = np.array((math.cos(about), math.sin(about), 0.0))
+    rotation = rotation_about(tilt * axis) @ rotation_about(np.array((0.0, 0.0, turn)))
+    around = (corners - middle) @ rotation.T
+    distance_m = _fitting_distance_m(camera, around) * rng.uniform(*_FARTHER)
+    aside = rng.uniform(-0.5, 0.5, 2) * np.array((camera.width, camera.height))
+    centre_px = 0.5 * np.array((camera.width - 1, camera.height - 1))
+    for step in range(_ROUNDS):
+        seen = camera.undistort(centre_px + aside * (1.0 - step / _ROUNDS))
+        translation = distance_m * np.array((*seen, 1.0))
+        if _is_in_frame(camera, around + translation):
+            break
+    else:
+        translation = np.array((0.0, 0.0, distance_m))
+    return Pose(rotation, translation - rotation @ middle)
+
+
+def _fitting_distance_m(camera: Camera, around: FloatArray) -> float:
+    """Return the least distance, but for a few per cent, at which the frame shows all corners."""
+    axis = np.array((*camera.undistort(0.5 * np.array((camera.width, camera.height))), 1.0))
+    far_m = 100.0 * float(np.linalg.norm(around, axis=1).max())
+    near_m = float(np.linalg.norm(around, axis=1).max())
+    for _ in range(_ROUNDS // 3):
+        between_m = math.sqrt(near_m * far_m)
+        if _is_in_frame(camera, around + between_m * axis):
+            far_m = between_m
+        else:
+            near_m = between_m
+    return far_m
+
+
+def _is_in_frame(camera: Camera, corners: FloatArray) -> bool:
+    """Tell whether a quadrangle's corners and the middles of its sides are in the frame."""
+    outline = np.vstack((corners, 0.5 * (corners + np.roll(corners, 1, axis=0))))
+    if outline[:, 2].min() <= 0.0:
+        return False
+    places = camera.project(outline)
+    limits = np.array((camera.width, camera.height)) - 1.0 - _MARGIN_PX
+    return bool(np.all((places >= _MARGIN_PX) & (places <= limits)))
