@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,6 +23,7 @@ _TURN_SD_DEG = 6.0
 _EVERY_TURNED = 3  # photograph, by 90°
 _ROUNDS = 60  # in which place and distance are found
 _MARGIN_PX = 4.0
+_OPTICS, _SENSOR = Optics(0.7), Sensor()
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,8 @@ class FieldSession:
     camera: Camera
     field: Field
     photographs: int = 14
-    optics: Optics = field(default_factory=lambda: Optics(0.7))
-    sensor: Sensor = field(default_factory=Sensor)
+    optics: Optics = _OPTICS
+    sensor: Sensor = _SENSOR
     gain: float = 1.0
     fall: float = 0.15
 

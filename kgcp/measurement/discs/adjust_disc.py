@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, distances_px
+from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
     DiscFit,
     DiscSample,
     DiscState,
-    FreeParameters,
+    Unknowns,
     fit_disc,
 )
 from kgcp.measurement.discs.pixel_choice import (
@@ -33,7 +34,6 @@ from kgcp.measurement.discs.records import (
 )
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import Censoring, find_censoring, median_at_edges
-from kgcp.measurement.image_model.photometry import light_of_levels, plateau_levels
 
 _ROUNDS = 3
 _SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
@@ -88,14 +88,16 @@ def outline_geometry(outline: DiscOutline) -> Geometry:
     return geometry_of(moments_of_ellipse(outline.ellipse))
 
 
-def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = None) -> DiscFit:
-    """Adjust a disc from its outline, or from an earlier state with the same light.
+def adjust_disc(
+    task: DiscTask, free: Unknowns, start: DiscState | None = None, blur_px: float = 0.0
+) -> DiscFit:
+    """Adjust a disc from its outline and a first blur, or from an earlier state.
 
     Raises
     ------
     DiscRejection, NoFit
     """
-    first_px = free.blur_px or min(_FIRST_BLUR_PX, _FIRST_BLUR * task.radius_px)
+    first_px = blur_px or min(_FIRST_BLUR_PX, _FIRST_BLUR * task.radius_px)
     blur = Blur(first_px**2, first_px**2, 0.0) if start is None else start.blur
     geometry = outline_geometry(task.outline) if start is None else start.geometry
     state = start
@@ -105,7 +107,7 @@ def adjust_disc(task: DiscTask, free: FreeParameters, start: DiscState | None = 
         state = state or _start(window, geometry, blur, free, is_dark=task.is_dark)
         limits = find_censoring(window.levels, window.levels_per_count)
         if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
-            free = replace(free, has_ink_slope=False)
+            free = free.without_ink_slope()
         index, is_enough = choose_pixels(window, geometry, blur, task.others)
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
@@ -128,7 +130,7 @@ def _adjust_on(
     limits: Censoring,
     index: IndexArray,
     state: DiscState,
-    free: FreeParameters,
+    free: Unknowns,
 ) -> DiscFit:
     sample = DiscSample.of(
         window, index, state, limits, free, is_dark=task.is_dark, radius_px=task.radius_px
@@ -137,7 +139,7 @@ def _adjust_on(
 
 
 def _start(
-    window: DiscWindow, geometry: Geometry, blur: Blur, free: FreeParameters, *, is_dark: bool
+    window: DiscWindow, geometry: Geometry, blur: Blur, free: Unknowns, *, is_dark: bool
 ) -> DiscState:
     """Return levels from the middle of the disc and the ground around it.
 
@@ -157,9 +159,11 @@ def _start(
     dark, bright = (inside, outside) if is_dark else (outside, inside)
     if bright - dark < _LEAST_CONTRAST_COUNTS * window.levels_per_count:
         raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {inside:.3f} and {outside:.3f}")
-    start = DiscState.of(geometry, blur, light_of_levels(dark, bright, free.tone))
-    for row, (value, _) in zip(CAMERA_ROWS, free.camera, strict=False):
-        start.vector[row] = value
+    shared = np.intersect1d(CAMERA_ROWS, free.rows)
+    start = DiscState.of(geometry, blur, (0.0, 0.0))
+    start.vector[shared] = free.mean[shared]
+    tone = start.tone(free.tone)
+    start.vector[[Row.BLACK, Row.WHITE]] = tone.light(np.array((dark, bright)))
     return start
 
 
@@ -174,7 +178,7 @@ def _check_inside(grey: GreyArray, geometry: Geometry) -> None:
 
 def _foreign(fit: DiscFit, window: DiscWindow, index: IndexArray) -> BoolArray | None:
     """Return which pixels of the window show neither disc nor ground; None if there are none."""
-    black, white = plateau_levels(fit.state.light, fit.free.tone)
+    black, white = fit.state.plateaus(fit.free.tone)
     limit = np.maximum(_FOREIGN_SIGMAS * fit.sd, _FOREIGN_CONTRAST * (white - black))
     clips = fit.sample.censoring
     model = np.clip(fit.levels, clips.low, clips.high)
@@ -198,7 +202,7 @@ def check_fit(fit: DiscFit, outline: DiscOutline) -> None:
     clips = fit.sample.censoring
     seen = ~(clips.at_high | clips.at_low)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
-    black, white = plateau_levels(fit.state.light, fit.free.tone)
+    black, white = fit.state.plateaus(fit.free.tone)
     residual = median_at_edges(fit.sd, fit.share, 0.2, 0.8, math.nan)
     if not white - black > _LEAST_CONTRAST_COUNTS * fit.sample.levels_per_count:
         raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {black:.3f} and {white:.3f}")

@@ -1,22 +1,23 @@
 """The tone curve and the sharpening of a camera, learned from the largest discs of a photograph.
 
 A disc alone tells little of them, and takes errors of the curve for a displacement where the light
-falls off. All discs of a photograph share them. Each of some large ones is adjusted with all of the
-curve's parameters free; what they say together is the prior for all.
+falls off. All discs share them: some large ones are adjusted together, as one problem in which each
+disc has its own ellipse, blur and light. What they say together is the prior for all.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.adjust_disc import DiscRejection, DiscTask, adjust_disc, check_fit
-from kgcp.measurement.discs.fit_disc import CAMERA_ROWS, DiscFit, FreeParameters, NoFit
+from kgcp.measurement.discs.disc_levels import Row
+from kgcp.measurement.discs.fit_disc import CameraPrior, DiscFit, DiscState, NoFit, Unknowns
+from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.image_model.photometry import Tone
 
 _MOST_DISCS = 9
@@ -25,53 +26,52 @@ _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are any
 _LARGE_RADIUS_PX = 20.0
 _MOST_CLIPPED = 0.05  # share of pixels
 _LARGEST_BLUR = 0.3  # of the radius, to start from
-_LEAST_SD = 0.03  # of each parameter, however many discs agree
-_MEDIAN_SQUARE, _OF_MEDIAN = 0.455, 1.57  # median of χ²₁; variance of a median over that of a mean
+_LEAST_SD = 0.01  # of each parameter, however many discs agree
+_MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class CameraTone:
     """What the camera does to the light of all discs of a photograph."""
 
     tone: Tone
     sharpens: bool = False
-    camera: tuple[tuple[float, float], ...] = ()  # as of `FreeParameters`
+    known: CameraPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
 
 
 def learn_tone(tasks: Sequence[DiscTask], response: Response) -> CameraTone:
     """Return the tone to use for discs of one photograph.
 
-    An unknown curve is shaped from sRGB's, and from a straight line; the one that is likelier for
-    most of the discs is kept.
+    An unknown curve is shaped from sRGB's, and from a straight line; the one that makes the same
+    pixels of all discs together likelier is kept.
     """
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
-    chosen = _to_learn_from(tasks)
-    if tone is Tone.SRGB:
-        return _pooled(tone, _fits(chosen, Tone.SRGB, Tone.SRGB))
-    curved = _fits(chosen, Tone.SRGB, Tone.UNKNOWN)
-    straight = _fits(chosen, Tone.LINEAR, Tone.UNKNOWN_FROM_LINE)
-    both = curved.keys() & straight.keys()
-    gain = sum(
-        (curved[i].loss_per_pixel - straight[i].loss_per_pixel) * len(curved[i].sd)
-        for i in sorted(both)
-    )
-    if gain > 0.0:
-        return _pooled(Tone.UNKNOWN_FROM_LINE, straight)
-    return _pooled(Tone.UNKNOWN, curved)
+    fits = _first_fits(_to_learn_from(tasks))
+    bases = (tone,) if tone is Tone.SRGB else (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE)
+    joints = [joint for joint in (_adjusted_together(fits, base) for base in bases) if joint]
+    if not joints:
+        return CameraTone(tone, sharpens=True)
+    best = min(joints, key=lambda joint: joint.loss)
+    blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
+    return CameraTone(best.tone, sharpens=True, known=_known_by(best), blur_px=blur_px)
 
 
-def parameters_of(task: DiscTask, camera: CameraTone) -> FreeParameters:
+def unknowns_of(task: DiscTask, camera: CameraTone) -> Unknowns:
     """Return what is estimated of a disc."""
-    return FreeParameters(
+    return Unknowns.of(
         camera.tone,
+        camera.known,
         sharpens=camera.sharpens,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
-        camera=camera.camera,
-        blur_px=min(camera.blur_px, _LARGEST_BLUR * task.radius_px),
     )
+
+
+def first_blur_px(task: DiscTask, camera: CameraTone) -> float:
+    """Return the blur to start from; 0: not known."""
+    return min(camera.blur_px, _LARGEST_BLUR * task.radius_px)
 
 
 def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
@@ -84,47 +84,49 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     return [large[i] for i in half[::step][:_MOST_DISCS]]
 
 
-def _fits(tasks: Sequence[DiscTask], first: Tone, then: Tone) -> dict[int, DiscFit]:
-    """Adjust discs by a known curve, and from there with all free; those that lead anywhere."""
-    fits = {}
-    for number, task in enumerate(tasks):
+def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
+    """Adjust discs each by itself, by sRGB's curve; those that lead anywhere, unclipped if any."""
+    fits = []
+    for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
-            fit = adjust_disc(task, FreeParameters(first, sharpens=True))
-            if then is not first:
-                fit = adjust_disc(task, FreeParameters(then, sharpens=True), fit.state)
+            fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpens=True))
             check_fit(fit, task.outline)
-            fits[number] = fit
-    return fits
+            fits.append(fit)
+    return [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED] or fits
 
 
-def _pooled(tone: Tone, fits: dict[int, DiscFit]) -> CameraTone:
-    """Return what the discs together say of the camera: medians, and how far each may be off.
+def _adjusted_together(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
+    """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
+    if not fits:
+        return None
+    samples = [replace(fit.sample, level_model=fit.sample.level_model.by(tone)) for fit in fits]
+    sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
+    states = [_state_by(fit, tone, sharpening) for fit in fits]
+    try:
+        return adjust_together(samples, states, tone)
+    except (NoFit, np.linalg.LinAlgError):
+        return None
 
-    Levels differ from disc to disc, and with them the part of the curve that is between. So the
-    scatter beyond the noise counts as well as the uncertainty of the median.
+
+def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
+    """Return the state of a fit by sRGB's curve, for another tone curve with the same levels."""
+    vector = fit.state.vector.copy()
+    vector[Row.SHARPENING] = sharpening
+    if not tone.is_srgb:
+        vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(Tone.SRGB)
+    return DiscState(vector)
+
+
+def _known_by(joint: JointFit) -> CameraPrior:
+    """Return what discs adjusted together say of the camera, as it may be off.
+
+    Where they contradict each other more than their noise lets them, it is known so much worse.
     """
-    rows = [row for row in CAMERA_ROWS if tone.is_shaped or row == CAMERA_ROWS[-1]]
-    clean = [fit for fit in fits.values() if fit.sample.censoring.share <= _MOST_CLIPPED]
-    learned = clean or list(fits.values())
-    if not learned:
-        return CameraTone(tone, sharpens=True)
-    values = np.array([fit.state.vector[rows] for fit in learned])
-    medians = np.median(values, axis=0)
-    scatter = np.median(np.square(values - medians), axis=0) / _MEDIAN_SQUARE
-    noise = np.median([_variances(fit, rows) for fit in learned], axis=0)
-    variances = np.maximum(scatter - noise, 0.0) + _LEAST_SD**2
-    variances += _OF_MEDIAN * np.maximum(scatter, noise) / len(learned)
-    known = dict(
-        zip(rows, zip(medians.tolist(), np.sqrt(variances).tolist(), strict=True), strict=True)
-    )
-    return CameraTone(
-        tone,
-        sharpens=True,
-        camera=tuple(known.get(row, (0.0, 1.0)) for row in CAMERA_ROWS),
-        blur_px=float(np.median([fit.state.blur.mean_sd_px for fit in learned])),
-    )
-
-
-def _variances(fit: DiscFit, rows: list[int]) -> FloatArray:
-    """Return the variances of some parameters of a fit."""
-    return np.asarray(np.diag(np.linalg.inv(fit.normal))[np.searchsorted(fit.free.rows, rows)])
+    own = joint.informations[0].any(axis=0)
+    squares = [
+        float(score[own] @ np.linalg.lstsq(information[np.ix_(own, own)], score[own])[0])
+        for score, information in zip(joint.scores, joint.informations, strict=True)
+    ]
+    excess = max(float(np.median(squares)) / _MEDIAN_SQUARE[int(own.sum())], 1.0)
+    cov = np.linalg.inv(joint.precision) * excess + _LEAST_SD**2 * np.eye(len(own))
+    return CameraPrior(joint.shared, np.asarray(np.linalg.inv(cov)))

@@ -17,9 +17,9 @@ from scipy.special import ndtri
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry
-from kgcp.measurement.discs.fit_disc import GEOMETRY_COUNT, DiscFit
+from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
+from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.image_model.noise import median_at_edges
-from kgcp.measurement.image_model.photometry import plateau_levels, share_at
 
 _ARC_PX = 6.0
 _FEWEST_ARCS = 8
@@ -71,8 +71,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
     if fit.free.tone.is_shaped:
-        falling = np.array((fit.state.light.slope_x, fit.state.light.slope_y))
-        aside_px = _TONED_FALL * fit.state.blur.mean_sd_px * falling
+        aside_px = _TONED_FALL * fit.state.blur.mean_sd_px * fit.state.slope
         common[:2, :2] += np.outer(aside_px, aside_px)
     to_moments = moments_by_stretch(fit.state.geometry)
     return DiscScatter(
@@ -117,12 +116,12 @@ def _common_displacement_px(fit: DiscFit) -> float:
     the middle of the edge is within what is clipped.
     """
     noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
-    light, tone, limits = fit.state.light, fit.free.tone, fit.sample.censoring
+    state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
     excess = noise.sd**2 - noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)
-    black, white = plateau_levels(light, tone)
+    black, white = state.plateaus(tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * blur_px)
-    burnt, sunk = share_at(limits.high, light, tone), share_at(limits.low, light, tone)
+    burnt, sunk = state.share_at(limits.high, tone), state.share_at(limits.low, tone)
     hidden = max(0.5 - burnt, sunk - 0.5, 0.0)
     reach_px = blur_px * float(ndtri(min(0.5 + hidden, 1.0 - 1e-3)))
     of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px

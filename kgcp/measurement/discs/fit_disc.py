@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -12,7 +11,9 @@ from scipy.linalg.lapack import dposv
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_products
 from kgcp.measurement.discs.affine_model import DiscPixels, Geometry, limited
+from kgcp.measurement.discs.disc_levels import COUNT, GEOMETRY_COUNT, LevelModel, Row
 from kgcp.measurement.discs.pixel_choice import DiscWindow
+from kgcp.measurement.discs.tone_curve import DiscTone, steep_enough
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import (
     Censoring,
@@ -21,113 +22,130 @@ from kgcp.measurement.image_model.noise import (
     estimate_noise,
     misfit,
 )
-from kgcp.measurement.image_model.photometry import (
-    PARAM_COUNT,
-    PLAIN_COUNT,
-    Light,
-    Param,
-    PhotometricModel,
-    Tone,
-)
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 
-GEOMETRY_COUNT = 5  # x, y and the stretch xx, xy, yy: rows 0…4, as a plate's pose takes 0…5
-INK_SLOPE_X, INK_SLOPE_Y = PLAIN_COUNT, PLAIN_COUNT + 1  # of the darker level alone, per radius
-COUNT = PLAIN_COUNT + 2
-_SHARPENING_PX = 1.2  # σ of the cameras' unsharp mask, as for coded targets
+_SHARPENING_PX = 1.0  # σ of the cameras' unsharp mask, as for coded targets
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
-_MOST_FLAT = 0.6  # by how much a tone curve may be less steep at its ends than in the mean
 _STEPS = 12
 _ENOUGH = 0.02  # of log-likelihood, promised by a step
+_LITTLE = 1e-4  # of a step
 _NOISE_ROUNDS, _SETTLED_NOISE = 3, 0.05
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 
 # Independent normal priors of what a disc alone hardly tells; lengths in radii.
 _PRIOR_SD = {
-    int(Param.BLUR_DIFFERENCE): 0.3,  # px²
-    int(Param.BLUR_XY): 0.3,
-    int(Param.SLOPE_X): 0.1,
-    int(Param.SLOPE_Y): 0.1,
-    # narrower than for coded targets: a disc has one edge, and a point spread with wide tails looks
-    # like a curve that is flat at its end
-    int(Param.TONE_1): 0.25,
-    int(Param.TONE_2): 0.1,
-    int(Param.TONE_3): 0.1,
-    int(Param.SHARPENING): 0.7,
-    INK_SLOPE_X: 0.05,
-    INK_SLOPE_Y: 0.05,
+    Row.BLUR_DIFFERENCE: 0.3,  # px²
+    Row.BLUR_XY: 0.3,
+    Row.SLOPE_X: 0.1,
+    Row.SLOPE_Y: 0.1,
+    Row.WAVE_1: 0.3,
+    Row.WAVE_2: 0.4,
+    Row.WAVE_3: 0.2,
+    Row.SHARPENING: 0.7,
+    Row.INK_SLOPE_X: 0.05,
+    Row.INK_SLOPE_Y: 0.05,
 }
 _WHITE, _WHITE_SD = 1.0, 0.4  # burnt levels of unknown tone: lest level and tone drift together
-_ALWAYS = (*range(GEOMETRY_COUNT), Param.BLUR_MEAN, Param.BLUR_DIFFERENCE, Param.BLUR_XY)
-_LIGHT = (Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y)
-_TONES = (Param.TONE_1, Param.TONE_2, Param.TONE_3)
-_INK_SLOPES = (INK_SLOPE_X, INK_SLOPE_Y)
-CAMERA_ROWS = tuple(int(row) for row in (*_TONES, Param.SHARPENING))
-"""What all discs of a photograph share: the camera's tone curve and sharpening."""
+_ALWAYS = (*range(GEOMETRY_COUNT), Row.BLUR_MEAN, Row.BLUR_DIFFERENCE, Row.BLUR_XY)
+_LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
+_WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
+_INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
+CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
+"""What all discs share: the camera's tone curve and sharpening."""
 
 
 class NoFit(Exception):  # noqa: N818 - the outcome of one disc
     """The equations of a disc cannot be solved."""
 
 
-@dataclass(frozen=True, slots=True)
-class FreeParameters:
-    """What is estimated of a disc beside geometry, blur, levels and light's gradient."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """What is known of the camera beforehand, in the order of `CAMERA_ROWS`."""
+
+    mean: FloatArray  # (4,)
+    precision: FloatArray  # (4, 4)
+
+    @classmethod
+    def usual(cls) -> CameraPrior:
+        """Return what is known of any camera."""
+        sd = np.array([_PRIOR_SD[row] for row in CAMERA_ROWS])
+        return cls(np.zeros(len(sd)), np.diag(sd**-2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unknowns:
+    """What is estimated of a disc, and what is known beforehand."""
 
     tone: Tone
-    sharpens: bool = False
-    has_ink_slope: bool = False  # a gradient of its own for the darker level: large discs
-    # mean and standard deviation of tone and sharpening, as other discs of the photograph show
-    # them, in the order of `CAMERA_ROWS`; empty: not known
-    camera: tuple[tuple[float, float], ...] = ()
-    blur_px: float = 0.0  # to start from; 0: not known
+    sharpens: bool
+    rows: IndexArray  # (p,): the free parameters
+    mean: FloatArray  # (18,)
+    precision: FloatArray  # (18, 18); zeros: nothing is known
 
-    @property
-    def rows(self) -> IndexArray:
-        """The free parameters (p,)."""
-        return _rows(self)
+    @classmethod
+    def of(
+        cls,
+        tone: Tone,
+        camera: CameraPrior | None = None,
+        *,
+        sharpens: bool = False,
+        has_ink_slope: bool = False,
+    ) -> Unknowns:
+        """Return the unknowns of a disc.
 
-    @property
-    def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and precision (21,) of the priors; precision 0: none."""
-        return _prior(self)
+        Parameters
+        ----------
+        camera : CameraPrior
+            What other discs show of tone and sharpening; None: what is known of any camera.
+        sharpens : bool
+            Whether the camera may sharpen.
+        has_ink_slope : bool
+            Whether the darker level has a gradient of its own: large discs.
+        """
+        rows = [*_ALWAYS, *_LIGHT]
+        rows += _WAVES if tone.is_shaped else ()
+        rows += (Row.SHARPENING,) if sharpens else ()
+        rows += _INK_SLOPES if has_ink_slope else ()
+        free = np.array(sorted(map(int, rows)))
+        known = camera or CameraPrior.usual()
+        mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
+        for row, sd in _PRIOR_SD.items():
+            precision[row, row] = sd**-2
+        shared = np.array(CAMERA_ROWS)
+        mean[shared], precision[np.ix_(shared, shared)] = known.mean, known.precision
+        if tone.is_shaped:
+            mean[Row.WHITE], precision[Row.WHITE, Row.WHITE] = _WHITE, _WHITE_SD**-2
+        is_fixed = ~np.isin(np.arange(COUNT), free)
+        precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
+        return cls(tone, sharpens, free, mean, precision)
 
+    def without_ink_slope(self) -> Unknowns:
+        """Return the unknowns without a gradient of the darker level's own."""
+        return replace(self, rows=self.rows[self.rows < Row.INK_SLOPE_X])
 
-@cache
-def _rows(free: FreeParameters) -> IndexArray:
-    rows = [*_ALWAYS, *_LIGHT]
-    rows += _TONES if free.tone.is_shaped else ()
-    rows += (Param.SHARPENING,) if free.sharpens else ()
-    rows += _INK_SLOPES if free.has_ink_slope else ()
-    return np.array([int(row) for row in sorted(rows)])
-
-
-@cache
-def _prior(free: FreeParameters) -> tuple[FloatArray, FloatArray]:
-    mean, precision = np.zeros(COUNT), np.zeros(COUNT)
-    for row, sd in _PRIOR_SD.items():
-        precision[row] = sd**-2 if row in free.rows else 0.0
-    if free.tone.is_shaped:
-        mean[Param.WHITE], precision[Param.WHITE] = _WHITE, _WHITE_SD**-2
-    for row, (value, sd) in zip(CAMERA_ROWS, free.camera, strict=False):
-        if row in free.rows:
-            mean[row], precision[row] = value, sd**-2
-    return mean, precision
+    def penalty(self, vector: FloatArray) -> float:
+        """Return the priors' part of the negative log-likelihood of a vector (18,)."""
+        off = vector - self.mean
+        return 0.5 * float(off @ self.precision @ off)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscState:
     """Numbers that the adjustment works with."""
 
-    vector: FloatArray  # (21,): geometry, 0, and the others in the order of `Param`; ink slopes
+    vector: FloatArray  # (18,): in the order of `Row`
 
     @classmethod
-    def of(cls, geometry: Geometry, blur: Blur, light: Light) -> DiscState:
-        """Collect the numbers."""
+    def of(cls, geometry: Geometry, blur: Blur, levels: tuple[float, float]) -> DiscState:
+        """Collect the numbers; levels are the light of ink and plate."""
+        vector = np.zeros(COUNT)
+        vector[:GEOMETRY_COUNT] = geometry
         mean, difference = 0.5 * (blur.xx + blur.yy), 0.5 * (blur.xx - blur.yy)
-        values = (*geometry, 0.0, mean, difference, blur.xy, 0.0, 0.0, *light.values, 0.0, 0.0)
-        return cls(np.array(values))
+        vector[Row.BLUR_MEAN : Row.BLACK] = mean, difference, blur.xy
+        vector[[Row.BLACK, Row.WHITE]] = levels
+        return cls(vector)
 
     @property
     def geometry(self) -> Geometry:
@@ -137,38 +155,54 @@ class DiscState:
     @property
     def blur(self) -> Blur:
         """The blur."""
-        mean, difference, xy = self.vector[Param.BLUR_MEAN : Param.STREAK_X].tolist()
+        mean, difference, xy = self.vector[Row.BLUR_MEAN : Row.BLACK].tolist()
         return Blur(mean + difference, mean - difference, xy)
 
     @property
-    def light(self) -> Light:
-        """The light."""
-        return Light(*self.vector[Param.BLACK : PLAIN_COUNT].tolist())
+    def slope(self) -> FloatArray:
+        """Gradient of the light (2,) per radius."""
+        return self.vector[Row.SLOPE_X : Row.WAVE_1]
 
-    def moved(self, step: FloatArray) -> DiscState:
-        """Return the state after a step (21,), such that ellipse and blur can be."""
-        moved, before = self.vector + step, self.vector[Param.BLUR_MEAN]
+    def tone(self, tone: Tone) -> DiscTone:
+        """Return the tone curve."""
+        return DiscTone(tone).bent(self.vector[Row.WAVE_1 : Row.SHARPENING])
+
+    def plateaus(self, tone: Tone) -> tuple[float, float]:
+        """Return the grey values of ink and plate before clipping."""
+        black, white = self.tone(tone).levels(self.vector[[Row.BLACK, Row.WHITE]]).tolist()
+        return black, white
+
+    def share_at(self, level: float, tone: Tone) -> float:
+        """Return the white share at which a grey value is reached, 0…1; in even light."""
+        black, white = self.vector[[Row.BLACK, Row.WHITE]].tolist()
+        light = float(self.tone(tone).light(np.array([level]))[0])
+        share = (light - black) / max(white - black, 1e-9)
+        return float(min(max(share, 0.0), 1.0))
+
+    def moved(self, step: FloatArray, tone: Tone) -> DiscState:
+        """Return the state after a step (18,), such that ellipse, blur and tone can be.
+
+        Where the tone curve changes, the levels follow such that their grey values change by as
+        much as the step promises: steps of both would go wrong together.
+        """
+        moved, before = self.vector + step, self.vector[Row.BLUR_MEAN]
         moved[:GEOMETRY_COUNT] = limited(moved[:GEOMETRY_COUNT])
-        if step[Param.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
-            moved[Param.BLUR_MEAN] = before**2 / (before - step[Param.BLUR_MEAN])
-        moved[Param.BLUR_MEAN] = max(moved[Param.BLUR_MEAN], _MIN_VARIANCE_PX2)
-        moved[_TONES[0] : _TONES[-1] + 1] *= _steep_enough(*moved[_TONES[0] : _TONES[-1] + 1])
-        elongation = math.hypot(moved[Param.BLUR_DIFFERENCE], moved[Param.BLUR_XY])
-        excess = elongation / (_MAX_ANISOTROPY * moved[Param.BLUR_MEAN])
+        if step[Row.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
+            moved[Row.BLUR_MEAN] = before**2 / (before - step[Row.BLUR_MEAN])
+        moved[Row.BLUR_MEAN] = max(moved[Row.BLUR_MEAN], _MIN_VARIANCE_PX2)
+        moved[Row.WAVE_1 : Row.SHARPENING] = steep_enough(moved[Row.WAVE_1 : Row.SHARPENING])
+        if tone.is_shaped:
+            levels = [Row.BLACK, Row.WHITE]
+            grey = self.tone(tone).levels(self.vector[levels])
+            nearby = self.vector + _LITTLE * step
+            grey += (DiscState(nearby).tone(tone).levels(nearby[levels]) - grey) / _LITTLE
+            moved[levels] = DiscState(moved).tone(tone).light(grey)
+        elongation = math.hypot(moved[Row.BLUR_DIFFERENCE], moved[Row.BLUR_XY])
+        excess = elongation / (_MAX_ANISOTROPY * moved[Row.BLUR_MEAN])
         if excess > 1.0:
-            moved[Param.BLUR_DIFFERENCE] /= excess
-            moved[Param.BLUR_XY] /= excess
+            moved[Row.BLUR_DIFFERENCE] /= excess
+            moved[Row.BLUR_XY] /= excess
         return DiscState(moved)
-
-
-def _steep_enough(tone_1: float, tone_2: float, tone_3: float) -> float:
-    """Return a factor 0…1 that keeps a tone curve from being flat at its ends.
-
-    Where it is flat, the ground shows no gradient of the light however large it is, and the
-    gradient explains whatever makes opposite edges differ: coma, or the order of the rows.
-    """
-    flattest = max(tone_1 + tone_2 + tone_3, tone_2 - tone_1 - tone_3)
-    return min(1.0, _MOST_FLAT / flattest) if flattest > 0.0 else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,10 +212,9 @@ class DiscSample:
     pixels: DiscPixels
     levels: FloatArray  # (n,)
     censoring: Censoring
-    photometry: PhotometricModel
+    level_model: LevelModel
     levels_per_count: float
-    offsets: FloatArray  # (2, n): from the disc's middle, in radii
-    radius_px: float  # that `offsets` are in
+    radius_px: float  # that gradients of the light refer to
 
     @classmethod
     def of(
@@ -190,7 +223,7 @@ class DiscSample:
         index: IndexArray,
         state: DiscState,
         limits: Censoring,
-        free: FreeParameters,
+        free: Unknowns,
         *,
         is_dark: bool,
         radius_px: float,
@@ -211,9 +244,8 @@ class DiscSample:
             pixels,
             window.levels[index],
             censoring,
-            PhotometricModel(offsets, free.tone, mask),
+            LevelModel(offsets, free.tone, mask),
             window.levels_per_count,
-            offsets,
             radius_px,
         )
 
@@ -223,28 +255,30 @@ class DiscFit:
     """The state of an adjustment."""
 
     sample: DiscSample
-    free: FreeParameters
+    free: Unknowns
     state: DiscState
     share: FloatArray  # (n,): white share
     levels: FloatArray  # (n,): modelled, before clipping
-    jacobian: FloatArray  # (21, n)
+    jacobian: FloatArray  # (18, n)
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit
     scaled: FloatArray  # (p, n): Jacobian of the free parameters, in units of the noise
     normal: FloatArray  # (p, p): with the priors
 
     @property
+    def gradient(self) -> FloatArray:
+        """Derivatives (p,) of the log-likelihood with the priors."""
+        free = self.free
+        of_prior = (free.precision @ (free.mean - self.state.vector))[free.rows]
+        return np.asarray(self.scaled @ self.misfit.score + of_prior)
+
+    @property
     def noise(self) -> GreyNoise:
         """The noise that the residuals show."""
         return _noise(self.sample, self.share, self.levels)
 
-    @property
-    def loss_per_pixel(self) -> float:
-        """Negative log-likelihood with the noise's own part, over the pixels; to compare tones."""
-        return (self.misfit.total + float(np.log(self.sd).sum())) / len(self.sd)
 
-
-def fit_disc(sample: DiscSample, start: DiscState, free: FreeParameters) -> DiscFit:
+def fit_disc(sample: DiscSample, start: DiscState, free: Unknowns) -> DiscFit:
     """Minimise the negative log-likelihood, until the noise is the one that residuals show.
 
     Raises
@@ -253,8 +287,7 @@ def fit_disc(sample: DiscSample, start: DiscState, free: FreeParameters) -> Disc
         If the equations cannot be solved.
     """
     state = start
-    share, levels, _ = _linearised(sample, state, free)
-    sd = _noise(sample, share, levels).sd
+    sd = noise_at(sample, state).sd
     for _ in range(_NOISE_ROUNDS):
         fit = _minimise(sample, state, free, sd)
         state = fit.state
@@ -264,36 +297,26 @@ def fit_disc(sample: DiscSample, start: DiscState, free: FreeParameters) -> Disc
     return fit
 
 
-def _linearised(
-    sample: DiscSample, state: DiscState, free: FreeParameters
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return white share, grey values (n,) and Jacobian (21, n).
+def fit_at(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:
+    """Linearise at a state, with noise (n,) that is known."""
+    share, levels, jacobian = _linearised(sample, state)
+    current = misfit(sample.levels, levels, sd, sample.censoring)
+    scaled = scaled_rows(jacobian, free.rows, sd)
+    normal = weighted_products(scaled, current.weight, np.zeros(len(free.rows)))
+    normal += free.precision[np.ix_(free.rows, free.rows)]
+    return DiscFit(sample, free, state, share, levels, jacobian, sd, current, scaled, normal)
 
-    A known curve is applied to light that falls off; so must be an unknown one. It is given the
-    gradient as what the light has more on ink and on plate, and not as a factor after the curve.
-    """
-    share, light = sample.pixels.white_share(state.geometry, state.blur), state.light
-    jacobian, offsets = np.zeros((COUNT, len(share.value))), sample.offsets
-    if not (free.tone.is_shaped or free.has_ink_slope):
-        levels, jacobian[:PLAIN_COUNT] = sample.photometry.linearised(share, light)
-        return share.value, levels, jacobian
-    added = np.zeros_like(offsets)
-    added[0] = state.vector[INK_SLOPE_X:] @ offsets
-    of_ink = of_plate = 0.0
-    if free.tone.is_shaped:
-        contrast = max(light.white - light.black, sample.levels_per_count)
-        of_ink, of_plate = light.black / contrast, light.white / contrast
-        falling = state.vector[Param.SLOPE_X : Param.TONE_1] @ offsets
-        added[0] += of_ink * falling
-        added[1] += of_plate * falling
-        light = replace(light, slope_x=0.0, slope_y=0.0)
-    levels, slopes = sample.photometry.linearised(share, light, added)
-    jacobian[:PLAIN_COUNT] = slopes[:PLAIN_COUNT]
-    by_ink, by_plate = slopes[PARAM_COUNT], slopes[PARAM_COUNT + 1]
-    jacobian[INK_SLOPE_X:] = by_ink * offsets
-    if free.tone.is_shaped:
-        by_both = of_ink * by_ink + of_plate * by_plate
-        jacobian[Param.SLOPE_X : Param.TONE_1] = by_both * offsets
+
+def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
+    """Return the noise that the residuals of a state show."""
+    share, levels, _ = _linearised(sample, state)
+    return _noise(sample, share, levels)
+
+
+def _linearised(sample: DiscSample, state: DiscState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return white share, grey values (n,) and Jacobian (18, n)."""
+    share = sample.pixels.white_share(state.geometry, state.blur)
+    levels, jacobian = sample.level_model.linearised(share, state.vector)
     return share.value, levels, jacobian
 
 
@@ -304,18 +327,16 @@ def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoi
     return estimate_noise(sample.levels - levels, share, usable, sample.levels_per_count)
 
 
-def _minimise(
-    sample: DiscSample, state: DiscState, free: FreeParameters, sd: FloatArray
-) -> DiscFit:
+def _minimise(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:
     """Take damped Gauss-Newton steps (Levenberg-Marquardt)."""
-    fit, damping = _fit_at(sample, state, free, sd), _DAMPING
-    total = fit.misfit.total + _penalty(fit.state, free)
+    fit, damping = fit_at(sample, state, free, sd), _DAMPING
+    total = fit.misfit.total + free.penalty(fit.state.vector)
     for _ in range(_STEPS):
         step, promised = _step(fit, damping)
         if promised < _ENOUGH:
             break
-        trial = _fit_at(sample, fit.state.moved(step), free, sd)
-        trial_total = trial.misfit.total + _penalty(trial.state, free)
+        trial = fit_at(sample, fit.state.moved(step, free.tone), free, sd)
+        trial_total = trial.misfit.total + free.penalty(trial.state.vector)
         if trial_total <= total:
             fit, total, damping = trial, trial_total, max(0.1 * damping, _DAMPING)
             continue
@@ -325,24 +346,10 @@ def _minimise(
     return fit
 
 
-def _fit_at(sample: DiscSample, state: DiscState, free: FreeParameters, sd: FloatArray) -> DiscFit:
-    share, levels, jacobian = _linearised(sample, state, free)
-    current = misfit(sample.levels, levels, sd, sample.censoring)
-    scaled = scaled_rows(jacobian, free.rows, sd)
-    normal = weighted_products(scaled, current.weight, free.prior[1][free.rows])
-    return DiscFit(sample, free, state, share, levels, jacobian, sd, current, scaled, normal)
-
-
-def _penalty(state: DiscState, free: FreeParameters) -> float:
-    mean, precision = free.prior
-    return 0.5 * float(precision @ (state.vector - mean) ** 2)
-
-
 def _step(fit: DiscFit, damping: float) -> tuple[FloatArray, float]:
-    """Return a step (21,) and the gain that it promises."""
-    rows, (mean, precision) = fit.free.rows, fit.free.prior
-    gradient = fit.scaled @ fit.misfit.score
-    gradient += (precision * (mean - fit.state.vector))[rows]
+    """Return a step (18,) and the gain that it promises."""
+    free = fit.free
+    gradient = fit.gradient
     damped = fit.normal.copy()
     damped[np.diag_indices_from(damped)] *= 1.0 + damping
     _, solution, failure = dposv(damped, gradient)
@@ -350,5 +357,5 @@ def _step(fit: DiscFit, damping: float) -> tuple[FloatArray, float]:
     if failure or not math.isfinite(promised):
         raise NoFit
     step = np.zeros(COUNT)
-    step[rows] = solution
+    step[free.rows] = solution
     return step, promised

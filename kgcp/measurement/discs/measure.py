@@ -20,7 +20,7 @@ from kgcp.measurement.discs.adjust_disc import (
     outline_geometry,
 )
 from kgcp.measurement.discs.affine_model import Geometry
-from kgcp.measurement.discs.camera_tone import CameraTone, learn_tone, parameters_of
+from kgcp.measurement.discs.camera_tone import CameraTone, first_blur_px, learn_tone, unknowns_of
 from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
 from kgcp.measurement.discs.covariance import DiscScatter, inflations, scatter_of
 from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
@@ -33,7 +33,6 @@ from kgcp.measurement.discs.records import (
     Polarity,
     moments_of_ellipse,
 )
-from kgcp.measurement.image_model.photometry import plateau_levels
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments over the radius
 _NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
@@ -105,7 +104,7 @@ def _measured(
 
 def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] | DiscMiss:
     try:
-        fit = adjust_disc(task, parameters_of(task, camera))
+        fit = adjust_disc(task, unknowns_of(task, camera), blur_px=first_blur_px(task, camera))
         check_fit(fit, task.outline)
         return fit, scatter_of(fit)
     except DiscRejection as rejection:
@@ -169,13 +168,13 @@ def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
 def _disc(fit: DiscFit, scatter: DiscScatter, outline: DiscOutline, inflation: float) -> Disc:
     x, y, xx, xy, yy = fit.state.geometry.tolist()
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
-    light, blur, clips = fit.state.light, fit.state.blur, fit.sample.censoring
-    gradient = np.array((light.slope_x, light.slope_y)) / fit.sample.radius_px
+    blur, clips = fit.state.blur, fit.sample.censoring
+    gradient = fit.state.slope / fit.sample.radius_px
     # The light falls on the scene before it is blurred: a gradient g displaces the whole image of
     # the disc by −B g, if B is the blur's covariance.
     spread = np.array(((blur.xx, blur.xy), (blur.xy, blur.yy)))
     centre = np.array((x, y)) + spread @ gradient
-    black, white = plateau_levels(light, fit.free.tone)
+    black, white = fit.state.plateaus(fit.free.tone)
     inside, outside = (black, white) if outline.polarity is Polarity.DARK else (white, black)
     return Disc(
         outline=outline,

@@ -58,7 +58,7 @@ class Mask:
         self,
         jacobian: FloatArray,
         rows: IndexArray,
-        others: tuple[float, float],
+        others: tuple[float | FloatArray, float | FloatArray],
         strength: float,
     ) -> None:
         """Sharpen some rows of a Jacobian (…, n).

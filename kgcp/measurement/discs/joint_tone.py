@@ -1,0 +1,192 @@
+"""Discs adjusted as one problem: all share the camera's tone curve and its sharpening.
+
+What is a disc's own, ellipse, blur and light, is eliminated disc by disc (Schur), so that a step
+costs no more than one of every disc.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.measurement.discs.disc_levels import COUNT
+from kgcp.measurement.discs.fit_disc import (
+    CAMERA_ROWS,
+    CameraPrior,
+    DiscFit,
+    DiscSample,
+    DiscState,
+    NoFit,
+    Unknowns,
+    fit_at,
+    noise_at,
+)
+from kgcp.measurement.image_model.photometry import Tone
+
+_STEPS, _NOISE_ROUNDS = 25, 2
+_ENOUGH = 0.1  # of log-likelihood, promised by a step
+_DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
+_SHARED = np.array(CAMERA_ROWS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointFit:
+    """Discs adjusted together."""
+
+    tone: Tone
+    fits: tuple[DiscFit, ...]
+    loss: float  # negative log-likelihood of all, with what is usual of cameras
+    precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
+    scores: FloatArray  # (k, 4): of each disc, by what is shared; they add up to the prior's
+    informations: FloatArray  # (k, 4, 4): their expected covariances
+
+    @property
+    def shared(self) -> FloatArray:
+        """What the discs share (4,)."""
+        return np.asarray(self.fits[0].state.vector[_SHARED])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reduced:
+    """Normal equations of what is shared, with all else eliminated."""
+
+    is_shared: BoolArray  # (p,)
+    normals: list[FloatArray]  # (c, c) of each disc
+    gradients: list[FloatArray]
+    inverse_others: list[FloatArray]
+    between: list[FloatArray]
+    own_gradients: list[FloatArray]
+
+
+def adjust_together(
+    samples: Sequence[DiscSample], states: Sequence[DiscState], tone: Tone
+) -> JointFit:
+    """Adjust discs with what they share, from states that share it.
+
+    Raises
+    ------
+    NoFit
+        If the equations cannot be solved.
+    """
+    usual = CameraPrior.usual()
+    free = Unknowns.of(
+        tone, replace(usual, precision=np.zeros_like(usual.precision)), sharpens=True
+    )
+    for _ in range(_NOISE_ROUNDS):
+        sds = [noise_at(sample, state).sd for sample, state in zip(samples, states, strict=True)]
+        fits = _minimised(samples, states, free, usual, sds)
+        states = [fit.state for fit in fits]
+    own = np.isin(_SHARED, free.rows)
+    reduced = _reduced(fits, 0.0)
+    count = len(CAMERA_ROWS)
+    scores, informations = np.zeros((len(fits), count)), np.zeros((len(fits), count, count))
+    scores[:, own] = reduced.gradients
+    informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
+    loss = _total(fits, usual) + sum(float(np.log(fit.sd).sum()) for fit in fits)
+    precision = usual.precision + informations.sum(axis=0)
+    return JointFit(tone, tuple(fits), loss, precision, scores, informations)
+
+
+def _minimised(
+    samples: Sequence[DiscSample],
+    states: Sequence[DiscState],
+    free: Unknowns,
+    usual: CameraPrior,
+    sds: Sequence[FloatArray],
+) -> list[DiscFit]:
+    """Take damped Gauss-Newton steps of all discs together.
+
+    After each, every disc takes a step of its own with what is shared held fast: tone curve, blur
+    and levels make a narrow, bent valley, and a step of all parameters at once ends on its slope.
+    """
+
+    def at(places: Sequence[DiscState]) -> list[DiscFit]:
+        return [
+            fit_at(sample, state, free, sd)
+            for sample, state, sd in zip(samples, places, sds, strict=True)
+        ]
+
+    fits, damping = at(states), _DAMPING
+    total = _total(fits, usual)
+    for _ in range(_STEPS):
+        steps, promised = _steps(fits, usual, damping)
+        if promised < _ENOUGH:
+            break
+        trial = at(
+            [fit.state.moved(step, free.tone) for fit, step in zip(fits, steps, strict=True)]
+        )
+        settled = at([fit.state.moved(_own_step(fit), free.tone) for fit in trial])
+        trial = [min(pair, key=_own_total) for pair in zip(trial, settled, strict=True)]
+        trial_total = _total(trial, usual)
+        if trial_total <= total:
+            fits, total, damping = trial, trial_total, max(0.1 * damping, _DAMPING)
+            continue
+        damping = max(10.0 * damping, _DAMPED)
+        if damping > _MOST_DAMPING:
+            break
+    return fits
+
+
+def _own_total(fit: DiscFit) -> float:
+    """Return the negative log-likelihood of a disc with the priors of what is its own."""
+    return fit.misfit.total + fit.free.penalty(fit.state.vector)
+
+
+def _total(fits: Sequence[DiscFit], usual: CameraPrior) -> float:
+    off = fits[0].state.vector[_SHARED] - usual.mean
+    return sum(_own_total(fit) for fit in fits) + 0.5 * float(off @ usual.precision @ off)
+
+
+def _own_step(fit: DiscFit) -> FloatArray:
+    """Return a step (18,) of what is a disc's own."""
+    own = np.flatnonzero(~np.isin(fit.free.rows, _SHARED))
+    step = np.zeros(COUNT)
+    step[fit.free.rows[own]] = np.linalg.solve(fit.normal[np.ix_(own, own)], fit.gradient[own])
+    return step
+
+
+def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
+    is_shared = np.isin(fits[0].free.rows, _SHARED)
+    made = _Reduced(is_shared, [], [], [], [], [])
+    for fit in fits:
+        normal, gradient = fit.normal.copy(), fit.gradient
+        normal[np.diag_indices_from(normal)] *= 1.0 + damping
+        between = normal[np.ix_(is_shared, ~is_shared)]
+        inverse = np.asarray(np.linalg.inv(normal[np.ix_(~is_shared, ~is_shared)]))
+        made.normals.append(normal[np.ix_(is_shared, is_shared)] - between @ inverse @ between.T)
+        made.gradients.append(gradient[is_shared] - between @ (inverse @ gradient[~is_shared]))
+        made.inverse_others.append(inverse)
+        made.between.append(between)
+        made.own_gradients.append(gradient[~is_shared])
+    return made
+
+
+def _steps(
+    fits: Sequence[DiscFit], usual: CameraPrior, damping: float
+) -> tuple[list[FloatArray], float]:
+    """Return a step (18,) of every disc, and the gain that they promise together."""
+    free = fits[0].free
+    own = np.isin(_SHARED, free.rows)
+    precision = usual.precision[np.ix_(own, own)]
+    off = (usual.mean - fits[0].state.vector[_SHARED])[own]
+    try:
+        reduced = _reduced(fits, damping)
+        gradient = precision @ off + sum(reduced.gradients)
+        shared = np.linalg.solve(precision + sum(reduced.normals), gradient)
+    except np.linalg.LinAlgError:
+        raise NoFit from None
+    promised, steps = 0.5 * float(gradient @ shared), []
+    for inverse, between, own_gradient in zip(
+        reduced.inverse_others, reduced.between, reduced.own_gradients, strict=True
+    ):
+        step = np.zeros(COUNT)
+        step[free.rows[reduced.is_shared]] = shared
+        step[free.rows[~reduced.is_shared]] = inverse @ (own_gradient - between.T @ shared)
+        promised += 0.5 * float(own_gradient @ inverse @ own_gradient)
+        steps.append(step)
+    if not np.isfinite(promised):
+        raise NoFit
+    return steps, promised

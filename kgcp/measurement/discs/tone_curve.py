@@ -1,0 +1,121 @@
+"""The tone curve of a camera, over the whole range of grey values.
+
+All discs of all photographs share it, whatever their levels. It is a known curve, sRGB's or a
+straight line, of which the grey value y is bent by three waves:
+
+    grey = y + Σ tₖ sin(kπy) / kπ,  k = 1, 2, 3
+
+so that black stays black and white stays white, and tₖ is what the slope changes by. The first wave
+is a gamma, the second the S that cameras add for contrast (trigonometric response models: Grossberg
+& Nayar, "What is the space of camera response functions?", CVPR 2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from kgcp.geometry._jit import compiled
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.image_model.photometry import Tone, srgb_decoded, srgb_encoded, srgb_slope
+
+WAVES = 3
+_LEAST_SLOPE = 0.15  # of the bent curve, relative to the known one
+_BRIGHTEST, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
+_NEWTON_STEPS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class DiscTone:
+    """The relation of light, 1 at full scale, to grey value before clipping.
+
+    Attributes
+    ----------
+    tone : Tone
+        Which known curve, and whether it is bent.
+    waves : (3,) tuple of float
+        Amplitudes of the waves; zeros: it is not.
+    """
+
+    tone: Tone
+    waves: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def bent(self, waves: FloatArray) -> DiscTone:
+        """Return the curve with other amplitudes (3,)."""
+        first, second, third = waves.tolist()
+        return replace(self, waves=(first, second, third))
+
+    def levels(self, light: FloatArray) -> FloatArray:
+        """Return grey values (n,) of light (n,)."""
+        known = srgb_encoded(light) if self.tone.is_srgb else light
+        return bend(known, np.array(self.waves))
+
+    def light(self, levels: FloatArray) -> FloatArray:
+        """Return the light (n,) of grey values (n,)."""
+        known = _straightened(levels, np.array(self.waves))
+        return srgb_decoded(known) if self.tone.is_srgb else known
+
+
+def steep_enough(waves: FloatArray) -> FloatArray:
+    """Return amplitudes (3,) that are small enough for the curve to rise everywhere.
+
+    Where it is flat, the ground shows no gradient of the light however large it is, and the
+    gradient explains whatever makes opposite edges differ: coma, or the order of the rows.
+    """
+    steepest_fall = -float((waves @ _slopes_of_waves()).min())
+    room = 1.0 - _LEAST_SLOPE
+    return waves * (room / steepest_fall) if steepest_fall > room else waves
+
+
+@cache
+def _slopes_of_waves() -> FloatArray:
+    places = np.linspace(0.0, 1.0, 33)
+    return np.cos(np.pi * np.arange(1, WAVES + 1)[:, None] * places)
+
+
+@cache
+def srgb_table() -> FloatArray:
+    """Return sRGB's curve and its slope (2, 65537) at even steps of light from 0 to 4."""
+    light = np.linspace(0.0, _BRIGHTEST, _STEPS + 1)
+    return np.stack((srgb_encoded(light), srgb_slope(light)))
+
+
+@compiled
+def bend(known: FloatArray, waves: FloatArray) -> FloatArray:
+    """Return the grey values of what a known curve gives; beyond 0…1 it goes on straight."""
+    level = np.empty(len(known))
+    for i in range(len(known)):
+        within = min(max(known[i], 0.0), 1.0)
+        bent, slope = within, 1.0
+        for k in range(len(waves)):
+            turn = np.pi * (k + 1.0)
+            bent += waves[k] * np.sin(turn * within) / turn
+            slope += waves[k] * np.cos(turn * within)
+        level[i] = bent + slope * (known[i] - within)
+    return level
+
+
+@compiled
+def _straightened(levels: FloatArray, waves: FloatArray) -> FloatArray:
+    """Return what `bend` makes these grey values of: Newton's method, kept from leaving 0…1."""
+    known = np.empty(len(levels))
+    for i in range(len(levels)):
+        low, high, at = 0.0, 1.0, min(max(levels[i], 0.0), 1.0)
+        for _ in range(_NEWTON_STEPS):
+            bent, slope = at, 1.0
+            for k in range(len(waves)):
+                turn = np.pi * (k + 1.0)
+                bent += waves[k] * np.sin(turn * at) / turn
+                slope += waves[k] * np.cos(turn * at)
+            low, high = (at, high) if bent < levels[i] else (low, at)
+            step = (levels[i] - bent) / slope
+            if levels[i] <= 0.0 or levels[i] >= 1.0:  # where the curve goes on straight
+                at += step
+                break
+            at = at + step if low <= at + step <= high else 0.5 * (low + high)
+            if abs(step) < 1e-13:
+                break
+        known[i] = at
+    return known
