@@ -11,10 +11,11 @@ DIR holds one folder per set, as they are published:
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +32,8 @@ from kgcp.network.calibration_records import (
     LensModel,
     PointModel,
 )
+from kgcp.network.camera_network import State, Unknowns, Work
+from kgcp.network.covariance import precision
 from kgcp.pipeline.calibration.photographs import Photo
 from kgcp.pipeline.calibration.run import (
     CalibrationOptions,
@@ -130,7 +133,7 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
         made, CalibrationSettings(PointModel.FIXED, LensModel.BROWN, is_same_aspect=False)
     )
     numbers = calibration_numbers(stiff)
-    z = _halves_z(made, halves) if halves else float("nan")
+    z = halves_z(stiff, halves) if halves else {}
     camera = stiff.camera
     eccentricity = np.linalg.norm(stiff.eccentricity.total_px, axis=1)
     verdict = judge(stiff, numbers).grade.value
@@ -139,14 +142,22 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
         f"  {numbers.discs_used:4}/{numbers.discs:4}  "
         f"  {fixed.rms_px:.4f} {stiff.rms_px:.4f} {free.rms_px:.4f}  "
         f"{numbers.operator_sd_px:.4f} {camera.fx:8.2f} {numbers.sd[0]:5.2f}"
-        f"  c {camera.cx:.2f} {camera.cy:.2f}  {z:5.2f}  {np.nanmax(eccentricity):.3f}"
+        f"  c {camera.cx:.2f} {camera.cy:.2f}"
+        f"  {_rms(z.values()):5.2f}  {np.nanmax(eccentricity):.3f}"
         f"  {seconds:5.1f}  {verdict}, {chosen.peer}",
         flush=True,
     )
+    if z:
+        print("    halves z:", ", ".join(f"{name} {value:.2f}" for name, value in z.items()))
     failures = _failures(chosen, fixed, stiff, free, photos)
     for failure in failures:
         print(f"    {failure}")
     return len(failures)
+
+
+def _rms(values: Iterable[float]) -> float:
+    squares = [value**2 for value in values]
+    return math.sqrt(sum(squares) / len(squares)) if squares else math.nan
 
 
 def _again(made: PhotoCalibration, settings: CalibrationSettings) -> CameraCalibration:
@@ -183,51 +194,43 @@ def _failures(
     return [text for is_met, text in checks if not is_met]
 
 
-def _halves_z(made: PhotoCalibration, count: int) -> float:
-    """Return differences of the cameras of random halves over their deviations, RMS.
+def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
+    """Return, by parameter, differences of random halves over their deviations, RMS.
 
-    The lens model is that of the whole set, so that both halves estimate the same parameters.
+    The parameters are those of the whole set, so that both halves estimate the same ones.
     """
-    whole = made.calibration
-    size = (whole.camera.width, whole.camera.height)
+    names = whole.network.model.names
+    terms = tuple(name for name in names if name[0] in "kp")
+    unknowns = Unknowns(whole.points_used, terms, is_same_aspect="fy" not in names)
     rng = np.random.default_rng(18)
     ratios: list[FloatArray] = []
     for _ in range(count):
         order = rng.permutation(len(whole.views))
         middle = len(order) // 2
-        cameras = []
-        for part in (np.sort(order[:middle]), np.sort(order[middle:])):
-            views = [whole.views[index] for index in part.tolist()]
-            terms = whole.network.model.names
-            lens = LensModel.BROWN if "k3" in terms else LensModel.RADIAL
-            cameras.append(
-                calibrate_camera(
-                    views,
-                    whole.field,
-                    size,
-                    CalibrationSettings(whole.points_used, lens),
-                    part_of(whole, part),
-                )
-            )
-        values = [
-            np.array([getattr(each.camera, name) for name in ("fx", "cx", "cy", "k1")])
-            for each in cameras
+        halves = [
+            _adjusted_part(whole, np.sort(part), unknowns)
+            for part in (order[:middle], order[middle:])
         ]
-        variance = sum(each.covariance.cov.diagonal()[[0, 2, 3, 4]] for each in cameras)
+        values = [state.estimate.cameras[0] for state in halves]
+        variance = sum(
+            precision(state.network, state.solution).camera_cov.diagonal() for state in halves
+        )
         ratios.append((values[0] - values[1]) / np.sqrt(variance))
-    return float(np.sqrt(np.mean(np.square(ratios))))
+    return dict(zip(names, np.sqrt(np.mean(np.square(ratios), axis=0)).tolist(), strict=True))
 
 
-def part_of(whole: CameraCalibration, part: IndexArray) -> CameraCalibration:
-    """Return a calibration as the start for some of its photographs."""
+def _adjusted_part(whole: CameraCalibration, part: IndexArray, unknowns: Unknowns) -> State:
+    """Return the adjustment of some of the photographs."""
+    views = tuple(whole.views[index] for index in part.tolist())
+    size = (whole.camera.width, whole.camera.height)
     estimate = whole.solution.estimate
-    own = replace(
+    start = replace(
         estimate,
         rotations=estimate.rotations[part],
         translations=estimate.translations[part],
-        points=whole.field.points_m(),
     )
-    return replace(whole, solution=replace(whole.solution, estimate=own))
+    work = Work(views, whole.field, size, whole.settings)
+    return work.adjusted(whole.camera, start, unknowns)
 
 
 if __name__ == "__main__":

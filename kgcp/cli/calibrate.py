@@ -66,9 +66,9 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf")
 @click.option(
     "--same-aspect/--free-aspect",
     "is_same_aspect",
-    default=True,
-    show_default=True,
-    help="Estimate one focal length, or fx and fy.",
+    default=None,
+    help="Estimate one focal length, or fx and fy.  [default: one; with --model auto, two where the"
+    " difference is significant and the format can hold it]",
 )
 @click.option(
     "--response",
@@ -117,7 +117,7 @@ def command(
     formats: tuple[str, ...],
     jobs: int | None,
     *,
-    is_same_aspect: bool,
+    is_same_aspect: bool | None,
     is_restart: bool,
     is_quiet: bool,
     as_json: bool,
@@ -142,17 +142,17 @@ def command(
     from kgcp.report.plotting import load_matplotlib
 
     load_matplotlib()  # before the report does
-    from kgcp.pipeline.calibration.results import check_formats, write_results
+    from kgcp.pipeline.calibration.results import settings_for, write_results
 
     field = read_field(field_text, unit)
+    settings = CalibrationSettings(PointModel(points), LensModel(lens), is_same_aspect)
     options = CalibrationOptions(
-        CalibrationSettings(PointModel(points), LensModel(lens), is_same_aspect),
+        settings_for(formats, settings),
         Response(response),
         Operator(operator),
         jobs,
         is_restart=is_restart,
     )
-    check_formats(options.settings, formats)
     found = find_photos(photos)
     with log_to_stderr(is_quiet=is_quiet, as_json=False, unit="photo") as log, stopping(log):
         made = calibrate_photos(found, field, out, options, log)

@@ -38,7 +38,8 @@ class CalibrationSettings:
 
     points: PointModel = PointModel.STIFF
     lens: LensModel = LensModel.AUTO
-    is_same_aspect: bool = True
+    # whether fx and fy are one; None: two where that is significant, with `LensModel.AUTO`
+    is_same_aspect: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

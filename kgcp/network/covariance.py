@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, optimize
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.network.equations import (
@@ -60,9 +60,41 @@ def precision(network: Network, solution: Solution) -> Precision:
 def observation_factor(network: Network, solution: Solution) -> float:
     """Return the variance factor of the observations alone, whatever priors there are."""
     squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
+    return squares / _observation_freedom(network, solution)
+
+
+def fitting_covariances(network: Network, solution: Solution, stated: FloatArray) -> FloatArray:
+    """Return covariances (n, 2, 2) of the discs to which their residuals fit.
+
+    Where residuals are smaller than `stated`, all are scaled. Where they are larger, the same
+    variance is added to all: what bends a photograph or a field, and is not in the model, knows
+    nothing of how well a disc was measured.
+
+    Parameters
+    ----------
+    stated : (n, 2, 2) array
+        Covariances as the discs were measured.
+    """
+    freedom = _observation_freedom(network, solution)
+    values, vectors = np.linalg.eigh(stated)
+    along = np.einsum("nij,ni->nj", vectors, solution.residuals)
+    squares = along**2 * solution.weights[:, None]
+    factor = float(np.sum(squares / values)) / freedom
+    if factor <= 1.0:
+        return np.asarray(factor * stated)
+
+    def excess(added: float) -> float:
+        return float(np.sum(squares / (values + added))) - freedom
+
+    added = optimize.brentq(excess, 0.0, factor * float(values.max()), rtol=1e-9)
+    return np.asarray(stated + added * np.eye(2))
+
+
+def _observation_freedom(network: Network, solution: Solution) -> float:
+    """Return how many observations there are beyond those that determine the unknowns."""
     used = 2 * int(np.count_nonzero(solution.weights))
     taken = _unknowns(network) - _determined_by_priors(network, solution)
-    return squares / max(used - taken - 6 * len(network.view_camera), 1.0)
+    return max(used - taken - 6 * len(network.view_camera), 1.0)
 
 
 def _unknowns(network: Network) -> int:

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.calibrate.jaicov import compare, read_network
 from kgcp.network.adjust import PLAIN, adjust
 from kgcp.network.covariance import (
+    fitting_covariances,
     observation_factor,
     precision,
     tangled,
@@ -156,6 +157,18 @@ def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
     by_formal, by_cluster = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
     assert by_cluster < 1.3
     assert by_formal > 1.15 * by_cluster
+
+
+def test_covariances_are_made_to_fit_the_residuals(rng: np.random.Generator) -> None:
+    """Residuals that are too small scale them; what is too much is the same for all discs."""
+    noisy = simulated().observed(rng)
+    solution = adjust(noisy.network, noisy.truth)
+    own = noisy.network.observations.cov
+    assert fitting_covariances(noisy.network, solution, 9.0 * own) == pytest.approx(own, rel=0.1)
+    stated = own * rng.uniform(0.01, 0.1, len(own))[:, None, None]
+    added = (fitting_covariances(noisy.network, solution, stated) - stated)[:, 0, 0]
+    assert np.ptp(added) < 1e-12
+    assert added[0] == pytest.approx(SD_PX**2, rel=0.15)
 
 
 def test_groups_have_their_own_variance(rng: np.random.Generator) -> None:

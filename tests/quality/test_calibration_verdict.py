@@ -35,7 +35,10 @@ TURNS = (0.0, 1.6, 0.2, 3.0, 1.5, 0.1)
 
 
 def views(
-    tilt: float = 0.5, bend_m: FloatArray | None = None, noise_px: float = SD_PX
+    tilt: float = 0.5,
+    bend_m: FloatArray | None = None,
+    noise_px: float = SD_PX,
+    camera: Camera = CAMERA,
 ) -> list[NamedView]:
     """Photographs of the field from six sides, with exact moments and noise."""
     rng = np.random.default_rng(18)
@@ -49,7 +52,7 @@ def views(
         centres = (points - points.mean(axis=0)) @ rotation.T + middle
         axes = np.broadcast_to(rotation[:, :2], (len(centres), 3, 2))
         circles = Circles3D(centres, axes, FIELD.radii_m())
-        vectors = circle_images(CAMERA, circles).moments
+        vectors = circle_images(camera, circles).moments
         vectors[:, :2] += noise_px * rng.standard_normal((len(vectors), 2))
         cov = np.diag([SD_PX**2, SD_PX**2, 1.0, 1.0, 1.0])
         covs = np.broadcast_to(cov, (len(vectors), 5, 5))
@@ -77,6 +80,15 @@ def test_a_good_calibration_is_called_good() -> None:
     assert result.camera.k1 == pytest.approx(-0.11, abs=0.002)
     assert result.radius_scale == pytest.approx(1.0, abs=0.001)
     assert 0.0 < np.nanmin(numbers.ray_sd_px) < np.nanmax(numbers.ray_sd_px) < 1.0
+
+
+def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
+    fixed, auto = PointModel.FIXED, LensModel.AUTO
+    alike = calibrated(views(), fixed, auto)
+    assert alike.camera.fy == alike.camera.fx
+    wider = calibrated(views(camera=replace(CAMERA, fy=1503.0)), fixed, auto)
+    assert wider.camera.fy - wider.camera.fx == pytest.approx(3.0, abs=0.2)
+    assert "fy" not in wider.tangled
 
 
 def test_what_neglected_eccentricity_costs_is_what_an_adjustment_loses() -> None:

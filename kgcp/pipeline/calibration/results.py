@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from kgcp import __version__
+from kgcp.errors import KgcpError
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.atomic import write_all
@@ -55,17 +56,29 @@ class CalibrationResults:
     summary: dict[str, object]  # calibration.json
 
 
-def check_formats(settings: CalibrationSettings, formats: Sequence[str]) -> None:
-    """Refuse formats that cannot hold what is to be estimated, before anything is measured.
+def settings_for(formats: Sequence[str], settings: CalibrationSettings) -> CalibrationSettings:
+    """Return settings whose camera all formats can hold, before anything is measured.
+
+    Whether fx and fy are two, if that was left open, depends on it.
 
     Raises
     ------
     KgcpError
-        Naming the terms.
+        Naming the terms that a format cannot hold.
     """
-    aspect = 1.0 if settings.is_same_aspect else 1.01
     k4 = 0.01 if settings.lens is LensModel.RATIONAL else 0.0
-    camera = Camera(100, 100, 100.0, 100.0 * aspect, 50.0, 50.0, k4=k4)
+    _require_formats(formats, is_same_aspect=settings.is_same_aspect is not False, k4=k4)
+    if settings.is_same_aspect is None:
+        try:
+            _require_formats(formats, is_same_aspect=False, k4=k4)
+        except KgcpError:
+            return replace(settings, is_same_aspect=True)
+    return settings
+
+
+def _require_formats(formats: Sequence[str], *, is_same_aspect: bool, k4: float) -> None:
+    fy = 100.0 if is_same_aspect else 101.0
+    camera = Camera(100, 100, 100.0, fy, 50.0, 50.0, k4=k4)
     size = len(CALIBRATION_PARAMETERS)
     for form in formats:
         camera_file(CalibratedCamera(camera, np.eye(size), 0.0), form)

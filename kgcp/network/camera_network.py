@@ -1,0 +1,205 @@
+"""One camera's network: what is observed, what is known beforehand, and its adjustment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D, Eccentricity, circle_images, eccentricity
+from kgcp.geometry.pose import Pose
+from kgcp.network.adjust import ROBUST, adjust
+from kgcp.network.calibration_records import CalibrationSettings, NamedView, PointModel
+from kgcp.network.covariance import fitting_covariances
+from kgcp.network.frame_camera import FrameCameraModel
+from kgcp.network.records import (
+    CameraPrior,
+    Estimate,
+    Network,
+    Observations,
+    PointPrior,
+    ScaleBar,
+    Solution,
+)
+from kgcp.targets.fields.layout import Field
+
+_CENTRE_SD = 0.1  # of the frame's longer side: how far a principal point may be from the middle
+_FOCAL_SD = 3.0  # of the focal length to start with
+_RADIAL_SD = 0.3  # of the distance from the middle, at the corner: what a term may displace
+_TANGENTIAL_SD = 0.05
+_SCALINGS = 10  # of the covariances, and new eccentricities, at most
+_SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
+_SETTLED_VARIANCE = 1.25  # ratio of the discs' variances between two adjustments
+_POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
+
+
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """What is estimated in an adjustment."""
+
+    points: PointModel
+    terms: tuple[str, ...]  # of the distortion
+    is_same_aspect: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """An adjusted network, and what was estimated in it."""
+
+    camera: Camera
+    estimate: Estimate
+    unknowns: Unknowns
+    network: Network
+    solution: Solution
+
+    @property
+    def model(self) -> FrameCameraModel:
+        """The camera with these unknowns."""
+        terms, is_same_aspect = self.unknowns.terms, self.unknowns.is_same_aspect
+        return FrameCameraModel(_without(self.camera, terms), terms, is_same_aspect)
+
+    @property
+    def poses(self) -> list[Pose]:
+        """The poses of all photographs."""
+        estimate = self.estimate
+        return [
+            Pose(rotation, translation)
+            for rotation, translation in zip(estimate.rotations, estimate.translations, strict=True)
+        ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Work:
+    """What all adjustments of one calibration share."""
+
+    views: tuple[NamedView, ...]
+    field: Field
+    size: tuple[int, int]
+    settings: CalibrationSettings
+
+    def observations(self) -> Observations:
+        """Return the centroids of all discs."""
+        counts = [len(view.point) for view in self.views]
+        return Observations(
+            np.repeat(np.arange(len(self.views)), counts),
+            np.concatenate([view.point for view in self.views]),
+            np.concatenate([view.vectors[:, :2] for view in self.views]),
+            np.concatenate([view.covs[:, :2, :2] for view in self.views]),
+        )
+
+    def with_unknowns(self, state: State, unknowns: Unknowns) -> State:
+        """Return the adjustment of other unknowns."""
+        return self.adjusted(state.camera, state.estimate, unknowns)
+
+    def with_estimate(self, state: State, estimate: Estimate) -> State:
+        """Return the adjustment from another start."""
+        return self.adjusted(state.camera, estimate, state.unknowns)
+
+    def adjusted(self, camera: Camera, estimate: Estimate, unknowns: Unknowns) -> State:
+        """Return the adjustment once the eccentricities have settled.
+
+        The covariances of the discs are made to fit their residuals, so that priors, which are
+        absolute, get the weight that they deserve.
+        """
+        observed = self.observations()
+        if unknowns.is_same_aspect:
+            camera = replace(camera, fy=camera.fx)
+        terms = unknowns.terms
+        model = FrameCameraModel(_without(camera, terms), terms, unknowns.is_same_aspect)
+        cov, before = observed.cov, np.full_like(observed.places, np.inf)
+        for _ in range(_SCALINGS):
+            offsets = self.eccentricity(camera, estimate, observed).total_px
+            offsets = np.where(np.isfinite(offsets), offsets, 0.0)
+            network = Network(
+                model,
+                np.zeros(len(self.views), dtype=np.intp),
+                replace(observed, places=observed.places - offsets, cov=cov),
+                self.point_prior(unknowns.points),
+                self.camera_prior(model, camera),
+            )
+            start = replace(estimate, cameras=model.values_of(camera)[None])
+            solution = adjust(network, start, ROBUST)
+            estimate = solution.estimate
+            camera = model.camera(estimate.cameras[0])
+            next_cov = fitting_covariances(network, solution, observed.cov)
+            change = float(np.trace(next_cov.sum(axis=0)) / np.trace(cov.sum(axis=0)))
+            is_scaled = 1.0 / _SETTLED_VARIANCE < change < _SETTLED_VARIANCE
+            is_settled = is_scaled and np.abs(offsets - before).max() < _SETTLED_PX
+            cov, before = next_cov, offsets
+            if is_settled:
+                break
+        return State(camera, estimate, unknowns, network, solution)
+
+    def eccentricity(
+        self, camera: Camera, estimate: Estimate, observed: Observations
+    ) -> Eccentricity:
+        """Return how far the centroids of all discs are from the images of their centres."""
+        return eccentricity(camera, self._circles(estimate, observed))
+
+    def _circles(self, estimate: Estimate, observed: Observations) -> Circles3D:
+        rotations = estimate.rotations[observed.view]
+        centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
+        centres += estimate.translations[observed.view]
+        radii = self.field.radii_m()[observed.point]
+        return Circles3D(centres, rotations[:, :, :2], radii)
+
+    def point_prior(self, points: PointModel) -> PointPrior:
+        """Return what the adjustment knows of the field; unseen points stay where they are."""
+        nominal = self.field.points_m()
+        if points is PointModel.FIXED:
+            return PointPrior(nominal, None)
+        names = self.field.names()
+        bars = tuple(
+            ScaleBar(names.index(bar.first), names.index(bar.second), bar.length_m, bar.sd_m)
+            for bar in self.field.bars
+        )
+        information = np.diag(np.array(self.field.flat_sd_m) ** -2.0)
+        if points is PointModel.FREE:
+            # a deviation of a tenth of the pitch holds what the photographs hardly see
+            information = np.eye(3) * (0.1 * self.field.pitch_m) ** -2.0
+        return PointPrior(nominal, np.tile(information, (len(nominal), 1, 1)), bars)
+
+    def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CameraPrior:
+        """Return what is known of any camera: a principal point in the middle, small distortion."""
+        width, height = self.size
+        corner = 0.5 * math.hypot(width, height) / camera.mean_focal_px
+        usual = {"cx": 0.5 * (width - 1), "cy": 0.5 * (height - 1)}
+        values, sd = [], []
+        for name in model.names:
+            values.append(usual.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
+            sd.append(self._sd(name, camera, corner))
+        return CameraPrior(np.array([values]), np.array([sd]))
+
+    def _sd(self, name: str, camera: Camera, corner: float) -> float:
+        if name in ("fx", "fy"):
+            return _FOCAL_SD * camera.mean_focal_px
+        if name in ("cx", "cy"):
+            return _CENTRE_SD * max(self.size)
+        if name in ("p1", "p2"):
+            return _TANGENTIAL_SD / corner
+        return _RADIAL_SD / corner ** _POWER[name]
+
+    def radius_scale(self, state: State) -> float:
+        """Return the median of measured over expected radii, the latter through the lens."""
+        observed = self.observations()
+        expected = circle_images(state.camera, self._circles(state.estimate, observed)).moments
+        measured = np.concatenate([view.vectors for view in self.views])
+        usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
+        ratio = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
+        return float(np.median(ratio))
+
+
+def _determinant(moments: FloatArray) -> FloatArray:
+    return moments[:, 2] * moments[:, 4] - moments[:, 3] ** 2
+
+
+def _without(camera: Camera, terms: Sequence[str]) -> Camera:
+    """Return a camera whose other terms of distortion are zero."""
+    absent = [name for name in (*_POWER, "p1", "p2") if name not in terms]
+    zeros: dict[str, Any] = dict.fromkeys(absent, 0.0)
+    return replace(camera, **zeros)

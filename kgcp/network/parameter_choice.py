@@ -1,0 +1,142 @@
+"""Which parameters of the camera are worth estimating."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.network.adjust import ROBUST, adjust
+from kgcp.network.calibration_records import LensModel
+from kgcp.network.camera_network import State, Unknowns, Work
+from kgcp.network.covariance import precision
+from kgcp.network.records import Estimate, Network, Observations, PointPrior
+from kgcp.network.start import refined_poses
+
+DETERMINED = 0.3  # of its prior deviation: what is known no better is not determined
+_SIGNIFICANT = 0.001
+_FOLDS = 5
+_LEAST_GAIN = 0.005  # of the misfit of photographs that took no part
+# Mean of the field's directions in the photographs, doubled so that half a turn is none. Above,
+# the camera was hardly turned, and a stretched print looks like pixels that are not square.
+_MOST_ALIKE = 0.95
+
+_TERMS: dict[LensModel, tuple[str, ...]] = {
+    LensModel.RADIAL: ("k1", "k2"),
+    LensModel.BROWN: ("k1", "k2", "p1", "p2", "k3"),
+    LensModel.RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_ASPECT = ("fy",)
+_ADDITIONS: tuple[tuple[str, ...], ...] = (_ASPECT, ("k2",), ("p1", "p2"), ("k3",))
+
+
+def with_chosen_parameters(work: Work, state: State) -> State:
+    """Return the adjustment with the terms asked for, or with as many as are worth it.
+
+    Every lens has k1. Another term, or a second focal length, is worth it if it is significant over
+    the photographs, known better than beforehand, and photographs that took no part in its
+    estimation fit better with it.
+    """
+    settings = work.settings
+    terms = _TERMS.get(settings.lens, ("k1",))
+    kept = work.with_unknowns(state, replace(state.unknowns, terms=terms, is_same_aspect=True))
+    if settings.is_same_aspect is False:
+        kept = work.with_unknowns(kept, _with(kept.unknowns, _ASPECT))
+    if settings.lens is not LensModel.AUTO:
+        return kept
+    jury = _Jury(kept.network.observations, kept.solution.is_used)
+    misfit = jury.misfit(kept)
+    is_aspect_open = settings.is_same_aspect is None and _is_camera_turned(kept)
+    for addition in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
+        trial = work.with_unknowns(kept, _with(kept.unknowns, addition))
+        trial_misfit = jury.misfit(trial)
+        is_better = trial_misfit < (1.0 - _LEAST_GAIN) * misfit
+        if is_better and _is_worth_it(trial, addition, len(work.views)):
+            kept, misfit = trial, trial_misfit
+    return kept
+
+
+def _with(unknowns: Unknowns, addition: tuple[str, ...]) -> Unknowns:
+    if addition == _ASPECT:
+        return replace(unknowns, is_same_aspect=False)
+    return replace(unknowns, terms=(*unknowns.terms, *addition))
+
+
+def _is_camera_turned(state: State) -> bool:
+    across = state.estimate.rotations[:, :2, 0]
+    directions = np.arctan2(across[:, 1], across[:, 0])
+    return bool(np.abs(np.mean(np.exp(2j * directions))) < _MOST_ALIKE)
+
+
+def _is_worth_it(state: State, addition: Sequence[str], views: int) -> bool:
+    limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), views - 1)
+    cov = precision(state.network, state.solution).camera_cov
+    names = state.network.model.names
+    values = state.estimate.cameras[0]
+    columns = [names.index(name) for name in addition]
+    if tuple(addition) == _ASPECT:  # which is there if fy is another length than fx
+        slope = np.zeros(len(names))
+        slope[[names.index("fx"), *columns]] = -1.0, 1.0
+        return bool(abs(slope @ values) > limit * np.sqrt(slope @ cov @ slope))
+    sd = np.sqrt(cov.diagonal()[columns])
+    is_known = sd < DETERMINED * state.network.cameras.sd[0, columns]
+    is_large = np.abs(values[columns]) > limit * sd
+    return bool(is_known.all() and is_large.any())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Jury:
+    """Photographs that take no part in the estimation, in turns (cross-validation).
+
+    All models are judged by the same discs with the same covariances.
+    """
+
+    observations: Observations
+    is_used: BoolArray
+
+    def misfit(self, state: State) -> float:
+        """Return the mean square of the residuals of photographs that took no part."""
+        network, estimate = state.network, state.estimate
+        # the field as it is estimated by all: only the camera is on trial
+        points = PointPrior(estimate.points, None)
+        views = np.arange(len(network.view_camera))
+        own = replace(
+            network,
+            points=points,
+            observations=network.observations.chosen(state.solution.is_used),
+        )
+        measured = replace(network.observations, cov=self.observations.cov)
+        jury = replace(own, observations=measured.chosen(self.is_used))
+        misfits: list[FloatArray] = []
+        for fold in range(min(_FOLDS, len(views))):
+            is_left_out = views % _FOLDS == fold
+            start = _part_of_estimate(estimate, ~is_left_out)
+            values = adjust(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
+            left = _part(jury, is_left_out).observations
+            poses = [state.poses[view] for view in np.flatnonzero(is_left_out).tolist()]
+            camera = state.model.camera(values)
+            _, costs = refined_poses(camera, left, estimate.points, poses)
+            misfits.append(costs / np.bincount(left.view))
+        return float(np.mean(np.concatenate(misfits)))
+
+
+def _part(network: Network, which: BoolArray) -> Network:
+    """Return the network of some of its photographs."""
+    index = np.cumsum(which) - 1
+    observed = network.observations.chosen(which[network.observations.view])
+    return replace(
+        network,
+        view_camera=network.view_camera[which],
+        observations=replace(observed, view=index[observed.view]),
+    )
+
+
+def _part_of_estimate(estimate: Estimate, which: BoolArray) -> Estimate:
+    return replace(
+        estimate,
+        rotations=estimate.rotations[which],
+        translations=estimate.translations[which],
+    )
