@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,10 +27,13 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.georef.crs import parse_crs
 from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.field_file import read_field
 from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.calibrations import read_calibration
 from kgcp.io.formats.exclusions import read_exclusions
+from kgcp.io.formats.fields import FORMATS as FIELD_FORMATS
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
@@ -159,6 +163,19 @@ def calibrations(data: bytes, folder: Path) -> None:
     read_calibration(path, (1600, 1200), _chosen(data, tuple(CALIBRATION_FORMATS.names)))
 
 
+def fields(data: bytes, folder: Path) -> None:
+    """Read a field of targets: a field.toml, or another program's board."""
+    path = _written(folder, data)
+    _allow(lambda: read_field(str(path), _chosen(data, (None, "mm", "in"))))
+    for form in FIELD_FORMATS.names:
+        file = ForeignFile(path, "the field")
+        _allow(partial(FIELD_FORMATS.reader(file, form), file, 0.001))
+    toml = folder / "field.toml"
+    toml.write_bytes(data)
+    field = read_field(str(toml))
+    field.symmetries()
+
+
 def frames(data: bytes, folder: Path) -> None:
     """Read a frame's EXIF and its pixels."""
     path = _written(folder, data)
@@ -187,7 +204,7 @@ TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
         *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
-        *(frames, discs, journal),
+        *(fields, frames, discs, journal),
     )
 }
 

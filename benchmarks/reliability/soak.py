@@ -15,7 +15,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.reliability.torture import Life, make_flight
+from benchmarks.reliability.torture import Life, detecting, make_flight
 
 _ABSENT = 0.8  # share of frames without a target, which are quick
 _TURN_S = 1.0
@@ -112,7 +112,7 @@ def main(frames: int, jobs: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         flight = Path(folder) / "flight"
         make_flight(flight, frames, jobs, absent_share=_ABSENT)
-        life = Life(flight, Path(folder) / "out", jobs)
+        life = Life(detecting(flight, Path(folder) / "out", jobs))
         taken = list(samples(life))
         if life.end() != 0:
             raise RuntimeError("".join(life.lines[-20:]))

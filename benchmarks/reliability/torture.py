@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,12 +78,16 @@ def make_flight(folder: Path, frames: int, jobs: int, *, absent_share: float = 0
     (folder / "frames.csv").write_text("\n".join(lines), encoding="utf-8")
 
 
-class Life:
-    """One process of `kgcp detect`, from its start to its end, whatever that is."""
+def detecting(flight: Path, out: Path, jobs: int) -> list[str]:
+    """Return the arguments of kgcp that make a flight's table."""
+    return ["detect", str(flight), "--out", str(out), "--jobs", str(jobs)]
 
-    def __init__(self, flight: Path, out: Path, jobs: int) -> None:
-        options = ["--out", str(out), "--jobs", str(jobs), "--log-json"]
-        command = [sys.executable, "-m", "kgcp", "detect", str(flight), *options]
+
+class Life:
+    """One process of kgcp, from its start to its end, whatever that is."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        command = [sys.executable, "-m", "kgcp", *command, "--log-json"]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         self.done = self.total = 0  # of all stages so far
         self._totals: dict[str, int] = {}
@@ -165,7 +170,7 @@ def kill(pid: int) -> None:
         return
 
 
-def torture(flight: Path, out: Path, jobs: int, kills: int, rng: random.Random) -> Toll:
+def torture(command: Sequence[str], out: Path, kills: int, rng: random.Random) -> Toll:
     """Run, kill and resume until all kills are done and the last run has come to its end.
 
     Raises
@@ -175,7 +180,7 @@ def torture(flight: Path, out: Path, jobs: int, kills: int, rng: random.Random) 
     """
     toll = Toll()
     while True:
-        life = Life(flight, out, jobs)
+        life = Life(command)
         if toll.kills < kills:
             live_and_die(life, kills - toll.kills, rng, toll)
         code = life.end()
@@ -200,13 +205,14 @@ def main(frames: int, kills: int, jobs: int | None, seed: int) -> None:
         flight, out, tortured = (Path(folder) / name for name in ("flight", "out", "tortured"))
         make_flight(flight, frames, jobs)
         start_s = time.perf_counter()
-        life = Life(flight, out, jobs)
+        life = Life(detecting(flight, out, jobs))
         if life.end() != 0:
             raise RuntimeError("".join(life.lines[-20:]))
         undisturbed_s = time.perf_counter() - start_s
         record = json.loads((out / "run.json").read_text(encoding="utf-8"))
         start_s = time.perf_counter()
-        toll = torture(flight, tortured, jobs, kills, random.Random(seed))  # noqa: S311 - no secret
+        rng = random.Random(seed)  # noqa: S311 - no secret
+        toll = torture(detecting(flight, tortured, jobs), tortured, kills, rng)
         tortured_s = time.perf_counter() - start_s
         tables = [(each / "detections.parquet").read_bytes() for each in (out, tortured)]
     journal_s = record["stages_s"]["journal, within these"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from benchmarks.reliability.soak import samples, speed_between
-from benchmarks.reliability.torture import Life
+from benchmarks.reliability.torture import Life, detecting
 from kgcp.io.images.frames import list_frames
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.simulate import write_simulated_flight
@@ -53,7 +53,7 @@ def main() -> None:
             flight = Path(folder) / "flight"
             size = make_flight(flight, scale, frames)
             for jobs in _JOBS:
-                life = Life(flight, Path(folder) / str(jobs), jobs)
+                life = Life(detecting(flight, Path(folder) / str(jobs), jobs))
                 taken = list(samples(life))
                 if life.end() != 0:
                     raise RuntimeError("".join(life.lines[-20:]))

@@ -18,7 +18,7 @@ POINTS = ("fixed", "stiff", "free")
 LENSES = ("auto", "radial", "brown", "rational")
 OPERATORS = ("model", "gaussian", "centroid")
 RESPONSES = ("linear", "srgb", "unknown")
-FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf")
+FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "mmvii")
 
 
 @click.command()
@@ -104,6 +104,11 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf")
     help="Discard the results of an interrupted run and start over.",
 )
 @click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
+@click.option(
+    "--log-json",
+    is_flag=True,
+    help="Print progress and summary to stderr as one JSON object per line.",
+)
 @json_option
 def command(
     photos: tuple[Path, ...],
@@ -120,6 +125,7 @@ def command(
     is_same_aspect: bool | None,
     is_restart: bool,
     is_quiet: bool,
+    log_json: bool,
     as_json: bool,
 ) -> None:
     """Calibrate a camera by photographs of a field of discs.
@@ -154,7 +160,7 @@ def command(
         is_restart=is_restart,
     )
     found = find_photos(photos)
-    with log_to_stderr(is_quiet=is_quiet, as_json=False, unit="photo") as log, stopping(log):
+    with log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo") as log, stopping(log):
         made = calibrate_photos(found, field, out, options, log)
     results = write_results(made, out, formats)
     if as_json:
@@ -162,7 +168,9 @@ def command(
 
         files = [str(path) for path in results.files]
         click.echo(json.dumps({**results.summary, "files": files}))
-    if not is_quiet:
+    if log_json:
+        log.event("summary", **results.summary)
+    elif not is_quiet:
         _tell(results)
 
 

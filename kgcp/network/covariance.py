@@ -182,6 +182,7 @@ def _camera_covariance(
     formal = factor * inverse[:cameras, :cameras]
     influences = [reach[:, view.columns] @ _score(view, inverse) for view in equations]
     clustered = sum((np.outer(each, each) for each in influences), np.zeros_like(formal))
+    clustered *= (len(influences) - 1) / len(influences)  # as of any jackknife
     # what comes from priors does not scatter between photographs
     known = inverse[:cameras, :cameras] / network.cameras.sd.ravel() ** 2
     clustered += known @ inverse[:cameras, :cameras]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-from benchmarks.reliability.torture import make_flight, torture
+from benchmarks.reliability.torture import detecting, make_flight, torture
 from kgcp.io.flight.flight import read_flight
 from kgcp.pipeline.detect import RunOptions, detect_flight
 
@@ -14,7 +14,7 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_table(tmp_path:
     flight, out, tortured = (tmp_path / name for name in ("flight", "out", "tortured"))
     make_flight(flight, 10, 2)
     detect_flight(read_flight(flight), out=out, options=RunOptions(jobs=0))
-    toll = torture(flight, tortured, 1, 2, random.Random(8))  # noqa: S311 - no secret
+    toll = torture(detecting(flight, tortured, 1), tortured, 2, random.Random(8))  # noqa: S311
     assert toll.kills >= 2
     tables = [(folder / "detections.parquet").read_bytes() for folder in (out, tortured)]
     assert tables[0] == tables[1]

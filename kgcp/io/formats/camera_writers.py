@@ -213,6 +213,59 @@ def _opf(made: CalibratedCamera) -> str:
     return json.dumps(document, indent=4) + "\n"
 
 
+def _mmvii(made: CalibratedCamera) -> str:
+    camera = made.camera
+    _refuse_rational(camera, "MMVII")
+    _refuse_aspect(camera, "MMVII")
+    sd = np.sqrt(made.cov.diagonal())
+    stated = ", ".join(
+        f"{name} {value:.3g}" for name, value in zip(CALIBRATION_PARAMETERS, sd, strict=True)
+    )
+    groups = {
+        "Radial": {"K1": camera.k1, "K2": camera.k2, "K3": camera.k3},
+        "Decentric": {"p1": camera.p2, "p2": camera.p1},  # the other way round
+        "Polynomial": {"b1": 0.0, "b2": 0.0},
+    }
+    terms: list[str] = []
+    for group, values in groups.items():
+        terms += [f"            <{group}>"]
+        terms += [f"               <{name}>{value!r}</{name}>" for name, value in values.items()]
+        terms += [f"            </{group}>"]
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>',
+        "<Root>",
+        '   <Type>"MMVII_Serialization"</Type>',
+        '   <Version>"0.0.0"</Version>',
+        "   <Data>",
+        "      <InternalCalibration>",
+        '         <Name>"Calib-PerspCentral-camera"</Name>',
+        "         <PixelFrame>",
+        f"            <NbPix>{camera.width} {camera.height}</NbPix>",
+        "         </PixelFrame>",
+        '         <Projection>"Stenope"</Projection>',
+        "         <Auxiliary>",
+        "            <SzBuffer>-1</SzBuffer>",
+        "            <Degree>3 1 1</Degree>",
+        "            <DegreeApproxInv>3 1 1</DegreeApproxInv>",
+        "            <IsFraserMode>1</IsFraserMode>",
+        "         </Auxiliary>",
+        "         <PerfectProj>",
+        f"            <F>{camera.fy!r}</F>",
+        f"            <PP>{camera.cx!r} {camera.cy!r}</PP>",
+        "         </PerfectProj>",
+        "         <Distorsion>",
+        *terms,
+        "         </Distorsion>",
+        "         <Informations>",
+        f'            <el>"kgcp; standard deviations: {stated}"</el>',
+        "         </Informations>",
+        "      </InternalCalibration>",
+        "   </Data>",
+        "</Root>",
+    ]
+    return "\n".join(lines) + "\n"
+
+
 _FORMATS: Mapping[str, tuple[str, Callable[[CalibratedCamera], str]]] = {
     "opencv": ("opencv.yml", _opencv),
     "ros": ("camera_info.yaml", _ros),
@@ -221,6 +274,7 @@ _FORMATS: Mapping[str, tuple[str, Callable[[CalibratedCamera], str]]] = {
     "opensfm": ("camera_models_overrides.json", _opensfm),
     "pix4d": ("pix4d.cam", _pix4d),
     "opf": ("opf_sensor.json", _opf),
+    "mmvii": ("mmvii_calib.xml", _mmvii),
 }
 
 CAMERA_FORMATS = tuple(_FORMATS)

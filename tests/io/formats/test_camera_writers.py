@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
@@ -59,13 +60,13 @@ def test_the_rational_model_is_kept_where_it_can_be(tmp_path: Path, form: str) -
     assert np.abs(read.distort(GRID) - RATIONAL.distort(GRID)).max() < 1e-9
 
 
-@pytest.mark.parametrize("form", ["metashape", "opensfm", "pix4d", "opf"])
+@pytest.mark.parametrize("form", ["metashape", "opensfm", "pix4d", "opf", "mmvii"])
 def test_what_a_format_cannot_hold_is_refused_by_name(form: str) -> None:
     with pytest.raises(KgcpError, match="k4, k5, k6"):
         camera_file(made(RATIONAL), form)
 
 
-@pytest.mark.parametrize("form", ["pix4d", "opf"])
+@pytest.mark.parametrize("form", ["pix4d", "opf", "mmvii"])
 def test_one_focal_length_is_not_two(form: str) -> None:
     with pytest.raises(KgcpError, match="fx and fy differ"):
         camera_file(made(replace(CAMERA, fx=1706.0)), form)
@@ -104,6 +105,30 @@ def test_pyopf_reads_its_file(tmp_path: Path) -> None:
     assert sensor.internals.focal_length_px == CAMERA.fx
     assert np.allclose(sensor.internals.principal_point_px, [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
     assert np.array_equal(sensor.image_size_px, [1600, 1100])
+
+
+def test_mmvii_has_the_terms_as_its_own_files_note_them(tmp_path: Path) -> None:
+    """By the comments of MMVII's own files: (3X2+Y2,2XY) is p1, and (2XY,X2+3Y2) p2."""
+    path = write(tmp_path, CAMERA, "mmvii")
+    root = ET.parse(path).getroot()  # noqa: S314 - written just now
+
+    def number(tag: str) -> float:
+        return float(root.findtext(f".//{tag}") or "nan")
+
+    x, y = GRID.T
+    r2 = x**2 + y**2
+    radial = number("K1") * r2 + number("K2") * r2**2 + number("K3") * r2**3
+    across = x + x * radial + number("p1") * (3 * x**2 + y**2) + number("p2") * 2 * x * y
+    down = y + y * radial + number("p1") * 2 * x * y + number("p2") * (x**2 + 3 * y**2)
+    centre = [float(text) for text in (root.findtext(".//PP") or "").split()]
+    pixels = np.stack((across, down), 1) * number("F") + centre
+    assert np.abs(pixels - CAMERA.distort(GRID)).max() < 1e-9
+    path.write_text(path.read_text().replace("<b2>0.0", "<b2>0.01"))
+    with pytest.raises(KgcpError, match=r"b2 = 0\.01"):
+        read_calibration(path, (None, None))
+    path.write_text(path.read_text().replace("Stenope", "EquiDist"))
+    with pytest.raises(KgcpError, match="the projection 'EquiDist'"):
+        read_calibration(path, (None, None))
 
 
 def test_metashape_has_the_covariance_in_its_own_terms() -> None:

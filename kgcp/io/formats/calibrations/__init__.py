@@ -13,7 +13,17 @@ from pathlib import Path
 from kgcp.errors import KgcpError, SettingError
 from kgcp.geometry.camera import Camera
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.calibrations import colmap, dji, metashape, opencv, opensfm, opf, pix4d, ros
+from kgcp.io.formats.calibrations import (
+    colmap,
+    dji,
+    metashape,
+    mmvii,
+    opencv,
+    opensfm,
+    opf,
+    pix4d,
+    ros,
+)
 from kgcp.io.formats.calibrations.entry import Entry
 from kgcp.io.formats.registry import Registry
 
@@ -23,6 +33,7 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
     {
         "opf": (opf.matches, opf.entries),
         "opensfm": (opensfm.matches, opensfm.entries),
+        "mmvii": (mmvii.matches, mmvii.entries),
         "metashape": (metashape.matches, metashape.entries),
         "dji": (dji.matches, dji.entries),
         "pix4d": (pix4d.matches, pix4d.entries),

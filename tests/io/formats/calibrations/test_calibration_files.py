@@ -39,6 +39,11 @@ SAMPLES: dict[str, object] = {
         "<calibration><projection>frame</projection><width>1600</width><height>1100</height>"
         "<f>1700</f></calibration>"
     ),
+    "mmvii": (
+        "<Root><Data><InternalCalibration><Name>a</Name><PixelFrame><NbPix>1600 1100</NbPix>"
+        '</PixelFrame><Projection>"Stenope"</Projection><PerfectProj><F>1700</F><PP>800 550</PP>'
+        "</PerfectProj></InternalCalibration></Data></Root>"
+    ),
     "opf": {
         "format": "application/opf-calibrated-cameras+json",
         "sensors": [{"id": 5, "internals": PERSPECTIVE}],
