@@ -21,6 +21,7 @@ from kgcp.io.tables.columns import Column
 from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
+from kgcp.io.tables.places import PLACE_COLUMNS, PLACE_RESIDUAL_COLUMNS
 from kgcp.quality.checks.doubt import Cause
 from tests.test_layers import LAYERS, MODULES
 
@@ -57,6 +58,8 @@ def first_column(text: str) -> list[str]:
         ("kgcps.parquet", GCP_COLUMNS),
         ("consistency.parquet", CONSISTENCY_COLUMNS),
         ("bias.parquet", BIAS_COLUMNS),
+        ("places.parquet", PLACE_COLUMNS),
+        ("place_residuals.parquet", PLACE_RESIDUAL_COLUMNS),
     ],
 )
 def test_exactly_the_columns_that_exist_are_documented(

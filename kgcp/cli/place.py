@@ -1,0 +1,115 @@
+"""`kgcp place`: detections and poses of the camera in, places of static targets out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+from kgcp.io.exporters.formats import FORMATS
+
+if TYPE_CHECKING:
+    from kgcp.io.images.remote import StoredFolder
+
+
+def _names(
+    context: click.Context,  # noqa: ARG001 - click's signature
+    parameter: click.Parameter,  # noqa: ARG001
+    value: str | None,
+) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (value or "").split(",") if name.strip())
+
+
+@click.command()
+@flight_place_argument
+@out_place_option
+@click.option(
+    "--targets",
+    metavar="NAMES",
+    callback=_names,
+    default=None,
+    help="Targets to place, separated by commas.  [default: all with position_m]",
+)
+@click.option(
+    "--poses",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Poses of the camera, in any format of [reference].  [default: that of flight.toml]",
+)
+@click.option(
+    "--eo",
+    type=click.Choice(["sd", "fixed"]),
+    default="sd",
+    show_default=True,
+    help="Whether the standard deviations of the poses count, or the poses are exact.",
+)
+@click.option(
+    "--min-frames",
+    metavar="N",
+    type=click.IntRange(2),
+    default=3,
+    show_default=True,
+    help="Place targets that at least N frames show.",
+)
+@click.option(
+    "--format",
+    "formats",
+    type=click.Choice([*FORMATS]),
+    multiple=True,
+    help="Write the placed targets for another program, too, into the folder places; may be"
+    " repeated. Formats are those of 'kgcp export-gcp'.",
+)
+@detections_option
+@json_option
+def command(
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    detections: Path | None,
+    *,
+    targets: tuple[str, ...],
+    poses: Path | None,
+    eo: str,
+    min_frames: int,
+    formats: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Place static targets from all frames that show them, and measure their diameters.
+
+    Computes centre, normal and diameter of every target with position_m from the frames with a
+    reference pose, and compares them with flight.toml: a check of the positions and of the print.
+    Writes places.parquet, place_residuals.parquet, places.csv, places.json and places.html to
+    FLIGHT/kgcp. Run 'kgcp detect' first.
+
+    \b
+    Examples:
+      kgcp place FLIGHT
+      kgcp place FLIGHT --poses FLIGHT/kgcp/poses.csv --format metashape
+    """  # noqa: D301 - \b is click's mark for lines that stay
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.workspace import DETECTIONS, open_workspace
+    from kgcp.report.plotting import load_matplotlib
+
+    load_matplotlib()  # before the report does
+    from kgcp.pipeline.ground.place import PlaceOptions, place_flight, write_places
+
+    options = PlaceOptions(targets, poses, min_frames, has_exact_poses=eo == "fixed")
+    with open_workspace(flight, out, (DETECTIONS,)) as workspace:
+        the_flight = read_flight(workspace.flight)
+        places = place_flight(the_flight, detections or workspace.out / DETECTIONS, options)
+        written = write_places(places, workspace.out, formats)
+    if as_json:
+        import json
+
+        files = [*map(workspace.named, written)]
+        click.echo(json.dumps({**places.summary(), "files": files}))
+    for sentence in places.sentences:
+        click.echo(sentence, err=True)
+    for name, reason in places.placement.skipped.items():
+        click.echo(f"not placed: {name}: {reason}", err=True)
+    for doubt in places.doubts:
+        click.echo(f"kgcp: look: {doubt}", err=True)
+    for path in written:
+        click.echo(f"wrote {workspace.named(path)}", err=True)

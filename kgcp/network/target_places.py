@@ -1,0 +1,348 @@
+"""Static targets placed from all frames with a known orientation, and compared with flight.toml.
+
+Of a coded ring a frame gives the pose, for which its configured diameter was used. What was
+measured is the image: the moments of its outer circle. They do not depend on the diameter, and
+both poses of the circle have nearly the same. So the ring is placed from its moments, and its
+diameter comes out as a check.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.attitude import ReferencePoses, covariance_along
+from kgcp.geometry.calibration import CalibrationCovariance
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
+from kgcp.geometry.pose import Pose
+from kgcp.georef.exterior_orientation import ExteriorOrientations
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.sighting import Sighting
+from kgcp.network.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
+from kgcp.network.target_plane import PlacedCircle, common_covariance, place_circles
+from kgcp.targets.layout import Target
+
+_FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose
+_CODED_EDGE_SD_PX = 0.0  # displaced edges are an unknown of every measurement of a coded ring
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedTarget:
+    """A static target placed from many frames.
+
+    Attributes
+    ----------
+    target : str
+        Name in flight.toml.
+    frames : tuple of str
+        All n frames with the target and a known orientation.
+    is_used : (n,) array
+        Which of them agree; the others are left out.
+    residuals : (n, 5) array
+        Observed minus computed centroid [px] and second moments [px²].
+    chi2 : (n,) array
+        Squared residuals of each frame over their covariance; five numbers each.
+    position_map : (3,) array
+        Centre x, y, z in the flight's CRS.
+    normal : (3,) array
+        Unit vector along the map's axes towards the side from which the target is seen; (0, 0, 1)
+        if it lies level.
+    other_normal : (3,) array or None
+        The mirrored normal that fits nearly as well; None: it leads to the same one.
+    ambiguity : float
+        Δχ² by which the mirrored normal fits worse.
+    diameter_m : float
+    cov, common_cov : (6, 6) array
+        x, y, z along the map's axes [m]; turns about two axes square to the normal [rad], of which
+        the first is the map's x made square to it; radius [m]. `cov` has what differs between
+        frames, `common_cov` what all frames share.
+    variance_factor : float
+        Squares of the residuals over what was expected.
+    check : PlaceCheck
+        Against flight.toml.
+    """
+
+    target: str
+    frames: tuple[str, ...]
+    is_used: BoolArray
+    residuals: FloatArray
+    chi2: FloatArray
+    position_map: FloatArray
+    normal: FloatArray
+    other_normal: FloatArray | None
+    ambiguity: float
+    diameter_m: float
+    cov: FloatArray
+    common_cov: FloatArray
+    variance_factor: float
+    check: PlaceCheck
+
+    @property
+    def total_cov(self) -> FloatArray:
+        """Both covariances together (6, 6)."""
+        return np.asarray(self.cov + self.common_cov)
+
+    @property
+    def sds(self) -> FloatArray:
+        """Standard deviations (6,) by both covariances: x, y, z [m], turns [rad], radius [m]."""
+        return np.asarray(np.sqrt(np.diag(self.total_cov)))
+
+    @property
+    def sd_diameter_m(self) -> float:
+        """Standard deviation of the diameter [m]."""
+        return 2.0 * float(self.sds[5])
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between normal and vertical [deg]."""
+        return math.degrees(math.atan2(math.hypot(*self.normal[:2]), self.normal[2]))
+
+    @property
+    def sd_normal_deg(self) -> float:
+        """Standard deviation of the normal about the worse one of its axes [deg]."""
+        return math.degrees(math.sqrt(float(np.linalg.eigvalsh(self.total_cov[3:5, 3:5])[-1])))
+
+    @property
+    def worst_frame(self) -> str:
+        """The frame that fits least."""
+        return self.frames[int(np.argmax(self.chi2))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceCheck:
+    """A placed target against what flight.toml says of it."""
+
+    # (3,): placed minus stated, along the map's axes [m]; None: flight.toml states no position
+    residual_m: FloatArray | None
+    cov_m2: FloatArray | None  # (3, 3): its covariance, that of the stated position included
+    stated_diameter_m: float
+    diameter_residual_m: float  # placed minus stated
+    sd_diameter_residual_m: float
+
+    @property
+    def diameter_permille(self) -> float:
+        """Residual of the diameter [‰]."""
+        return 1e3 * self.diameter_residual_m / self.stated_diameter_m
+
+    @property
+    def position_chi2(self) -> float | None:
+        """Squared residual of the place over its covariance; three numbers."""
+        if self.residual_m is None or self.cov_m2 is None:
+            return None
+        return float(self.residual_m @ np.linalg.solve(self.cov_m2, self.residual_m))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """All static targets of a flight.
+
+    Attributes
+    ----------
+    targets : tuple of PlacedTarget
+    skipped : mapping of str to str
+        Why a target was not placed, by its name.
+    noise : ExtraNoise
+        Deviations beyond the stated ones that the residuals of all targets show.
+    """
+
+    targets: tuple[PlacedTarget, ...]
+    skipped: Mapping[str, str]
+    noise: ExtraNoise
+
+
+def place_targets(
+    sightings: Sequence[Sighting],
+    targets: Sequence[Target],
+    poses: ReferencePoses,
+    local_frame: LocalFrame,
+    camera: Camera,
+    calibration: CalibrationCovariance | None,
+    *,
+    min_frames: int,
+    has_exact_poses: bool,
+) -> Placement:
+    """Place targets from all their sightings in frames with a reference pose.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        In the frames' order; second plates with the same code are passed over.
+    targets : sequence of Target
+        That stand still.
+    poses : ReferencePoses
+        With standard deviations, unless they are to count as exact.
+    min_frames : int
+        Least number of frames.
+    has_exact_poses : bool
+        Whether the deviations of the reference poses are disregarded.
+    """
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    exterior_cov = None if has_exact_poses else _exterior_cov(poses, orientations)
+    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    skipped: dict[str, str] = {}
+    usable, all_views, all_frames = [], [], []
+    for target in targets:
+        mine = [each for each in sightings if each.target == target.name and not each.instance]
+        posed = [each for each in mine if each.frame in rows and each.pose_cov is not None]
+        if len(posed) < min_frames:
+            skipped[target.name] = _too_few(mine, posed, rows, min_frames)
+            continue
+        at = [rows[each.frame] for each in posed]
+        moments, cov = _images(camera, posed, 0.5 * target.ring.outer_diameter_m)
+        usable.append(target)
+        all_frames.append(tuple(each.frame for each in posed))
+        all_views.append(
+            CircleViews(
+                orientations.centre_m[at],
+                orientations.enu_from_camera[at],
+                moments,
+                cov,
+                None if exterior_cov is None else exterior_cov[at],
+            )
+        )
+    outcomes, noise = place_circles(camera, all_views)
+    placed = []
+    for target, frames, views, outcome in zip(usable, all_frames, all_views, outcomes, strict=True):
+        if isinstance(outcome, NoCircleError):
+            skipped[target.name] = str(outcome)
+            continue
+        common = common_covariance(
+            camera,
+            views,
+            outcome.fit,
+            noise,
+            None if calibration is None else calibration.cov,
+            _CODED_EDGE_SD_PX,
+        )
+        placed.append(_on_the_map(target, frames, outcome, common, local_frame))
+    return Placement(tuple(placed), skipped, noise)
+
+
+def _too_few(
+    mine: Sequence[Sighting],
+    posed: Sequence[Sighting],
+    rows: Mapping[str, int],
+    min_frames: int,
+) -> str:
+    if not mine:
+        return "measured in no frame"
+    oriented = sum(each.frame in rows for each in mine)
+    if oriented > len(posed):
+        return f"{oriented - len(posed)} of its measurements have no covariance"
+    return (
+        f"measured in {len(mine)} frames, {len(posed)} of them with a reference pose;"
+        f" {min_frames} are needed"
+    )
+
+
+def _exterior_cov(poses: ReferencePoses, orientations: ExteriorOrientations) -> FloatArray | None:
+    """Return the covariances (n, 6, 6) of positions [m] and turns [rad] in the ENU frame."""
+    if orientations.cov_m2 is None and poses.sd_angle_deg is None:
+        return None
+    cov = np.zeros((len(poses.frames), 6, 6))
+    if orientations.cov_m2 is not None:
+        cov[:, :3, :3] = orientations.cov_m2
+    if poses.sd_angle_deg is not None:
+        cov[:, 3:, 3:] = np.radians(poses.sd_angle_deg)[:, None, None] ** 2 * np.eye(3)
+    return cov
+
+
+def _images(
+    camera: Camera, sightings: Sequence[Sighting], radius_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return moments (n, 5) of outer circles, and their covariances (n, 5, 5), by measured poses.
+
+    A pose has six numbers, of which the turn about the normal does not move the circle: the five
+    others and the five moments follow from each other.
+    """
+    pairs = [
+        (each.pose, each.pose_cov)
+        for each in sightings
+        if each.pose is not None and each.pose_cov is not None
+    ]
+    circles = _circles([pose for pose, _ in pairs], radius_m)
+    moments = circle_images(camera, circles).moments
+    slopes = circle_slopes(camera, circles)
+    by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
+    cov = by_pose @ np.array([cov for _, cov in pairs]) @ np.swapaxes(by_pose, 1, 2)
+    size = np.sqrt(np.maximum(moments[:, 2] + moments[:, 4], 0.0))
+    floor = np.ones((len(moments), 5))
+    floor[:, 2:] = size[:, None]
+    return moments, cov + _FLOOR_PX**2 * floor[:, :, None] ** 2 * np.eye(5)
+
+
+def _circles(poses: Sequence[Pose], radius_m: float) -> Circles3D:
+    return Circles3D(
+        np.array([pose.translation_m for pose in poses]),
+        np.array([pose.rotation[:, :2] for pose in poses]),
+        np.full(len(poses), radius_m),
+    )
+
+
+def _on_the_map(
+    target: Target,
+    frames: tuple[str, ...],
+    placed: PlacedCircle,
+    common_cov: FloatArray,
+    local_frame: LocalFrame,
+) -> PlacedTarget:
+    fit = placed.fit
+    circle = fit.circle
+    enu_from_map = local_frame.grid_rotation(circle.centre_m)
+    on_map = _turned(circle, enu_from_map)
+    to_map = np.zeros((6, 6))
+    to_map[:3, :3] = enu_from_map.T
+    to_map[3:5, 3:5] = on_map.axes.T @ enu_from_map.T @ circle.axes
+    to_map[5, 5] = 1.0
+    cov, common_cov = to_map @ fit.cov @ to_map.T, to_map @ common_cov @ to_map.T
+    other = placed.other
+    return PlacedTarget(
+        target=target.name,
+        frames=frames,
+        is_used=fit.is_used,
+        residuals=fit.residuals,
+        chi2=fit.chi2,
+        position_map=local_frame.map_from_enu(circle.centre_m[None])[0],
+        normal=on_map.normal,
+        other_normal=None if other is None else enu_from_map.T @ other.circle.normal,
+        ambiguity=placed.ambiguity,
+        diameter_m=2.0 * circle.radius_m,
+        cov=cov,
+        common_cov=common_cov,
+        variance_factor=fit.variance_factor,
+        check=_check(target, circle, cov + common_cov, enu_from_map, local_frame),
+    )
+
+
+def _turned(circle: SpaceCircle, enu_from_map: FloatArray) -> SpaceCircle:
+    return SpaceCircle(
+        enu_from_map.T @ circle.centre_m, enu_from_map.T @ circle.normal, circle.radius_m
+    )
+
+
+def _check(
+    target: Target,
+    circle: SpaceCircle,
+    cov: FloatArray,
+    enu_from_map: FloatArray,
+    local_frame: LocalFrame,
+) -> PlaceCheck:
+    residual, residual_cov = None, None
+    if target.position_m is not None:
+        stated = local_frame.enu_from_map(np.array([target.position_m]))[0]
+        residual = enu_from_map.T @ (circle.centre_m - stated)
+        stated_cov = covariance_along(np.eye(3), np.array(target.sd_position_m))
+        residual_cov = cov[:3, :3] + stated_cov
+    diameter_m = target.ring.outer_diameter_m
+    return PlaceCheck(
+        residual,
+        residual_cov,
+        diameter_m,
+        2.0 * circle.radius_m - diameter_m,
+        math.hypot(2.0 * math.sqrt(cov[5, 5]), target.ring.sd_outer_diameter_m),
+    )

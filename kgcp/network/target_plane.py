@@ -1,0 +1,426 @@
+"""A circle in space from its images in oriented frames: centre, normal and radius.
+
+After Otepka & Fraser (2004), section 2.2, with two changes. The observations are centroid and
+second moments of the circle's image (`kgcp.geometry.circle_image`), which are regular everywhere,
+also for a circle seen from straight above; and the normal has two unknowns instead of elements and
+constraints.
+
+One image has two circles of a given radius behind it (Kager 1981). Two frames from different
+directions tell them apart. Both are followed to the end here, and how much worse the other one
+fits is part of the result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import circle_images, circle_slopes
+from kgcp.network.circle_start import circle_starts
+from kgcp.network.space_circle import (
+    CircleViews,
+    ExtraNoise,
+    NoCircleError,
+    SpaceCircle,
+    angle_deg,
+    mean_radius,
+    outline_noise,
+)
+
+MIN_FRAMES = 2
+"""Frames with fewer than which a circle has no place: the rays of one do not meet."""
+
+_MOST_STEPS = 60
+_ROUND_STEPS = 3  # between two reweightings, of what changes anyway
+_CONVERGED = 1e-9  # relative decrease of the cost
+_ROBUST_ROUNDS = 12
+_REJECTED_CHI2 = 37.0  # of five numbers: by chance once in 1.7 million, as 5 σ of one
+_CAUCHY_CHI2 = 12.0
+_MEDIAN_CHI2 = 4.351  # of five numbers
+_SAME_NORMAL_DEG = 0.5
+_LEAST_KEPT = 0.5  # share of the frames: if fewer agree, none is believed
+_EXTRA_ROUNDS = 2
+_MOST_EXTRA_PX = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleFit:
+    """A circle adjusted to its images."""
+
+    circle: SpaceCircle
+    cov: FloatArray  # (6, 6): in the order of `SpaceCircle.moved`
+    residuals: FloatArray  # (n, 5): observed minus computed moments
+    chi2: FloatArray  # (n,): squared residuals of each frame over their own covariance
+    is_used: BoolArray  # (n,): whether a frame took part
+    cost: float  # robust sum of squares over all frames, by which two fits are compared
+
+    @property
+    def variance_factor(self) -> float:
+        """Weighted squares of the residuals per degree of freedom, of the frames that are used."""
+        freedom = 5 * int(np.count_nonzero(self.is_used)) - 6
+        return float(np.sum(self.chi2[self.is_used])) / freedom
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedCircle:
+    """A circle placed from many frames.
+
+    Attributes
+    ----------
+    fit : CircleFit
+        The better one of the two normals.
+    other : CircleFit or None
+        The other one; None: it leads to the same circle.
+    ambiguity : float
+        Δχ² by which the mirrored normal fits worse.
+    common_cov : (6, 6) array
+        Share of errors that all frames have alike; not in `fit.cov`.
+    """
+
+    fit: CircleFit
+    other: CircleFit | None
+    ambiguity: float
+    common_cov: FloatArray
+
+
+def place_circle(
+    camera: Camera,
+    views: CircleViews,
+    noise: ExtraNoise = ExtraNoise(),  # noqa: B008 - frozen
+) -> PlacedCircle:
+    """Adjust a circle to its images, without a start, frames that do not fit left out.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its lens acts on every point of the outline.
+    views : CircleViews
+        Of at least `MIN_FRAMES` frames from different places.
+
+    Returns
+    -------
+    PlacedCircle
+        Without common errors: see `common_covariance`.
+
+    Raises
+    ------
+    NoCircleError
+        If the rays do not meet before the cameras, no plane explains the shapes, or fewer than
+        half of the frames agree.
+    """
+    starts = circle_starts(camera, views)
+    fits = [fit for start in starts if (fit := _fit(camera, views, start, noise)) is not None]
+    if not fits:
+        raise NoCircleError("no circle has images like these")
+    best = min(fits, key=lambda fit: fit.cost)
+    mirrored = best.circle.mirrored(views.camera_m[best.is_used])
+    other = _fit(camera, views, mirrored, noise)
+    if other is not None and other.cost < best.cost:
+        best, other = other, best
+        mirrored = best.circle.mirrored(views.camera_m[best.is_used])
+    if np.count_nonzero(best.is_used) < max(MIN_FRAMES, _LEAST_KEPT * len(views)):
+        used = int(np.count_nonzero(best.is_used))
+        raise NoCircleError(f"only {used} of {len(views)} frames agree with each other")
+    if other is None or _is_same(best.circle, other.circle):
+        worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
+        return PlacedCircle(best, None, max(0.0, worse - best.cost), np.zeros((6, 6)))
+    return PlacedCircle(best, other, other.cost - best.cost, np.zeros((6, 6)))
+
+
+def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]]) -> ExtraNoise:
+    """Return how large the images' deviations are beyond the stated ones, by the residuals.
+
+    Places and shapes apart: the weighted squares of all circles' residuals are made to be as many
+    as there are degrees of freedom. Nothing is taken away where residuals are smaller than stated.
+    """
+    found = []
+    for part, unknowns in ((slice(0, 2), 3), (slice(2, 5), 3)):
+        residuals, stated, unit, freedom = [], [], [], 0
+        for views, fit in placed:
+            kept = views.chosen(fit.is_used)
+            covs = _stated(camera, kept, fit.circle)
+            residuals.append(fit.residuals[fit.is_used][:, part])
+            stated.append(covs[:, part, part])
+            unit.append(outline_noise(kept.moments)[:, part, part])
+            freedom += residuals[-1].size - unknowns
+        found.append(
+            _excess(
+                np.concatenate(residuals), np.concatenate(stated), np.concatenate(unit), freedom
+            )
+        )
+    return ExtraNoise(*found)
+
+
+def place_circles(
+    camera: Camera, many: Sequence[CircleViews]
+) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
+    """Place several circles, with the deviations that their residuals show together.
+
+    Returns
+    -------
+    placed : list of PlacedCircle or NoCircleError
+        In the circles' order.
+    noise : ExtraNoise
+        What was added to the stated covariances.
+    """
+    noise = ExtraNoise()
+    outcomes = [_attempt(camera, views, noise) for views in many]
+    for _ in range(_EXTRA_ROUNDS):
+        pairs = [
+            (views, outcome.fit)
+            for views, outcome in zip(many, outcomes, strict=True)
+            if isinstance(outcome, PlacedCircle)
+        ]
+        if not pairs:
+            break
+        noise = extra_noise(camera, pairs)
+        if noise == ExtraNoise():
+            break
+        outcomes = [_attempt(camera, views, noise) for views in many]
+    return outcomes, noise
+
+
+def common_covariance(
+    camera: Camera,
+    views: CircleViews,
+    fit: CircleFit,
+    noise: ExtraNoise,
+    calibration_cov: FloatArray | None,
+    edge_sd_px: float,
+) -> FloatArray:
+    """Return the covariance (6, 6) of what all frames have alike, and averaging does not reduce.
+
+    Three errors: the calibration's; edges that are displaced in all images by as many pixels; and
+    a shift of all projection centres, as large as their mean covariance says: how much of it is
+    common is not known, an adjustment that hangs on few control points shifts as a whole.
+
+    Parameters
+    ----------
+    calibration_cov : (12, 12) array or None
+        By `CALIBRATION_PARAMETERS`; None: not known.
+    edge_sd_px : float
+        Of the displacement of edges, the same in all frames [px].
+    """
+    kept = views.chosen(fit.is_used)
+    slopes = circle_slopes(camera, fit.circle.in_cameras(kept))
+    weights = np.linalg.inv(_total(camera, kept, fit.circle, noise))
+    design = _design(kept, fit.circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
+    gain = fit.cov @ np.einsum("nmp,nmk->npk", design, weights).transpose(1, 0, 2).reshape(6, -1)
+    common = np.zeros((6, 6))
+    if calibration_cov is not None:
+        by_calibration = -gain @ slopes.by_calibration.reshape(-1, len(calibration_cov))
+        common += by_calibration @ calibration_cov @ by_calibration.T
+    # a displacement δ along the whole outline changes the mean moment a²/4 by a δ / 2
+    radius = mean_radius(kept.moments)
+    wider = np.zeros((len(kept), 5))
+    wider[:, 2] = wider[:, 4] = 0.5 * radius
+    by_edge = gain @ wider.ravel() * edge_sd_px
+    common += np.outer(by_edge, by_edge)
+    if kept.exterior_cov is not None:
+        common[:3, :3] += kept.exterior_cov[:, :3, :3].mean(axis=0)
+    return common
+
+
+def _attempt(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | NoCircleError:
+    try:
+        return place_circle(camera, views, noise)
+    except NoCircleError as error:
+        return error
+
+
+def _fit(
+    camera: Camera, views: CircleViews, start: SpaceCircle, noise: ExtraNoise
+) -> CircleFit | None:
+    """Return the robust fit from a start; None if it leads nowhere."""
+    circle, weights = start, np.ones(len(views))
+    for _ in range(_ROBUST_ROUNDS):
+        covs = _total(camera, views, circle, noise)
+        moved = _minimised(camera, views, circle, covs, weights, _ROUND_STEPS)
+        if moved is None:
+            return None
+        circle = moved
+        chi2 = _chi2(camera, views, circle, covs)
+        scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
+        renewed = 1.0 / (1.0 + chi2 / (_CAUCHY_CHI2 * scale))
+        is_settled = np.allclose(renewed, weights, atol=1e-3)
+        weights = renewed
+        if is_settled:
+            break
+    return _without_outliers(camera, views, circle, noise)
+
+
+def _without_outliers(
+    camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
+) -> CircleFit | None:
+    """Return the fit to the frames that agree: all others are rejected as a whole."""
+    used = np.zeros(len(views), dtype=np.bool_)
+    covs = _total(camera, views, circle, noise)
+    chi2 = _chi2(camera, views, circle, covs)
+    for _ in range(_ROBUST_ROUNDS):
+        scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
+        kept = chi2 <= _REJECTED_CHI2 * scale
+        if np.array_equal(kept, used) or np.count_nonzero(kept) < MIN_FRAMES:
+            break
+        used = kept
+        moved = _minimised(camera, views, circle, covs, used.astype(np.float64))
+        if moved is None:
+            return None
+        circle = moved
+        covs = _total(camera, views, circle, noise)
+        chi2 = _chi2(camera, views, circle, covs)
+    if not used.any():
+        return None
+    normal = _normal_equations(camera, views.chosen(used), circle, covs[used])[0]
+    if not np.linalg.cond(_unit_diagonal(normal)) < 1e13:
+        return None
+    residuals = views.moments - circle_images(camera, circle.in_cameras(views)).moments
+    cov = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return CircleFit(circle, cov, residuals, chi2, used, _robust_cost(chi2))
+
+
+def _minimised(
+    camera: Camera,
+    views: CircleViews,
+    circle: SpaceCircle,
+    covs: FloatArray,
+    weights: FloatArray,
+    most_steps: int = _MOST_STEPS,
+) -> SpaceCircle | None:
+    """Return the circle with the least weighted squares by Levenberg's damped steps."""
+    damping, cost = 1e-4, _weighted_cost(camera, views, circle, covs, weights)
+    if not math.isfinite(cost):
+        return None
+    weighted = covs / np.maximum(weights, 1e-12)[:, None, None]
+    for _ in range(most_steps):
+        normal, right = _normal_equations(camera, views, circle, weighted)
+        scale = 1.0 / np.sqrt(np.diag(normal))
+        while True:
+            damped = _unit_diagonal(normal) + damping * np.eye(6)
+            step = scale * np.linalg.solve(damped, scale * right)
+            trial = circle.moved(step) if circle.radius_m + step[5] > 0.0 else circle
+            trial_cost = _weighted_cost(camera, views, trial, covs, weights)
+            if trial_cost < cost or damping > 1e8:
+                break
+            damping *= 10.0
+        if not trial_cost < cost:
+            return circle
+        is_done = cost - trial_cost <= _CONVERGED * cost
+        circle, cost, damping = trial, trial_cost, max(0.1 * damping, 1e-12)
+        if is_done:
+            break
+    return circle
+
+
+def _unit_diagonal(normal: FloatArray) -> FloatArray:
+    size = np.sqrt(np.diag(normal))
+    return np.asarray(normal / np.outer(size, size))
+
+
+def _weighted_cost(
+    camera: Camera,
+    views: CircleViews,
+    circle: SpaceCircle,
+    covs: FloatArray,
+    weights: FloatArray,
+) -> float:
+    counted = weights > 0.0
+    squares = _chi2(camera, views, circle, covs)[counted]
+    return float(np.sum(weights[counted] * squares)) if np.isfinite(squares).all() else math.inf
+
+
+def _chi2(camera: Camera, views: CircleViews, circle: SpaceCircle, covs: FloatArray) -> FloatArray:
+    """Return the squares (n,) of all frames' residuals over covariances; infinite: unseen."""
+    residuals = views.moments - circle_images(camera, circle.in_cameras(views)).moments
+    squares = np.einsum("nm,nm->n", residuals, np.linalg.solve(covs, residuals[..., None])[..., 0])
+    return np.asarray(np.where(np.isfinite(squares), squares, np.inf))
+
+
+def _chi2_of(
+    camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
+) -> FloatArray:
+    return _chi2(camera, views, circle, _total(camera, views, circle, noise))
+
+
+def _robust_cost(chi2: FloatArray) -> float:
+    return float(np.sum(np.minimum(chi2, _REJECTED_CHI2)))
+
+
+def _normal_equations(
+    camera: Camera, views: CircleViews, circle: SpaceCircle, covs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return normal matrix (6, 6) and right-hand side (6,)."""
+    circles = circle.in_cameras(views)
+    slopes = circle_slopes(camera, circles)
+    design = _design(views, circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
+    residuals = views.moments - circle_images(camera, circles).moments
+    weighted = np.linalg.solve(covs, design)
+    normal = np.einsum("nmp,nmq->pq", weighted, design)
+    return 0.5 * (normal + normal.T), np.einsum("nmp,nm->p", weighted, residuals)
+
+
+def _design(
+    views: CircleViews,
+    circle: SpaceCircle,
+    by_centre: FloatArray,
+    by_rotation: FloatArray,
+    by_radius: FloatArray,
+) -> FloatArray:
+    """Return the derivatives (n, 5, 6) of the moments by the circle's unknowns."""
+    camera_from_world = np.swapaxes(views.world_from_camera, 1, 2)
+    turned = by_rotation @ camera_from_world @ circle.axes
+    return np.concatenate((by_centre @ camera_from_world, turned, by_radius[..., None]), axis=2)
+
+
+def _total(
+    camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
+) -> FloatArray:
+    """Return the covariances (n, 5, 5) of moments with everything that differs between frames."""
+    unit = outline_noise(views.moments)
+    extra = np.zeros_like(unit)
+    extra[:, :2, :2] = noise.centre_px**2 * unit[:, :2, :2]
+    extra[:, 2:, 2:] = noise.outline_px**2 * unit[:, 2:, 2:]
+    return np.asarray(_stated(camera, views, circle) + extra)
+
+
+def _stated(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArray:
+    """Return the stated covariances (n, 5, 5): of the images, and of the exterior orientations.
+
+    With R' = exp(ω) R and C' = C + δ, the circle moves in the camera's frame by
+    Rᵀ((X − C) × ω − δ), and turns by −Rᵀ ω.
+    """
+    if views.exterior_cov is None:
+        return views.cov
+    slopes = circle_slopes(camera, circle.in_cameras(views))
+    camera_from_world = np.swapaxes(views.world_from_camera, 1, 2)
+    by_place = slopes.by_centre @ camera_from_world
+    by_turn = by_place @ cross_matrix(circle.centre_m - views.camera_m)
+    by_turn = by_turn - slopes.by_rotation @ camera_from_world
+    by_exterior = np.concatenate((-by_place, by_turn), axis=2)
+    share = by_exterior @ views.exterior_cov @ np.swapaxes(by_exterior, 1, 2)
+    return np.asarray(views.cov + np.nan_to_num(share))
+
+
+def _excess(residuals: FloatArray, stated: FloatArray, unit: FloatArray, freedom: int) -> float:
+    """Return σ ≥ 0 such that the squares over (stated + σ² unit) are as many as `freedom`."""
+
+    def squares(sd: float) -> float:
+        solved = np.linalg.solve(stated + sd**2 * unit, residuals[..., None])[..., 0]
+        return float(np.sum(residuals * solved))
+
+    if freedom <= 0 or squares(0.0) <= freedom:
+        return 0.0
+    low, high = 0.0, _MOST_EXTRA_PX
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if squares(middle) > freedom else (low, middle)
+    return high
+
+
+def _is_same(first: SpaceCircle, second: SpaceCircle) -> bool:
+    return angle_deg(first.normal, second.normal) < _SAME_NORMAL_DEG

@@ -1,0 +1,301 @@
+"""Static targets placed from all oriented frames of a flight, and the files of the result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.attitude import ReferencePoses
+from kgcp.georef.gcp import Gcp, build_gcps
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition, TargetPositions
+from kgcp.io.exporters.points import MapPoints
+from kgcp.io.files.atomic import write_all
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.orientations import read_reference_poses
+from kgcp.io.tables.columns import row_of
+from kgcp.io.tables.detections import read_attempts
+from kgcp.io.tables.parquet import write_table
+from kgcp.io.tables.places import (
+    PLACE_COLUMNS,
+    PLACE_RESIDUAL_COLUMNS,
+    places_csv,
+    residual_rows,
+)
+from kgcp.io.tables.provenance import derived_provenance
+from kgcp.network.target_places import PlacedTarget, Placement, place_targets
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.export import write_formats
+from kgcp.pipeline.workspace import DETECTIONS, results_folder
+from kgcp.quality.place_sentences import (
+    diameter_sentence,
+    doubts_of,
+    noise_sentence,
+    position_sentence,
+)
+from kgcp.report.places.figures import draw_places
+from kgcp.report.places.page import PlacesPage, render_places
+from kgcp.targets.layout import Target
+
+EXPORTS = "places"
+"""Folder of the packages' files, below that of the results."""
+
+MIN_FRAMES = 3
+"""Least number of frames by default: two place a circle, a third checks it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceOptions:
+    """What is to be placed, and from what.
+
+    Attributes
+    ----------
+    targets : tuple of str
+        Names; empty: all that have a position in flight.toml.
+    poses : Path or None
+        File of the camera's poses; None: [reference] of flight.toml.
+    min_frames : int
+        Least number of frames that show a target.
+    has_exact_poses : bool
+        Whether the standard deviations of the poses are disregarded.
+    """
+
+    targets: tuple[str, ...] = ()
+    poses: Path | None = None
+    min_frames: int = MIN_FRAMES
+    has_exact_poses: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightPlaces:
+    """Placed targets of a flight.
+
+    Attributes
+    ----------
+    flight : Flight
+    placement : Placement
+    sightings : tuple of Sighting
+        Those that took part.
+    local_frame : LocalFrame
+        Of the places.
+    provenance : mapping of str
+        The metadata of the tables.
+    """
+
+    flight: Flight
+    placement: Placement
+    sightings: tuple[Sighting, ...]
+    local_frame: LocalFrame
+    provenance: Mapping[str, str]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Diameters and places against flight.toml, in words."""
+        sentences = []
+        for placed in self.placement.targets:
+            sentences += [diameter_sentence(placed), position_sentence(placed)]
+        return tuple(sentences)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What to look at before the places are used."""
+        doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
+        noise = noise_sentence(self.placement)
+        return (*doubts, noise) if noise else tuple(doubts)
+
+    def gcps(self) -> tuple[Gcp, ...]:
+        """Return a ground control point for every sighting that took part, at the placed target."""
+        positions = TargetPositions(
+            self.local_frame,
+            {placed.target: self._in_enu(placed) for placed in self.placement.targets},
+            None,
+        )
+        gcps, _ = build_gcps(self.sightings, positions, self.flight.camera)
+        return gcps
+
+    def _in_enu(self, placed: PlacedTarget) -> TargetPosition:
+        position = self.local_frame.enu_from_map(placed.position_map[None])[0]
+        axes = self.local_frame.grid_rotation(position)
+        return TargetPosition(position, axes @ placed.total_cov[:3, :3] @ axes.T)
+
+    def summary(self) -> dict[str, object]:
+        """Return all numbers for machines."""
+        noise = self.placement.noise
+        return {
+            "targets": [_numbers(placed) for placed in self.placement.targets],
+            "skipped": dict(self.placement.skipped),
+            "extra_noise_px": {"centre": noise.centre_px, "outline": noise.outline_px},
+            "sentences": self.sentences,
+            "doubts": self.doubts,
+        }
+
+
+@single_threaded()
+def place_flight(
+    flight: Flight,
+    detections: Path | str | None = None,
+    options: PlaceOptions = PlaceOptions(),
+) -> FlightPlaces:
+    """Place the static targets of a flight.
+
+    Parameters
+    ----------
+    detections : Path, optional
+        What `detect_flight` wrote; by default in the flight's results folder.
+    options : PlaceOptions
+        What to place, and by which poses.
+
+    Raises
+    ------
+    KgcpError
+        If there is no static target, no pose, no crs, a target's name is unknown, a file is
+        unreadable, or no target can be placed.
+    """
+    table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
+    targets = _targets(flight, options.targets)
+    attempts = read_attempts(table, flight)
+    data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
+    poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
+    local_frame = _local_frame(flight, poses)
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    placement = place_targets(
+        sightings,
+        targets,
+        poses,
+        local_frame,
+        flight.camera,
+        flight.calibration_covariance,
+        min_frames=options.min_frames,
+        has_exact_poses=options.has_exact_poses,
+    )
+    if not placement.targets:
+        name, reason = next(iter(placement.skipped.items()))
+        raise KgcpError(f"no target can be placed: {name!r} {reason}")
+    used = {
+        (placed.target, frame)
+        for placed in placement.targets
+        for frame, is_used in zip(placed.frames, placed.is_used, strict=True)
+        if is_used
+    }
+    chosen = tuple(
+        each for each in sightings if (each.target, each.frame) in used and not each.instance
+    )
+    choices = {
+        "targets": options.targets,
+        "min_frames": options.min_frames,
+        "exact_poses": options.has_exact_poses,
+    }
+    provenance = derived_provenance(
+        flight, table, choices, has_reference=options.poses is None and data.has_reference
+    )
+    return FlightPlaces(flight, placement, chosen, local_frame, provenance)
+
+
+def write_places(
+    places: FlightPlaces, folder: Path, formats: Sequence[str] = ()
+) -> tuple[Path, ...]:
+    """Write tables, page and the files of some formats; return their paths.
+
+    Raises
+    ------
+    KgcpError
+        If a format is unknown or cannot hold the points, or a file cannot be written.
+    """
+    placed = places.placement.targets
+    flight = places.flight
+    tables = (folder / "places.parquet", folder / "place_residuals.parquet")
+    rows = (row_of(PLACE_COLUMNS, target) for target in placed)
+    about = {**places.provenance, "crs": places.local_frame.crs}
+    write_table(tables[0], PLACE_COLUMNS, rows, about)
+    write_table(tables[1], PLACE_RESIDUAL_COLUMNS, residual_rows(placed), about)
+    names = ("places.csv", "places.json", "places.html")
+    page = PlacesPage(
+        flight.name,
+        places.local_frame.crs,
+        places.placement,
+        places.sentences,
+        places.doubts,
+        draw_places(placed),
+        [*(path.name for path in tables), *names],
+    )
+    text = json.dumps(places.summary(), indent=1, allow_nan=False)
+    texts = dict(zip(names, (places_csv(placed), f"{text}\n", render_places(page)), strict=True))
+    write_all({folder / name: text.encode() for name, text in texts.items()})
+    written = [*tables, *(folder / name for name in names)]
+    if formats:
+        points = MapPoints(places.local_frame.crs, places.gcps(), flight.camera)
+        written += write_formats(points, formats, folder / EXPORTS)
+    return tuple(written)
+
+
+def _targets(flight: Flight, names: Sequence[str]) -> list[Target]:
+    known = {target.name: target for target in flight.targets}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise KgcpError(
+            f"target {unknown[0]!r}: is not in flight.toml; name one of {', '.join(known)}",
+            option="targets",
+        )
+    if names:
+        return [known[name] for name in dict.fromkeys(names)]
+    static = [target for target in flight.targets if target.position_m is not None]
+    if not static:
+        raise KgcpError(
+            f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"
+            " that do, roughly is enough, or name the targets to place",
+            option="targets",
+        )
+    return static
+
+
+def _poses(
+    flight: Flight, data: FlightData, file: Path | None, frames: Sequence[str]
+) -> ReferencePoses:
+    if file is None:
+        return data.reference_poses
+    return read_reference_poses(file, crs=flight.crs, frames=sorted(set(frames)))
+
+
+def _local_frame(flight: Flight, poses: ReferencePoses) -> LocalFrame:
+    if flight.crs is None:
+        raise KgcpError(
+            f"{flight.folder / 'flight.toml'}: has no crs; name that of the coordinates,"
+            ' for example crs = "EPSG:25831"'
+        )
+    return LocalFrame.at(flight.crs, poses.position_map[0])
+
+
+def _numbers(placed: PlacedTarget) -> dict[str, object]:
+    check = placed.check
+    residual = None if check.residual_m is None else check.residual_m.tolist()
+    cov = check.cov_m2
+    return {
+        "target": placed.target,
+        "position": placed.position_map.tolist(),
+        "sd_position_m": placed.sds[:3].tolist(),
+        "normal": placed.normal.tolist(),
+        "sd_normal_deg": placed.sd_normal_deg,
+        "tilt_deg": placed.tilt_deg,
+        "ambiguity": placed.ambiguity,
+        "diameter_m": placed.diameter_m,
+        "sd_diameter_m": placed.sd_diameter_m,
+        "frames": len(placed.frames),
+        "frames_used": int(np.count_nonzero(placed.is_used)),
+        "rejected": [
+            frame for frame, used in zip(placed.frames, placed.is_used, strict=True) if not used
+        ],
+        "variance_factor": placed.variance_factor,
+        "residual_m": residual,
+        "sd_residual_m": None if cov is None else np.sqrt(np.diag(cov)).tolist(),
+        "diameter_residual_permille": check.diameter_permille,
+        "sd_diameter_residual_permille": 1e3
+        * check.sd_diameter_residual_m
+        / check.stated_diameter_m,
+    }

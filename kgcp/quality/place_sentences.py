@@ -1,0 +1,80 @@
+"""What placed targets say about flight.toml, in sentences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kgcp.georef.camera_priors import MIN_AMBIGUITY
+from kgcp.network.target_places import PlacedTarget, Placement
+from kgcp.quality.number_text import minus
+
+_DOUBTFUL = 3.0  # standard deviations
+_DOUBTFUL_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviations of one
+_LEAST_EXTRA_PX = 0.005  # of what is worth a sentence
+
+
+def diameter_sentence(placed: PlacedTarget) -> str:
+    """Return how large a ring is, against what flight.toml states."""
+    check = placed.check
+    sd = placed.sd_diameter_m
+    decimals = 4 if not sd > 0.0 else min(7, max(4, 1 - math.floor(math.log10(sd))))
+    ratio = abs(check.diameter_residual_m) / check.sd_diameter_residual_m
+    verdict = "which is not what" if ratio > _DOUBTFUL else "as"
+    return (
+        f"{placed.target}: the ring of {check.stated_diameter_m:g} m measures"
+        f" {placed.diameter_m:.{decimals}f} ± {sd:.{decimals}f} m"
+        f" ({minus(f'{check.diameter_permille:+.2f}')} ‰, {ratio:.1f} standard deviations),"
+        f" {verdict} flight.toml says"
+    )
+
+
+def position_sentence(placed: PlacedTarget) -> str:
+    """Return where a target lies, against the position that flight.toml states."""
+    check = placed.check
+    chi2 = check.position_chi2
+    if check.residual_m is None or chi2 is None:
+        return f"{placed.target}: flight.toml states no position"
+    x, y, z = (minus(f"{value:+.4f}") for value in check.residual_m.tolist())
+    verdict = "more than its deviations explain" if chi2 > _DOUBTFUL_CHI2 else "as expected"
+    return (
+        f"{placed.target}: lies {x}, {y}, {z} m (x, y, z) from its position in flight.toml,"
+        f" {verdict} (χ² {chi2:.1f} of 3)"
+    )
+
+
+def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
+    """Return what to look at before a placed target is used."""
+    doubts = []
+    rejected = int(np.count_nonzero(~placed.is_used))
+    if rejected:
+        frames = f"{rejected} of {len(placed.frames)} frames do"
+        if rejected == 1:
+            frames = f"1 of {len(placed.frames)} frames does"
+        doubts.append(
+            f"{placed.target}: {frames} not fit the others and took no part;"
+            f" the worst is {placed.worst_frame}"
+        )
+    if placed.ambiguity < MIN_AMBIGUITY:
+        doubts.append(
+            f"{placed.target}: its mirrored normal fits nearly as well"
+            f" (Δχ² {placed.ambiguity:.1f}); see it from more directions"
+        )
+    return tuple(doubts)
+
+
+def noise_sentence(placement: Placement) -> str:
+    """Return what the residuals have beyond the stated deviations; empty if next to nothing."""
+    noise = placement.noise
+    parts = [
+        f"{value:.3f} px in {what}"
+        for value, what in (
+            (noise.centre_px, "the places (mostly of the reference poses)"),
+            (noise.outline_px, "size and shape"),
+        )
+        if value > _LEAST_EXTRA_PX
+    ]
+    if not parts:
+        return ""
+    return f"the images deviate by more than is stated: {' and '.join(parts)}; this is allowed for"

@@ -1,0 +1,89 @@
+"""Figures of the report of placed targets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kgcp.network.target_places import PlacedTarget
+from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
+
+_COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}
+_EXPECTED_CHI2 = 5.0  # five numbers of a frame
+_MM = 1e3
+
+
+def draw_places(placed: tuple[PlacedTarget, ...]) -> dict[str, bytes]:
+    """Return the figures of the page by their names, as PNG."""
+    figures = {"diameters": _diameters(placed), "frames": _frames(placed)}
+    if any(target.check.residual_m is not None for target in placed):
+        figures["positions"] = _positions(placed)
+    return {name: figure.png for name, figure in figures.items()}
+
+
+def _diameters(placed: tuple[PlacedTarget, ...]) -> Picture:
+    """Draw the diameters' residuals with two standard deviations."""
+    places = np.arange(len(placed))
+    off = [target.check.diameter_permille for target in placed]
+    sd = [
+        1e3 * target.check.sd_diameter_residual_m / target.check.stated_diameter_m
+        for target in placed
+    ]
+    with sheet(3.4) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        axes.errorbar(places, off, yerr=2.0 * np.array(sd), fmt="o", color=BLUE, capsize=4.0)
+        axes.set_xticks(places, [target.target for target in placed])
+        axes.set_xlim(-0.5, len(placed) - 0.5)
+        axes.set_ylabel("diameter: placed − stated [‰]")
+        return picture(figure)
+
+
+def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
+    """Draw the places' residuals with two standard deviations."""
+    stated = [target for target in placed if target.check.residual_m is not None]
+    with sheet(3.8) as figure:
+        axes = figure.subplots()
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        for index, (name, colour) in enumerate(_COLOURS.items()):
+            off = np.array([_residual_mm(target, index) for target in stated])
+            sd = np.array([_sd_mm(target, index) for target in stated])
+            places = np.arange(len(stated)) + 0.2 * (index - 1)
+            axes.errorbar(
+                places, off, yerr=2.0 * sd, fmt="o", color=colour, capsize=4.0, label=name
+            )
+        axes.set_xticks(np.arange(len(stated)), [target.target for target in stated])
+        axes.set_xlim(-0.5, len(stated) - 0.5)
+        axes.set_ylabel("place: placed − stated [mm]")
+        axes.legend(ncols=3)
+        return picture(figure)
+
+
+def _residual_mm(target: PlacedTarget, axis: int) -> float:
+    residual = target.check.residual_m
+    return float("nan") if residual is None else _MM * float(residual[axis])
+
+
+def _sd_mm(target: PlacedTarget, axis: int) -> float:
+    cov = target.check.cov_m2
+    return float("nan") if cov is None else _MM * float(np.sqrt(cov[axis, axis]))
+
+
+def _frames(placed: tuple[PlacedTarget, ...]) -> Picture:
+    """Draw how well every frame fits, target by target."""
+    with sheet(3.8) as figure:
+        axes = figure.subplots()
+        axes.axhline(_EXPECTED_CHI2, color=GREY, linewidth=0.8, label="expected")
+        first, ticks = 0, []
+        for target in placed:
+            rows = first + np.arange(len(target.frames))
+            used, chi2 = target.is_used, np.maximum(target.chi2, 1e-3)
+            axes.plot(rows[used], chi2[used], "o", color=BLUE, markersize=3.5)
+            axes.plot(rows[~used], chi2[~used], "x", color=VERMILION, markersize=7.0)
+            ticks.append((float(rows.mean()), target.target))
+            first += len(rows) + 1
+        axes.set_yscale("log")
+        axes.set_xticks([place for place, _ in ticks], [name for _, name in ticks])
+        axes.set_xlabel("frames, target by target (×: left out)")
+        axes.set_ylabel("χ² of five numbers")
+        axes.legend()
+        return picture(figure)

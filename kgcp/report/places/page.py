@@ -1,0 +1,48 @@
+"""The report of placed targets as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+from kgcp.network.target_places import Placement
+from kgcp.quality.number_text import minus
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacesPage:
+    """All that the page shows."""
+
+    name: str  # of the flight
+    crs: str
+    placement: Placement
+    sentences: Sequence[str]  # of diameters and places
+    doubts: Sequence[str]
+    figures: Mapping[str, bytes]  # PNG, by name
+    files: Sequence[str]
+
+
+def render_places(page: PlacesPage) -> str:
+    """Return the page."""
+    environment = Environment(
+        # the shell is that of the bias report
+        loader=ChoiceLoader(
+            [PackageLoader("kgcp.report.places"), PackageLoader("kgcp.report.bias")]
+        ),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["fixed"] = lambda value, digits: minus(f"{value:.{digits}f}")
+    return environment.get_template("places.html").render(
+        page=page,
+        placement=page.placement,
+        images={
+            name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
+            for name, png in page.figures.items()
+        },
+    )

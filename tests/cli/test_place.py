@@ -1,0 +1,88 @@
+"""`kgcp place` on a flight over four static targets, made here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from tests.ground_flight import GroundFlight
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["place", *map(str, arguments)], catch_exceptions=False)
+
+
+def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None:
+    flight = GroundFlight(diameter_m=0.8993, stated_diameter_m=0.9)
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder, "--eo", "fixed", "--json", "--format", "csv", "--format", "metashape")
+    assert result.exit_code == 0, result.stderr
+    table = pd.read_parquet(folder / "kgcp" / "places.parquet").set_index("target")
+    assert list(table.index) == ["A", "B", "C", "D"]
+    off = table[["x", "y", "z"]].to_numpy() - flight.positions_map
+    z = off / table[["sd_x", "sd_y", "sd_z"]].to_numpy()
+    assert np.abs(off).max() < 0.002
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.8
+    diameters = (table["diameter_m"] - 0.8993) / table["sd_diameter_m"]
+    assert 0.2 < np.sqrt(np.mean(diameters**2)) < 2.0
+    assert (table["tilt_deg"] < 4.0 * table["sd_normal_deg"]).all()
+    assert (table["ambiguity"] > 100.0).all()
+    assert "the ring of 0.9 m measures 0.899" in result.stderr
+    assert "‰, " in result.stderr
+    assert "which is not what flight.toml says" in result.stderr
+    summary = json.loads(result.stdout)
+    assert summary["targets"][0]["frames_used"] == 12
+    assert (folder / "kgcp" / "places" / "kgcps.csv").exists()
+    page = (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
+    assert "Targets on the ground" in page
+    assert summary["sentences"][0] in page
+
+
+def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
+    flight = GroundFlight(wrong={(3, "B"): np.array([0.4, 0.0, 0.0])})
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder, "--targets", "B", "--json")
+    assert result.exit_code == 0, result.stderr
+    (target,) = json.loads(result.stdout)["targets"]
+    assert target["rejected"] == ["f_003.png"]
+    assert "1 of 12 frames does not fit the others" in result.stderr
+    residuals = pd.read_parquet(folder / "kgcp" / "place_residuals.parquet")
+    worst = residuals.set_index("frame").loc["f_003.png"]
+    assert not worst["used"]
+    assert abs(worst["residual_x_px"]) + abs(worst["residual_y_px"]) > 5.0
+
+
+def test_deviations_of_poses_count(tmp_path: Path) -> None:
+    folder = GroundFlight().write(tmp_path / "flight")
+    path = folder / "reference.csv"
+    head, *lines = path.read_text(encoding="utf-8").splitlines()
+    lines = [f"{line},0.02,0.02,0.03,0.01" for line in lines]
+    text = "\n".join((f"{head},sd_x,sd_y,sd_z,sd_angle_deg", *lines))
+    path.write_text(f"{text}\n", encoding="utf-8")
+    exact = json.loads(run(folder, "--eo", "fixed", "--json").stdout)["targets"][0]
+    free = json.loads(run(folder, "--json").stdout)["targets"][0]
+    assert free["sd_position_m"][0] > 0.02 > 10.0 * exact["sd_position_m"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("--targets", "A,Z"), "'Z': is not in flight.toml"),
+        (("--min-frames", "40"), "12 of them with a reference pose; 40 are needed"),
+        (("--poses", "none.csv"), "none.csv"),
+    ],
+)
+def test_what_cannot_be_placed_is_one_line(
+    tmp_path: Path, arguments: tuple[str, ...], problem: str
+) -> None:
+    folder = GroundFlight(frames=12).write(tmp_path / "flight")
+    result = run(folder, *arguments)
+    assert result.exit_code == 1
+    assert problem in result.stderr
+    assert result.stderr.count("\n") == 1

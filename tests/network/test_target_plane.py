@@ -1,0 +1,151 @@
+"""Circles in space from images with known noise: errors, deviations, both normals, wrong frames."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import rotation_about
+from kgcp.network.space_circle import (
+    CircleViews,
+    ExtraNoise,
+    NoCircleError,
+    SpaceCircle,
+    angle_deg,
+    outline_noise,
+)
+from kgcp.network.target_plane import common_covariance, place_circle, place_circles
+
+CAMERA = Camera(1500, 1000, 2222.0, 2222.0, 749.5, 499.5, k1=-0.08)
+NORMAL = np.array([0.05, 0.03, 1.0]) / np.linalg.norm([0.05, 0.03, 1.0])
+DISTANCE_M = 10.0
+
+
+def circle_of(radius_px: float) -> SpaceCircle:
+    return SpaceCircle(np.array([0.3, -0.2, 0.1]), NORMAL, radius_px * DISTANCE_M / CAMERA.fx)
+
+
+def views_of(
+    circle: SpaceCircle,
+    rng: np.random.Generator,
+    *,
+    sd_px: float = 0.005,
+    stated_px: float | None = None,
+    tilt_deg: tuple[float, float] = (25.0, 40.0),
+    frames: int = 8,
+) -> CircleViews:
+    centres, rotations = [], []
+    for index in range(frames):
+        azimuth = 2.0 * math.pi * index / frames + rng.normal(0.0, 0.1)
+        off = math.radians(rng.uniform(*tilt_deg))
+        centre = DISTANCE_M * np.array(
+            [math.sin(off) * math.cos(azimuth), math.sin(off) * math.sin(azimuth), math.cos(off)]
+        )
+        look = circle.centre_m + rng.normal(0.0, 0.5, 3) - centre
+        z = look / np.linalg.norm(look)
+        x = np.cross(z, [0.0, 1.0, 0.3])
+        x /= np.linalg.norm(x)
+        turn = rotation_about(np.array([0.0, 0.0, rng.uniform(0.0, 6.2)]))
+        centres.append(centre)
+        rotations.append(np.column_stack((x, np.cross(z, x), z)) @ turn)
+    nothing = CircleViews(
+        np.array(centres), np.array(rotations), np.zeros((frames, 5)), np.zeros((frames, 5, 5))
+    )
+    moments = circle_images(CAMERA, circle.in_cameras(nothing)).moments
+    unit = outline_noise(moments)
+    noise = np.einsum("nij,nj->ni", np.linalg.cholesky(unit), rng.standard_normal((frames, 5)))
+    return CircleViews(
+        nothing.camera_m,
+        nothing.world_from_camera,
+        moments + sd_px * noise,
+        (sd_px if stated_px is None else stated_px) ** 2 * unit,
+    )
+
+
+def errors_of(placed: SpaceCircle, truth: SpaceCircle) -> FloatArray:
+    turn = -placed.axes.T @ np.cross(placed.normal, truth.normal)
+    return np.array([*(placed.centre_m - truth.centre_m), *turn, placed.radius_m - truth.radius_m])
+
+
+def test_deviations_are_those_of_the_errors() -> None:
+    rng, truth, z = np.random.default_rng(3), circle_of(10.0), []
+    for _ in range(16):
+        fit = place_circle(CAMERA, views_of(truth, rng)).fit
+        z.append(errors_of(fit.circle, truth) / np.sqrt(np.diag(fit.cov)))
+    assert 0.8 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+
+
+def test_a_frame_that_shows_something_else_is_left_out() -> None:
+    truth = circle_of(10.0)
+    views = views_of(truth, np.random.default_rng(4))
+    views.moments[3, 0] += 1.0
+    views.moments[5, 2:] *= 1.2
+    fit = place_circle(CAMERA, views).fit
+    assert np.flatnonzero(~fit.is_used).tolist() == [3, 5]
+    assert fit.residuals[3, 0] == pytest.approx(1.0, abs=0.05)
+    assert angle_deg(fit.circle.normal, truth.normal) < 0.3
+
+
+def test_frames_from_one_direction_leave_two_normals() -> None:
+    truth = circle_of(10.0)
+    around = views_of(truth, np.random.default_rng(5), tilt_deg=(25.0, 26.0))
+    one_side = around.chosen(np.arange(8) == 0)
+    rng = np.random.default_rng(6)
+    jitter = 0.01 * rng.standard_normal((6, 3))
+    same = CircleViews(
+        one_side.camera_m + jitter,
+        np.repeat(one_side.world_from_camera, 6, axis=0),
+        np.zeros((6, 5)),
+        np.repeat(one_side.cov, 6, axis=0),
+    )
+    moments = circle_images(CAMERA, truth.in_cameras(same)).moments
+    noise = 0.005 * rng.standard_normal((6, 5)) * np.array([1, 1, 5, 5, 5])
+    placed = place_circle(
+        CAMERA, CircleViews(same.camera_m, same.world_from_camera, moments + noise, same.cov)
+    )
+    assert placed.other is not None
+    normals = (placed.fit.circle.normal, placed.other.circle.normal)
+    assert min(angle_deg(normal, truth.normal) for normal in normals) < 3.0
+    assert angle_deg(*normals) > 30.0
+    assert placed.ambiguity < 20.0
+    assert place_circle(CAMERA, around).ambiguity > 200.0
+
+
+def test_noise_beyond_the_stated_one_is_learnt() -> None:
+    rng, truth = np.random.default_rng(7), circle_of(10.0)
+    many = [views_of(truth, rng, sd_px=0.02, stated_px=0.005) for _ in range(4)]
+    placed, noise = place_circles(CAMERA, many)
+    expected = math.sqrt(0.02**2 - 0.005**2)
+    assert noise.centre_px == pytest.approx(expected, rel=0.35)
+    assert noise.outline_px == pytest.approx(expected, rel=0.35)
+    assert all(not isinstance(each, NoCircleError) for each in placed)
+
+
+def test_what_all_frames_share_is_stated_apart() -> None:
+    truth = circle_of(20.0)
+    views = views_of(truth, np.random.default_rng(8))
+    fit = place_circle(CAMERA, views).fit
+    calibration = np.zeros((12, 12))
+    calibration[0, 0] = calibration[1, 1] = calibration[0, 1] = calibration[1, 0] = 2.222**2
+    focal = common_covariance(CAMERA, views, fit, ExtraNoise(), calibration, 0.0)
+    edge = common_covariance(CAMERA, views, fit, ExtraNoise(), None, 0.02)
+    # a focal length that is 1 ‰ too long makes the circle 1 ‰ smaller, an edge 0.02 px larger
+    assert math.sqrt(focal[5, 5]) == pytest.approx(1e-3 * truth.radius_m, rel=0.3)
+    assert math.sqrt(edge[5, 5]) == pytest.approx(0.02 / 20.0 * truth.radius_m, rel=0.2)
+
+
+def test_rays_that_do_not_meet_are_no_circle() -> None:
+    views = views_of(circle_of(10.0), np.random.default_rng(9), frames=3)
+    backwards = CircleViews(
+        views.camera_m,
+        views.world_from_camera @ np.diag([1.0, -1.0, -1.0]),
+        views.moments,
+        views.cov,
+    )
+    with pytest.raises(NoCircleError, match="behind the cameras"):
+        place_circle(CAMERA, backwards)
