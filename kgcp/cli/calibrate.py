@@ -92,6 +92,13 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     help="Also write the camera for this program; may be repeated.",
 )
 @click.option(
+    "--against",
+    metavar="FILE",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Compare with another calibration of the camera: a camera.toml, or a file of OpenCV, ROS,"
+    " Metashape, COLMAP, OpenSfM, Pix4D, OPF or MMVII.",
+)
+@click.option(
     "--jobs",
     type=click.IntRange(0, 256),
     default=None,
@@ -120,8 +127,9 @@ def command(
     response: str,
     operator: str,
     formats: tuple[str, ...],
-    jobs: int | None,
     *,
+    against: Path | None,
+    jobs: int | None,
     is_same_aspect: bool | None,
     is_restart: bool,
     is_quiet: bool,
@@ -144,6 +152,7 @@ def command(
     from kgcp.io.flight.field_file import read_field
     from kgcp.measurement.discs.records import Operator
     from kgcp.network.calibration_records import CalibrationSettings, LensModel, PointModel
+    from kgcp.pipeline.calibration.against import read_other
     from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, find_photos
     from kgcp.report.plotting import load_matplotlib
 
@@ -160,9 +169,10 @@ def command(
         is_restart=is_restart,
     )
     found = find_photos(photos)
+    other = None if against is None else read_other(against, found)
     with log_to_stderr(is_quiet=is_quiet, as_json=log_json, unit="photo") as log, stopping(log):
         made = calibrate_photos(found, field, out, options, log)
-    results = write_results(made, out, formats)
+    results = write_results(made, out, formats, other)
     if as_json:
         import json
 

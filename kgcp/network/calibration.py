@@ -81,21 +81,31 @@ def calibrate_camera(
     Raises
     ------
     KgcpError
-        If fewer than three photographs show the field.
+        If fewer than three photographs show the field, or they determine nothing.
     """
     _require_views(views)
-    work = Work(tuple(views), field, size, settings)
+    try:
+        return _calibrated(Work(tuple(views), field, size, settings), start)
+    except np.linalg.LinAlgError as error:
+        raise KgcpError(
+            "the photographs determine no camera, however its parameters are limited; take some"
+            " from other sides, or correct what describes the field"
+        ) from error
+
+
+def _calibrated(work: Work, start: CameraCalibration | None) -> CameraCalibration:
+    field, settings = work.field, work.settings
     if start is not None:
         work = replace(work, field=start.field)
     points = field.points_m()
     # what a former calibration has dropped is all that is dropped now
     disordered = () if start is not None else _disordered(work)
-    work = replace(work, views=tuple(view for view in views if view.photo not in disordered))
+    work = replace(work, views=tuple(v for v in work.views if v.photo not in disordered))
     _require_views(work.views)
     observations = work.observations()
     unknowns = Unknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
-        camera, estimate = start_camera_and_poses(observations, points, size)
+        camera, estimate = start_camera_and_poses(observations, points, work.size)
         state = work.adjusted(camera, estimate, replace(unknowns, terms=()))
         for terms in (("k1",), ("k1", "k2")):
             state = work.with_unknowns(state, replace(unknowns, terms=terms))

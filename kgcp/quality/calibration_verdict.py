@@ -9,15 +9,16 @@ from enum import StrEnum
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.records import PointPrior
 from kgcp.quality.eccentricity import parameters_if_neglected
+from kgcp.quality.frame_rays import ray_deviations_px
 
 _CELLS = (8, 6)  # of the frame, that discs cover or do not
 _LEAST_VIEWS = 4
 _LEAST_DISCS = 6  # per photograph
+_MOST_REJECTED = 0.1
 _FOCAL_SHARE = 0.01
 _OPERATOR_RATIO = 3.0
 _FIELD_RATIO = 3.0
@@ -25,7 +26,6 @@ _COVERAGE = 0.7
 _NORMALS_DEG = 15.0
 _RADIUS_SHARE = 0.03
 _WIDE_DEG = 100.0  # of the field of view, beyond which lenses are fisheyes
-_GRID = 25  # points along the longer side of the frame, for the map of uncertainty
 
 
 class Grade(StrEnum):
@@ -96,41 +96,11 @@ def calibration_numbers(calibration: CameraCalibration) -> CalibrationNumbers:
         float(between.max()),
         np.degrees(np.arctan2(axes[:, 1], axes[:, 0])),
         math.degrees(2.0 * math.atan(0.5 * diagonal)),
-        _ray_sd_px(calibration),
+        ray_deviations_px(camera, calibration.covariance),
         None
         if calibration.points_used is PointModel.FIXED
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
     )
-
-
-def _ray_sd_px(calibration: CameraCalibration) -> FloatArray:
-    """Return the deviation of every pixel's ray as no turn of the camera could take it away [px].
-
-    A shift of the principal point and a turn of the camera look nearly the same. What a user of the
-    camera meets is what is left after the best turn.
-    """
-    camera = calibration.camera
-    columns = _GRID
-    rows = max(2, round(_GRID * camera.height / camera.width))
-    x, y = np.meshgrid(
-        np.linspace(0.0, camera.width - 1.0, columns), np.linspace(0.0, camera.height - 1.0, rows)
-    )
-    pixels = np.column_stack((x.ravel(), y.ravel()))
-    normalised = camera.undistort(pixels)
-    reachable = np.all(np.isfinite(normalised), axis=1)
-    normalised = np.where(reachable[:, None], normalised, 0.0)
-    by_camera = image_by_calibration(camera, normalised).reshape(-1, len(CALIBRATION_PARAMETERS))
-    u, v = normalised.T
-    one = np.ones_like(u)
-    turns = np.stack((u * v, -(1.0 + u * u), v, 1.0 + v * v, -u * v, -u), axis=1).reshape(-1, 2, 3)
-    by_turn = (camera.distort_jacobian(normalised) @ turns).reshape(-1, 3)
-    kept = np.repeat(reachable, 2)
-    basis = np.linalg.qr(by_turn[kept])[0]
-    left = np.zeros_like(by_camera)
-    left[kept] = by_camera[kept] - basis @ (basis.T @ by_camera[kept])
-    variances = np.einsum("ij,jk,ik->i", left, calibration.covariance.cov, left)
-    sd = np.sqrt(np.maximum(variances, 0.0).reshape(-1, 2).sum(axis=1))
-    return np.asarray(np.where(reachable, sd, np.nan * one).reshape(rows, columns))
 
 
 def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
@@ -173,6 +143,9 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> li
         reasons.append(f"{numbers.views} photographs are fewer than {_LEAST_VIEWS}")
     if numbers.discs_used < _LEAST_DISCS * numbers.views:
         reasons.append("there are fewer than 6 discs per photograph")
+    rejected = 1.0 - numbers.discs_used / numbers.discs
+    if rejected > _MOST_REJECTED:
+        reasons.append(f"{100.0 * rejected:.0f} % of the discs do not fit")
     share = numbers.sd[0] / calibration.camera.fx
     if share > _FOCAL_SHARE:
         reasons.append(f"the focal length is known to {100.0 * share:.1f} % only")

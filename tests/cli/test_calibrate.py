@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from PIL import ExifTags, Image
 
 from kgcp.cli import main
 from kgcp.cli.calibrate import FORMATS, LENSES, OPERATORS, POINTS, RESPONSES
@@ -18,7 +20,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.flight.camera_table import read_camera_file
 from kgcp.io.flight.flight import read_camera_and_targets
-from kgcp.io.formats.camera_writers import CAMERA_FORMATS
+from kgcp.io.formats.camera_writers import CAMERA_FORMATS, CalibratedCamera, camera_file
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration_records import LensModel, PointModel
 from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
@@ -171,12 +173,89 @@ def test_the_field_may_be_free_and_the_lens_chosen(photos: Path, tmp_path: Path)
     assert summary["camera"]["fx"] == pytest.approx(390.0, abs=3.0)
 
 
+def test_another_calibration_is_compared_with(
+    photos: Path, calibration: tuple[Path, Result], tmp_path: Path
+) -> None:
+    """With itself there is no difference; with a longer lens, one that grows outwards."""
+    own = calibration[0] / "camera.toml"
+    field = photos / "field.toml"
+    chosen = ("--points", "fixed", "--model", "radial", "--operator", "centroid", "--json")
+    camera = read_camera_file(own)[0]
+    longer = tmp_path / "longer.yml"
+    calibrated = CalibratedCamera(replace(camera, fx=1.01 * camera.fx), np.eye(12), 0.0)
+    longer.write_text(camera_file(calibrated, "opencv")[1])
+    out = tmp_path / "out"
+    result = run(photos, "--field", field, "--out", out, *QUIET, *chosen, "--against", longer)
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)["against"]
+    assert told["file"] == "longer.yml"
+    assert told["change"]["fx"] == pytest.approx(-3.9, abs=1.5)
+    assert 0.3 < told["rms_px"] < told["largest_px"] < 4.0
+    assert "Against longer.yml" in (out / "calibration.html").read_text(encoding="utf-8")
+    own.with_name("wide.toml").write_text(own.read_text().replace("width = 400", "width = 401"))
+    result = run(
+        photos,
+        "--field",
+        field,
+        "--out",
+        out,
+        *QUIET,
+        *chosen,
+        "--against",
+        own.parent / "wide.toml",
+    )
+    assert result.exit_code == 1
+    assert "wide.toml: is of frames of 401 x 300 px" in result.stderr
+
+
 def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:
     files = [photos / "photo1.png", photos / "photo2.png", photos / "photo10.png"]
     result = run(*files, "--field", photos / "field.toml", "--out", tmp_path, *QUIET)
     assert result.exit_code == 1
     assert "the field is found in 2 of 3 photographs (1 too_few), and 3 are needed" in result.stderr
     assert not (tmp_path / "camera.toml").exists()
+
+
+def test_copies_and_damaged_files_do_not_count(photos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name, source in (("a.png", 1), ("b.png", 1), ("c.png", 2)):
+        shutil.copy(photos / f"photo{source}.png", folder / name)
+    content = (photos / "photo3.png").read_bytes()
+    (folder / "d.png").write_bytes(content[: len(content) // 2])
+    result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
+    assert result.exit_code == 1
+    assert "found in 2 of 4 photographs (1 decode_failed, 1 duplicate), and 3" in result.stderr
+
+
+def test_two_focal_lengths_are_two_cameras(photos: Path, tmp_path: Path) -> None:
+    for index, focal in ((1, 24.0), (2, 35.0)):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "M1"
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal
+        with Image.open(photos / f"photo{index}.png") as image:
+            image.save(tmp_path / f"{index}.jpg", quality=98, exif=exif)
+    field, out = photos / "field.toml", tmp_path / "out"
+    result = run(tmp_path, "--field", field, "--out", out, *QUIET)
+    assert result.exit_code == 1
+    assert "several cameras or focal lengths: 1 by " in result.stderr
+    assert "24 mm, 1 by " in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_field_in_one_row_is_not_enough(photos: Path, tmp_path: Path) -> None:
+    """All but one row is out of the frame."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index in (1, 3, 5):
+        grey = cv2.imread(str(photos / f"photo{index}.png"), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        grey[:, : grey.shape[1] // 2] = 200
+        grey[: grey.shape[0] * 2 // 3] = 200
+        cv2.imwrite(str(folder / f"{index}.png"), grey)
+    result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
+    assert result.exit_code == 1
+    assert "the field is found in 0 of 3 photographs" in result.stderr
 
 
 def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ def views(
     bend_m: FloatArray | None = None,
     noise_px: float = SD_PX,
     camera: Camera = CAMERA,
+    distance_m: float = 0.33,
 ) -> list[NamedView]:
     """Photographs of the field from six sides, with exact moments and noise."""
     rng = np.random.default_rng(18)
@@ -48,7 +49,7 @@ def views(
         angle = 2.0 * np.pi * index / len(TURNS)
         about = np.array([np.cos(angle), np.sin(angle), 0.0])
         rotation = rotation_about(tilt * about) @ rotation_about(np.array([0.0, 0.0, turn]))
-        middle = [0.03 * np.cos(angle), 0.02 * np.sin(angle), 0.33]
+        middle = [0.03 * np.cos(angle), 0.02 * np.sin(angle), distance_m]
         centres = (points - points.mean(axis=0)) @ rotation.T + middle
         axes = np.broadcast_to(rotation[:, :2], (len(centres), 3, 2))
         circles = Circles3D(centres, axes, FIELD.radii_m())
@@ -78,15 +79,13 @@ def test_a_good_calibration_is_called_good() -> None:
     assert np.all(np.abs(errors) < 4.0 * sd)
     assert np.all(sd < 0.5)
     assert result.camera.k1 == pytest.approx(-0.11, abs=0.002)
+    assert result.camera.fy == result.camera.fx
     assert result.radius_scale == pytest.approx(1.0, abs=0.001)
     assert 0.0 < np.nanmin(numbers.ray_sd_px) < np.nanmax(numbers.ray_sd_px) < 1.0
 
 
 def test_two_focal_lengths_are_estimated_where_they_differ() -> None:
-    fixed, auto = PointModel.FIXED, LensModel.AUTO
-    alike = calibrated(views(), fixed, auto)
-    assert alike.camera.fy == alike.camera.fx
-    wider = calibrated(views(camera=replace(CAMERA, fy=1503.0)), fixed, auto)
+    wider = calibrated(views(camera=replace(CAMERA, fy=1503.0)), lens=LensModel.AUTO)
     assert wider.camera.fy - wider.camera.fx == pytest.approx(3.0, abs=0.2)
     assert "fy" not in wider.tangled
 
@@ -141,6 +140,55 @@ def test_discs_that_were_not_measured_are_expected_where_they_are() -> None:
     assert point.tolist() == [0, 1, 2, 3]
     assert np.abs(vectors[:, :2] - made[0].vectors[:4, :2]).max() < 0.1
     assert vectors[:, 2:] == pytest.approx(made[0].vectors[:4, 2:], rel=0.01)
+
+
+def test_a_displaced_disc_is_rejected_everywhere() -> None:
+    made = []
+    for view in views():
+        vectors = view.vectors.copy()
+        vectors[7, 0] += 3.0
+        made.append(replace(view, vectors=vectors))
+    result = calibrated(made)
+    rejected = result.network.observations.point[~result.solution.is_used]
+    assert rejected.tolist() == [7] * 6
+    assert result.camera.fx == pytest.approx(1500.0, abs=0.5)
+
+
+def test_more_than_a_tenth_of_wrong_discs_make_it_unusable() -> None:
+    rng = np.random.default_rng(4)
+    made = []
+    for view in views():
+        vectors = view.vectors.copy()
+        wrong = rng.choice(len(vectors), 5, replace=False)
+        vectors[wrong, :2] += 8.0 * rng.standard_normal((5, 2))
+        made.append(replace(view, vectors=vectors))
+    result = calibrated(made)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is Grade.UNUSABLE
+    assert "% of the discs do not fit" in verdict.sentence
+
+
+def test_a_fisheye_is_told() -> None:
+    """Rays by r = f θ, at up to 60° from the axis."""
+    wide = Camera(1600, 1200, 500.0, 500.0, 811.0, 583.0)
+    made = []
+    for view in views(camera=wide, distance_m=0.1)[:4]:
+        vectors = view.vectors.copy()
+        across = vectors[:, :2] - [811.0, 583.0]
+        radius = np.linalg.norm(across, axis=1, keepdims=True)
+        vectors[:, :2] = [811.0, 583.0] + across / radius * 500.0 * np.arctan(radius / 500.0)
+        made.append(replace(view, vectors=vectors))
+    result = calibrated(made, lens=LensModel.RADIAL)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is Grade.UNUSABLE
+    assert "fisheye" in verdict.sentence
+
+
+def test_one_photograph_three_times_is_no_traceback() -> None:
+    once = views()[0]
+    copies = [replace(once, photo=f"copy{index}") for index in range(3)]
+    with pytest.raises(KgcpError, match="the photographs determine no camera"):
+        calibrated(copies, PointModel.STIFF)
 
 
 def test_two_photographs_are_too_few() -> None:

@@ -21,6 +21,7 @@ from kgcp.targets.fields.layout import Field
 from kgcp.targets.fields.naming import NamingProblem, SeenDiscs, name_discs
 
 _LEAST_DISCS = 6
+_LEAST_WIDTH = 0.01  # of their length, of discs that are not in one row
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +91,9 @@ def measure_field(
     if len(named) < _LEAST_DISCS:
         detail = f"{len(named)} of {len(naming.disc)} discs could be measured"
         return PhotoMiss(photo, width, height, NamingProblem.TOO_FEW.value, detail)
+    if _are_in_one_row(task.field.points_m()[[point for point, _ in named]]):
+        detail = f"all {len(named)} discs are in one row"
+        return PhotoMiss(photo, width, height, NamingProblem.TOO_FEW.value, detail)
     named.sort(key=lambda pair: pair[0])
     discs = [disc for _, disc in named]
     return PhotoDiscs(
@@ -103,6 +107,16 @@ def measure_field(
         *_values(discs),
         np.zeros(len(discs)),
     )
+
+
+def _are_in_one_row(points_m: FloatArray) -> bool:
+    """Return whether points (k, 3) of a plane determine no homography: all but one in a row."""
+    for left_out in range(len(points_m)):
+        rest = np.delete(points_m, left_out, axis=0)
+        _, widths, _ = np.linalg.svd(rest - rest.mean(axis=0))
+        if widths[1] < _LEAST_WIDTH * widths[0]:
+            return True
+    return False
 
 
 def measure_more(

@@ -31,6 +31,7 @@ from kgcp.io.tables.calibration import (
 from kgcp.io.tables.columns import SCHEMA_VERSION, row_of
 from kgcp.io.tables.parquet import write_table
 from kgcp.network.calibration_records import CalibrationSettings, LensModel
+from kgcp.pipeline.calibration.against import OtherCalibration
 from kgcp.pipeline.calibration.run import PhotoCalibration
 from kgcp.quality.calibration_verdict import (
     CalibrationNumbers,
@@ -39,8 +40,9 @@ from kgcp.quality.calibration_verdict import (
     change_if_neglected,
     judge,
 )
-from kgcp.report.calibration.figures import draw_figures
-from kgcp.report.calibration.page import CalibrationPage, render_calibration
+from kgcp.quality.frame_rays import compare_cameras
+from kgcp.report.calibration.figures import draw_comparison, draw_figures
+from kgcp.report.calibration.page import CalibrationPage, CameraComparison, render_calibration
 
 CAMERA_FILE = "camera.toml"
 
@@ -84,11 +86,18 @@ def _require_formats(formats: Sequence[str], *, is_same_aspect: bool, k4: float)
         camera_file(CalibratedCamera(camera, np.eye(size), 0.0), form)
 
 
-def write_results(made: PhotoCalibration, out: Path, formats: Sequence[str]) -> CalibrationResults:
+def write_results(
+    made: PhotoCalibration,
+    out: Path,
+    formats: Sequence[str],
+    other: OtherCalibration | None = None,
+) -> CalibrationResults:
     """Write all files of a calibration into a folder.
 
     Parameters
     ----------
+    other : OtherCalibration, optional
+        To compare with.
     formats : sequence of str
         Of `kgcp.io.formats.camera_writers.CAMERA_FORMATS`.
 
@@ -100,6 +109,10 @@ def write_results(made: PhotoCalibration, out: Path, formats: Sequence[str]) -> 
     calibration = made.calibration
     numbers = calibration_numbers(calibration)
     verdict = judge(calibration, numbers)
+    comparison = None
+    if other is not None:
+        difference = compare_cameras(calibration.camera, other.camera)
+        comparison = CameraComparison(other.name, other.camera, difference)
     exported = CalibratedCamera(calibration.camera, calibration.covariance.cov, numbers.rms_px)
     texts = dict(camera_file(exported, form) for form in formats)
     texts[CAMERA_FILE] = camera_toml(calibration.camera, calibration.covariance)
@@ -107,7 +120,7 @@ def write_results(made: PhotoCalibration, out: Path, formats: Sequence[str]) -> 
     discs = field_discs(calibration)
     texts["field.csv"] = field_csv(discs)
     photos = photo_rows(calibration, made.misses, made.photos)
-    summary = _summary(made, numbers, verdict, photos)
+    summary = _summary(made, numbers, verdict, photos, comparison)
     texts["calibration.json"] = json.dumps(summary, indent=1) + "\n"
     tables = (
         ("observations.parquet", OBSERVATION_COLUMNS, observation_rows(calibration, made.discs)),
@@ -115,9 +128,10 @@ def write_results(made: PhotoCalibration, out: Path, formats: Sequence[str]) -> 
         ("photos.parquet", PHOTO_COLUMNS, (row_of(PHOTO_COLUMNS, row) for row in photos)),
     )
     names = sorted([*texts, *(name for name, _, _ in tables), "calibration.html"])
-    page = CalibrationPage(
-        calibration, numbers, verdict, photos, draw_figures(calibration, numbers), names
-    )
+    figures = draw_figures(calibration, numbers)
+    if comparison is not None:
+        figures["against"] = draw_comparison(calibration.camera, comparison.difference)
+    page = CalibrationPage(calibration, numbers, verdict, photos, figures, names, comparison)
     texts["calibration.html"] = render_calibration(page)
     about = {"schema_version": SCHEMA_VERSION, "kgcp_version": __version__}
     for name, columns, rows in tables:
@@ -132,10 +146,13 @@ def _summary(
     numbers: CalibrationNumbers,
     verdict: CalibrationVerdict,
     photos: Sequence[PhotoRow],
+    comparison: CameraComparison | None,
 ) -> dict[str, object]:
     calibration = made.calibration
     camera = calibration.camera
+    against = {} if comparison is None else {"against": comparison.numbers(camera)}
     return {
+        **against,
         "kgcp_version": __version__,
         "verdict": verdict.grade.value,
         "reasons": verdict.reasons,

@@ -47,6 +47,7 @@ _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
 UNLIKE_FIELD = "unlike_field"
+DUPLICATE = "duplicate"
 REASONS: Mapping[str, str] = {
     Reason.DECODE_FAILED.value: "the file is not an image, or is damaged",
     Reason.WORKER_DIED.value: Reason.WORKER_DIED.description,
@@ -56,6 +57,7 @@ REASONS: Mapping[str, str] = {
     "two_fields": "two fields in one photograph",
     "ambiguous": "a part of the field that could be another part; show all of it, or a mark",
     OTHER_SIZE: "the photograph has another size than most",
+    DUPLICATE: "the same as another photograph, which says nothing new",
     UNLIKE_FIELD: "most discs do not fit the camera and the field of the other photographs",
 }
 """Why a photograph is not used: the words of the `reason` column."""
@@ -168,7 +170,7 @@ def calibrate_photos(
         first = looks.through(
             "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
         )
-        results = _of_one_camera(first)
+        results = _without_duplicates(_of_one_camera(first))
         views = _views(results)
         start = calibrate_camera(
             views,
@@ -268,6 +270,22 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
         )
         for result in results
     ]
+
+
+def _without_duplicates(
+    results: Sequence[PhotoDiscs | PhotoMiss],
+) -> list[PhotoDiscs | PhotoMiss]:
+    """Return the results, all but the first of those with the very same discs left out."""
+    first_of: dict[bytes, str] = {}
+    kept: list[PhotoDiscs | PhotoMiss] = []
+    for result in results:
+        if isinstance(result, PhotoDiscs):
+            first = first_of.setdefault(result.vectors.tobytes(), result.photo)
+            if first != result.photo:
+                size = (result.width, result.height)
+                result = PhotoMiss(result.photo, *size, DUPLICATE, f"of {first}")  # noqa: PLW2901
+        kept.append(result)
+    return kept
 
 
 def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:

@@ -7,8 +7,10 @@ from matplotlib.axes import Axes
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibration
+from kgcp.geometry.camera import Camera
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.quality.calibration_verdict import CalibrationNumbers
+from kgcp.quality.frame_rays import CameraDifference
 from kgcp.report.eccentricity_figure import draw_eccentricity
 from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
 
@@ -32,6 +34,21 @@ def draw_figures(calibration: CameraCalibration, numbers: CalibrationNumbers) ->
     if calibration.points_used is not PointModel.FIXED:
         figures["field"] = _field(calibration)
     return {name: figure.png for name, figure in figures.items()}
+
+
+def draw_comparison(camera: Camera, difference: CameraDifference) -> bytes:
+    """Return how another calibration moves the rays of a camera over the frame, as PNG."""
+    is_there = np.isfinite(difference.shifts_px).all(axis=1)
+    shifts = difference.shifts_px[is_there]
+    length = 2.0 * _ARROW_SHARE * camera.width
+    largest = max(difference.largest_px, 1e-9)
+    with sheet(5.2) as figure:
+        axes = figure.subplots()
+        _frame(axes, camera.width, camera.height)
+        _arrows(axes, difference.pixels[is_there], shifts, largest / length, BLUE)
+        axes.set_xlabel(f"x [px]   (the longest arrow is {largest:.3f} px)")
+        axes.set_ylabel("y [px]")
+        return picture(figure).png
 
 
 def _residuals(calibration: CameraCalibration) -> Picture:

@@ -10,6 +10,7 @@ import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
+from kgcp.geometry.camera import Camera
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.quality.calibration_verdict import (
@@ -18,11 +19,30 @@ from kgcp.quality.calibration_verdict import (
     Grade,
     change_if_neglected,
 )
+from kgcp.quality.frame_rays import CameraDifference
 from kgcp.quality.number_text import minus
 from kgcp.report.calibration.figures import ellipse_sizes
 
 _PIXELS = 4  # the first parameters are lengths in pixels
 _CLASSES = {Grade.GOOD: "good", Grade.LOOK: "look", Grade.UNUSABLE: "unusable"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraComparison:
+    """The camera beside that of another calibration."""
+
+    name: str
+    camera: Camera
+    difference: CameraDifference
+
+    def numbers(self, camera: Camera) -> dict[str, object]:
+        """Return what calibration.json says of it; changes are this camera's minus the other's."""
+        changes = {
+            name: getattr(camera, name) - getattr(self.camera, name)
+            for name in CALIBRATION_PARAMETERS
+        }
+        sizes = {"rms_px": self.difference.rms_px, "largest_px": self.difference.largest_px}
+        return {"file": self.name, **sizes, "change": changes}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +55,7 @@ class CalibrationPage:
     photos: Sequence[PhotoRow]
     figures: Mapping[str, bytes]  # PNG, by name
     files: Sequence[str]
+    comparison: CameraComparison | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +91,7 @@ def render_calibration(page: CalibrationPage) -> str:
         correlations=_correlations(page.calibration),
         eccentricity=_eccentricity(page.calibration),
         neglected=neglected_words(page.calibration),
+        ray_sd_px=float(np.sqrt(np.nanmean(page.numbers.ray_sd_px**2))),
         images={
             name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
             for name, png in page.figures.items()

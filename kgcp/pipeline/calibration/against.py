@@ -1,0 +1,46 @@
+"""Another calibration of the same camera, to compare with."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
+from kgcp.io.flight.camera_table import read_camera_file
+from kgcp.io.formats.calibrations import read_calibration
+from kgcp.io.images.exif import read_frame_header
+from kgcp.pipeline.calibration.photographs import Photo
+
+
+@dataclass(frozen=True, slots=True)
+class OtherCalibration:
+    """A camera, and the file that it is from."""
+
+    name: str
+    camera: Camera
+
+
+def read_other(path: Path, photos: Sequence[Photo]) -> OtherCalibration:
+    """Read a camera.toml, or another program's calibration, of the camera that took photographs.
+
+    Raises
+    ------
+    KgcpError
+        Naming the file and the remedy, also if its frames have another size than most photographs.
+    """
+    headers = [read_frame_header(photo.path, photo.name).size_px for photo in photos]
+    sizes = Counter(size for size in headers if size is not None)
+    usual = max(sizes, key=lambda size: (sizes[size], size)) if sizes else (None, None)
+    if path.suffix != ".toml":
+        return OtherCalibration(path.name, read_calibration(path, usual))
+    camera, _ = read_camera_file(path)
+    if sizes and usual != (camera.width, camera.height):
+        raise KgcpError(
+            f"{path}: is of frames of {camera.width} x {camera.height} px, and the photographs have"
+            f" {usual[0]} x {usual[1]} px; give a calibration of the same frames",
+            option="against",
+        )
+    return OtherCalibration(path.name, camera)
