@@ -22,6 +22,7 @@ from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from kgcp.io.tables.places import PLACE_COLUMNS, PLACE_RESIDUAL_COLUMNS
+from kgcp.io.tables.poses import POSE_COLUMNS
 from kgcp.quality.checks.doubt import Cause
 from tests.test_layers import LAYERS, MODULES
 
@@ -59,6 +60,7 @@ def first_column(text: str) -> list[str]:
         ("consistency.parquet", CONSISTENCY_COLUMNS),
         ("bias.parquet", BIAS_COLUMNS),
         ("places.parquet", PLACE_COLUMNS),
+        ("poses.parquet", POSE_COLUMNS),
         ("place_residuals.parquet", PLACE_RESIDUAL_COLUMNS),
     ],
 )

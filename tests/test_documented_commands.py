@@ -27,12 +27,14 @@ OF_OTHERS = {"--force-gps", "--gcp", "--gps-accuracy", "--tilt", "--wander"}
 HERE = "sample_flight"
 BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
 # Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates, and
-# tests/cli/test_calibrate.py calibrates, and tests/cli/test_place.py has static targets.
+# tests/cli/test_calibrate.py calibrates, and test_place.py and test_orient.py have
+# static targets.
 READ_ONLY = {
     "--scheduler",
     "simulate",
     "calibrate",
     "place",
+    "orient",
     "north",
 }  # tests/cli/test_merging.py merges flights
 STORES = ("s3://", "gs://")

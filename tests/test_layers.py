@@ -62,7 +62,7 @@ LIBRARIES: dict[str, frozenset[str]] = {
     "measurement.discs": IMAGES,
     "measurement": IMAGES,
     "georef": ARRAYS | {"scipy", "pyproj"},
-    "network": ARRAYS | {"scipy"},
+    "network": ARRAYS | {"scipy", "cv2"},
     "simulation": IMAGES,
     "quality": ARRAYS | {"scipy"},
     "io.files": ARRAYS | {"yaml"},

@@ -23,6 +23,7 @@ COMMANDS = {
     "detect": "kgcp.cli.detect",
     "export-gcp": "kgcp.cli.export_gcp",
     "bias-report": "kgcp.cli.bias_report",
+    "orient": "kgcp.cli.orient",
     "place": "kgcp.cli.place",
     "plan": "kgcp.cli.plan",
     "target": "kgcp.cli.target",

@@ -188,12 +188,22 @@ def place_targets(
     usable, all_views, all_frames = [], [], []
     for target in targets:
         mine = [each for each in sightings if each.target == target.name and not each.instance]
-        posed = [each for each in mine if each.frame in rows and each.pose_cov is not None]
+        posed = [each for each in mine if each.frame in rows and _has_pose(each)]
         if len(posed) < min_frames:
             skipped[target.name] = _too_few(mine, posed, rows, min_frames)
             continue
         at = [rows[each.frame] for each in posed]
-        moments, cov = _images(camera, posed, 0.5 * target.ring.outer_diameter_m)
+        measured = [
+            (each.pose, each.pose_cov)
+            for each in posed
+            if each.pose is not None and each.pose_cov is not None
+        ]
+        moments, cov = ring_images(
+            camera,
+            [pose for pose, _ in measured],
+            [cov for _, cov in measured],
+            0.5 * target.ring.outer_diameter_m,
+        )
         usable.append(target)
         all_frames.append(tuple(each.frame for each in posed))
         all_views.append(
@@ -221,6 +231,10 @@ def place_targets(
         )
         placed.append(_on_the_map(target, frames, outcome, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
+
+
+def _has_pose(sighting: Sighting) -> bool:
+    return sighting.pose is not None and sighting.pose_cov is not None
 
 
 def _too_few(
@@ -252,24 +266,26 @@ def _exterior_cov(poses: ReferencePoses, orientations: ExteriorOrientations) -> 
     return cov
 
 
-def _images(
-    camera: Camera, sightings: Sequence[Sighting], radius_m: float
+def ring_images(
+    camera: Camera, poses: Sequence[Pose], pose_covs: Sequence[FloatArray], radius_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return moments (n, 5) of outer circles, and their covariances (n, 5, 5), by measured poses.
+    """Return moments (n, 5) of circles, and their covariances (n, 5, 5), by n measured poses.
 
     A pose has six numbers, of which the turn about the normal does not move the circle: the five
     others and the five moments follow from each other.
+
+    Parameters
+    ----------
+    poses, pose_covs
+        Of the targets in the camera frame, as measured with this radius.
+    radius_m : float
+        Of the circle that was assumed.
     """
-    pairs = [
-        (each.pose, each.pose_cov)
-        for each in sightings
-        if each.pose is not None and each.pose_cov is not None
-    ]
-    circles = _circles([pose for pose, _ in pairs], radius_m)
+    circles = _circles(poses, radius_m)
     moments = circle_images(camera, circles).moments
     slopes = circle_slopes(camera, circles)
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
-    cov = by_pose @ np.array([cov for _, cov in pairs]) @ np.swapaxes(by_pose, 1, 2)
+    cov = by_pose @ np.array(pose_covs) @ np.swapaxes(by_pose, 1, 2)
     size = np.sqrt(np.maximum(moments[:, 2] + moments[:, 4], 0.0))
     floor = np.ones((len(moments), 5))
     floor[:, 2:] = size[:, None]

@@ -1,0 +1,1 @@
+"""Targets on the ground: placing them, and orienting frames by them."""

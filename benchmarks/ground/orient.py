@@ -1,0 +1,158 @@
+"""Frames oriented from points with wrong names among them: right poses and stated deviations.
+
+One line per number of points, with and without distances by the images' sizes. A pose is right if
+its squared error over its covariance is one that chance allows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.pool import ordered_map
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import rotation_about
+from kgcp.network.resection import CameraPose, NoPoseError, PointImages, orient
+from kgcp.pipeline.execution.threads import use_one_thread_each
+
+_CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)
+_HEIGHT_M = 30.0
+_SD_PX, _SD_POSITION_M, _SD_DISTANCE = 0.05, 0.005, 5e-4
+_WRONG = 0.3  # share of wrong names
+_RIGHT_CHI2 = 50.0  # of six numbers: beyond it once in a hundred million times
+_POINTS = (3, 4, 5, 6, 8, 12, 20, 30)
+_LEAST_RIGHT = 0.999
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """One line of the table."""
+
+    points: int
+    has_distance: bool
+    frames: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What became of the frames of one setup."""
+
+    setup: Setup
+    refused: int
+    wrong: int
+    z: FloatArray  # (n, 6): standardised errors of right poses
+
+    @property
+    def right_share(self) -> float:
+        """Right poses among those that were given."""
+        given = len(self.z) + self.wrong
+        return len(self.z) / given if given else math.nan
+
+
+def _true_pose(rng: np.random.Generator) -> CameraPose:
+    off, azimuth = math.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 2.0 * math.pi)
+    centre = _HEIGHT_M * np.array(
+        [math.sin(off) * math.cos(azimuth), math.sin(off) * math.sin(azimuth), math.cos(off)]
+    )
+    z = -centre / _HEIGHT_M
+    x = np.cross(z, [0.0, 1.0, 0.2])
+    x /= np.linalg.norm(x)
+    turn = rotation_about(np.array([0.0, 0.0, rng.uniform(-math.pi, math.pi)]))
+    return CameraPose(centre, np.column_stack((x, np.cross(z, x), z)) @ turn)
+
+
+def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointImages]:
+    """Draw a frame: points on nearly flat or rough ground, some of them under another's name."""
+    count, pose = setup.points, _true_pose(rng)
+    places = np.column_stack(
+        (
+            rng.uniform(-9.0, 9.0, count),
+            rng.uniform(-6.5, 6.5, count),
+            rng.normal(0.0, rng.choice([0.05, 1.0]), count),
+        )
+    )
+    true = places + rng.normal(0.0, _SD_POSITION_M, places.shape)
+    in_camera = pose.in_camera(true)
+    pixels = _CAMERA.project(in_camera) + rng.normal(0.0, _SD_PX, (count, 2))
+    distance = np.linalg.norm(in_camera, axis=1) * (1.0 + rng.normal(0.0, _SD_DISTANCE, count))
+    names = np.arange(count)
+    bad = rng.choice(count, int(_WRONG * count), replace=False)
+    if len(bad) == 1:
+        names[bad[0]] = rng.choice(np.setdiff1d(names, bad))
+    else:
+        names[bad] = np.roll(bad, 1)
+    unknown = np.full(count, np.nan)
+    images = PointImages(
+        places[names],
+        np.repeat(_SD_POSITION_M**2 * np.eye(3)[None], count, axis=0),
+        pixels,
+        np.repeat(_SD_PX**2 * np.eye(2)[None], count, axis=0),
+        distance if setup.has_distance else unknown,
+        _SD_DISTANCE * distance if setup.has_distance else unknown,
+    )
+    return pose, images
+
+
+def measure(setup: Setup) -> Outcome:
+    """Orient frames of one setup."""
+    rng = np.random.default_rng([setup.seed, setup.points, setup.has_distance])
+    refused, wrong, z = 0, 0, []
+    for _ in range(setup.frames):
+        truth, images = _scene(setup, rng)
+        try:
+            found = orient(_CAMERA, images)
+        except NoPoseError:
+            refused += 1
+            continue
+        turn = found.pose.world_from_camera @ truth.world_from_camera.T
+        odd = 0.5 * (turn - turn.T)
+        error = np.array([*(found.pose.centre_m - truth.centre_m), odd[2, 1], odd[0, 2], odd[1, 0]])
+        if error @ np.linalg.solve(found.cov, error) < _RIGHT_CHI2:
+            z.append(error / np.sqrt(np.diag(found.cov)))
+        else:
+            wrong += 1
+    return Outcome(setup, refused, wrong, np.array(z).reshape(-1, 6))
+
+
+def line(outcome: Outcome) -> str:
+    """Return the outcome in words."""
+    setup = outcome.setup
+    kind = "places and distances" if setup.has_distance else "places alone"
+    if not len(outcome.z):
+        return f"{setup.points:2d} points, {kind}: all {outcome.refused} frames refused"
+    z = np.sqrt(np.mean(outcome.z**2, axis=0))
+    is_reached = outcome.right_share >= _LEAST_RIGHT and 0.9 <= float(np.sqrt(np.mean(z**2))) <= 1.1
+    return (
+        f"{setup.points:2d} points, {kind}: right {100 * outcome.right_share:.2f} % of"
+        f" {len(outcome.z) + outcome.wrong}, {outcome.refused} refused, z"
+        f" {' '.join(f'{each:.2f}' for each in z)}{'' if is_reached else '  MISSED'}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a line per number of points."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--frames", type=int, default=300, help="per line")
+    parser.add_argument("--points", type=int, nargs="+", default=_POINTS)
+    options = parser.parse_args(arguments)
+    setups = [
+        Setup(points, has_distance, options.frames, 0)
+        for has_distance, points in itertools.product((True, False), options.points)
+    ]
+    for outcome in ordered_map(
+        measure, setups, jobs=options.jobs, start=use_one_thread_each, start_arguments=()
+    ):
+        print(line(outcome), flush=True)
+
+
+if __name__ == "__main__":
+    main()

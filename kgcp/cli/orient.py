@@ -1,0 +1,96 @@
+"""`kgcp orient`: detections of static targets in, poses of the camera out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+
+if TYPE_CHECKING:
+    from kgcp.io.images.remote import StoredFolder
+    from kgcp.pipeline.ground.orient import FlightPoses
+
+
+@click.command()
+@flight_place_argument
+@out_place_option
+@click.option(
+    "--frames",
+    "patterns",
+    metavar="PATTERN",
+    multiple=True,
+    help="Orient these frames, for example 'west/*'; may be repeated.  [default: all]",
+)
+@click.option(
+    "--min-points",
+    metavar="N",
+    type=click.IntRange(3),
+    default=4,
+    show_default=True,
+    help="Targets that must agree in a frame; three whose distances are measured are enough.",
+)
+@click.option(
+    "--free-focal",
+    is_flag=True,
+    help="Estimate the focal length, too; that in flight.toml may be wrong by a factor of two.",
+)
+@detections_option
+@json_option
+def command(
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    detections: Path | None,
+    *,
+    patterns: tuple[str, ...],
+    min_points: int,
+    free_focal: bool,
+    as_json: bool,
+) -> None:
+    """Orient frames by the static targets in them, without an adjustment.
+
+    Computes the camera's pose in every frame with three or more targets that have a position_m, and
+    rejects targets that do not agree. A frame with one ring is oriented once other frames have told
+    how that ring lies. Writes poses.parquet and poses.csv to FLIGHT/kgcp. poses.csv can be given as
+    [reference] poses. Run 'kgcp detect' first.
+
+    Example: kgcp orient FLIGHT
+    """
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
+    from kgcp.pipeline.workspace import DETECTIONS, open_workspace
+
+    options = OrientOptions(patterns, min_points, has_free_focal=free_focal)
+    with open_workspace(flight, out, (DETECTIONS,)) as workspace:
+        the_flight = read_flight(workspace.flight)
+        poses = orient_flight(the_flight, detections or workspace.out / DETECTIONS, options)
+        written = write_poses(poses, workspace.out)
+    if as_json:
+        import json
+
+        files = [*map(workspace.named, written)]
+        click.echo(json.dumps({**poses.summary(), "files": files}))
+    _report(poses)
+    for path in written:
+        click.echo(f"wrote {workspace.named(path)}", err=True)
+
+
+def _report(poses: FlightPoses) -> None:
+    from collections import Counter
+
+    oriented = poses.oriented
+    by_ring = sum(each.is_by_one_ring for each in oriented)
+    of_these = f" ({by_ring} by one ring)" if by_ring else ""
+    click.echo(f"{len(oriented)} of {len(poses.poses)} frames oriented{of_these}", err=True)
+    reasons = Counter(each.reason for each in poses.poses if each.pose is None)
+    for reason, count in reasons.most_common():
+        click.echo(f"  {count:6d} {reason}", err=True)
+    for each in oriented:
+        left_out = [name for name in each.targets if name not in each.used]
+        if left_out and not each.is_by_one_ring:
+            click.echo(f"kgcp: look: {each.frame}: {', '.join(left_out)} left out", err=True)
+    if poses.focal_px is not None:
+        focal, sd = poses.focal_px
+        click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)

@@ -1,0 +1,135 @@
+"""`poses.parquet` and `poses.csv`: oriented frames on the flight's map."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
+from kgcp.network.frame_poses import FramePose
+
+_AXES = "xyz"
+_ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+_DEGREES_DECIMALS = 12  # of geographic coordinates, by which 0.1 µm shows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPose:
+    """A frame's pose on the map."""
+
+    frame_pose: FramePose
+    position_map: FloatArray | None  # (3,); None: not oriented
+    opk_deg: FloatArray | None  # (3,)
+    cov: FloatArray | None  # (6, 6): position [m] and rotation vector [rad], the map's axes
+
+    @property
+    def sd_angle_deg(self) -> float | None:
+        """Standard deviation of an angle, as the root of the three's mean square [deg]."""
+        if self.cov is None:
+            return None
+        return math.degrees(math.sqrt(float(np.trace(self.cov[3:, 3:])) / 3.0))
+
+
+def on_map(poses: Sequence[FramePose], local_frame: LocalFrame) -> list[MapPose]:
+    """Bring poses from the ENU frame to the map."""
+    rows = []
+    for each in poses:
+        if each.pose is None or each.cov is None:
+            rows.append(MapPose(each, None, None, None))
+            continue
+        map_from_enu = local_frame.grid_rotation(each.pose.centre_m).T
+        rotation = map_from_enu @ each.pose.world_from_camera @ CAMERA_FROM_PHOTO
+        turn = np.kron(np.eye(2), map_from_enu)
+        rows.append(
+            MapPose(
+                each,
+                local_frame.map_from_enu(each.pose.centre_m[None])[0],
+                opk_from_rotation(rotation[None])[0],
+                turn @ each.cov @ turn.T,
+            )
+        )
+    return rows
+
+
+def _position(axis: int, row: MapPose) -> float | None:
+    return None if row.position_map is None else float(row.position_map[axis])
+
+
+def _angle(axis: int, row: MapPose) -> float | None:
+    return None if row.opk_deg is None else float(row.opk_deg[axis])
+
+
+def _sd_position(axis: int, row: MapPose) -> float | None:
+    return None if row.cov is None else math.sqrt(row.cov[axis, axis])
+
+
+def _rejected(row: MapPose) -> str:
+    pose = row.frame_pose
+    return "" if pose.pose is None else " ".join(n for n in pose.targets if n not in pose.used)
+
+
+def _method(row: MapPose) -> str:
+    if row.frame_pose.pose is None:
+        return ""
+    return "ring" if row.frame_pose.is_by_one_ring else "points"
+
+
+def _focal(row: MapPose) -> float | None:
+    pose = row.frame_pose
+    if pose.pose is None or pose.sd_focal_scale is None:
+        return None
+    return pose.pose.focal_scale
+
+
+POSE_COLUMNS: tuple[Column[MapPose], ...] = (
+    Column("frame", TEXT, lambda row: row.frame_pose.frame),
+    Column("method", TEXT, _method),
+    Column("reason", TEXT, lambda row: row.frame_pose.reason),
+    *(Column(a, NUMBER, partial(_position, i)) for i, a in enumerate(_AXES)),
+    *(Column(a, NUMBER, partial(_angle, i)) for i, a in enumerate(_ANGLES)),
+    *(Column(f"sd_{a}", NUMBER, partial(_sd_position, i)) for i, a in enumerate(_AXES)),
+    Column("sd_angle_deg", NUMBER, lambda row: row.sd_angle_deg),
+    Column("cov", NUMBERS, lambda row: matrix_cell(row.cov)),
+    Column("targets", INTEGER, lambda row: len(row.frame_pose.targets)),
+    Column("targets_used", INTEGER, lambda row: len(row.frame_pose.used)),
+    Column("rejected", TEXT, _rejected),
+    Column("margin", NUMBER, lambda row: row.frame_pose.margin),
+    Column("variance_factor", NUMBER, lambda row: row.frame_pose.variance_factor),
+    Column("focal_scale", NUMBER, _focal),
+    Column("sd_focal_scale", NUMBER, lambda row: row.frame_pose.sd_focal_scale),
+)
+
+
+def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
+    """Return the oriented frames in the columns of reference poses."""
+    decimals = _DEGREES_DECIMALS if is_geographic else 6
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    sds = [f"sd_{a}" for a in _AXES]
+    writer.writerow(["frame", *_AXES, *_ANGLES, *sds, "sd_angle_deg"])
+    for row in rows:
+        if row.position_map is None or row.opk_deg is None or row.cov is None:
+            continue
+        x, y, z = row.position_map.tolist()
+        deviations = np.sqrt(np.diag(row.cov)[:3]).tolist()
+        writer.writerow(
+            [
+                row.frame_pose.frame,
+                f"{x:.{decimals}f}",
+                f"{y:.{decimals}f}",
+                f"{z:.6f}",
+                *(f"{angle:.9f}" for angle in row.opk_deg.tolist()),
+                *(f"{sd:.6f}" for sd in deviations),
+                f"{row.sd_angle_deg:.7f}",
+            ]
+        )
+    return stream.getvalue()

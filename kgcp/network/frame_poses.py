@@ -1,0 +1,296 @@
+"""Frames of a flight oriented by the static targets in them.
+
+Three targets or more give a pose by resection. A single ring gives one as well, once it is known
+how its plate lies: the frames with three targets tell that. Its normal then comes from its image
+alone, so that such a pose is much weaker, and none if the circle's two poses cannot be told apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.network.resection import (
+    MIN_MARGIN,
+    MIN_POINTS,
+    CameraPose,
+    NoPoseError,
+    PointImages,
+    Resection,
+    orient,
+)
+
+FOCAL_SCALES = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
+"""Starts for an unknown focal length, as multiples of the camera's."""
+
+_SD_FOCAL = 0.7  # of the logarithm: a factor of two
+_DETERMINED = 0.05  # of a focal length that is determined
+_LEAST_PLATE_FRAMES = 3  # that tell how a plate lies
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePose:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    frame : str
+    targets : tuple of str
+        Static targets that were measured in it.
+    pose : CameraPose or None
+        In the local ENU frame; None: not oriented.
+    cov : (6, 6) array or None
+        Position [m] and left rotation vector [rad], ENU axes.
+    used : tuple of str
+        Targets that agree with it.
+    reason : str
+        Why it was not oriented; empty: it was.
+    is_by_one_ring : bool
+        Whether the pose comes from one ring, with the plate's attitude from other frames.
+    margin : float or None
+        Δχ² by which the next best pose fits worse; None: there is no other.
+    variance_factor : float or None
+        Squares of the residuals per degree of freedom; None: there is none.
+    sd_focal_scale : float or None
+        Relative standard deviation of the focal length; None: it was known.
+    """
+
+    frame: str
+    targets: tuple[str, ...]
+    pose: CameraPose | None
+    cov: FloatArray | None
+    used: tuple[str, ...]
+    reason: str
+    is_by_one_ring: bool = False
+    margin: float | None = None
+    variance_factor: float | None = None
+    sd_focal_scale: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlateAttitude:
+    """How a static plate lies."""
+
+    enu_from_plate: FloatArray  # (3, 3): its axes in the ENU frame, as columns
+    cov: FloatArray  # (3, 3): of a left rotation vector, ENU axes [rad²]
+
+
+def orient_frames(
+    frames: Sequence[str],
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    camera: Camera,
+    *,
+    min_points: int = MIN_POINTS,
+    has_free_focal: bool = False,
+) -> list[FramePose]:
+    """Orient frames by their static targets.
+
+    Parameters
+    ----------
+    frames : sequence of str
+        That are to be oriented.
+    sightings : sequence of Sighting
+        Of static targets; second plates with one code are passed over.
+    positions : mapping of str to TargetPosition
+        Of the static targets, in the ENU frame.
+    min_points : int
+        Targets that must agree where their distances are not known; three that are.
+    has_free_focal : bool
+        Whether the focal length is unknown, to a factor of two.
+    """
+    by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
+    for each in sightings:
+        if each.frame in by_frame and each.target in positions and not each.instance:
+            by_frame[each.frame].append(each)
+    poses = [
+        _by_points(frame, mine, positions, camera, min_points, has_free_focal=has_free_focal)
+        for frame, mine in by_frame.items()
+    ]
+    if has_free_focal:
+        return poses
+    plates = _plate_attitudes(poses, by_frame)
+    return [
+        _by_ring(pose, by_frame[pose.frame], positions, plates)
+        if pose.pose is None and pose.targets
+        else pose
+        for pose in poses
+    ]
+
+
+def point_images(
+    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition]
+) -> PointImages:
+    """Return measured targets as points of known position."""
+    no_cov = np.zeros((3, 3))
+    places = [positions[each.target] for each in sightings]
+    sds = [
+        math.nan
+        if each.sd_distance_m is None
+        else math.hypot(each.sd_distance_m, each.sd_common_distance_m or 0.0)
+        for each in sightings
+    ]
+    known = np.isfinite(sds)
+    return PointImages(
+        np.array([place.position_m for place in places]),
+        np.array([no_cov if place.cov_m2 is None else place.cov_m2 for place in places]),
+        np.array([each.centre_px for each in sightings]),
+        np.array([each.centre_cov_px2 for each in sightings]),
+        np.where(known, [each.distance_m for each in sightings], np.nan),
+        np.array(sds),
+    )
+
+
+def _by_points(
+    frame: str,
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    camera: Camera,
+    min_points: int,
+    *,
+    has_free_focal: bool,
+) -> FramePose:
+    usable = [each for each in sightings if each.centre_cov_px2 is not None]
+    names = tuple(each.target for each in usable)
+    if len(usable) < 3:
+        return FramePose(frame, names, None, None, (), _count_words(len(usable)))
+    try:
+        found = orient(
+            camera,
+            point_images(usable, positions),
+            min_points=min_points,
+            focals=FOCAL_SCALES if has_free_focal else (1.0,),
+            sd_focal=_SD_FOCAL if has_free_focal else 0.0,
+        )
+    except NoPoseError as error:
+        return FramePose(frame, names, None, None, (), str(error))
+    sd_focal = math.sqrt(found.cov[6, 6]) if has_free_focal else None
+    if sd_focal is not None and sd_focal > _DETERMINED:
+        reason = f"the focal length is not determined (± {100.0 * sd_focal:.0f} %)"
+        return FramePose(frame, names, None, None, (), reason)
+    return _of_resection(frame, names, found, sd_focal)
+
+
+def _of_resection(
+    frame: str, names: tuple[str, ...], found: Resection, sd_focal: float | None
+) -> FramePose:
+    return FramePose(
+        frame=frame,
+        targets=names,
+        pose=found.pose,
+        cov=found.cov[:6, :6],
+        used=tuple(name for name, used in zip(names, found.is_used, strict=True) if used),
+        reason="",
+        margin=None if math.isinf(found.margin) else found.margin,
+        variance_factor=found.variance_factor,
+        sd_focal_scale=sd_focal,
+    )
+
+
+def _count_words(count: int) -> str:
+    return "no static target" if count == 0 else f"{count} static target{'s' * (count > 1)}"
+
+
+def _plate_attitudes(
+    poses: Sequence[FramePose], by_frame: Mapping[str, Sequence[Sighting]]
+) -> dict[str, PlateAttitude]:
+    """Return how plates lie, by the frames that were oriented without them being needed."""
+    samples: dict[str, list[FloatArray]] = {}
+    for pose in poses:
+        if pose.pose is None:
+            continue
+        for each in by_frame[pose.frame]:
+            if each.target in pose.used and _is_told_apart(each) and each.pose is not None:
+                attitude = pose.pose.world_from_camera @ each.pose.rotation
+                samples.setdefault(each.target, []).append(attitude)
+    plates = {}
+    for target, attitudes in samples.items():
+        if len(attitudes) >= _LEAST_PLATE_FRAMES:
+            plates[target] = _mean_attitude(np.array(attitudes))
+    return plates
+
+
+def _mean_attitude(attitudes: FloatArray) -> PlateAttitude:
+    """Return the mean of rotations (n, 3, 3) that scatter by little, without those far off."""
+    middle = Rotation.from_matrix(attitudes).mean().as_matrix()
+    for _ in range(3):
+        off = Rotation.from_matrix(attitudes @ middle.T).as_rotvec()
+        size = np.linalg.norm(off, axis=1)
+        kept = size <= 4.0 * max(float(np.median(size)), 1e-6)
+        middle = Rotation.from_matrix(attitudes[kept]).mean().as_matrix()
+    off = Rotation.from_matrix(attitudes[kept] @ middle.T).as_rotvec()
+    count = int(np.count_nonzero(kept))
+    cov = off.T @ off / max(1, count - 1) / count + 1e-10 * np.eye(3)
+    return PlateAttitude(middle, cov)
+
+
+def _is_told_apart(sighting: Sighting) -> bool:
+    is_clear = sighting.ambiguity is None or sighting.ambiguity >= MIN_MARGIN
+    return sighting.pose is not None and sighting.pose_cov is not None and is_clear
+
+
+def _by_ring(
+    failed: FramePose,
+    sightings: Sequence[Sighting],
+    positions: Mapping[str, TargetPosition],
+    plates: Mapping[str, PlateAttitude],
+) -> FramePose:
+    """Return the pose by the best of a frame's rings; the frame as it was, if there is none."""
+    options = []
+    for each in sightings:
+        if each.target not in plates or not _is_told_apart(each):
+            continue
+        made = _pose_by_ring(each, positions[each.target], plates[each.target])
+        if made is not None:
+            pose, cov = made
+            options.append((float(np.trace(cov[:3, :3])), each, pose, cov))
+    if not options:
+        return failed
+    _, ring, pose, cov = min(options, key=lambda option: option[0])
+    return FramePose(
+        frame=failed.frame,
+        targets=failed.targets,
+        pose=pose,
+        cov=cov,
+        used=(ring.target,),
+        reason="",
+        is_by_one_ring=True,
+        margin=ring.ambiguity,
+    )
+
+
+def _pose_by_ring(
+    ring: Sighting, place: TargetPosition, plate: PlateAttitude
+) -> tuple[CameraPose, FloatArray] | None:
+    """Return the camera's pose and covariance by one ring, to first order; None: without its own.
+
+    With R = W Mᵀ, W that of the plate, M the measured rotation and t the measured centre, and
+    C = X − R t: errors α of the plate, δ and τ of the measured pose and ρ of the place give the
+    rotation α − R δ and the position ρ − α × R t − R (τ + t × δ).
+    """
+    if ring.pose is None or ring.pose_cov is None:
+        return None
+    rotation = plate.enu_from_plate @ ring.pose.rotation.T
+    sight = rotation @ ring.pose.translation_m
+    common = ring.common_pose_cov
+    pose_cov = ring.pose_cov if common is None else ring.pose_cov + common
+    from_pose = np.block(
+        [
+            [-rotation, -rotation @ cross_matrix(ring.pose.translation_m)],
+            [np.zeros((3, 3)), -rotation],
+        ]
+    )
+    from_plate = np.vstack((cross_matrix(sight), np.eye(3)))
+    cov = from_pose @ pose_cov @ from_pose.T + from_plate @ plate.cov @ from_plate.T
+    if place.cov_m2 is not None:
+        cov[:3, :3] += place.cov_m2
+    return CameraPose(place.position_m - sight, rotation), np.asarray(cov)

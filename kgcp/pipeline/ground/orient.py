@@ -1,0 +1,194 @@
+"""Frames of a flight oriented by the static targets in them, and the files of the result."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.georef.crs import parse_crs
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.files.atomic import write_bytes
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight
+from kgcp.io.tables.columns import row_of
+from kgcp.io.tables.detections import read_attempts
+from kgcp.io.tables.parquet import write_table
+from kgcp.io.tables.poses import POSE_COLUMNS, on_map, poses_csv
+from kgcp.io.tables.provenance import derived_provenance
+from kgcp.network.frame_poses import FramePose, orient_frames
+from kgcp.network.resection import MIN_POINTS
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.workspace import DETECTIONS, results_folder
+
+
+@dataclass(frozen=True, slots=True)
+class OrientOptions:
+    """Which frames to orient, and how.
+
+    Attributes
+    ----------
+    frames : tuple of str
+        Patterns of their names; empty: all.
+    min_points : int
+        Targets that must agree where distances do not check a pose.
+    has_free_focal : bool
+        Whether the focal length is unknown.
+    """
+
+    frames: tuple[str, ...] = ()
+    min_points: int = MIN_POINTS
+    has_free_focal: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightPoses:
+    """Oriented frames of a flight.
+
+    Attributes
+    ----------
+    flight : Flight
+    poses : tuple of FramePose
+        One per frame, in their order, in the ENU frame of `local_frame`.
+    local_frame : LocalFrame
+    provenance : mapping of str
+        The metadata of the table.
+    """
+
+    flight: Flight
+    poses: tuple[FramePose, ...]
+    local_frame: LocalFrame
+    provenance: Mapping[str, str]
+
+    @property
+    def oriented(self) -> tuple[FramePose, ...]:
+        """Those with a pose."""
+        return tuple(each for each in self.poses if each.pose is not None)
+
+    @property
+    def focal_px(self) -> tuple[float, float] | None:
+        """Focal length and its standard deviation by all frames [px]; None: it was known."""
+        pairs = [
+            (math.log(each.pose.focal_scale), each.sd_focal_scale)
+            for each in self.oriented
+            if each.pose is not None and each.sd_focal_scale is not None
+        ]
+        if not pairs:
+            return None
+        logs, sds = np.array(pairs).T
+        weights = 1.0 / sds**2
+        mean = float(np.sum(weights * logs) / np.sum(weights))
+        scatter = float(np.sum(weights * (logs - mean) ** 2)) / max(1, len(logs) - 1)
+        sd = math.sqrt(max(1.0, scatter) / float(np.sum(weights)))
+        focal = self.flight.camera.mean_focal_px * math.exp(mean)
+        return focal, focal * sd
+
+    def summary(self) -> dict[str, object]:
+        """Return all numbers for machines."""
+        reasons = Counter(each.reason for each in self.poses if each.pose is None)
+        focal = self.focal_px
+        return {
+            "frames": len(self.poses),
+            "oriented": len(self.oriented),
+            "by_one_ring": sum(each.is_by_one_ring for each in self.oriented),
+            "rejected_targets": {
+                each.frame: [name for name in each.targets if name not in each.used]
+                for each in self.oriented
+                if len(each.used) < len(each.targets) and not each.is_by_one_ring
+            },
+            "reasons": dict(sorted(reasons.items())),
+            "focal_px": None if focal is None else {"value": focal[0], "sd": focal[1]},
+        }
+
+
+@single_threaded()
+def orient_flight(
+    flight: Flight,
+    detections: Path | str | None = None,
+    options: OrientOptions = OrientOptions(),
+) -> FlightPoses:
+    """Orient frames by the static targets that were measured in them.
+
+    Parameters
+    ----------
+    detections : Path, optional
+        What `detect_flight` wrote; by default in the flight's results folder.
+    options : OrientOptions
+        Which frames, and how.
+
+    Raises
+    ------
+    KgcpError
+        If there is no static target, no crs, no frame of these names, or no frame can be oriented.
+    """
+    table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
+    if not any(target.position_m is not None for target in flight.targets):
+        raise KgcpError(
+            f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"
+            " that frames are to be oriented by"
+        )
+    attempts = read_attempts(table, flight)
+    frames = _chosen(sorted({attempt.frame for attempt in attempts}), options.frames)
+    data = FlightData(flight, frames)
+    positions = data.target_positions
+    sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    poses = orient_frames(
+        frames,
+        sightings,
+        positions.static,
+        flight.camera,
+        min_points=options.min_points,
+        has_free_focal=options.has_free_focal,
+    )
+    if not any(each.pose is not None for each in poses):
+        reasons = Counter(each.reason for each in poses)
+        reason, count = reasons.most_common(1)[0]
+        raise KgcpError(
+            f"{table}: no frame can be oriented; of {len(poses)} frames {count} have this reason:"
+            f" {reason}"
+        )
+    choices = {
+        "frames": options.frames,
+        "min_points": options.min_points,
+        "free_focal": options.has_free_focal,
+    }
+    provenance = derived_provenance(flight, table, choices, has_reference=False)
+    return FlightPoses(flight, tuple(poses), positions.local_frame, provenance)
+
+
+def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
+    """Write `poses.parquet` and `poses.csv`; return their paths.
+
+    Raises
+    ------
+    KgcpError
+        If a file cannot be written.
+    """
+    rows = on_map(poses.poses, poses.local_frame)
+    crs = poses.local_frame.crs
+    table, text = folder / "poses.parquet", folder / "poses.csv"
+    cells = (row_of(POSE_COLUMNS, row) for row in rows)
+    write_table(table, POSE_COLUMNS, cells, {**poses.provenance, "crs": crs})
+    is_geographic = bool(parse_crs(crs).is_geographic)
+    write_bytes(text, poses_csv(rows, is_geographic=is_geographic).encode())
+    return table, text
+
+
+def _chosen(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
+    chosen = [
+        frame for frame in frames if not patterns or any(fnmatch(frame, each) for each in patterns)
+    ]
+    if not chosen:
+        raise KgcpError(
+            f"no frame matches {' or '.join(map(repr, patterns))}; the first is {frames[0]!r}"
+            if frames
+            else "the table of detections has no frame; run 'kgcp detect' on this flight again",
+            option="frames",
+        )
+    return chosen

@@ -1,0 +1,102 @@
+"""`kgcp orient` on a flight over four static targets, made here, and what follows from it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from click.testing import CliRunner, Result
+
+from kgcp.cli import main
+from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
+from kgcp.io.tables.parquet import write_table
+from tests.ground_flight import GroundFlight
+
+
+def run(command: str, *arguments: object) -> Result:
+    return CliRunner().invoke(main, [command, *map(str, arguments)], catch_exceptions=False)
+
+
+def write_rows(path: Path, table: pd.DataFrame) -> None:
+    records = table.astype(object).where(table.notna(), None).to_dict("records")
+    rows = ({str(name): cell for name, cell in record.items()} for record in records)
+    write_table(path, DETECTION_COLUMNS, rows, {})
+
+
+def keep_only(folder: Path, frame: str, target: str) -> None:
+    """Let a frame have one target alone."""
+    path = folder / "kgcp" / "detections.parquet"
+    table = read_detections(path)
+    kept = table[(table["frame"] != frame) | (table["target"] == target)]
+    write_rows(path, kept)
+
+
+def test_frames_are_oriented_and_their_poses_place_targets(tmp_path: Path) -> None:
+    flight = GroundFlight()
+    folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
+    keep_only(folder, "f_004.png", "C")
+    result = run("orient", folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert summary["oriented"] == 12
+    assert summary["by_one_ring"] == 1
+    poses = pd.read_parquet(folder / "kgcp" / "poses.parquet").set_index("frame")
+    off = poses[["x", "y", "z"]].to_numpy() - flight.local_frame.map_from_enu(flight.centres)
+    sds = poses[["sd_x", "sd_y", "sd_z"]].to_numpy()
+    assert poses.loc["f_004.png", "method"] == "ring"
+    assert sds[4].max() > 1.2 * np.delete(sds, 4, axis=0).max()
+    # the places of the targets are exact here: their deviations are not used up
+    assert 0.05 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.3
+    assert np.abs(np.delete(off, 4, axis=0)).max() < 0.02
+    placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
+    assert placed.exit_code == 0, placed.stderr
+    for target in json.loads(placed.stdout)["targets"]:
+        assert np.abs(target["residual_m"]).max() < 0.02
+        assert (np.abs(target["residual_m"]) < 3.0 * np.array(target["sd_residual_m"])).all()
+        assert abs(target["diameter_residual_permille"]) < 1.0
+
+
+def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
+    wrong = {(2, "B"): np.array([0.5, 0.3, 0.0])}
+    folder = GroundFlight(wrong=wrong).write(tmp_path / "flight")
+    result = run("orient", folder, "--frames", "f_00[1-3].png", "--min-points", "3", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["rejected_targets"] == {"f_002.png": ["B"]}
+    assert "f_002.png: B left out" in result.stderr
+
+
+def test_an_unknown_focal_length_is_found_where_the_ground_is_not_flat(tmp_path: Path) -> None:
+    offsets = np.array([[-4.0, -3.0, 0.0], [4.0, -3.0, 2.5], [4.0, 3.0, -2.0], [-4.0, 3.0, 2.0]])
+    folder = GroundFlight(offsets_m=offsets, frames=6).write(
+        tmp_path / "flight", sd_position_m=0.001
+    )
+    wrong = 1900.0 / 2300.0  # distances are measured with the focal length of flight.toml
+    toml = folder / "flight.toml"
+    text = toml.read_text(encoding="utf-8").replace("2300.0", "1900.0")
+    toml.write_text(text.replace("-0.05", str(-0.05 * wrong**2)), encoding="utf-8")
+    path = folder / "kgcp" / "detections.parquet"
+    table = read_detections(path)
+    for column in ("distance_m", "sd_distance_m", "tx_m", "ty_m", "tz_m"):
+        table[column] *= wrong
+    write_rows(path, table)
+    result = run("orient", folder, "--free-focal", "--json")
+    assert result.exit_code == 0, result.stderr
+    focal = json.loads(result.stdout)["focal_px"]
+    assert abs(focal["value"] - 2300.0) < 4.0 * focal["sd"]
+    assert focal["sd"] < 20.0
+
+
+def test_nothing_to_orient_by_is_one_line(tmp_path: Path) -> None:
+    folder = GroundFlight(frames=4).write(tmp_path / "flight")
+    result = run("orient", folder, "--frames", "x*")
+    assert result.exit_code == 1
+    assert "no frame matches 'x*'" in result.stderr
+    toml = folder / "flight.toml"
+    lines = toml.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if "position_m" not in line]
+    toml.write_text("\n".join(kept), encoding="utf-8")
+    result = run("orient", folder)
+    assert result.exit_code == 1
+    assert "no target stands still" in result.stderr
