@@ -17,7 +17,7 @@ from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import write_table
-from kgcp.network.space_circle import outline_noise
+from kgcp.network.ground.space_circle import outline_noise
 
 CRS = "EPSG:25832"
 ORIGIN_MAP = np.array([689_412.0, 5_336_208.0, 545.0])

@@ -19,7 +19,7 @@ from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
-from kgcp.network.resection import CameraPose, NoPoseError, PointImages, orient
+from kgcp.network.ground.resection import CameraPose, NoPoseError, PointImages, orient
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
 _CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)

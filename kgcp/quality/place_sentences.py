@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from kgcp.georef.camera_priors import MIN_AMBIGUITY
-from kgcp.network.target_places import PlacedTarget, Placement
+from kgcp.network.ground.target_places import PlacedTarget, Placement
 from kgcp.quality.number_text import minus
 
 _DOUBTFUL = 3.0  # standard deviations

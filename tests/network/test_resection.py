@@ -9,7 +9,7 @@ from benchmarks.ground.orient import Setup, measure
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
-from kgcp.network.resection import CameraPose, NoPoseError, PointImages, orient
+from kgcp.network.ground.resection import CameraPose, NoPoseError, PointImages, orient
 
 CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)
 POSE = CameraPose(

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import rotation_about
-from kgcp.network.space_circle import (
+from kgcp.network.ground.space_circle import (
     CircleViews,
     ExtraNoise,
     NoCircleError,
@@ -19,7 +19,7 @@ from kgcp.network.space_circle import (
     angle_deg,
     outline_noise,
 )
-from kgcp.network.target_plane import common_covariance, place_circle, place_circles
+from kgcp.network.ground.target_plane import common_covariance, place_circle, place_circles
 
 CAMERA = Camera(1500, 1000, 2222.0, 2222.0, 749.5, 499.5, k1=-0.08)
 NORMAL = np.array([0.05, 0.03, 1.0]) / np.linalg.norm([0.05, 0.03, 1.0])

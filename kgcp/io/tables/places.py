@@ -22,7 +22,7 @@ from kgcp.io.tables.columns import (
     matrix_cell,
     row_of,
 )
-from kgcp.network.target_places import PlacedTarget
+from kgcp.network.ground.target_places import PlacedTarget
 
 _AXES = "xyz"
 _MOMENTS = ("x_px", "y_px", "s_xx_px2", "s_xy_px2", "s_yy_px2")

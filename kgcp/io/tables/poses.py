@@ -15,7 +15,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
-from kgcp.network.frame_poses import FramePose
+from kgcp.network.ground.frame_poses import FramePose
 
 _AXES = "xyz"
 _ANGLES = ("omega_deg", "phi_deg", "kappa_deg")

@@ -22,8 +22,8 @@ from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.parquet import write_table
 from kgcp.io.tables.poses import POSE_COLUMNS, on_map, poses_csv
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.network.frame_poses import FramePose, orient_frames
-from kgcp.network.resection import MIN_POINTS
+from kgcp.network.ground.frame_poses import FramePose, orient_frames
+from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 

@@ -30,7 +30,7 @@ from kgcp.io.tables.places import (
     residual_rows,
 )
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.network.target_places import PlacedTarget, Placement, place_targets
+from kgcp.network.ground.target_places import PlacedTarget, Placement, place_targets
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
 from kgcp.pipeline.workspace import DETECTIONS, results_folder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kgcp.network.target_places import PlacedTarget
+from kgcp.network.ground.target_places import PlacedTarget
 from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
 _COLOURS = {"x": BLUE, "y": VERMILION, "z": GREEN}

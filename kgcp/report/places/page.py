@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from kgcp.network.target_places import Placement
+from kgcp.network.ground.target_places import Placement
 from kgcp.quality.number_text import minus
 
 

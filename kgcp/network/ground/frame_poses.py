@@ -19,7 +19,7 @@ from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.resection import (
+from kgcp.network.ground.resection import (
     MIN_MARGIN,
     MIN_POINTS,
     CameraPose,

@@ -13,7 +13,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes
 from kgcp.geometry.circle_image import circle_images
 from kgcp.measurement.discs.records import ellipse_of_moments
-from kgcp.network.space_circle import (
+from kgcp.network.ground.space_circle import (
     CircleViews,
     NoCircleError,
     SpaceCircle,

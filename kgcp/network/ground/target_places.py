@@ -23,8 +23,8 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
-from kgcp.network.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
-from kgcp.network.target_plane import PlacedCircle, common_covariance, place_circles
+from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
+from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circles
 from kgcp.targets.layout import Target
 
 _FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose

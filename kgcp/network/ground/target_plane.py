@@ -22,8 +22,8 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_images, circle_slopes
-from kgcp.network.circle_start import circle_starts
-from kgcp.network.space_circle import (
+from kgcp.network.ground.circle_start import circle_starts
+from kgcp.network.ground.space_circle import (
     CircleViews,
     ExtraNoise,
     NoCircleError,

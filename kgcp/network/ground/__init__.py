@@ -1,0 +1,1 @@
+"""Static targets placed from oriented frames, and frames oriented by static targets."""
