@@ -1,7 +1,7 @@
 """Frames oriented from points with wrong names among them: right poses and stated deviations.
 
 One line per number of points, with and without distances by the images' sizes. A pose is right if
-its squared error over its covariance is one that chance allows.
+its squared error over its covariance is one that chance allows. The last line is of EO devices.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from benchmarks.pool import ordered_map
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
+from kgcp.network.ground.device import orient_by_device
 from kgcp.network.ground.resection import CameraPose, NoPoseError, PointImages, orient
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
@@ -29,6 +30,12 @@ _WRONG = 0.3  # share of wrong names
 _RIGHT_CHI2 = 50.0  # of six numbers: beyond it once in a hundred million times
 _POINTS = (3, 4, 5, 6, 8, 12, 20, 30)
 _LEAST_RIGHT = 0.999
+_SD_FOCAL, _LEAST_DEVICES = 0.2, 0.995
+
+DEVICE_M: FloatArray = np.array(
+    [[0.0, 0.0, 0.0], [0.30, 0.0, 0.0], [0.05, 0.22, 0.0], [0.26, 0.19, 0.0], [0.14, 0.08, 0.12]]
+)
+"""Four points in a plane and one above it, without a symmetry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +144,51 @@ def line(outcome: Outcome) -> str:
     )
 
 
+def measure_devices(count: int, seed: int = 0) -> str:
+    """Orient cameras whose focal length is known to 20 % by a device of five points, in a line."""
+    rng = np.random.default_rng([seed, 5])
+    camera = Camera(1600, 1200, 2300.0, 2300.0, 799.5, 599.5)
+    right = refused = wrong = 0
+    margins = []
+    for _ in range(count):
+        truth = _true_pose(rng)
+        middle = DEVICE_M.mean(axis=0)
+        distance = rng.uniform(0.8, 2.0)
+        pose = CameraPose(
+            middle + distance / _HEIGHT_M * truth.centre_m,
+            truth.world_from_camera,
+            math.exp(rng.normal(0.0, _SD_FOCAL)),
+        )
+        points = pose.in_camera(DEVICE_M)
+        pixels = camera.distort(pose.focal_scale * points[:, :2] / points[:, 2:])
+        order = rng.permutation(len(DEVICE_M))
+        pixels = (pixels + rng.normal(0.0, _SD_PX, pixels.shape))[order]
+        cov = np.repeat(_SD_PX**2 * np.eye(2)[None], len(pixels), axis=0)
+        try:
+            found = orient_by_device(camera, DEVICE_M, pixels, cov, sd_focal=_SD_FOCAL)
+        except NoPoseError:
+            refused += 1
+            continue
+        margins.append(found.margin)
+        if np.array_equal(found.names, order):
+            right += 1
+        else:
+            wrong += 1
+    verdict = "" if right >= _LEAST_DEVICES * count else "  MISSED"
+    return (
+        f"device of 5 points, focal length ± 20 %: right permutation in"
+        f" {100 * right / count:.2f} % of {count}, {wrong} wrong, {refused} refused, margin"
+        f" {min(margins):.1f} at least, {np.median(margins):.0f} in the middle{verdict}"
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print a line per number of points."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--frames", type=int, default=300, help="per line")
-    parser.add_argument("--points", type=int, nargs="+", default=_POINTS)
+    parser.add_argument("--points", type=int, nargs="*", default=_POINTS)
+    parser.add_argument("--devices", type=int, default=400, help="frames with an EO device")
     options = parser.parse_args(arguments)
     setups = [
         Setup(points, has_distance, options.frames, 0)
@@ -152,6 +198,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         measure, setups, jobs=options.jobs, start=use_one_thread_each, start_arguments=()
     ):
         print(line(outcome), flush=True)
+    if options.devices:
+        print(measure_devices(options.devices), flush=True)
 
 
 if __name__ == "__main__":

@@ -443,6 +443,31 @@ def _robust_fit(
     return float(np.sum(np.minimum(chi2, _REJECTED_CHI2))) + prior, pose, used
 
 
+def adjusted_pose(
+    camera: Camera, images: PointImages, start: CameraPose, sd_focal: float
+) -> tuple[CameraPose, FloatArray, FloatArray] | None:
+    """Return pose, covariance and residuals (n, 3) of an adjustment to all points.
+
+    Parameters
+    ----------
+    start : CameraPose
+        Near enough that all points lie in front of the camera.
+    sd_focal : float
+        As for `orient`.
+
+    Returns
+    -------
+    tuple or None
+        None: a point falls behind the camera, or the pose is not determined.
+    """
+    used = np.ones(len(images), dtype=np.bool_)
+    pose = _minimised(camera, images, start, used.astype(np.float64), sd_focal)
+    result = None if pose is None else _result(camera, images, pose, used, sd_focal)
+    if pose is None or result is None:
+        return None
+    return pose, result[0], result[1]
+
+
 def _cauchy(chi2: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + chi2 / 9.0))
 

@@ -1,0 +1,189 @@
+"""EO devices: a few points whose own geometry tells which is which.
+
+A device has four to eight points in its own frame, mostly five with one out of plane. Their images
+have no names. Three image points are taken for every ordered three of the device's points (P3P),
+the rest is projected and assigned. The best permutations are adjusted, with the focal length if it
+is known roughly only. The one with the smallest residuals is taken, if it is by far the smallest.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import SettingError
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.camera import Camera
+from kgcp.network.ground.resection import (
+    CameraPose,
+    NoPoseError,
+    PointImages,
+    adjusted_pose,
+    three_point_poses,
+)
+
+MIN_MARGIN = 3.0
+"""RMS of the next best permutation over that of the best, from which on the best counts."""
+
+MIN_POINTS, MOST_POINTS = 4, 8
+_ALIKE = 0.03  # of the device's size: distances that differ by less are the same
+_FOCALS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts, in standard deviations of the logarithm
+_REFINED = 12  # permutations that are adjusted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DevicePose:
+    """A camera oriented in a device's frame.
+
+    Attributes
+    ----------
+    pose : CameraPose
+        With the focal length's scale.
+    cov : (6, 6) or (7, 7) array
+        As of `Resection`.
+    names : (n,) array
+        Which point of the device each image point is.
+    rms_px : float
+        Of the residuals, per coordinate.
+    margin : float
+        RMS of the next best permutation over this one's, which counts as no smaller than the
+        stated deviation.
+    """
+
+    pose: CameraPose
+    cov: FloatArray
+    names: IndexArray
+    rms_px: float
+    margin: float
+
+
+def require_distinct(points_m: FloatArray) -> None:
+    """Refuse a device (n, 3) that looks the same with its points exchanged.
+
+    Raises
+    ------
+    SettingError
+        Naming the points, if the device has too few, too many, or a symmetry: a turn that brings
+        all points to places of others.
+    """
+    count = len(points_m)
+    if not MIN_POINTS <= count <= MOST_POINTS:
+        raise SettingError("device", f"has {count} points", f"give {MIN_POINTS} to {MOST_POINTS}")
+    gaps = np.linalg.norm(points_m[:, None] - points_m[None], axis=-1)
+    size = float(gaps.max())
+    orders = np.array(list(itertools.permutations(range(count))))[1:]
+    change = np.abs(gaps[orders[:, :, None], orders[:, None, :]] - gaps).max(axis=(1, 2))
+    for order in orders[change < _ALIKE * size]:
+        if _misfit(points_m, points_m[order]) < _ALIKE * size:
+            moved = [str(i + 1) for i in np.flatnonzero(order != np.arange(count)).tolist()]
+            raise SettingError(
+                "device",
+                f"looks the same with its points {', '.join(moved)} exchanged",
+                "move one of them: distances must differ by more than 3 % of the device's size",
+            )
+
+
+def _misfit(points_m: FloatArray, others_m: FloatArray) -> float:
+    """Return the largest distance of points that are turned, but not mirrored, onto others."""
+    here, there = points_m - points_m.mean(axis=0), others_m - others_m.mean(axis=0)
+    left, _, right = np.linalg.svd(here.T @ there)
+    proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
+    return float(np.linalg.norm(here @ left @ proper @ right - there, axis=1).max())
+
+
+def orient_by_device(
+    camera: Camera,
+    points_m: FloatArray,
+    pixels: FloatArray,
+    pixel_cov: FloatArray,
+    *,
+    sd_focal: float = 0.0,
+    min_margin: float = MIN_MARGIN,
+) -> DevicePose:
+    """Return the camera's pose in the frame of a device, and which point is which.
+
+    Parameters
+    ----------
+    points_m : (n, 3) array
+        Points of the device; see `require_distinct`.
+    pixels : (n, 2) array
+        Their images, in any order.
+    pixel_cov : (n, 2, 2) array
+    sd_focal : float
+        Relative standard deviation of the focal length; 0: it is known.
+    min_margin : float
+        Least ratio of the next best permutation's RMS to the best one's.
+
+    Raises
+    ------
+    NoPoseError
+        If no permutation fits before the camera, or the next best fits nearly as well.
+    """
+    starts = _starts(camera, points_m, pixels, sd_focal)
+    fits = []
+    for names, start in starts[:_REFINED]:
+        images = _named(points_m[list(names)], pixels, pixel_cov)
+        adjusted = adjusted_pose(camera, images, start, sd_focal)
+        if adjusted is not None:
+            pose, cov, residuals = adjusted
+            fits.append((float(np.sqrt(np.mean(residuals[:, :2] ** 2))), names, pose, cov))
+    if not fits:
+        raise NoPoseError("no permutation of the device's points fits")
+    fits.sort(key=lambda fit: fit[0])
+    rms, names, pose, cov = fits[0]
+    floor = math.sqrt(float(np.mean(np.trace(pixel_cov, axis1=1, axis2=2))) / 2.0)
+    margin = fits[1][0] / max(rms, floor) if len(fits) > 1 else math.inf
+    if margin < min_margin:
+        raise NoPoseError(
+            f"two permutations of the device's points fit alike (margin {margin:.1f})"
+        )
+    return DevicePose(pose, cov, np.array(names), rms, margin)
+
+
+def _named(positions_m: FloatArray, pixels: FloatArray, pixel_cov: FloatArray) -> PointImages:
+    unknown = np.full(len(pixels), np.nan)
+    exact = np.zeros((len(pixels), 3, 3))
+    return PointImages(positions_m, exact, pixels, pixel_cov, unknown, unknown)
+
+
+def _starts(
+    camera: Camera, points_m: FloatArray, pixels: FloatArray, sd_focal: float
+) -> list[tuple[tuple[int, ...], CameraPose]]:
+    """Return permutations (device's point of each image point) with a pose, likely ones first."""
+    count = len(pixels)
+    triple = _widest(pixels)
+    others = [i for i in range(count) if i not in triple]
+    focals = [math.exp(sd_focal * step) for step in _FOCALS] if sd_focal else [1.0]
+    best: dict[tuple[int, ...], tuple[float, CameraPose]] = {}
+    for focal in focals:
+        rays = camera.undistort(pixels) / focal
+        for chosen in itertools.permutations(range(count), 3):
+            for start in three_point_poses(points_m[list(chosen)], rays[triple]):
+                pose = CameraPose(start.centre_m, start.world_from_camera, focal)
+                in_camera = pose.in_camera(points_m)
+                if not np.all(in_camera[:, 2] > 0.0):
+                    continue
+                projected = in_camera[:, :2] / in_camera[:, 2:]
+                left = [i for i in range(count) if i not in chosen]
+                for order in itertools.permutations(left):
+                    off = projected[list(order)] - rays[others]
+                    misfit = focal * float(np.sum(off**2))
+                    names = np.empty(count, dtype=np.intp)
+                    names[triple], names[others] = chosen, order
+                    key = tuple(names.tolist())
+                    if key not in best or misfit < best[key][0]:
+                        best[key] = (misfit, pose)
+    ordered = sorted(best.items(), key=lambda item: (item[1][0], item[0]))
+    return [(names, pose) for names, (_, pose) in ordered]
+
+
+def _widest(pixels: FloatArray) -> list[int]:
+    """Return the three image points with the largest triangle."""
+    triples = np.array(list(itertools.combinations(range(len(pixels)), 3)))
+    first, second = (pixels[triples[:, i]] - pixels[triples[:, 0]] for i in (1, 2))
+    areas = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    widest: list[int] = triples[int(np.argmax(areas))].tolist()
+    return widest
