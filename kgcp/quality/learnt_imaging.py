@@ -154,7 +154,8 @@ def _common_curve(images: list[Imaging], grey: FloatArray) -> FloatArray:
 def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
     """Return the light (n,) of grey values, 0 of ink and 1 of plate; NaN beyond them."""
     share = np.linspace(0.0, 1.0, 4 * _STEPS + 1)
-    light = Light(imaging.black, imaging.white, 0.0, 0.0, *imaging.tone)
+    tone_1, tone_2, tone_3 = imaging.tone
+    light = Light(imaging.black, imaging.white, tone_1=tone_1, tone_2=tone_2, tone_3=tone_3)
     levels = np.maximum.accumulate(encoded(toned(share, light.values), TONE_OF_BASE[imaging.base]))
     return np.interp(grey, levels, share, left=np.nan, right=np.nan)
 

@@ -132,8 +132,8 @@ def _common_displacement_px(fit: TargetFit) -> float:
     is_plain = problem.window.binning == 1 or problem.tone is Tone.LINEAR
     floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / problem.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
-    noise = noise_of(fit.sample, fit.prediction)
-    excess = noise.sd**2 - noise.plateau_sd**2
+    noise = noise_of(fit.sample, fit.prediction, is_even=fit.varied is None)
+    excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
     black, white = plateau_levels(fit.parameters.light, problem.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)

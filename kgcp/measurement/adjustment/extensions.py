@@ -28,9 +28,9 @@ from kgcp.measurement.adjustment.random_levels import asks_for_levels, even_fiel
 from kgcp.measurement.adjustment.skewed import asks_for_skew, with_skew
 from kgcp.measurement.adjustment.solver import adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
-from kgcp.measurement.adjustment.unknowns import unknowns_of
+from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.photometry import PARAM_COUNT, Param, Tone, decoded
+from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
 from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
@@ -113,7 +113,9 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
             best.parameters.pose, Blur(*blur.total_covariance), best.parameters.light
         )
         gaussian = replace(gaussian, field=best.parameters.field)
-        spreads.append((gaussian, unknowns_of(problem, has_streak=False)))
+        unknowns = unknowns_of(problem, has_streak=False)
+        is_even = gaussian.field is None
+        spreads.append((gaussian, unknowns if is_even else without_fine_light(unknowns)))
     skewed = []
     for parameters, unknowns in spreads:
         with contextlib.suppress(Rejection):  # then the plain model is the better one
@@ -151,7 +153,7 @@ def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) 
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()
-    light = replace(first.light, black=black, white=white)
+    light = _of_levels(first.light, black, white)
     field = field_of(even_field(problem), problem, plateaus, light)
     smooth = replace(Parameters.of(first.pose, first.blur, light), field=field)
     return _fitted(problem, poses, [*_shadow_across(problem, first, plateaus), smooth])
@@ -167,12 +169,17 @@ def _shadow_across(problem: FitProblem, first: Parameters, plateaus: Plateaus) -
     lit, shaded = (
         decoded(np.array(plateaus.typical) + half * edge[3:], problem.tone) for half in (-0.5, 0.5)
     )
-    light = replace(first.light, black=float(lit[0]), white=float(lit[1]))
+    light = _of_levels(first.light, float(lit[0]), float(lit[1]))
     edge[3:] = (shaded - lit) / (light.white - light.black)
     edged = Parameters.of(first.pose, first.blur, light)
     return [replace(edged, field=replace(even_field(problem), edges=edge[None]))]
 
 
+def _of_levels(light: Light, black: float, white: float) -> Light:
+    return replace(light, black=black, white=white, curvature=0.0, linear_sharpening=0.0)
+
+
 def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
-    best, other = fit_levels(problem, starts, poses.other.parameters.pose, poses.best.unknowns)
+    unknowns = without_fine_light(poses.best.unknowns)
+    best, other = fit_levels(problem, starts, poses.other.parameters.pose, unknowns)
     return TwoPoses(best, other, poses.best)

@@ -26,7 +26,7 @@ class Parameters:
     """A pose, a blur and a light, as the numbers that the adjustment works with."""
 
     matrix: FloatArray  # (3, 4): of the pose: rotation and translation [m], target → camera
-    vector: FloatArray  # (23,): all others in the order of `Param`, with zeros for the pose
+    vector: FloatArray  # (25,): all others in the order of `Param`, with zeros for the pose
     field: LightField | None = None  # of light that is not the same everywhere
 
     @staticmethod
@@ -64,7 +64,7 @@ class Parameters:
         return Parameters(pose.matrix, self.vector, self.field)
 
     def moved(self, step: FloatArray) -> Parameters:
-        """Return the parameters after a step (23,) in the order of `Param`.
+        """Return the parameters after a step (25,) in the order of `Param`.
 
         That of the pose is a translation [m] and a left rotation vector [rad].
         """

@@ -182,7 +182,7 @@ def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Ta
     at_knots = AtKnots(*field.knots.weights(sample.problem.window.pixels(sample.index)))
     linear = linearise(sample, parameters)
     for phase in range(_PHASES):
-        sd = noise_of(sample, linear[0]).sd
+        sd = noise_of(sample, linear[0], is_even=False).sd
         fit = _minimise(sample, parameters, sd, unknowns, at_knots, linear)
         linear = (fit.prediction, fit.jacobian)
         parameters = fit.parameters

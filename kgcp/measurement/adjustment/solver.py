@@ -56,7 +56,7 @@ class TargetFit:
     sample: Sample
     parameters: Parameters
     prediction: PredictedImage
-    jacobian: FloatArray  # (19, n): as of `PhotometricModel.linearised`
+    jacobian: FloatArray  # (21, n): as of `PhotometricModel.linearised`
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit  # without the priors
     unknowns: Unknowns
@@ -199,11 +199,11 @@ def _is_settled(before: Parameters, fit: TargetFit) -> bool:
     return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
 
 
-def noise_of(sample: Sample, prediction: PredictedImage) -> GreyNoise:
+def noise_of(sample: Sample, prediction: PredictedImage, *, is_even: bool = True) -> GreyNoise:
     """Return the noise of every pixel of a sample, from its residuals.
 
-    Of pixels that are clipped, or should be, there are none: a white that is not bounded would make
-    its own noise.
+    Where the light is not even, residuals are also what levels miss, whatever the tone. Pixels that
+    are clipped, or should be, have none: a white that is not bounded would make its own noise.
     """
     limits, levels = sample.censoring, prediction.levels
     usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
@@ -212,6 +212,7 @@ def noise_of(sample: Sample, prediction: PredictedImage) -> GreyNoise:
         prediction.share,
         usable,
         sample.problem.window.levels_per_count,
+        in_bands=is_even and sample.problem.tone.is_curved,
     )
 
 

@@ -2,6 +2,8 @@
 
 Noise is estimated from the plateaus of ink and plate, in between it grows linearly with the level
 (shot noise); near edges it is inflated to what the residuals there show (jagged prints, JPEG).
+Under a tone curve it is estimated in bands of the white share: the curve raises that of dark
+levels, and demosaicing leaves most of it on the dark side of edges.
 Clipped pixels are censored observations (Tobin): they only say "at least white". Outliers (dirt,
 a finger of shadow, a hidden part) are weighted down as by a heavy-tailed distribution.
 """
@@ -13,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 _OUTLIER_SIGMAS = 3.5
@@ -27,6 +29,10 @@ _MIN_SAMPLES = 8
 _PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
 _MOST_SMEARED = 6  # grey values below the top in which smeared pixels are looked for
 _SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # least excess there, of the pixels at the top; reach of it
+
+_BANDS = np.array([0.0, 0.02, 0.15, 0.35, 0.65, 0.85, 0.98, 1.0])  # limits of the white share
+_MIDDLES = np.array([0.005, 0.07, 0.25, 0.5, 0.75, 0.93, 0.995])
+_WORTH_PIXELS = 10.0  # that the variance between ink and white counts for in each band
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +122,8 @@ def estimate_noise(
     share: FloatArray,
     usable: BoolArray,
     count: float,
+    *,
+    in_bands: bool = False,
 ) -> GreyNoise:
     """Return the noise of every pixel from the residuals of a fit.
 
@@ -129,9 +137,12 @@ def estimate_noise(
         Not clipped.
     count : float
         One grey value's step.
+    in_bands : bool
+        Whether the noise between ink and plate follows its own course, band by band.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
-    _estimate(residuals, share, usable, (_MIN_NOISE_COUNTS * count) ** 2, sd, plateau_sd)
+    floor = (_MIN_NOISE_COUNTS * count) ** 2
+    _estimate(residuals, share, usable, floor, in_bands, sd, plateau_sd)
     return GreyNoise(sd, plateau_sd)
 
 
@@ -141,6 +152,7 @@ def _estimate(
     share: FloatArray,
     usable: BoolArray,
     floor: float,
+    in_bands: bool,  # noqa: FBT001 - compiled functions have no keywords
     sd: FloatArray,
     plateau_sd: FloatArray,
 ) -> None:
@@ -155,9 +167,56 @@ def _estimate(
             of_edge += 1
     standardised = _trimmed_variance(edge[:of_edge])
     excess = 0.0 if math.isnan(standardised) else max(0.0, standardised - 1.0)
+    if in_bands:
+        of_band = _band_variances(residuals, share, usable, (ink, white, excess, floor))
+        sd[:] = np.exp(0.5 * np.interp(share, _MIDDLES, np.log(of_band)))
+        return
     for i in range(len(share)):
-        within = min(max(share[i], 0.0), 1.0)
-        sd[i] = plateau_sd[i] * math.sqrt(1.0 + excess * 4.0 * within * (1.0 - within))
+        sd[i] = math.sqrt(_variance_at(share[i], ink, white, excess, floor))
+
+
+@inlined
+def _variance_at(share: float, ink: float, white: float, excess: float, floor: float) -> float:
+    """Return the variance between those of ink and white, inflated towards the middle of edges."""
+    within = min(max(share, 0.0), 1.0)
+    return max(ink + (white - ink) * within, floor) * (1.0 + excess * 4.0 * within * (1.0 - within))
+
+
+@compiled
+def _band_variances(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    of_line: tuple[float, float, float, float],
+) -> FloatArray:
+    """Return the variances that the bands show, drawn to `_variance_at` where pixels are few."""
+    ink, white, excess, floor = of_line
+    squares, number = _by_band(residuals, share, usable)
+    variances = np.empty(len(_MIDDLES))
+    for band in range(len(_MIDDLES)):
+        variances[band] = _variance_at(_MIDDLES[band], ink, white, excess, floor)
+        shown = _trimmed_variance(squares[band, : number[band]])
+        if not math.isnan(shown):
+            weight = number[band] / (number[band] + _WORTH_PIXELS)
+            variances[band] = max(weight * shown + (1.0 - weight) * variances[band], floor)
+    return variances
+
+
+@compiled
+def _by_band(
+    residuals: FloatArray, share: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, IndexArray]:
+    """Return the squares of usable residuals (bands, n) by band, and how many each band has."""
+    squares = np.empty((len(_MIDDLES), len(share)))
+    number = np.zeros(len(_MIDDLES), np.intp)
+    for i in range(len(share)):
+        if usable[i]:
+            band = 0
+            while band < len(_MIDDLES) - 1 and share[i] >= _BANDS[band + 1]:
+                band += 1
+            squares[band, number[band]] = residuals[i] * residuals[i]
+            number[band] += 1
+    return squares, number
 
 
 @compiled

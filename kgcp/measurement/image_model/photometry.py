@@ -1,10 +1,12 @@
-"""From white share to grey value: levels, tone, a lit gradient, in-camera sharpening.
+"""From white share to grey value: levels, tone, light that is not quite even, sharpening.
 
-grey = sharpen(sRGB((black + (white − black) · tone(share)) · (1 + slope · offset))): an unknown
-response departs from sRGB's curve, which nearly all cameras follow, by a function of the share
-between ink and plate that has three parameters; sharpening is an unsharp mask on the pixel grid,
-after the tone curve as in cameras. Together they are what displaces apparent edges: δ is a
-consequence here, not a parameter.
+grey = sharpen(sRGB(sharpen((black + (white − black) · tone(share)) · light))), where the light is
+1 + slope · offset + curvature · (offset² − ⅝): an unknown response departs from sRGB's curve, which
+nearly all cameras follow, by a function of the share between ink and plate that has three
+parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve as in cameras.
+Demosaicing sharpens, too, and before the tone curve: behind it, that shows most on the dark side of
+edges. Local tone mapping curves the light over the plate. Together they are what displaces apparent
+edges: δ is a consequence here, not a parameter.
 """
 
 from __future__ import annotations
@@ -41,6 +43,11 @@ class Tone(Enum):
         return self in {Tone.SRGB, Tone.UNKNOWN}
 
     @property
+    def is_curved(self) -> bool:
+        """Whether noise, which is that of light, follows the level by a curve."""
+        return self in {Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}
+
+    @property
     def is_shaped(self) -> bool:
         """Whether the tone parameters take part."""
         return self in {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE, Tone.OF_BINS}
@@ -58,18 +65,20 @@ class Param(IntEnum):
     WHITE = 12
     SLOPE_X = 13
     SLOPE_Y = 14
-    TONE_1 = 15
-    TONE_2 = 16
-    TONE_3 = 17
-    SHARPENING = 18
-    SKEW_XXX = 19
-    SKEW_XXY = 20
-    SKEW_XYY = 21
-    SKEW_YYY = 22
+    CURVATURE = 15
+    TONE_1 = 16
+    TONE_2 = 17
+    TONE_3 = 18
+    SHARPENING = 19
+    LINEAR_SHARPENING = 20
+    SKEW_XXX = 21
+    SKEW_XXY = 22
+    SKEW_XYY = 23
+    SKEW_YYY = 24
 
 
-PARAM_COUNT = 23
-PLAIN_COUNT = 19  # without the skew
+PARAM_COUNT = 25
+PLAIN_COUNT = 21  # without the skew
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +91,22 @@ class Light:
     # relative gradient of the light over one ring radius
     slope_x: float = 0.0
     slope_y: float = 0.0
+    # relative growth of the light with the square of the distance from the centre, in ring radii
+    curvature: float = 0.0
     # shape of an unknown tone curve between black and white; 0, 0, 0 is linear
     tone_1: float = 0.0
     tone_2: float = 0.0
     tone_3: float = 0.0
-    sharpening: float = 0.0  # strength of the unsharp mask
+    # strength of the unsharp mask after the tone curve, and of the one before it
+    sharpening: float = 0.0
+    linear_sharpening: float = 0.0
 
     @property
     def values(self) -> tuple[float, ...]:
-        """All eight, in the order of `Param`."""
-        levels = (self.black, self.white, self.slope_x, self.slope_y)
-        return (*levels, self.tone_1, self.tone_2, self.tone_3, self.sharpening)
+        """All ten, in the order of `Param`."""
+        levels = (self.black, self.white, self.slope_x, self.slope_y, self.curvature)
+        tone = (self.tone_1, self.tone_2, self.tone_3)
+        return (*levels, *tone, self.sharpening, self.linear_sharpening)
 
 
 def plateau_levels(light: Light, tone: Tone) -> tuple[float, float]:
@@ -141,7 +155,7 @@ def srgb_slope(light: FloatArray) -> FloatArray:
     return np.where(light > 0.0031308, 1.055 / 2.4 * safe ** (1.0 / 2.4 - 1.0), 12.92)
 
 
-# The gradient of the light is left out: over a whole ring, it is flat over the mask.
+# Gradient and curvature of the light are left out: over a whole ring, they are flat over the mask.
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
@@ -150,6 +164,7 @@ _SHARE_STEPS = 400
 GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
+_MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
 _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 
 
@@ -171,6 +186,9 @@ class PhotometricModel:
         """
         value = np.empty(len(share))
         _expose(share, self.offsets, light.values, self._added(added), value)
+        if self._linear_mask is not None:
+            detail = self._linear_detail(self._linear_mask, value, light, added)
+            value += light.linear_sharpening * detail
         value = encoded(value, self.tone)
         if self.mask is None:
             return value
@@ -179,7 +197,7 @@ class PhotometricModel:
     def slopes(self, share: FloatArray, light: Light) -> FloatArray:
         """Return the derivatives (n,) of the levels by the share, in even light, unsharpened."""
         slopes, values = _tone_slopes(share, light.values), light.values
-        slopes *= 1.0 + values[2] * self.offsets[0] + values[3] * self.offsets[1]
+        slopes *= _light_at(self.offsets, values)
         if self.tone.is_srgb:
             value = np.empty(len(share))
             _expose(share, self.offsets, values, _NOTHING, value)
@@ -191,6 +209,11 @@ class PhotometricModel:
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
         return encoded(ink, self.tone), encoded(plate, self.tone)
 
+    @property
+    def _linear_mask(self) -> Mask | None:
+        """The mask of what is sharpened before the tone curve, if that curve is over sRGB's."""
+        return self.mask if self.tone is Tone.UNKNOWN else None
+
     def _sharpen_levels(
         self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray
     ) -> None:
@@ -199,9 +222,7 @@ class PhotometricModel:
         if self.tone.is_srgb:
             ink *= srgb_slope(toned(added[0], light.values))
             plate *= srgb_slope(toned(1.0 + added[1], light.values))
-        by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
-        by_ink += light.sharpening * mask.detail(by_ink, ink, 0.0)
-        by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate)
+        _sharpen_by_levels(mask, jacobian, ink, plate, light.sharpening)
 
     def _added(self, added: FloatArray | None) -> FloatArray:
         return _NOTHING if added is None else added
@@ -211,7 +232,7 @@ class PhotometricModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) and their Jacobian; `added` as in `levels`.
 
-        It has 19 rows, or 23 where the point spread is skew. Where the light is uneven it has 25,
+        It has 21 rows, or 25 where the point spread is skew. Where the light is uneven it has 27,
         the last two by what is added to ink and to plate.
         """
         value = np.empty(len(share.value))
@@ -229,6 +250,11 @@ class PhotometricModel:
             value,
             jacobian,
         )
+        if self._linear_mask is not None:
+            detail = self._linear_detail(self._linear_mask, value, light, added)
+            self._sharpen_in_light(self._linear_mask, jacobian, light, added)
+            jacobian[Param.LINEAR_SHARPENING] = detail
+            value += light.linear_sharpening * detail
         if self.tone.is_srgb:
             jacobian *= srgb_slope(value)
             value = encoded(value, self.tone)
@@ -253,19 +279,53 @@ class PhotometricModel:
         ink, plate = self.local_levels(light, added)
         return mask.detail(value, ink, plate)
 
+    def _linear_detail(
+        self, mask: Mask, value: FloatArray, light: Light, added: FloatArray | None
+    ) -> FloatArray:
+        """Return what the mask adds to the light at full strength, before the tone curve."""
+        if added is None:
+            return mask.detail(value, light.black, light.white)
+        ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
+        return mask.detail(value, ink, plate)
+
+    def _sharpen_in_light(
+        self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray | None
+    ) -> None:
+        """Sharpen the rows of a Jacobian before the tone curve."""
+        strength = light.linear_sharpening
+        if not strength:
+            return
+        if added is not None:
+            ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
+            _sharpen_by_levels(mask, jacobian, ink, plate, strength)
+        self._sharpen_rows(mask, jacobian, (1.0, 1.0), strength)
+
     def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
         """Sharpen the rows of a Jacobian."""
-        rows = [*_FILTERED, *(_TONE_ROWS if self.tone.is_shaped else [])]
-        if jacobian[Param.STREAK_X].any() or jacobian[Param.STREAK_Y].any():
-            rows += _STREAK_ROWS
-        if len(jacobian) > PLAIN_COUNT and jacobian[Param.SKEW_XXX].any():
-            for row in SKEW_PARAMS:
-                jacobian[row] += light.sharpening * mask.detail(jacobian[row], 0.0, 0.0)
         others = (1.0, 1.0)
         if self.tone.is_srgb:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
-        mask.sharpen(jacobian, np.array(rows), others, light.sharpening)
+        self._sharpen_rows(mask, jacobian, others, light.sharpening)
+
+    def _sharpen_rows(
+        self, mask: Mask, jacobian: FloatArray, others: tuple[float, float], strength: float
+    ) -> None:
+        rows = [*_FILTERED, *(_TONE_ROWS if self.tone.is_shaped else [])]
+        of_skew = SKEW_PARAMS if len(jacobian) > PLAIN_COUNT else []
+        for row in (*_STREAK_ROWS, Param.LINEAR_SHARPENING, *of_skew):
+            if jacobian[row].any():
+                jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0)
+        mask.sharpen(jacobian, np.array(rows), others, strength)
+
+
+def _sharpen_by_levels(
+    mask: Mask, jacobian: FloatArray, ink: FloatArray, plate: FloatArray, strength: float
+) -> None:
+    """Sharpen the rows by what is added to ink and plate; ink and plate (n,) are the others'."""
+    by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
+    by_ink += strength * mask.detail(by_ink, ink, 0.0)
+    by_plate += strength * mask.detail(by_plate, 0.0, plate)
 
 
 def share_at(level: float, light: Light, tone: Tone) -> float:
@@ -293,7 +353,7 @@ def _toned(
 @compiled
 def _share_at(level: float, light: tuple[float, ...]) -> float:
     """Return where between ink and plate a level is first passed for good, by steps of 1/400."""
-    black, white, _, _, tone_1, tone_2, tone_3, _ = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
     highest = black
     if level < highest:
         return 0.0
@@ -312,7 +372,7 @@ def toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
     """Return the levels, before a known encoding, of light between that of ink, 0, and plate, 1."""
     level = np.empty(len(x))
     for i in range(len(x)):
-        tone, _, _, _ = _toned(x[i], light[4], light[5], light[6])
+        tone, _, _, _ = _toned(x[i], light[5], light[6], light[7])
         level[i] = light[0] + (light[1] - light[0]) * tone
     return level
 
@@ -322,9 +382,29 @@ def _tone_slopes(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
     """Return the derivatives of `toned`."""
     slopes = np.empty(len(x))
     for i in range(len(x)):
-        _, slope, _, _ = _toned(x[i], light[4], light[5], light[6])
+        _, slope, _, _ = _toned(x[i], light[5], light[6], light[7])
         slopes[i] = (light[1] - light[0]) * slope
     return slopes
+
+
+@inlined
+def _lit(x: float, y: float, light: tuple[float, ...]) -> tuple[float, float]:
+    """Return the light at a place in ring radii, and by how much its curvature raises it there.
+
+    The curvature leaves the mean of both edges as it is: of (1² + ½²)/2 for a ring half as wide
+    inside, so that it is not mistaken for the level of white.
+    """
+    bulge = x * x + y * y - _MEAN_SQUARE
+    return 1.0 + light[2] * x + light[3] * y + light[4] * bulge, bulge
+
+
+@compiled
+def _light_at(offsets: FloatArray, light: tuple[float, ...]) -> FloatArray:
+    """Return the light (n,) at all places."""
+    lit = np.empty(offsets.shape[1])
+    for i in range(len(lit)):
+        lit[i], _ = _lit(offsets[0, i], offsets[1, i], light)
+    return lit
 
 
 @compiled
@@ -335,13 +415,13 @@ def _expose(
     added: FloatArray,
     value: FloatArray,
 ) -> None:
-    """Fill in black + (white − black) · tone(share), times the gradient of the light."""
-    black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
+    """Fill in black + (white − black) · tone(share), times the light."""
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         tone, _, _, _ = _toned(ink + (plate - ink) * share[i], tone_1, tone_2, tone_3)
-        lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
+        lit, _ = _lit(offsets[0, i], offsets[1, i], light)
         value[i] = (black + (white - black) * tone) * lit
 
 
@@ -360,7 +440,7 @@ def _expose_with_slopes(
 
     Where the light is uneven, those by what is added to ink and to plate follow.
     """
-    black, white, slope_x, slope_y, tone_1, tone_2, tone_3, _ = light
+    black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
     contrast, gains = white - black, np.empty(len(share))
     has_skew = by_geometry.shape[0] > 11
     each = 1 if added.shape[1] > 1 else 0
@@ -368,7 +448,7 @@ def _expose_with_slopes(
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         x = ink + (plate - ink) * share[i]
         tone, slope, arch, lean = _toned(x, tone_1, tone_2, tone_3)
-        lit = 1.0 + slope_x * offsets[0, i] + slope_y * offsets[1, i]
+        lit, bulge = _lit(offsets[0, i], offsets[1, i], light)
         core = black + contrast * tone
         value[i] = core * lit
         gain = contrast * lit
@@ -377,14 +457,15 @@ def _expose_with_slopes(
         jacobian[12, i] = lit * tone
         jacobian[13, i], jacobian[14, i] = core * offsets[0, i], core * offsets[1, i]
         bend = gain * arch if has_tone else 0.0
-        jacobian[15, i], jacobian[16, i], jacobian[17, i] = bend, bend * lean, bend * lean * lean
-        jacobian[18, i] = 0.0
+        jacobian[15, i] = core * bulge
+        jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend, bend * lean, bend * lean * lean
+        jacobian[19, i] = jacobian[20, i] = 0.0
         if each:
-            jacobian[23, i] = gain * slope * (1.0 - share[i])
-            jacobian[24, i] = gain * slope * share[i]
-    for k in range(19, min(23, len(jacobian))):
+            jacobian[25, i] = gain * slope * (1.0 - share[i])
+            jacobian[26, i] = gain * slope * share[i]
+    for k in range(21, min(25, len(jacobian))):
         for i in range(len(share)):
-            jacobian[k, i] = gains[i] * by_geometry[k - 8, i] if has_skew else 0.0
+            jacobian[k, i] = gains[i] * by_geometry[k - 10, i] if has_skew else 0.0
     for k in range(11):
         for i in range(len(share)):
             jacobian[k, i] = gains[i] * by_geometry[k, i]

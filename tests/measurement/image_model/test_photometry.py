@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.blur import Blur
@@ -21,14 +22,17 @@ from kgcp.measurement.image_model.photometry import (
     Param,
     PhotometricModel,
     Tone,
+    decoded,
+    encoded,
     plateau_levels,
     srgb_encoded,
 )
 from kgcp.measurement.image_model.sharpening import unsharp_mask
 
 WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
+TONE = Tone.UNKNOWN
 STEP = 1e-6
-LIGHT = Light(0.06, 0.8, 0.04, -0.03, tone_1=0.35, tone_2=-0.2, sharpening=0.5)
+LIGHT = Light(0.06, 0.8, 0.04, -0.03, 0.02, 0.35, -0.2, sharpening=0.5, linear_sharpening=0.2)
 LINEAR = replace(LIGHT, tone_1=0.0, tone_2=0.0, sharpening=0.0)
 CASES = [
     (Tone.LINEAR, 0.0, LINEAR),
@@ -81,7 +85,7 @@ def test_geometric_rows_of_the_jacobian_are_derivatives(
             for sign in (1.0, -1.0)
         )
         expected = (high - low) / (2.0 * STEP)
-        np.testing.assert_allclose(jacobian[row], expected, atol=1e-7, err_msg=str(row))
+        np.testing.assert_allclose(jacobian[row], expected, atol=5e-7, err_msg=str(row))
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Light)])
@@ -95,8 +99,12 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     photometry = make_imager(tone, sharpening_px)
     share = make_share(photometry)
     _, jacobian = photometry.linearised(share, light)
-    # a gradient over a whole ring is flat over the mask: its rows leave sharpening out
-    seen = make_imager(tone, 0.0) if name.startswith("slope") else photometry
+    # light that varies over a whole ring is flat over the mask: its rows leave sharpening out
+    is_flat = name.startswith("slope") or name == "curvature"
+    if is_flat:
+        light = replace(light, linear_sharpening=0.0)
+        _, jacobian = photometry.linearised(share, light)
+    seen = make_imager(tone, 0.0) if is_flat else photometry
     high, low = (
         seen.levels(share.value, replace(light, **{name: getattr(light, name) + sign * STEP}))
         for sign in (1.0, -1.0)
@@ -110,27 +118,32 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
 @pytest.mark.parametrize("modelled", [0.05, 0.5, 1.0])
 def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> None:
     """The same as OpenCV's blur of the plain image, in which other pixels are ink or plate."""
+
+    def sharpened(image: FloatArray, strength: float) -> FloatArray:
+        smooth = cv2.GaussianBlur(
+            image.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
+        )
+        return np.where(is_modelled, image + strength * (image - smooth.ravel()), image)
+
     rng = np.random.default_rng(1)
     index = np.flatnonzero(rng.random(WIDTH * HEIGHT) < modelled)
     share = rng.random(len(index))
     plateau = rng.integers(0, 2, WIDTH * HEIGHT).astype(np.float64)
+    is_modelled = np.isin(np.arange(WIDTH * HEIGHT), index)
+    light = replace(LIGHT, slope_x=0.0, slope_y=0.0, curvature=0.0)
     even = np.zeros((2, len(index)))
-    black, white = plateau_levels(LIGHT, Tone.UNKNOWN)
-    plain = np.where(plateau > 0.5, white, black)
-    plain[index] = PhotometricModel(even, Tone.UNKNOWN, None).levels(share, LIGHT)
-    smooth = cv2.GaussianBlur(
-        plain.reshape(HEIGHT, WIDTH), (7, 7), SHARPENING_PX, borderType=cv2.BORDER_REPLICATE
-    ).ravel()
+    in_light = np.where(plateau > 0.5, light.white, light.black)
+    in_light[index] = decoded(PhotometricModel(even, TONE, None).levels(share, light), TONE)
+    grey = encoded(sharpened(in_light, light.linear_sharpening), TONE)
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
-    sharp = PhotometricModel(even, Tone.UNKNOWN, mask).levels(share, LIGHT)
-    expected = (plain + LIGHT.sharpening * (plain - smooth))[index]
-    np.testing.assert_allclose(sharp, expected, atol=1e-12)
+    sharp = PhotometricModel(even, TONE, mask).levels(share, light)
+    np.testing.assert_allclose(sharp, sharpened(grey, light.sharpening)[index], atol=1e-12)
 
 
 def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
     photometry = make_imager(Tone.UNKNOWN, 0.0)
     count = photometry.offsets.shape[1]
-    even = replace(LIGHT, slope_x=0.0, slope_y=0.0)
+    even = replace(LIGHT, slope_x=0.0, slope_y=0.0, curvature=0.0)
     black, white = plateau_levels(even, Tone.UNKNOWN)
     np.testing.assert_allclose(photometry.levels(np.zeros(count), even), black)
     np.testing.assert_allclose(photometry.levels(np.ones(count), even), white)
