@@ -192,18 +192,10 @@ def test_another_calibration_is_compared_with(
     assert told["change"]["fx"] == pytest.approx(-3.9, abs=1.5)
     assert 0.3 < told["rms_px"] < told["largest_px"] < 4.0
     assert "Against longer.yml" in (out / "calibration.html").read_text(encoding="utf-8")
-    own.with_name("wide.toml").write_text(own.read_text().replace("width = 400", "width = 401"))
-    result = run(
-        photos,
-        "--field",
-        field,
-        "--out",
-        out,
-        *QUIET,
-        *chosen,
-        "--against",
-        own.parent / "wide.toml",
-    )
+    wide = tmp_path / "wide.toml"
+    wide.write_text(own.read_text().replace("width = 400", "width = 401"))
+    options = ("--same-aspect", "--against", wide)
+    result = run(photos, "--field", field, "--out", out, *QUIET, *options)
     assert result.exit_code == 1
     assert "wide.toml: is of frames of 401 x 300 px" in result.stderr
 
