@@ -16,6 +16,7 @@ from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
 
 _ARROW_SHARE = 0.04  # of the frame's width, that a typical residual is drawn long
 _RADII = 60
+_SHAPE_IN = 5.0  # width of a frame or field in a figure
 _MM = 1e3
 
 
@@ -42,7 +43,7 @@ def draw_comparison(camera: Camera, difference: CameraDifference) -> bytes:
     shifts = difference.shifts_px[is_there]
     length = 2.0 * _ARROW_SHARE * camera.width
     largest = max(difference.largest_px, 1e-9)
-    with sheet(5.2) as figure:
+    with sheet(_height_in(camera.width, camera.height)) as figure:
         axes = figure.subplots()
         _frame(axes, camera.width, camera.height)
         _arrows(axes, difference.pixels[is_there], shifts, largest / length, BLUE)
@@ -58,7 +59,7 @@ def _residuals(calibration: CameraCalibration) -> Picture:
     residuals = solution.residuals
     typical = float(np.median(np.linalg.norm(residuals[used], axis=1)))
     scale = max(typical, 1e-9) / (_ARROW_SHARE * camera.width)
-    with sheet(5.6) as figure:
+    with sheet(_height_in(camera.width, camera.height)) as figure:
         axes = figure.subplots()
         _frame(axes, camera.width, camera.height)
         _arrows(axes, places[used], residuals[used], scale, BLUE)
@@ -67,7 +68,7 @@ def _residuals(calibration: CameraCalibration) -> Picture:
         axes.set_xlabel(f"x [px]   (an arrow of {length:.0f} px is a residual of {typical:.3f} px)")
         axes.set_ylabel("y [px]")
         if not used.all():
-            axes.legend(loc="upper right")
+            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
         return picture(figure)
 
 
@@ -90,7 +91,7 @@ def _photographs(calibration: CameraCalibration) -> Picture:
 
 def _rays(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Picture:
     camera = calibration.camera
-    with sheet(5.2) as figure:
+    with sheet(_height_in(camera.width, camera.height)) as figure:
         axes = figure.subplots()
         _frame(axes, camera.width, camera.height)
         image = axes.imshow(
@@ -99,7 +100,7 @@ def _rays(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Pictur
             cmap="viridis",
             interpolation="bilinear",
         )
-        figure.colorbar(image, ax=axes, label="standard deviation of a ray [px]")
+        figure.colorbar(image, cax=_beside(axes), label="standard deviation of a ray [px]")
         axes.set_xlabel("x [px]")
         axes.set_ylabel("y [px]")
         axes.grid(visible=False)
@@ -139,7 +140,7 @@ def _field(calibration: CameraCalibration) -> Picture:
     largest = float(np.linalg.norm(change[:, :2], axis=1).max())
     scale = max(largest, 1e-9) / (2.0 * _ARROW_SHARE * _MM * reach)
     bound = max(float(np.abs(change[:, 2]).max()), 1e-9)
-    with sheet(5.4) as figure:
+    with sheet(_height_in(reach, float(np.ptp(nominal[:, 1])))) as figure:
         axes = figure.subplots()
         x, y = (_MM * nominal[:, :2]).T
         heights = axes.scatter(
@@ -148,7 +149,7 @@ def _field(calibration: CameraCalibration) -> Picture:
         _arrows(axes, _MM * nominal[:, :2], change[:, :2], scale, "black")
         axes.invert_yaxis()
         axes.set_aspect("equal")
-        figure.colorbar(heights, ax=axes, label="towards the camera [mm]")
+        figure.colorbar(heights, cax=_beside(axes), label="towards the camera [mm]")
         axes.set_xlabel(f"x [mm]   (the longest arrow is {largest:.3f} mm)")
         axes.set_ylabel("y [mm]")
         return picture(figure)
@@ -164,6 +165,16 @@ def _arrows(axes: Axes, places: FloatArray, vectors: FloatArray, scale: float, c
         scale=scale,
         width=0.002,
     )
+
+
+def _beside(axes: Axes) -> Axes:
+    """Return room for the scale of the colours, as high as the picture."""
+    return axes.inset_axes((1.04, 0.0, 0.05, 1.0))
+
+
+def _height_in(width: float, height: float) -> float:
+    """Return the height of a figure of something with this shape [in]."""
+    return float(np.clip(1.0 + _SHAPE_IN * height / width, 2.5, 9.0))
 
 
 def _frame(axes: Axes, width: int, height: int) -> None:

@@ -11,6 +11,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.quality.calibration_verdict import (
@@ -19,9 +20,9 @@ from kgcp.quality.calibration_verdict import (
     Grade,
     change_if_neglected,
 )
+from kgcp.quality.eccentricity import EccentricitySummary, summarise_eccentricity
 from kgcp.quality.frame_rays import CameraDifference
 from kgcp.quality.number_text import minus
-from kgcp.report.calibration.figures import ellipse_sizes
 
 _PIXELS = 4  # the first parameters are lengths in pixels
 _CLASSES = {Grade.GOOD: "good", Grade.LOOK: "look", Grade.UNUSABLE: "unusable"}
@@ -155,17 +156,13 @@ def _correlations(calibration: CameraCalibration) -> tuple[list[str], list[list[
     return [CALIBRATION_PARAMETERS[index] for index in known], texts
 
 
-def _eccentricity(calibration: CameraCalibration) -> dict[str, float]:
-    """Return how far centroids are from centres, and how large discs are, median and largest."""
-    perspective = np.linalg.norm(calibration.eccentricity.perspective_px, axis=1)
-    in_marker = np.linalg.norm(calibration.eccentricity.in_marker_px, axis=1)
-    radius = ellipse_sizes(np.concatenate([view.vectors for view in calibration.views]))
-    return {
-        f"{name}_{kind}": float(value)
-        for name, values in (
-            ("perspective", perspective),
-            ("in_marker", in_marker),
-            ("radius", radius),
-        )
-        for kind, value in (("median", np.nanmedian(values)), ("max", np.nanmax(values)))
-    }
+def _eccentricity(calibration: CameraCalibration) -> EccentricitySummary:
+    """Return how large and tilted discs are, and how far their centroids are from their centres."""
+    estimate, observed = calibration.solution.estimate, calibration.network.observations
+    rotations = estimate.rotations[observed.view]
+    centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
+    centres += estimate.translations[observed.view]
+    radii = calibration.field.radii_m()[observed.point]
+    return summarise_eccentricity(
+        calibration.camera, Circles3D(centres, rotations[:, :, :2], radii)
+    )
