@@ -128,9 +128,11 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     seconds = time.perf_counter() - began_s
     stiff = made.calibration
     free = _again(made, replace(settings, points=PointModel.FREE))
-    # what the peers estimate: all terms, fx and fy, and the field as it is stated
-    fixed = _again(
-        made, CalibrationSettings(PointModel.FIXED, LensModel.BROWN, is_same_aspect=False)
+    # what the peers estimate: all terms, and the field as it is stated
+    peers = CalibrationSettings(PointModel.FIXED, LensModel.BROWN)
+    fixed = min(
+        (_again(made, replace(peers, is_same_aspect=is_same)) for is_same in (True, False)),
+        key=lambda calibration: calibration.rms_px,
     )
     numbers = calibration_numbers(stiff)
     z = halves_z(stiff, halves) if halves else {}

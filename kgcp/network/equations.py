@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import rotation_about
-from kgcp.network.records import Estimate, Network, PointPrior, ScaleBar
+from kgcp.network.records import Estimate, ImageSlopes, Network, PointPrior, ScaleBar
 
 _LEAST_DEPTH = 1e-9  # of the distance: a point in the camera's own plane has no image
 
@@ -85,41 +85,61 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
 
     A pose changes as in `Pose.moved`: translation, and a left rotation vector in the camera frame.
     """
-    seen = network.observations
+    seen, used = network.observations, np.flatnonzero(weights > 0.0)
+    view_of = seen.view[used]
+    rays = _camera_points(network, estimate)[used]
+    image = _images(network, estimate, network.view_camera[view_of], rays)
+    x, y, z = rays.T
+    zero = np.zeros_like(x)
+    ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
+    by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
+    by_turn = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
+    white = np.linalg.inv(np.linalg.cholesky(seen.cov[used]))
+    white *= np.sqrt(weights[used])[:, None, None]
+    by_pose = white @ np.concatenate((by_place, by_turn), axis=2)
+    by_camera = white @ image.by_parameter
+    residuals = white @ (seen.places[used] - image.places)[:, :, None]
+    by_point = None
+    if not network.points.is_fixed:
+        by_point = white @ by_place @ estimate.rotations[view_of]
     parameters = len(network.model.names)
     first_point = network.cameras.values.size
-    camera_points = _camera_points(network, estimate)
-    factors = np.linalg.cholesky(seen.cov)
     equations = []
     for view, camera in enumerate(network.view_camera.tolist()):
-        rows = np.flatnonzero((seen.view == view) & (weights > 0.0))
-        x, y, z = camera_points[rows].T
-        image = network.model.image(estimate.cameras[camera], np.stack((x / z, y / z), axis=1))
-        zero = np.zeros_like(x)
-        ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
-        by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
-        arm = camera_points[rows] - estimate.translations[view]
-        by_turn = -by_place @ _cross_matrices(arm)
-        white = np.linalg.inv(factors[rows]) * np.sqrt(weights[rows])[:, None, None]
-        points = seen.point[rows]
+        own = np.flatnonzero(view_of == view)
         columns = camera * parameters + np.arange(parameters)
-        by_point = None
-        if not network.points.is_fixed:
-            by_point = white @ by_place @ estimate.rotations[view]
-            own = first_point + 3 * points[:, None] + np.arange(3)
-            columns = np.concatenate((columns, own.ravel()))
-        gaps = (seen.places[rows] - image.places)[:, :, None]
+        if by_point is not None:
+            points = first_point + 3 * seen.point[used[own]][:, None] + np.arange(3)
+            columns = np.concatenate((columns, points.ravel()))
         equations.append(
             ViewRows(
-                rows,
+                used[own],
                 columns,
-                np.reshape(white @ np.concatenate((by_place, by_turn), axis=2), (-1, 6)),
-                np.reshape(white @ image.by_parameter, (-1, parameters)),
-                by_point,
-                np.ravel(white @ gaps),
+                by_pose[own].reshape(-1, 6),
+                by_camera[own].reshape(-1, parameters),
+                None if by_point is None else by_point[own],
+                residuals[own].ravel(),
             )
         )
     return equations
+
+
+def _images(
+    network: Network, estimate: Estimate, cameras: IndexArray, rays: FloatArray
+) -> ImageSlopes:
+    """Return where points (n, 3) in the frames of their cameras (n,) are seen, with derivatives."""
+    count, parameters = len(rays), len(network.model.names)
+    whole = ImageSlopes(
+        np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2, parameters))
+    )
+    normalised = rays[:, :2] / rays[:, 2:]
+    for camera, values in enumerate(estimate.cameras):
+        mine = cameras == camera
+        image = network.model.image(values, normalised[mine])
+        whole.places[mine] = image.places
+        whole.by_ray[mine] = image.by_ray
+        whole.by_parameter[mine] = image.by_parameter
+    return whole
 
 
 def reduce_poses(
