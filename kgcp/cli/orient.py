@@ -37,6 +37,15 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Estimate the focal length, too; that in flight.toml may be wrong by a factor of two.",
 )
+@click.option(
+    "--device",
+    "device_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Orient frames by an EO device in them instead, in its own frame: device.toml has its"
+    " points.",
+)
 @detections_option
 @json_option
 def command(
@@ -47,6 +56,7 @@ def command(
     patterns: tuple[str, ...],
     min_points: int,
     free_focal: bool,
+    device_file: Path | None,
     as_json: bool,
 ) -> None:
     """Orient frames by the static targets in them, without an adjustment.
@@ -56,8 +66,17 @@ def command(
     how that ring lies. Writes poses.parquet and poses.csv to FLIGHT/kgcp. poses.csv can be given as
     [reference] poses. Run 'kgcp detect' first.
 
-    Example: kgcp orient FLIGHT
-    """
+    With --device, frames are oriented by plain discs within a closed boundary, whose arrangement
+    tells which is which. 'kgcp detect' is not needed. Writes device_poses.csv.
+
+    \b
+    Examples:
+      kgcp orient FLIGHT
+      kgcp orient FLIGHT --device device.toml --free-focal
+    """  # noqa: D301 - \b is click's mark for lines that stay
+    if device_file is not None:
+        _orient_by_device(flight, out, patterns, device_file, free_focal=free_focal)
+        return
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
@@ -94,3 +113,33 @@ def _report(poses: FlightPoses) -> None:
     if poses.focal_px is not None:
         focal, sd = poses.focal_px
         click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)
+
+
+def _orient_by_device(
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    patterns: tuple[str, ...],
+    device_file: Path,
+    *,
+    free_focal: bool,
+) -> None:
+    from kgcp.errors import KgcpError
+    from kgcp.io.flight.device_file import read_device
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.ground.device import orient_frames_by_device, write_device_poses
+    from kgcp.pipeline.workspace import results_folder
+
+    if not isinstance(flight, Path) or (out is not None and not isinstance(out, Path)):
+        raise KgcpError(f"{flight}: frames with a device are read from a disk; copy them there")
+    device, the_flight = read_device(device_file), read_flight(flight)
+    made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)
+    path = write_device_poses(made, out or results_folder(flight))
+    for each in made:
+        if each.pose is None:
+            click.echo(f"{each.frame}: not oriented: {each.reason}", err=True)
+        else:
+            click.echo(
+                f"{each.frame}: RMS {each.pose.rms_px:.3f} px, margin {each.pose.margin:.0f}",
+                err=True,
+            )
+    click.echo(f"wrote {path}", err=True)

@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 from click.testing import CliRunner, Result
 
+from benchmarks.ground.orient import DEVICE_M
 from kgcp.cli import main
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
 from kgcp.io.tables.parquet import write_table
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.imaging import Optics, Sensor
 from tests.ground_flight import GroundFlight
 
 
@@ -92,7 +98,7 @@ def test_nothing_to_orient_by_is_one_line(tmp_path: Path) -> None:
     folder = GroundFlight(frames=4).write(tmp_path / "flight")
     result = run("orient", folder, "--frames", "x*")
     assert result.exit_code == 1
-    assert "no frame matches 'x*'" in result.stderr
+    assert "'x*' matches none of 4 frames" in result.stderr
     toml = folder / "flight.toml"
     lines = toml.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if "position_m" not in line]
@@ -100,3 +106,73 @@ def test_nothing_to_orient_by_is_one_line(tmp_path: Path) -> None:
     result = run("orient", folder)
     assert result.exit_code == 1
     assert "no target stands still" in result.stderr
+
+
+def device_flight(folder: Path) -> Path:
+    """A device of five dark discs on a bright plate on dark ground, seen once, and its file."""
+    camera = Camera(640, 480, 900.0, 900.0, 319.5, 239.5, response=Response.LINEAR)
+    pose = Pose(rotation_about(np.array([0.35, -0.2, 0.4])), np.array([-0.12, -0.12, 1.05]))
+    discs = tuple(FieldDisc((x, y, z), 0.03) for x, y, z in DEVICE_M.tolist())
+    scene = FieldScene(
+        discs, ground=0.8, ink=0.08, board_m=(-0.06, -0.06, 0.36, 0.28), surround=0.15
+    )
+    grey = photograph(camera, pose, scene, Optics(0.6), Sensor(), np.random.default_rng(1))
+    (folder / "frames").mkdir(parents=True)
+    cv2.imwrite(str(folder / "frames" / "one.png"), grey)
+    cv2.imwrite(str(folder / "frames" / "two.png"), np.full_like(grey, 90))
+    camera_lines = [f"{key} = {getattr(camera, key)!r}" for key in ("width", "height", "cx", "cy")]
+    lines = ["[camera]", *camera_lines, "fx = 1000.0", "fy = 1000.0", 'response = "linear"']
+    ring = "outer_diameter_m = 0.9\ninner_diameter_m = 0.45\ncode_diameter_m = 0.64"
+    lines += ["[[target]]", 'name = "A"', ring, "dot_diameter_m = 0.12", "code_deg = [0, 43, 78]"]
+    (folder / "flight.toml").write_text("\n".join(lines), encoding="utf-8")
+    points = [
+        f'[[point]]\nname = "{name}"\nposition_m = {place}'
+        for name, place in zip("abcde", DEVICE_M.tolist(), strict=True)
+    ]
+    device = folder / "device.toml"
+    device.write_text("\n".join(points), encoding="utf-8")
+    return device
+
+
+def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> None:
+    device = device_flight(tmp_path / "flight")
+    result = run("orient", tmp_path / "flight", "--device", device, "--free-focal")
+    assert result.exit_code == 0, result.stderr
+    assert "two.png: not oriented: no closed region with 5 discs" in result.stderr
+    table = pd.read_csv(tmp_path / "flight" / "kgcp" / "device_poses.csv")
+    assert table["frame"].tolist() == ["one.png"]
+    assert table["margin"][0] > 3.0
+    assert abs(table["focal_scale"][0] - 0.9) < 0.02
+    rotation = rotation_about(np.array([0.35, -0.2, 0.4]))
+    centre = -rotation.T @ np.array([-0.12, -0.12, 1.05])
+    assert np.abs(table[["x", "y", "z"]].to_numpy()[0] - centre).max() < 0.02
+
+
+def test_a_symmetric_device_is_refused(tmp_path: Path) -> None:
+    device = device_flight(tmp_path / "flight")
+    text = device.read_text(encoding="utf-8").replace("[0.14, 0.08, 0.12]", "[0.15, 0.11, 0.1]")
+    text = text.replace("[0.05, 0.22, 0.0]", "[0.0, 0.22, 0.0]")
+    device.write_text(text.replace("[0.26, 0.19, 0.0]", "[0.3, 0.22, 0.0]"), encoding="utf-8")
+    result = run("orient", tmp_path / "flight", "--device", device)
+    assert result.exit_code == 1
+    assert "looks the same with its points 1, 2, 3, 4 exchanged" in result.stderr
+
+
+def test_the_example_of_the_page_runs_from_end_to_end(tmp_path: Path) -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "ground.md"
+    example = page.read_text(encoding="utf-8").partition("## From end to end")[2]
+    text = example.partition("##")[0]
+    lines = [line.split()[1:] for line in text.splitlines() if line.startswith("    kgcp")]
+    assert [line[0] for line in lines] == ["detect", "orient", "place", "export-gcp"]
+    folder = GroundFlight(frames=5, stated_diameter_m=0.9, diameter_m=0.9005).write(
+        tmp_path / "flight"
+    )
+    for name, *arguments in lines[1:]:  # detections are made already
+        result = run(name, *(word.replace("FLIGHT", str(folder)) for word in arguments))
+        assert result.exit_code == 0, result.stderr
+    places = pd.read_parquet(folder / "kgcp" / "places.parquet")
+    off = (places["diameter_m"] - 0.9005) / places["sd_diameter_m"]
+    assert (off.abs() < 4.0).all()
+    assert (folder / "kgcp" / "places" / "kgcps.csv").exists()
+    points = pd.read_parquet(folder / "kgcp" / "kgcps.parquet")
+    assert sorted(set(points["id"])) == ["A", "B", "C", "D"]

@@ -32,7 +32,7 @@ _MOST_TRIPLES = 200
 _REJECTED_CHI2 = 25.0  # of three numbers: by chance once in 65 000
 _REFINED = 4  # best hypotheses that are adjusted
 _MOST_STEPS, _ROUND_STEPS = 40, 3  # of an adjustment, and between two reweightings
-_CONVERGED = 1e-9
+_CONVERGED = 1e-5  # decrease of χ² that means nothing
 _ROUNDS = 10
 _SAME_RAD, _SAME_SHARE = 2e-3, 2e-3  # of two poses that are one: turn, and shift over distance
 _START_PX, _START_SHARE = 2.0, 0.01  # what a hypothesis of three points with noise is off by
@@ -518,7 +518,7 @@ def _minimised(
             damping = max(10.0 * damping, 1e-6)
         if not trial_cost < cost:
             return pose
-        is_done = cost - trial_cost <= _CONVERGED * cost
+        is_done = cost - trial_cost <= _CONVERGED
         pose, normal, right, cost = trial, trial_normal, trial_right, trial_cost
         damping *= 0.1
         if is_done:

@@ -38,7 +38,7 @@ MIN_FRAMES = 2
 
 _MOST_STEPS = 60
 _ROUND_STEPS = 3  # between two reweightings, of what changes anyway
-_CONVERGED = 1e-9  # relative decrease of the cost
+_CONVERGED = 1e-5  # decrease of χ² that means nothing
 _ROBUST_ROUNDS = 12
 _REJECTED_CHI2 = 37.0  # of five numbers: by chance once in 1.7 million, as 5 σ of one
 _CAUCHY_CHI2 = 12.0
@@ -310,7 +310,7 @@ def _minimised(
             damping *= 10.0
         if not trial_cost < cost:
             return circle
-        is_done = cost - trial_cost <= _CONVERGED * cost
+        is_done = cost - trial_cost <= _CONVERGED
         circle, cost, damping = trial, trial_cost, max(0.1 * damping, 1e-12)
         if is_done:
             break

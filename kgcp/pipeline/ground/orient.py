@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.images.frames import matching_frames
 from kgcp.io.tables.columns import row_of
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.parquet import write_table
@@ -134,7 +134,9 @@ def orient_flight(
             " that frames are to be oriented by"
         )
     attempts = read_attempts(table, flight)
-    frames = _chosen(sorted({attempt.frame for attempt in attempts}), options.frames)
+    frames = sorted({attempt.frame for attempt in attempts})
+    if options.frames:
+        frames = matching_frames(frames, options.frames)
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
@@ -178,17 +180,3 @@ def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
     is_geographic = bool(parse_crs(crs).is_geographic)
     write_bytes(text, poses_csv(rows, is_geographic=is_geographic).encode())
     return table, text
-
-
-def _chosen(frames: Sequence[str], patterns: Sequence[str]) -> list[str]:
-    chosen = [
-        frame for frame in frames if not patterns or any(fnmatch(frame, each) for each in patterns)
-    ]
-    if not chosen:
-        raise KgcpError(
-            f"no frame matches {' or '.join(map(repr, patterns))}; the first is {frames[0]!r}"
-            if frames
-            else "the table of detections has no frame; run 'kgcp detect' on this flight again",
-            option="frames",
-        )
-    return chosen
