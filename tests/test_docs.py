@@ -24,7 +24,7 @@ from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from kgcp.io.tables.places import PLACE_COLUMNS, PLACE_RESIDUAL_COLUMNS
 from kgcp.io.tables.poses import POSE_COLUMNS
 from kgcp.quality.checks.doubt import Cause
-from tests.test_layers import LAYERS, MODULES
+from tests.test_layers import LAYERS, module_names
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
@@ -212,4 +212,4 @@ def test_the_modules_of_the_data_flow_exist() -> None:
         first, *others = line.split(", ")
         room = first.rpartition(".")[0]
         for name in (first, *(other if "." in other else f"{room}.{other}" for other in others)):
-            assert any(f".{module}".endswith(f".{name}") for module in MODULES), name
+            assert any(f".{module}".endswith(f".{name}") for module in module_names()), name
