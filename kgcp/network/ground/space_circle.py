@@ -91,6 +91,10 @@ class ExtraNoise:
 
     centre_px: float = 0.0  # of the places: largely the exterior orientations'
     outline_px: float = 0.0  # of size and shape: print, light, tone
+    # variance factors of the stated covariances of places and of shapes, where residuals of many
+    # images are smaller than stated
+    centre_factor: float = 1.0
+    outline_factor: float = 1.0
 
 
 class NoCircleError(Exception):

@@ -47,6 +47,7 @@ _SAME_NORMAL_DEG = 0.5
 _LEAST_KEPT = 0.5  # share of the frames: if fewer agree, none is believed
 _EXTRA_ROUNDS = 2
 _MOST_EXTRA_PX = 100.0
+_MANY, _LEAST_FACTOR = 200, 0.25  # degrees of freedom that tell a variance factor, and its least
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,9 +138,10 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
     """Return how large the images' deviations are beyond the stated ones, by the residuals.
 
     Places and shapes apart: the weighted squares of all circles' residuals are made to be as many
-    as there are degrees of freedom. Nothing is taken away where residuals are smaller than stated.
+    as there are degrees of freedom. Where they are smaller than stated, in enough images to tell,
+    the stated variances are scaled.
     """
-    found = []
+    found, factors = [], []
     for part, unknowns in ((slice(0, 2), 3), (slice(2, 5), 3)):
         residuals, stated, unit, freedom = [], [], [], 0
         for views, fit in placed:
@@ -149,12 +151,14 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
             stated.append(covs[:, part, part])
             unit.append(outline_noise(kept.moments)[:, part, part])
             freedom += residuals[-1].size - unknowns
-        found.append(
-            _excess(
-                np.concatenate(residuals), np.concatenate(stated), np.concatenate(unit), freedom
-            )
+        sd, factor = _excess(
+            np.concatenate(residuals), np.concatenate(stated), np.concatenate(unit), freedom
         )
-    return ExtraNoise(*found)
+        # errors of poses that all frames share do not show in residuals: their deviations stay
+        is_of_poses = part.start == 0 and any(views.exterior_cov is not None for views, _ in placed)
+        found.append(sd)
+        factors.append(1.0 if is_of_poses else factor)
+    return ExtraNoise(*found, *factors)
 
 
 def place_circles(
@@ -385,7 +389,8 @@ def _total(
     extra = np.zeros_like(unit)
     extra[:, :2, :2] = noise.centre_px**2 * unit[:, :2, :2]
     extra[:, 2:, 2:] = noise.outline_px**2 * unit[:, 2:, 2:]
-    return np.asarray(_stated(camera, views, circle) + extra)
+    scale = np.sqrt([noise.centre_factor] * 2 + [noise.outline_factor] * 3)
+    return np.asarray(_stated(camera, views, circle) * np.outer(scale, scale) + extra)
 
 
 def _stated(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArray:
@@ -406,20 +411,28 @@ def _stated(camera: Camera, views: CircleViews, circle: SpaceCircle) -> FloatArr
     return np.asarray(views.cov + np.nan_to_num(share))
 
 
-def _excess(residuals: FloatArray, stated: FloatArray, unit: FloatArray, freedom: int) -> float:
-    """Return σ ≥ 0 such that the squares over (stated + σ² unit) are as many as `freedom`."""
+def _excess(
+    residuals: FloatArray, stated: FloatArray, unit: FloatArray, freedom: int
+) -> tuple[float, float]:
+    """Return σ ≥ 0 and a factor ≤ 1, such that the squares are as many as `freedom`.
+
+    They are over stated + σ² unit, or over stated times the factor.
+    """
 
     def squares(sd: float) -> float:
         solved = np.linalg.solve(stated + sd**2 * unit, residuals[..., None])[..., 0]
         return float(np.sum(residuals * solved))
 
-    if freedom <= 0 or squares(0.0) <= freedom:
-        return 0.0
+    if freedom <= 0:
+        return 0.0, 1.0
+    ratio = squares(0.0) / freedom
+    if ratio <= 1.0:
+        return 0.0, max(ratio, _LEAST_FACTOR) if freedom >= _MANY else 1.0
     low, high = 0.0, _MOST_EXTRA_PX
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if squares(middle) > freedom else (low, middle)
-    return high
+    return high, 1.0
 
 
 def _is_same(first: SpaceCircle, second: SpaceCircle) -> bool:
