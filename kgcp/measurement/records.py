@@ -181,6 +181,9 @@ class Measurement:
         None where the method fits no tone.
     rival : RivalTone or None
         The same by the other base of an unknown tone; None where only one base leads anywhere.
+    eccentricity_px : (2,) array or None
+        Centroid of the image of the main ring's outer circle minus `centre_px`: what other
+        programs measure is off by this. None where it was not asked for.
     """
 
     target: str
@@ -197,6 +200,7 @@ class Measurement:
     is_guided: bool = False
     imaging: Imaging | None = None
     rival: RivalTone | None = None
+    eccentricity_px: FloatArray | None = None
 
     @property
     def distance_m(self) -> float:

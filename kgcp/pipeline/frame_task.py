@@ -12,6 +12,7 @@ from kgcp.errors import KgcpError, Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
+from kgcp.geometry.circle_image import Circles3D, eccentricity
 from kgcp.geometry.conic import Ellipse
 from kgcp.io.images.exif import Exif, read_exif
 from kgcp.io.images.frames import read_grey
@@ -235,9 +236,16 @@ def _mid_exposure_s(
 
 
 def with_common_uncertainty(job: DetectionJob, outcome: Outcome) -> Outcome:
-    """Return an outcome with what calibration and diameter make wrong in all frames alike."""
+    """Return an outcome with what is wrong in all frames alike, and with its eccentricity."""
     if isinstance(outcome, Miss):
         return outcome
     ring = next(target.ring for target in job.targets if target.name == outcome.target)
     common = common_uncertainty(job.camera, job.calibration_covariance, ring, outcome.pose)
-    return replace(outcome, common=common)
+    pose = outcome.pose
+    circle = Circles3D(
+        pose.translation_m[None],
+        pose.rotation[None, :, :2],
+        np.array([0.5 * ring.outer_diameter_m]),
+    )
+    off = eccentricity(job.camera, circle).total_px[0]
+    return replace(outcome, common=common, eccentricity_px=off)

@@ -11,7 +11,7 @@ import pytest
 
 from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.pose import Pose
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss
 from kgcp.pipeline.frame_task import (
@@ -20,6 +20,7 @@ from kgcp.pipeline.frame_task import (
     GuidedInput,
     examine_frame,
     examine_frame_again,
+    with_common_uncertainty,
 )
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
@@ -92,3 +93,21 @@ def test_a_measured_target_is_left_as_it_is(folder: Path) -> None:
     missed = second.outcomes[1]
     assert isinstance(missed, Miss)
     assert missed == first.outcomes[1], "the plate of A is not looked at for B"
+
+
+def test_an_ellipse_s_centre_is_off_by_the_eccentricity(folder: Path) -> None:
+    """Seen along the axis of the camera: ½ R² / f sin 2θ, towards the nearer side."""
+    job = DetectionJob(folder, CAMERA, None, (A,), DetectSettings())
+    (measured,) = examine_frame(job, FRAME_INPUT).outcomes
+    assert isinstance(measured, Measurement)
+    tilt_rad = 0.6
+    tilted = Pose(rotation_about(np.array([0.0, tilt_rad, 0.0])), np.array([0.0, 0.0, 5.0]))
+    changed = with_common_uncertainty(job, replace(measured, pose=tilted))
+    assert isinstance(changed, Measurement)
+    radius_px = CAMERA.fx * 0.45 / 5.0
+    expected = 0.5 * radius_px**2 / CAMERA.fx * np.sin(2.0 * tilt_rad)
+    assert changed.eccentricity_px is not None
+    assert abs(changed.eccentricity_px[0]) == pytest.approx(expected, rel=0.02)
+    assert changed.eccentricity_px[1] == pytest.approx(0.0, abs=1e-9)
+    # the side at +x is turned away from the camera's plane by the sine: -x is the farther one
+    assert np.sign(changed.eccentricity_px[0]) == np.sign(-tilted.rotation[2, 0])

@@ -97,6 +97,10 @@ def _alternative(get: Callable[[Alternative], object]) -> _Get:
     return _part(lambda seen: seen.alternative, get)
 
 
+def _eccentricity(seen: Measurement) -> FloatArray | None:
+    return seen.eccentricity_px
+
+
 @lru_cache(maxsize=2)
 def _quaternion(pose: Pose) -> list[float]:
     quaternion: list[float] = pose.quaternion_wxyz.tolist()
@@ -144,6 +148,8 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("sd_common_distance_m", NUMBER, _common(lambda common: common.sd_distance_m)),
     Column("sd_common_direction_mrad", NUMBER, _common(lambda common: common.sd_direction_mrad)),
     Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
+    Column("ecc_x_px", NUMBER, _part(_eccentricity, lambda off: float(off[0]))),
+    Column("ecc_y_px", NUMBER, _part(_eccentricity, lambda off: float(off[1]))),
     Column("score", NUMBER, lambda record: record[1].score),
     Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
     Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),

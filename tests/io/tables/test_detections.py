@@ -41,6 +41,7 @@ FULL = Measurement(
     alternative=Alternative(POSE.mirrored(), 17.5),
     uncertainty=Uncertainty(COV, np.array([[4e-4, 1e-5], [1e-5, 9e-4]]), 0.03, 0.2, 0.3, 0.1),
     common=CommonUncertainty(2.0 * COV, 0.05, 0.4),
+    eccentricity_px=np.array([0.12, -0.03]),
 )
 BARE = replace(FULL, instance=1, alternative=None, uncertainty=None, common=None)
 NAMES = [column.name for column in DETECTION_COLUMNS]
