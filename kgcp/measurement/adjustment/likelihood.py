@@ -1,7 +1,9 @@
 """Which of two fits of one target is the likelier one.
 
 Every fit has pixels and noise of its own, so that sums over its pixels do not compare with those of
-another fit. Both are held against the same pixels therefore: those of either, in turn.
+another fit. Both are held against the same pixels therefore: those of either, in turn. A fit of
+more unknowns comes nearer to any pixels; what that is worth, Laplace's approximation of the evidence
+takes off: of a prior, only the share that the pixels leave counts.
 """
 
 from __future__ import annotations
@@ -10,16 +12,28 @@ from dataclasses import replace
 
 import numpy as np
 
+from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.pixels import Sample
 from kgcp.measurement.adjustment.solver import TargetFit, negative_log_posterior, noise_of, predict
 from kgcp.measurement.image_model.noise import misfit
 
 
 def advantage_over(other: TargetFit, fit: TargetFit) -> float:
-    """Return by how much log-likelihood and priors are greater for `fit` than for `other`."""
-    return 0.5 * sum(
+    """Return by how much the logarithm of the evidence is greater for `fit` than for `other`."""
+    advantage = 0.5 * sum(
         _loss(other, sample) - _loss(fit, sample) for sample in (fit.sample, other.sample)
     )
+    if fit.varied is None and other.varied is None:  # with levels, both have as many unknowns
+        advantage += _loss_of_volume(other) - _loss_of_volume(fit)
+    return advantage
+
+
+def _loss_of_volume(fit: TargetFit) -> float:
+    """Return the negative logarithm of the priors' share that a fit leaves, up to a constant."""
+    normal = normal_matrix(fit.scaled_jacobian, fit.misfit, fit.unknowns)
+    precision = fit.unknowns.free_precision
+    of_priors = float(np.sum(np.log(precision[precision > 0.0])))
+    return 0.5 * (float(np.linalg.slogdet(normal)[1]) - of_priors)
 
 
 def _loss(fit: TargetFit, sample: Sample) -> float:
