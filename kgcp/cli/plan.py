@@ -161,12 +161,18 @@ _COLUMNS = (
     ("diameter", "m"),
 )
 _ROUND_M = 10.0  # sides on the ground from which decimetres do not matter
-_GROUND_COLUMNS = (("height", "m"), ("GSD", "mm"), ("footprint", "m"), ("frames", "per pass"))
+_GROUND_COLUMNS = (
+    ("height", "m"),
+    ("GSD", "mm"),
+    ("footprint", "m"),
+    ("frames", "per pass"),
+    ("eccentricity", "px"),
+)
 
 
 def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
     """Yield the lines of the table and of the notes on its columns."""
-    from kgcp.simulation.outlook import SURE_PX, TILT_DEG
+    from kgcp.simulation.outlook import OBLIQUE_DEG, SURE_PX, TILT_DEG
 
     yield f"Target {name}"
     yield from _aligned(_COLUMNS, map(_cells, outlooks))
@@ -185,6 +191,8 @@ def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> It
         f"frames per pass: with the whole target, at {conditions.speed_mps:g} m/s along the image's"
         f" height, one every {conditions.interval_s:g} s."
     )
+    yield f"eccentricity: of the ring's ellipse, seen at {OBLIQUE_DEG:g}° in the image's middle;"
+    yield "  programs that measure ellipses are off by it."
 
 
 def _aligned(columns: Sequence[tuple[str, str]], rows: Iterable[Sequence[str]]) -> Iterator[str]:
@@ -201,6 +209,7 @@ def _ground_cells(outlook: Outlook) -> list[str]:
         f"{1e3 * outlook.gsd_m:.1f}",
         " × ".join(f"{side_m:.{digits}f}" for side_m in outlook.footprint_m),
         f"{outlook.frames_per_pass:.1f}",
+        f"{outlook.eccentricity_px:.3f}",
     ]
 
 

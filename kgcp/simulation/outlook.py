@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.errors import SettingError
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import Circles3D, eccentricity
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.settings import require_range
@@ -53,6 +54,9 @@ LARGEST_SHARE = 0.46
 _RADII_PX = (6.0, 9.0, 20.0, 45.0)  # where the bound is computed
 _SPAN = 50.0
 _ROUND = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+OBLIQUE_DEG = 30.0
+"""Angle between normal and viewing ray for which the eccentricity is given [deg]."""
+
 _WAYS_DEG = (35.0, 125.0)  # of tilt and streak: small rings feel where their dots are
 _OFF_PX = 0.3  # the centre is not a pixel's
 _SUB_PIXELS = 150
@@ -102,6 +106,8 @@ class Outlook:
     footprint_m: tuple[float, float]  # of the image on the ground: its width and height
     # in which the main ring is whole while the camera passes along the image's height
     frames_per_pass: float
+    # what the centre of the ring's ellipse is off by, in the image's middle and at `OBLIQUE_DEG`
+    eccentricity_px: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,7 +216,18 @@ def _outlook(
         footprint_m=(camera.width / metre_px, camera.height / metre_px),
         frames_per_pass=max(0.0, camera.height / metre_px - target.ring.outer_diameter_m)
         / (conditions.speed_mps * conditions.interval_s),
+        eccentricity_px=_eccentricity_px(camera, radius_px),
     )
+
+
+def _eccentricity_px(camera: Camera, radius_px: float) -> float:
+    angle_rad = math.radians(OBLIQUE_DEG)
+    circle = Circles3D.with_normals(
+        np.array([[0.0, 0.0, 1.0]]),
+        np.array([[math.sin(angle_rad), 0.0, math.cos(angle_rad)]]),
+        np.array([radius_px / camera.mean_focal_px]),
+    )
+    return float(np.linalg.norm(eccentricity(camera, circle).total_px[0]))
 
 
 def _seen_ring(camera: Camera, target: Target, metre_px: float) -> Ring | None:

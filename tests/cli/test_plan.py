@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -75,13 +76,15 @@ def test_the_ground_has_a_table_of_its_own(flight: Path) -> None:
     result = run(flight, "--height", "40", "--speed", "5", "--interval", "0.5")
     rows = result.stdout.splitlines()
     head = next(i for i, line in enumerate(rows) if "GSD" in line)
-    assert rows[head].split() == ["height", "GSD", "footprint", "frames"]
+    assert rows[head].split() == ["height", "GSD", "footprint", "frames", "eccentricity"]
     # 40 m / 1902 px; 1200 x 900 px; (900 px - 0.9 m) over 2.5 m per frame
-    assert rows[head + 2].split() == ["40", "21.0", "25", "×", "19", "7.2"]
+    assert rows[head + 2].split() == ["40", "21.0", "25", "×", "19", "7.2", "0.104"]
     assert "at 5 m/s along the image's height, one every 0.5 s" in rows[head + 3]
     plan = json.loads(run(flight, "--height", "40", "--json").stdout)["heights"][0]
     assert plan["gsd_m"] == pytest.approx(40 / 1902)
     assert plan["footprint_m"] == pytest.approx([1200 * 40 / 1902, 900 * 40 / 1902])
+    expected_px = 0.5 * plan["radius_px"] ** 2 / 1902 * math.sin(math.radians(60.0))
+    assert plan["eccentricity_px"] == pytest.approx(expected_px, rel=0.05)
     assert plan["frames_per_pass"] == pytest.approx((900 * 40 / 1902 - 0.9) / 10.0)
 
 
