@@ -28,6 +28,7 @@ from kgcp.georef.crs import parse_crs
 from kgcp.io.files.csv_columns import CsvLayout
 from kgcp.io.files.gps_time import TimeSystem
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.device_file import read_device
 from kgcp.io.flight.field_file import read_field
 from kgcp.io.flight.flight import read_camera_and_targets, read_flight, read_printed_targets
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
@@ -176,6 +177,11 @@ def fields(data: bytes, folder: Path) -> None:
     field.symmetries()
 
 
+def devices(data: bytes, folder: Path) -> None:
+    """Read the points of an EO device."""
+    read_device(_written(folder, data))
+
+
 def frames(data: bytes, folder: Path) -> None:
     """Read a frame's EXIF and its pixels."""
     path = _written(folder, data)
@@ -204,7 +210,7 @@ TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
         *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
-        *(fields, frames, discs, journal),
+        *(fields, devices, frames, discs, journal),
     )
 }
 

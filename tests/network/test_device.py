@@ -35,6 +35,10 @@ def test_a_mirror_image_is_no_symmetry_of_a_device_with_a_raised_point() -> None
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.8, 0.0], [0.5, 0.3, 0.5]])
     require_distinct(points)
     require_distinct(DEVICE_M)
+    with pytest.raises(SettingError, match="farther than 1000 m"):
+        require_distinct(1e306 * points)
+    with pytest.raises(SettingError, match="exchanged"):
+        require_distinct(0.0 * points)
     with pytest.raises(SettingError, match="3 points; give 4 to 8"):
         require_distinct(points[:3])
 

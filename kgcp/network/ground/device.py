@@ -29,6 +29,7 @@ MIN_MARGIN = 3.0
 """RMS of the next best permutation over that of the best, from which on the best counts."""
 
 MIN_POINTS, MOST_POINTS = 4, 8
+_FARTHEST_M = 1000.0
 _ALIKE = 0.03  # of the device's size: distances that differ by less are the same
 _FOCALS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts, in standard deviations of the logarithm
 _REFINED = 12  # permutations that are adjusted
@@ -72,12 +73,16 @@ def require_distinct(points_m: FloatArray) -> None:
     count = len(points_m)
     if not MIN_POINTS <= count <= MOST_POINTS:
         raise SettingError("device", f"has {count} points", f"give {MIN_POINTS} to {MOST_POINTS}")
+    if not np.abs(points_m).max() <= _FARTHEST_M:
+        raise SettingError(
+            "device", f"has a point farther than {_FARTHEST_M:g} m", "give positions in metres"
+        )
     gaps = np.linalg.norm(points_m[:, None] - points_m[None], axis=-1)
     size = float(gaps.max())
     orders = np.array(list(itertools.permutations(range(count))))[1:]
     change = np.abs(gaps[orders[:, :, None], orders[:, None, :]] - gaps).max(axis=(1, 2))
-    for order in orders[change < _ALIKE * size]:
-        if _misfit(points_m, points_m[order]) < _ALIKE * size:
+    for order in orders[change <= _ALIKE * size]:
+        if _misfit(points_m, points_m[order]) <= _ALIKE * size:
             moved = [str(i + 1) for i in np.flatnonzero(order != np.arange(count)).tolist()]
             raise SettingError(
                 "device",
