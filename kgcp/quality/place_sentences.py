@@ -15,12 +15,26 @@ _DOUBTFUL_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviation
 _LEAST_EXTRA_PX = 0.005  # of what is worth a sentence
 
 
+def contradicts(placed: PlacedTarget) -> bool:
+    """Tell whether a placed target does not agree with flight.toml."""
+    check = placed.check
+    chi2 = check.position_chi2
+    is_moved = chi2 is not None and chi2 > _DOUBTFUL_CHI2
+    return is_moved or _diameter_ratio(placed) > _DOUBTFUL
+
+
+def _diameter_ratio(placed: PlacedTarget) -> float:
+    """Return the diameter's residual over its standard deviation."""
+    check = placed.check
+    return abs(check.diameter_residual_m) / check.sd_diameter_residual_m
+
+
 def diameter_sentence(placed: PlacedTarget) -> str:
     """Return how large a ring is, against what flight.toml states."""
     check = placed.check
     sd = placed.sd_diameter_m
     decimals = 4 if not sd > 0.0 else min(7, max(4, 1 - math.floor(math.log10(sd))))
-    ratio = abs(check.diameter_residual_m) / check.sd_diameter_residual_m
+    ratio = _diameter_ratio(placed)
     verdict = "which is not what" if ratio > _DOUBTFUL else "as"
     return (
         f"{placed.target}: the ring of {check.stated_diameter_m:g} m measures"

@@ -42,6 +42,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     page = (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
     assert "Targets on the ground" in page
     assert summary["sentences"][0] in page
+    assert 'class="verdict look"' in page
 
 
 def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
@@ -66,6 +67,8 @@ def test_deviations_of_poses_count(tmp_path: Path) -> None:
     text = "\n".join((f"{head},sd_x,sd_y,sd_z,sd_angle_deg", *lines))
     path.write_text(f"{text}\n", encoding="utf-8")
     exact = json.loads(run(folder, "--eo", "fixed", "--json").stdout)["targets"][0]
+    page = (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
+    assert 'class="verdict good"' in page
     free = json.loads(run(folder, "--json").stdout)["targets"][0]
     assert free["sd_position_m"][0] > 0.02 > 10.0 * exact["sd_position_m"][0]
 

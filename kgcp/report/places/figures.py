@@ -54,7 +54,7 @@ def _positions(placed: tuple[PlacedTarget, ...]) -> Picture:
         axes.set_xticks(np.arange(len(stated)), [target.target for target in stated])
         axes.set_xlim(-0.5, len(stated) - 0.5)
         axes.set_ylabel("place: placed − stated [mm]")
-        axes.legend(ncols=3)
+        axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
         return picture(figure)
 
 
@@ -85,5 +85,5 @@ def _frames(placed: tuple[PlacedTarget, ...]) -> Picture:
         axes.set_xticks([place for place, _ in ticks], [name for _, name in ticks])
         axes.set_xlabel("frames, target by target (×: left out)")
         axes.set_ylabel("χ² of five numbers")
-        axes.legend()
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
         return picture(figure)

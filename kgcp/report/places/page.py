@@ -10,6 +10,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from kgcp.network.ground.target_places import Placement
 from kgcp.quality.number_text import minus
+from kgcp.quality.place_sentences import contradicts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +42,7 @@ def render_places(page: PlacesPage) -> str:
     return environment.get_template("places.html").render(
         page=page,
         placement=page.placement,
+        is_good=not page.doubts and not any(map(contradicts, page.placement.targets)),
         images={
             name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
             for name, png in page.figures.items()
