@@ -74,10 +74,30 @@ def errors_of(placed: SpaceCircle, truth: SpaceCircle) -> FloatArray:
 
 def test_deviations_are_those_of_the_errors() -> None:
     rng, truth, z = np.random.default_rng(3), circle_of(10.0), []
-    for _ in range(16):
+    for _ in range(8):
         fit = place_circle(CAMERA, views_of(truth, rng)).fit
         z.append(errors_of(fit.circle, truth) / np.sqrt(np.diag(fit.cov)))
     assert 0.8 < float(np.sqrt(np.mean(np.square(z)))) < 1.25
+
+
+def test_errors_of_poses_count_by_their_covariance() -> None:
+    rng, truth, z = np.random.default_rng(11), circle_of(10.0), []
+    exterior = np.diag([0.02**2, 0.01**2, 0.03**2, *[2e-4**2] * 3])
+    for _ in range(6):
+        views = views_of(truth, rng)
+        errors = rng.standard_normal((len(views), 6)) * np.sqrt(np.diag(exterior))
+        turns = np.array([rotation_about(error) for error in errors[:, 3:].copy()])
+        wrong = CircleViews(
+            views.camera_m + errors[:, :3],
+            turns @ views.world_from_camera,
+            views.moments,
+            views.cov,
+            np.repeat(exterior[None], len(views), axis=0),
+        )
+        fit = place_circle(CAMERA, wrong).fit
+        assert fit.is_used.sum() >= 7
+        z.append(errors_of(fit.circle, truth) / np.sqrt(np.diag(fit.cov)))
+    assert 0.75 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
 
 
 def test_a_frame_that_shows_something_else_is_left_out() -> None:
@@ -118,7 +138,7 @@ def test_frames_from_one_direction_leave_two_normals() -> None:
 
 def test_noise_beyond_the_stated_one_is_learnt() -> None:
     rng, truth = np.random.default_rng(7), circle_of(10.0)
-    many = [views_of(truth, rng, sd_px=0.02, stated_px=0.005) for _ in range(4)]
+    many = [views_of(truth, rng, sd_px=0.02, stated_px=0.005) for _ in range(3)]
     placed, noise = place_circles(CAMERA, many)
     expected = math.sqrt(0.02**2 - 0.005**2)
     assert noise.centre_px == pytest.approx(expected, rel=0.35)
