@@ -30,8 +30,7 @@ _TERMS: dict[LensModel, tuple[str, ...]] = {
     LensModel.RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 _ASPECT = ("fy",)
-# k3 comes with k2: without it, it would stand for it
-_ADDITIONS: tuple[tuple[str, ...], ...] = (_ASPECT, ("k2",), ("p1", "p2"), ("k2", "k3"))
+_ADDITIONS: tuple[tuple[str, ...], ...] = (_ASPECT, ("k2",), ("p1", "p2"), ("k3",))
 
 
 def with_chosen_parameters(work: Work, state: State) -> State:
@@ -51,8 +50,7 @@ def with_chosen_parameters(work: Work, state: State) -> State:
     jury = _Jury(kept.network.observations, kept.solution.is_used)
     misfit = jury.misfit(kept)
     is_aspect_open = settings.is_same_aspect is None and _is_camera_turned(kept)
-    for additions in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
-        addition = tuple(term for term in additions if term not in kept.unknowns.terms)
+    for addition in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
         trial = work.with_unknowns(kept, _with(kept.unknowns, addition))
         trial_misfit = jury.misfit(trial)
         is_better = trial_misfit < (1.0 - _LEAST_GAIN) * misfit
