@@ -2,8 +2,8 @@
 
 Every fit has pixels and noise of its own, so that sums over its pixels do not compare with those of
 another fit. Both are held against the same pixels therefore: those of either, in turn. A fit of
-more unknowns comes nearer to any pixels; what that is worth, Laplace's approximation of the evidence
-takes off: of a prior, only the share that the pixels leave counts.
+more unknowns comes nearer to any pixels; Laplace's approximation of the evidence takes off what
+that is worth: of a prior, only the share that the pixels leave counts.
 """
 
 from __future__ import annotations
