@@ -204,7 +204,7 @@ def check_fit(fit: DiscFit, outline: DiscOutline) -> None:
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
     black, white = fit.state.plateaus(fit.free.tone)
     residual = median_at_edges(fit.sd, fit.share, 0.2, 0.8, math.nan)
-    if not white - black > _LEAST_CONTRAST_COUNTS * fit.sample.levels_per_count:
+    if not white - black > _LEAST_CONTRAST_COUNTS * fit.sample.window.levels_per_count:
         raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {black:.3f} and {white:.3f}")
     if not residual < _MAX_EDGE_NOISE * (white - black) or outlying > _MAX_OUTLIERS:
         share = residual / (white - black)

@@ -9,14 +9,22 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.adjust_disc import DiscRejection, DiscTask, adjust_disc, check_fit
 from kgcp.measurement.discs.disc_levels import Row
-from kgcp.measurement.discs.fit_disc import CameraPrior, DiscFit, DiscState, NoFit, Unknowns
+from kgcp.measurement.discs.fit_disc import (
+    CAMERA_ROWS,
+    SHARPENING_PX,
+    CameraPrior,
+    DiscFit,
+    DiscState,
+    NoFit,
+    Unknowns,
+)
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.image_model.photometry import Tone
 
@@ -27,6 +35,9 @@ _LARGE_RADIUS_PX = 20.0
 _MOST_CLIPPED = 0.05  # share of pixels
 _LARGEST_BLUR = 0.3  # of the radius, to start from
 _LEAST_SD = 0.01  # of each parameter, however many discs agree
+# Masks are tried from 1 px on by steps of this factor, if the camera sharpens at all.
+_MASK_STEP, _MOST_STEPS = 1.25, 2
+_LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
 _MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
 
@@ -35,28 +46,29 @@ class CameraTone:
     """What the camera does to the light of all discs of a photograph."""
 
     tone: Tone
-    sharpens: bool = False
+    sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
     known: CameraPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
 
 
-def learn_tone(tasks: Sequence[DiscTask], response: Response) -> CameraTone:
-    """Return the tone to use for discs of one photograph.
+def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
+    """Return the tone to use for discs of one photograph, or of all by one camera.
 
     An unknown curve is shaped from sRGB's, and from a straight line; the one that makes the same
-    pixels of all discs together likelier is kept.
+    pixels of all discs together likelier is kept. Then the width of the mask is adjusted, where the
+    camera sharpens.
     """
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
-    fits = _first_fits(_to_learn_from(tasks))
+    fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
     bases = (tone,) if tone is Tone.SRGB else (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE)
-    joints = [joint for joint in (_adjusted_together(fits, base) for base in bases) if joint]
+    joints = [joint for joint in (_from_first_fits(fits, base) for base in bases) if joint]
     if not joints:
-        return CameraTone(tone, sharpens=True)
-    best = min(joints, key=lambda joint: joint.loss)
+        return CameraTone(tone, SHARPENING_PX)
+    best = _with_best_mask(min(joints, key=lambda joint: joint.loss))
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
-    return CameraTone(best.tone, sharpens=True, known=_known_by(best), blur_px=blur_px)
+    return CameraTone(best.tone, best.sharpening_px, _known_by(best), blur_px)
 
 
 def unknowns_of(task: DiscTask, camera: CameraTone) -> Unknowns:
@@ -64,7 +76,7 @@ def unknowns_of(task: DiscTask, camera: CameraTone) -> Unknowns:
     return Unknowns.of(
         camera.tone,
         camera.known,
-        sharpens=camera.sharpens,
+        sharpening_px=camera.sharpening_px,
         has_ink_slope=not camera.tone.is_shaped and task.radius_px >= _LARGE_RADIUS_PX,
     )
 
@@ -89,23 +101,68 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     fits = []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
-            fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpens=True))
+            fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_fit(fit, task.outline)
             fits.append(fit)
     return [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED] or fits
 
 
-def _adjusted_together(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
+def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
     """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
     if not fits:
         return None
-    samples = [replace(fit.sample, level_model=fit.sample.level_model.by(tone)) for fit in fits]
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
     states = [_state_by(fit, tone, sharpening) for fit in fits]
+    return _adjusted_together(fits, states, tone, SHARPENING_PX)
+
+
+def _adjusted_together(
+    fits: Sequence[DiscFit], states: Sequence[DiscState], tone: Tone, sharpening_px: float
+) -> JointFit | None:
+    samples = [
+        fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
+    ]
     try:
-        return adjust_together(samples, states, tone)
+        return adjust_together(samples, states, tone, sharpening_px)
     except (NoFit, np.linalg.LinAlgError):
         return None
+
+
+def _with_best_mask(joint: JointFit) -> JointFit:
+    """Return discs adjusted by the mask that makes them likeliest.
+
+    Its width is tried in steps, and a parabola through the last three gives the rest.
+    """
+    sharpening = CAMERA_ROWS.index(Row.SHARPENING)
+    sd = float(np.sqrt(np.linalg.inv(joint.precision)[sharpening, sharpening]))
+    if abs(joint.shared[sharpening]) < max(_LEAST_SHARPENING, _SIGNIFICANT * sd):
+        return joint
+
+    def at(step: float) -> JointFit | None:
+        states = [fit.state for fit in joint.fits]
+        return _adjusted_together(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
+
+    # anew, since the pixels beside the modelled ones are masked by what is known by now
+    tried = {0: at(0) or joint}
+    for direction in (1, -1):
+        step = direction
+        while abs(step) <= _MOST_STEPS:
+            other = at(step)
+            if other is None:
+                break
+            tried[step] = other
+            if other.loss > tried[step - direction].loss:
+                break
+            step += direction
+        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
+            break
+    best = min(tried, key=lambda step: tried[step].loss)
+    if best - 1 not in tried or best + 1 not in tried:
+        return tried[best]
+    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
+    bend = before + after - 2.0 * middle
+    between = at(best + 0.5 * (before - after) / bend) if bend > 0.0 else None
+    return between if between is not None and between.loss < middle else tried[best]
 
 
 def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:

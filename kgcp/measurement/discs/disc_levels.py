@@ -6,7 +6,7 @@ follow. The tone curve is a lookup: powers would take most of the time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -52,10 +52,6 @@ class LevelModel:
     offsets: FloatArray  # (2, n): from the disc's middle, in radii
     tone: Tone
     mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
-
-    def by(self, tone: Tone) -> LevelModel:
-        """Return the relation by another tone curve."""
-        return replace(self, tone=tone)
 
     def linearised(self, share: WhiteShare, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the grey values (n,) before clipping and their Jacobian (18, n).

@@ -23,9 +23,9 @@ from kgcp.measurement.image_model.noise import (
     misfit,
 )
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.measurement.image_model.sharpening import unsharp_mask
+from kgcp.measurement.image_model.sharpening import Mask, unsharp_mask
 
-_SHARPENING_PX = 1.0  # σ of the cameras' unsharp mask, as for coded targets
+SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until more is known
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 _STEPS = 12
@@ -79,7 +79,7 @@ class Unknowns:
     """What is estimated of a disc, and what is known beforehand."""
 
     tone: Tone
-    sharpens: bool
+    sharpening_px: float  # σ of the camera's unsharp mask; 0: it does not sharpen
     rows: IndexArray  # (p,): the free parameters
     mean: FloatArray  # (18,)
     precision: FloatArray  # (18, 18); zeros: nothing is known
@@ -90,7 +90,7 @@ class Unknowns:
         tone: Tone,
         camera: CameraPrior | None = None,
         *,
-        sharpens: bool = False,
+        sharpening_px: float = 0.0,
         has_ink_slope: bool = False,
     ) -> Unknowns:
         """Return the unknowns of a disc.
@@ -99,14 +99,14 @@ class Unknowns:
         ----------
         camera : CameraPrior
             What other discs show of tone and sharpening; None: what is known of any camera.
-        sharpens : bool
-            Whether the camera may sharpen.
+        sharpening_px : float
+            σ of the camera's unsharp mask [px]; 0: it does not sharpen.
         has_ink_slope : bool
             Whether the darker level has a gradient of its own: large discs.
         """
         rows = [*_ALWAYS, *_LIGHT]
         rows += _WAVES if tone.is_shaped else ()
-        rows += (Row.SHARPENING,) if sharpens else ()
+        rows += (Row.SHARPENING,) if sharpening_px else ()
         rows += _INK_SLOPES if has_ink_slope else ()
         free = np.array(sorted(map(int, rows)))
         known = camera or CameraPrior.usual()
@@ -119,7 +119,7 @@ class Unknowns:
             mean[Row.WHITE], precision[Row.WHITE, Row.WHITE] = _WHITE, _WHITE_SD**-2
         is_fixed = ~np.isin(np.arange(COUNT), free)
         precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
-        return cls(tone, sharpens, free, mean, precision)
+        return cls(tone, sharpening_px, free, mean, precision)
 
     def without_ink_slope(self) -> Unknowns:
         """Return the unknowns without a gradient of the darker level's own."""
@@ -213,7 +213,8 @@ class DiscSample:
     levels: FloatArray  # (n,)
     censoring: Censoring
     level_model: LevelModel
-    levels_per_count: float
+    window: DiscWindow  # that they are from
+    index: IndexArray  # (n,): where in it
     radius_px: float  # that gradients of the light refer to
 
     @classmethod
@@ -233,21 +234,38 @@ class DiscSample:
         pixels = DiscPixels.of(places, state.geometry, state.blur, is_dark=is_dark)
         offsets = (places - state.geometry[:2, None]) / radius_px
         mask = None
-        if free.sharpens:
-            everywhere = window.places_px(np.arange(len(window.levels)))
-            whole = DiscPixels.of(everywhere, state.geometry, state.blur, is_dark=is_dark)
-            share = whole.white_share(state.geometry, state.blur).value
-            shape = (window.height, window.width)
-            mask = unsharp_mask(shape, index, share, _SHARPENING_PX)
+        if free.sharpening_px:
+            mask = _mask(window, index, state, free.sharpening_px, is_dark=is_dark)
         censoring = replace(limits, at_high=limits.at_high[index], at_low=limits.at_low[index])
         return cls(
             pixels,
             window.levels[index],
             censoring,
             LevelModel(offsets, free.tone, mask),
-            window.levels_per_count,
+            window,
+            index,
             radius_px,
         )
+
+    def by(self, tone: Tone, sharpening_px: float, state: DiscState) -> DiscSample:
+        """Return the same pixels for another tone curve and another mask of the camera's."""
+        mask = _mask(self.window, self.index, state, sharpening_px, is_dark=self.pixels.is_dark)
+        return replace(self, level_model=replace(self.level_model, tone=tone, mask=mask))
+
+
+def _mask(
+    window: DiscWindow,
+    index: IndexArray,
+    state: DiscState,
+    sharpening_px: float,
+    *,
+    is_dark: bool,
+) -> Mask:
+    """Return the mask of the camera's sharpening about a disc."""
+    everywhere = window.places_px(np.arange(len(window.levels)))
+    whole = DiscPixels.of(everywhere, state.geometry, state.blur, is_dark=is_dark)
+    share = whole.white_share(state.geometry, state.blur).value
+    return unsharp_mask((window.height, window.width), index, share, sharpening_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,7 +342,7 @@ def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoi
     """Return the noise of every pixel; clipped ones would make their own."""
     limits = sample.censoring
     usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
-    return estimate_noise(sample.levels - levels, share, usable, sample.levels_per_count)
+    return estimate_noise(sample.levels - levels, share, usable, sample.window.levels_per_count)
 
 
 def _minimise(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:

@@ -37,6 +37,7 @@ class JointFit:
     """Discs adjusted together."""
 
     tone: Tone
+    sharpening_px: float  # σ of the camera's unsharp mask
     fits: tuple[DiscFit, ...]
     loss: float  # negative log-likelihood of all, with what is usual of cameras
     precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
@@ -62,7 +63,7 @@ class _Reduced:
 
 
 def adjust_together(
-    samples: Sequence[DiscSample], states: Sequence[DiscState], tone: Tone
+    samples: Sequence[DiscSample], states: Sequence[DiscState], tone: Tone, sharpening_px: float
 ) -> JointFit:
     """Adjust discs with what they share, from states that share it.
 
@@ -73,7 +74,9 @@ def adjust_together(
     """
     usual = CameraPrior.usual()
     free = Unknowns.of(
-        tone, replace(usual, precision=np.zeros_like(usual.precision)), sharpens=True
+        tone,
+        replace(usual, precision=np.zeros_like(usual.precision)),
+        sharpening_px=sharpening_px,
     )
     for _ in range(_NOISE_ROUNDS):
         sds = [noise_at(sample, state).sd for sample, state in zip(samples, states, strict=True)]
@@ -87,7 +90,7 @@ def adjust_together(
     informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
     loss = _total(fits, usual) + sum(float(np.log(fit.sd).sum()) for fit in fits)
     precision = usual.precision + informations.sum(axis=0)
-    return JointFit(tone, tuple(fits), loss, precision, scores, informations)
+    return JointFit(tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
 
 
 def _minimised(

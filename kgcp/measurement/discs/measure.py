@@ -92,7 +92,7 @@ def _measured(
     if operator is not Operator.MODEL:
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
         return [_certain(measure(task)) for task in tasks]
-    camera = learn_tone(tasks, response)
+    camera = learn_tone([tasks], response)
     outcomes = [_fitted(task, camera) for task in tasks]
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     found = iter(inflations([scatter for _, scatter in fits]).tolist())
