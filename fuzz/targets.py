@@ -196,6 +196,8 @@ def discs(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
     follow_outlines(grey, outlines)
     operator = _chosen(data[::-1], tuple(Operator))
     measure_discs(grey, outlines, response=_chosen(data, tuple(Response)), operator=operator)
+    for form in (grey.reshape(1, -1), grey.reshape(-1, 1), grey.view(np.uint16)):
+        measure_discs(form, find_outlines(form), response=_chosen(data, tuple(Response)))
 
 
 def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets

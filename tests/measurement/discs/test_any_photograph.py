@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, Operator
@@ -36,6 +39,37 @@ def test_nothing_breaks(name: str) -> None:
             if isinstance(disc, Disc):
                 assert np.isfinite(disc.vector).all()
                 assert np.linalg.eigvalsh(disc.cov)[0] > 0.0
+
+
+@st.composite
+def photographs(draw: st.DrawFn) -> GreyArray:
+    """Draw small photographs: noise, checkers, stripes, and ellipses cut by the border."""
+    height, width = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    rng = np.random.default_rng(draw(st.integers(0, 1000)))
+    rows, columns = np.mgrid[0:height, 0:width]
+    period = draw(st.integers(1, 9))
+    checkers = (rows // period + columns // period * draw(st.integers(0, 1))) % 2
+    a, b = draw(st.floats(1.0, 20.0)), draw(st.floats(1.0, 20.0))
+    x, y = draw(st.floats(-3.0, 43.0)), draw(st.floats(-3.0, 43.0))
+    ellipse = 0.5 - 0.5 * np.tanh(2.0 * (np.hypot((columns - x) / a, (rows - y) / b) - 1.0) * a)
+    share = draw(st.sampled_from((checkers, ellipse, 1.0 - ellipse, rng.uniform(size=rows.shape))))
+    levels = share * draw(st.floats(0.0, 1.6)) + draw(st.floats(0.0, 0.1))
+    levels = levels + draw(st.sampled_from((0.0, 0.01, 0.1))) * rng.standard_normal(rows.shape)
+    kind = draw(st.sampled_from((np.uint8, np.uint16)))
+    photo: GreyArray = np.rint(np.clip(levels, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)
+    return photo
+
+
+@settings(max_examples=25, deadline=None)
+@given(photographs(), st.sampled_from(Response), st.sampled_from(Operator))
+def test_no_photograph_breaks_anything(
+    photo: GreyArray, response: Response, operator: Operator
+) -> None:
+    outlines = find_outlines(photo)
+    for disc in measure_discs(photo, outlines, response=response, operator=operator):
+        if isinstance(disc, Disc):
+            assert np.isfinite(disc.vector).all()
+            assert np.linalg.eigvalsh(disc.cov)[0] > 0.0
 
 
 def test_read_only_and_deep_photographs_give_the_same(sharp: GreyArray) -> None:
