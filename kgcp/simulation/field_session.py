@@ -43,6 +43,8 @@ class FieldSession:
         Exposure relative to the one at which radiance 1 fills the well.
     fall : float
         By how much the light falls off across half the frame's width, in random directions.
+    has_edges : bool
+        Whether the board ends; the ground is everywhere if not, which is rendered sooner.
     """
 
     camera: Camera
@@ -52,6 +54,7 @@ class FieldSession:
     sensor: Sensor = _SENSOR
     gain: float = 1.0
     fall: float = 0.15
+    has_edges: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +87,7 @@ def field_photographs(
         turn = rng.uniform(0.0, 2.0 * math.pi)
         fall_per_px = session.fall * rng.uniform() / (0.5 * session.camera.width)
         gradient = (fall_per_px * math.cos(turn), fall_per_px * math.sin(turn))
-        scene = FieldScene(discs, ground, ink, gradient, board_m)
+        scene = FieldScene(discs, ground, ink, gradient, board_m if session.has_edges else None)
         pose = _pose(session.camera, board_m, number, rng)
         grey = photograph(
             session.camera, pose, scene, session.optics, session.sensor, rng, session.gain

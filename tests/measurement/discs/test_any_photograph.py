@@ -55,8 +55,8 @@ def photographs(draw: st.DrawFn) -> GreyArray:
     share = draw(st.sampled_from((checkers, ellipse, 1.0 - ellipse, rng.uniform(size=rows.shape))))
     levels = share * draw(st.floats(0.0, 1.6)) + draw(st.floats(0.0, 0.1))
     levels = levels + draw(st.sampled_from((0.0, 0.01, 0.1))) * rng.standard_normal(rows.shape)
-    kind = draw(st.sampled_from((np.uint8, np.uint16)))
-    photo: GreyArray = np.rint(np.clip(levels, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)
+    white, kind = draw(st.sampled_from(((255, "uint8"), (65535, "uint16"))))
+    photo: GreyArray = np.rint(np.clip(levels, 0.0, 1.0) * white).astype(kind)
     return photo
 
 

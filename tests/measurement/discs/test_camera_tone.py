@@ -1,0 +1,45 @@
+"""What all discs of a photograph say of the camera's tone curve and its sharpening."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.discs.adjust_disc import DiscTask
+from kgcp.measurement.discs.camera_tone import learn_tone
+from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+
+CAMERA = Camera(330, 250, 1000.0, 1000.0, 165.0, 125.0)
+DISCS = tuple(
+    FieldDisc((0.08 * (column - 1.5) + 0.0003 * row, 0.08 * (row - 1.0), 0.0), 0.05)
+    for column in range(4)
+    for row in range(3)
+)
+
+
+@pytest.mark.parametrize(
+    ("curve", "tone", "waves"),
+    [(ToneCurve.FILM, Tone.UNKNOWN, (0.0, -0.7, 0.0)), (ToneCurve.LINEAR, None, None)],
+)
+def test_curve_and_sharpening_are_those_of_the_camera(
+    curve: ToneCurve, tone: Tone | None, waves: tuple[float, float, float] | None
+) -> None:
+    scene = FieldScene(DISCS, 0.62, 0.1, (0.0012, -0.0008))
+    sensor = Sensor(tone=curve, sharpening=0.5, sharpening_px=0.8)
+    rng = np.random.default_rng(5)
+    grey = photograph(
+        CAMERA, Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), scene, Optics(0.6), sensor, rng
+    )
+    tasks = [DiscTask(grey, outline, []) for outline in find_outlines(grey)]
+    camera = learn_tone([tasks], Response.UNKNOWN)
+    assert camera.known is not None
+    assert 0.65 < camera.sharpening_px < 0.97
+    assert camera.known.mean[3] == pytest.approx(0.5, abs=0.25)
+    if waves is not None:
+        assert camera.tone is tone
+        assert camera.known.mean[:3] == pytest.approx(waves, abs=0.25)

@@ -1,0 +1,72 @@
+"""Grey values of discs: the tone curve, and derivatives as differences show them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.discs.disc_levels import COUNT, LevelModel, Row
+from kgcp.measurement.discs.tone_curve import DiscTone, steep_enough
+from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.photometry import Tone, srgb_encoded
+from kgcp.measurement.image_model.sharpening import unsharp_mask
+
+SIDE = 24
+ROWS, COLUMNS = (each.ravel().astype(np.float64) for each in np.mgrid[0:SIDE, 0:SIDE])
+FAR_PX = np.hypot(COLUMNS - 11.3, ROWS - 12.1) - 6.0
+SHARE = 0.5 + 0.5 * np.tanh(FAR_PX)
+NEAR = np.flatnonzero((np.abs(FAR_PX) < 4.0) & ((ROWS + COLUMNS) % 2 == 0))  # as of large discs
+LEVEL_ROWS = [
+    *(Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y),
+    *(Row.WAVE_1, Row.WAVE_2, Row.WAVE_3, Row.SHARPENING),
+]
+
+
+def vector() -> FloatArray:
+    values = np.zeros(COUNT)
+    values[LEVEL_ROWS] = 0.12, 0.66, 0.03, -0.05, 0.1, -0.5, 0.05, 0.4
+    return values
+
+
+def levels(tone: Tone, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    offsets = np.stack((COLUMNS[NEAR] - 11.3, ROWS[NEAR] - 12.1)) / 6.0
+    mask = unsharp_mask((SIDE, SIDE), NEAR, SHARE, 1.0)
+    share = WhiteShare(offsets, SHARE[NEAR], np.zeros((11, len(NEAR))))
+    return LevelModel(offsets, tone, mask).linearised(share, values)
+
+
+@pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+def test_derivatives_contain_what_beside_the_pixels_changes(tone: Tone) -> None:
+    """Pixels that are not modelled are in the mask, and depend on light and tone as well."""
+    _, jacobian = levels(tone, vector())
+    for row in LEVEL_ROWS:
+        step = np.zeros(COUNT)
+        step[row] = 1e-5
+        slopes = (levels(tone, vector() + step)[0] - levels(tone, vector() - step)[0]) / 2e-5
+        assert np.abs(jacobian[row] - slopes).max() < 2e-3 * max(np.abs(slopes).max(), 0.1)
+
+
+def test_table_is_srgb() -> None:
+    values = vector()
+    values[Row.SLOPE_X :] = 0.0
+    found, _ = levels(Tone.SRGB, values)
+    light = 0.12 + 0.54 * SHARE[NEAR]
+    assert np.abs(found - srgb_encoded(light)).max() < 1e-7
+
+
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+def test_light_is_found_of_every_level(tone: Tone) -> None:
+    curve = DiscTone(tone, (0.2, -0.6, 0.1))
+    light = np.linspace(-0.1, 1.6, 50)
+    assert curve.light(curve.levels(light)) == pytest.approx(light, abs=1e-9)
+
+
+def test_curves_rise_everywhere() -> None:
+    waves = steep_enough(np.array((1.5, -2.0, 0.3)))
+    light = np.linspace(0.0, 1.0, 2000)
+    curve = DiscTone(Tone.UNKNOWN_FROM_LINE).bent(waves)
+    slopes = np.diff(curve.levels(light)) / np.diff(light)
+    assert 0.14 < slopes.min() < 0.2
+    few = np.array((0.1, -0.2, 0.0))
+    assert np.all(steep_enough(few) == few)
