@@ -29,7 +29,7 @@ from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.image_model.photometry import Tone
 
 _MOST_DISCS = 9
-_LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are any
+_LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 # From there on, the two levels fall off differently enough to tell, but for an unknown curve.
 _LARGE_RADIUS_PX = 20.0
 _MOST_CLIPPED = 0.05  # share of pixels
@@ -88,7 +88,9 @@ def first_blur_px(task: DiscTask, camera: CameraTone) -> float:
 
 def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     """Return the tasks of some large discs of high contrast, evenly drawn from the larger half."""
-    large = [task for task in tasks if task.radius_px >= _LEAST_RADIUS_PX] or list(tasks)
+    large = [task for task in tasks if task.radius_px >= _LEAST_RADIUS_PX]
+    if len(large) < min(_MOST_DISCS, len(tasks)):  # a mark alone does not speak for all
+        large = list(tasks)
     worth = [task.radius_px * task.outline.contrast for task in large]
     order = sorted(range(len(large)), key=lambda i: (-worth[i], i))
     half = order[: max(len(order) // 2, min(len(order), _MOST_DISCS))]
@@ -97,14 +99,18 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
 
 
 def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
-    """Adjust discs each by itself, by sRGB's curve; those that lead anywhere, unclipped if any."""
+    """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
+
+    Of burnt discs the upper end of the curve is not seen: without them, if enough are left.
+    """
     fits = []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
             fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_fit(fit, task.outline)
             fits.append(fit)
-    return [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED] or fits
+    clean = [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED]
+    return clean if len(clean) >= min(_MOST_DISCS, len(fits) // 2) else fits
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,11 +44,9 @@ def measure_discs(
     *,
     response: Response = Response.UNKNOWN,
     operator: Operator = Operator.MODEL,
+    camera: CameraTone | None = None,
 ) -> list[Disc | DiscMiss]:
     """Measure many discs of one photograph: one outcome for each outline, in their order.
-
-    What the camera does to all of them, an unknown tone curve and sharpening, is learned from the
-    largest first.
 
     Parameters
     ----------
@@ -58,12 +56,26 @@ def measure_discs(
         By `find_outlines` or `follow_outlines`. Each one's pixels are kept clear of the others.
     response : Response
         How grey values follow light.
+    camera : CameraTone, optional
+        What the camera does to all discs, an unknown tone curve and sharpening, as `learn_camera`
+        says; by default, it is learned from the largest of these.
     """
-    tasks = [
-        DiscTask(grey, outline, _others(outline, [outlines[j] for j in near]))
-        for outline, near in zip(outlines, _neighbours(outlines), strict=True)
-    ]
-    return _measured(tasks, response, operator)
+    return _measured(_tasks(grey, outlines), response, operator, camera)
+
+
+def learn_camera(
+    photographs: Iterable[tuple[GreyArray, Sequence[DiscOutline]]], response: Response
+) -> CameraTone:
+    """Learn what a camera does to all discs from several photographs with their outlines.
+
+    Parameters
+    ----------
+    photographs : iterable of (array, sequence of DiscOutline)
+        Grey values of 8 or 16 bits, and outlines by `find_outlines`.
+    response : Response
+        How grey values follow light.
+    """
+    return learn_tone([_tasks(grey, outlines) for grey, outlines in photographs], response)
 
 
 def measure_disc(
@@ -83,16 +95,24 @@ def measure_disc(
     neighbours : sequence of DiscOutline
         Other edges that may be near: their pixels are left out.
     """
-    return _measured([DiscTask(grey, outline, _others(outline, neighbours))], response, operator)[0]
+    task = DiscTask(grey, outline, _others(outline, neighbours))
+    return _measured([task], response, operator, None)[0]
+
+
+def _tasks(grey: GreyArray, outlines: Sequence[DiscOutline]) -> list[DiscTask]:
+    return [
+        DiscTask(grey, outline, _others(outline, [outlines[j] for j in near]))
+        for outline, near in zip(outlines, _neighbours(outlines), strict=True)
+    ]
 
 
 def _measured(
-    tasks: Sequence[DiscTask], response: Response, operator: Operator
+    tasks: Sequence[DiscTask], response: Response, operator: Operator, camera: CameraTone | None
 ) -> list[Disc | DiscMiss]:
     if operator is not Operator.MODEL:
         measure = measure_by_centroid if operator is Operator.CENTROID else measure_by_gaussian
         return [_certain(measure(task)) for task in tasks]
-    camera = learn_tone([tasks], response)
+    camera = learn_tone([tasks], response) if camera is None else camera
     outcomes = [_fitted(task, camera) for task in tasks]
     fits = [each for each in outcomes if not isinstance(each, DiscMiss)]
     found = iter(inflations([scatter for _, scatter in fits]).tolist())

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Response
-from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.camera_tone import CameraTone
+from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
     Disc,
@@ -60,6 +62,20 @@ class PhotoTask:
     field: Field
     response: Response
     operator: Operator
+    camera: CameraTone | None = None  # what all photographs share; None: each says it for itself
+
+
+def learn_from_fields(greys: Iterable[GreyArray], task: PhotoTask) -> CameraTone | None:
+    """Learn what a camera does to all discs from some photographs; None if that tells nothing."""
+    if task.operator is not Operator.MODEL or task.response is Response.LINEAR:
+        return None
+    photographs = []
+    for grey in greys:
+        outlines = find_outlines(grey)
+        own = [each for each in outlines if each.polarity.value == task.field.polarity.value]
+        photographs.append((grey, own))
+    camera = learn_camera(photographs, task.response)
+    return None if camera.known is None else camera
 
 
 def measure_field(
@@ -79,7 +95,13 @@ def measure_field(
         detail = f"{len(own)} outlines like the field's discs"
         return PhotoMiss(photo, width, height, naming.value, detail)
     # holes and others stay in the list as neighbours, whose pixels are left out
-    measured = measure_discs(grey, outlines, response=task.response, operator=task.operator)
+    measured = measure_discs(
+        grey,
+        outlines,
+        response=task.response,
+        operator=task.operator,
+        camera=task.camera,
+    )
     named = [
         (point, disc)
         for disc, point in (
@@ -142,7 +164,11 @@ def measure_more(
         return first
     outlines = [outline for outline in followed if outline is not None]
     measured = measure_discs(
-        grey, [*outlines, *from_first], response=task.response, operator=task.operator
+        grey,
+        [*outlines, *from_first],
+        response=task.response,
+        operator=task.operator,
+        camera=task.camera,
     )
     more = [
         (int(point[index]), disc)

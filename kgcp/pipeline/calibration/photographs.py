@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,12 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.exif import read_frame_header
 from kgcp.io.images.frames import read_grey
+from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.photograph import (
     PhotoDiscs,
     PhotoMiss,
     PhotoTask,
+    learn_from_fields,
     measure_field,
     measure_more,
 )
@@ -40,6 +43,16 @@ class SecondLook:
     first: PhotoDiscs
     predicted: FloatArray  # (k, 5): centroids and moments
     point: FloatArray  # (k,): which of the field's discs they are
+
+
+@single_threaded()
+def learn_from_photos(task: PhotoTask, photos: tuple[Photo, ...]) -> CameraTone | None:
+    """Learn what a camera does to all discs from some photographs, as far as they can be read."""
+    greys = []
+    for photo in photos:
+        with suppress(Rejection):
+            greys.append(_read(photo.path))
+    return learn_from_fields(greys, task)
 
 
 @single_threaded()

@@ -19,6 +19,7 @@ from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
 from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import versions
+from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss, PhotoTask
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration import LEAST_VIEWS, calibrate_camera, missing_discs
@@ -32,6 +33,7 @@ from kgcp.network.calibration_records import (
 from kgcp.pipeline.calibration.photographs import (
     Photo,
     SecondLook,
+    learn_from_photos,
     measure_photo,
     measure_photo_again,
 )
@@ -43,6 +45,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.targets.fields.layout import Field
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
+_LEARNED_FROM = 5  # photographs, what the camera does to grey values
 _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
@@ -167,6 +170,7 @@ def calibrate_photos(
         open_pool(options.jobs, options.photo_timeout_s, None, out) as pool,
     ):
         looks = _Looks(journal, pool, listener)
+        task = replace(task, camera=_camera_of(pool, task, photos))
         first = looks.through(
             "photographs", photos, [photo.name for photo in photos], partial(measure_photo, task)
         )
@@ -184,6 +188,14 @@ def calibrate_photos(
     camera = replace(final.camera, response=options.response)
     calibration = replace(final, camera=camera)
     return _outcome(photos, field, options, results, calibration)
+
+
+def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> CameraTone | None:
+    """Learn from some photographs what the camera does to all discs; None: each for itself."""
+    some = tuple(photos[:: max(len(photos) // _LEARNED_FROM, 1)][:_LEARNED_FROM])
+    with closing(pool.map(partial(learn_from_photos, task), [some])) as outcomes:
+        ((_, learned),) = outcomes
+    return None if isinstance(learned, TaskFailure) else learned
 
 
 class _Looks:
