@@ -134,7 +134,8 @@ def line(outcome: Outcome) -> str:
     setup = outcome.setup
     kind = "places and distances" if setup.has_distance else "places alone"
     if not len(outcome.z):
-        return f"{setup.points:2d} points, {kind}: all {outcome.refused} frames refused"
+        verdict = f", {outcome.wrong} wrong  MISSED" if outcome.wrong else ""
+        return f"{setup.points:2d} points, {kind}: {outcome.refused} refused{verdict}"
     z = np.sqrt(np.mean(outcome.z**2, axis=0))
     is_reached = outcome.right_share >= _LEAST_RIGHT and 0.9 <= float(np.sqrt(np.mean(z**2))) <= 1.1
     return (
