@@ -3,7 +3,8 @@
     python -m benchmarks.calibrate.speed [--photographs 20] [--jobs 2] [--response unknown]
 
 The photographs are rendered into a temporary folder first, which is not timed. Wall time depends on
-what else the machine does; the CPU time of all processes hardly does.
+what else the machine does; CPU time hardly does, but that of workers may be missing in it: take it
+with --jobs 0.
 """
 
 from __future__ import annotations
