@@ -22,7 +22,7 @@ demo: $(VENV)/.runs ## detect, export-gcp and bias-report on sample_flight/
 	@echo "Open sample_flight/kgcp/bias_report.html in a browser."
 
 test: $(VENV)/.develops ## run the tests
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: lint types test ## all that must pass before a change goes in
 

@@ -39,22 +39,15 @@ def test_the_package_alone_imports_no_library() -> None:
 
 def test_the_examples_of_the_page_run_one_after_the_other(tmp_path: Path) -> None:
     (tmp_path / "sample_flight").symlink_to(ROOT / "sample_flight")
-    lines = []
-    for number, example in enumerate(EXAMPLES):
-        script = tmp_path / f"example_{number}.py"
-        body = "".join(f"    {line}\n" if line else "\n" for line in example.splitlines())
-        script.write_text(f'if __name__ == "__main__":\n{body}', encoding="utf-8")
-        done = subprocess.run(
-            [sys.executable, str(script)],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{example}\n{done.stderr}"
-        lines.append(done.stdout)
+    lines = [f"    {line}\n" for example in EXAMPLES for line in example.splitlines()]
+    script = tmp_path / "examples.py"
+    script.write_text(f'if __name__ == "__main__":\n{"".join(lines)}', encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
     assert len(EXAMPLES) >= 5
-    assert re.match(r"\d+\.\d{3} m ± \d+\.\d mm \[", lines[0])
+    assert re.match(r"\d+\.\d{3} m ± \d+\.\d mm \[", done.stdout)
     report = (tmp_path / "results" / "bias_report.html").read_text(encoding="utf-8")
     assert re.search(r"by vehicle and by camera differ by\s+\d+ mm along", report)
     assert re.search(r"24: 21 measured, 3 out of view", report)

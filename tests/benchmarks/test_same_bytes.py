@@ -27,7 +27,6 @@ def circumstances(core: str | None) -> Iterator[Circumstances]:
     )
     if core is None:
         yield Circumstances("four threads, two jobs", 2, four)
-        yield Circumstances("four threads, a cluster", 2, four, has_cluster=True)
 
 
 @pytest.fixture(scope="module")

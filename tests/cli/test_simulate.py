@@ -86,10 +86,11 @@ def test_options_of_effects_reach_the_flight_and_its_readme(tmp_path: Path) -> N
         *("--glare", "0.3", "--astigmatism", "1.4", "--coma", "0.1", "--phone"),
         *("--rolling", "0.02", "--motion", "30", "-40"),
     ]
-    arguments = ["simulate", str(out), "--frames", "1", "--jobs", "1", *options]
+    only = ["--preset", "sample", "--frames", "1"]
+    arguments = ["simulate", str(out), *only, "--jobs", "1", *options]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
-    command = f"kgcp simulate OUT --preset clean --frames 1 --seed 1 {' '.join(options)}\n"
+    command = f"kgcp simulate OUT --preset sample --frames 1 --seed 1 {' '.join(options)}\n"
     assert command in (out / "README.md").read_text(encoding="utf-8")
     camera = read_flight(out).camera
     assert camera.readout_s == 0.02
