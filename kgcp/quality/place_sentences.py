@@ -15,12 +15,15 @@ _DOUBTFUL_CHI2 = 14.2  # of three coordinates, as likely as 3 standard deviation
 _LEAST_EXTRA_PX = 0.005  # of what is worth a sentence
 
 
-def contradicts(placed: PlacedTarget) -> bool:
-    """Tell whether a placed target does not agree with flight.toml."""
-    check = placed.check
-    chi2 = check.position_chi2
-    is_moved = chi2 is not None and chi2 > _DOUBTFUL_CHI2
-    return is_moved or _diameter_ratio(placed) > _DOUBTFUL
+def has_other_diameter(placed: PlacedTarget) -> bool:
+    """Tell whether a ring is not as large as flight.toml says."""
+    return _diameter_ratio(placed) > _DOUBTFUL
+
+
+def lies_elsewhere(placed: PlacedTarget) -> bool:
+    """Tell whether a target does not lie where flight.toml says."""
+    chi2 = placed.check.position_chi2
+    return chi2 is not None and chi2 > _DOUBTFUL_CHI2
 
 
 def _diameter_ratio(placed: PlacedTarget) -> float:
@@ -35,7 +38,7 @@ def diameter_sentence(placed: PlacedTarget) -> str:
     sd = placed.sd_diameter_m
     decimals = 4 if not sd > 0.0 else min(7, max(4, 1 - math.floor(math.log10(sd))))
     ratio = _diameter_ratio(placed)
-    verdict = "which is not what" if ratio > _DOUBTFUL else "as"
+    verdict = "which is not what" if has_other_diameter(placed) else "as"
     return (
         f"{placed.target}: the ring of {check.stated_diameter_m:g} m measures"
         f" {placed.diameter_m:.{decimals}f} ± {sd:.{decimals}f} m"
@@ -51,7 +54,8 @@ def position_sentence(placed: PlacedTarget) -> str:
     if check.residual_m is None or chi2 is None:
         return f"{placed.target}: flight.toml states no position"
     x, y, z = (minus(f"{value:+.4f}") for value in check.residual_m.tolist())
-    verdict = "more than its deviations explain" if chi2 > _DOUBTFUL_CHI2 else "as expected"
+    is_doubtful = lies_elsewhere(placed)
+    verdict = "more than its deviations explain" if is_doubtful else "as expected"
     return (
         f"{placed.target}: lies {x}, {y}, {z} m (x, y, z) from its position in flight.toml,"
         f" {verdict} (χ² {chi2:.1f} of 3)"

@@ -43,6 +43,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     assert "Targets on the ground" in page
     assert summary["sentences"][0] in page
     assert 'class="verdict look"' in page
+    assert page.count('<li class="look">') == 4, "the diameters, and not the places"
 
 
 def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:

@@ -220,7 +220,6 @@ def write_places(
         flight.name,
         places.local_frame.crs,
         places.placement,
-        places.sentences,
         places.doubts,
         draw_places(placed),
         [*(path.name for path in tables), *names],

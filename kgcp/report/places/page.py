@@ -10,7 +10,12 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from kgcp.network.ground.target_places import Placement
 from kgcp.quality.number_text import minus
-from kgcp.quality.place_sentences import contradicts
+from kgcp.quality.place_sentences import (
+    diameter_sentence,
+    has_other_diameter,
+    lies_elsewhere,
+    position_sentence,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,7 +25,6 @@ class PlacesPage:
     name: str  # of the flight
     crs: str
     placement: Placement
-    sentences: Sequence[str]  # of diameters and places
     doubts: Sequence[str]
     figures: Mapping[str, bytes]  # PNG, by name
     files: Sequence[str]
@@ -38,11 +42,20 @@ def render_places(page: PlacesPage) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    statements = [
+        statement
+        for placed in page.placement.targets
+        for statement in (
+            (diameter_sentence(placed), has_other_diameter(placed)),
+            (position_sentence(placed), lies_elsewhere(placed)),
+        )
+    ]
     environment.filters["fixed"] = lambda value, digits: minus(f"{value:.{digits}f}")
     return environment.get_template("places.html").render(
         page=page,
         placement=page.placement,
-        is_good=not page.doubts and not any(map(contradicts, page.placement.targets)),
+        statements=statements,
+        is_good=not page.doubts and not any(is_doubtful for _, is_doubtful in statements),
         images={
             name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
             for name, png in page.figures.items()
