@@ -111,12 +111,11 @@ class Life:
                 self.done = self.total - event["total"] + event["done"]
 
     def workers(self) -> list[int]:
-        """Find the processes that work for it: every thread counts its own children."""
-        children: list[str] = []
-        for path in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
-            with suppress(OSError):  # the thread has just ended
-                children += path.read_text(encoding="ascii").split()
-        return [int(child) for child in children if is_worker(int(child))]
+        """Find the processes that work for it: its server's children, or its own."""
+        children = children_of(self.process.pid)
+        servers = [child for child in children if is_started_by(child, b"forkserver")]
+        forked = [worker for server in servers for worker in children_of(server)]
+        return forked + [child for child in children if is_started_by(child, b"spawn_main")]
 
     def wait_for(self, done: float, seconds: float) -> None:
         """Wait until some number of frames is done, and some seconds more, at most to the end."""
@@ -136,10 +135,19 @@ class Life:
         return code
 
 
-def is_worker(pid: int) -> bool:
-    """Whether a process is one that a pool has spawned."""
+def children_of(pid: int) -> list[int]:
+    """Return the processes that one has started: every thread counts its own."""
+    children: list[str] = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):  # the thread has just ended
+            children += path.read_text(encoding="ascii").split()
+    return [int(child) for child in children]
+
+
+def is_started_by(pid: int, function: bytes) -> bool:
+    """Tell whether a process runs this function of multiprocessing."""
     try:
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return function in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return False
 
