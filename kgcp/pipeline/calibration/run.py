@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -13,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from kgcp.errors import KgcpError, Reason
+from kgcp.errors import KgcpError, KgcpWarning, Reason
 from kgcp.geometry.camera import Response
 from kgcp.io.files.safe_read import is_file, is_folder
 from kgcp.io.images.frames import FRAME_SUFFIXES, list_frames
@@ -195,7 +196,15 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
     some = tuple(photos[:: max(len(photos) // _LEARNED_FROM, 1)][:_LEARNED_FROM])
     with closing(pool.map(partial(learn_from_photos, task), [some])) as outcomes:
         ((_, learned),) = outcomes
-    return None if isinstance(learned, TaskFailure) else learned
+    if isinstance(learned, TaskFailure):
+        warnings.warn(
+            "the tone curve is learned in every photograph by itself, since the process that"
+            " learned it from five of them has ended or taken too long; results differ slightly",
+            KgcpWarning,
+            stacklevel=2,
+        )
+        return None
+    return learned
 
 
 class _Looks:
