@@ -102,11 +102,16 @@ def test_frames_are_the_same_each_time_and_differ() -> None:
 def observed(shot: Shot, seen: PlatePose, pose: Pose | None = None) -> Measurement:
     pose = pose or seen.pose
     return Measurement(
-        *(seen.plate.target.name, seen.plate.target.name, 0, 0.97, pose),
-        shot.camera.project(pose.translation_m),
-        image_heading_deg(shot.camera, pose),
-        Appearance(radius_px(shot.camera, seen), 0.1, 0.8, 0.0),
-        *(None, None),
+        target=seen.plate.target.name,
+        ring=seen.plate.target.name,
+        instance=0,
+        score=0.97,
+        pose=pose,
+        centre_px=shot.camera.project(pose.translation_m),
+        heading_deg=image_heading_deg(shot.camera, pose),
+        appearance=Appearance(radius_px(shot.camera, seen), 0.1, 0.8, 0.0),
+        alternative=None,
+        uncertainty=None,
     )
 
 

@@ -17,7 +17,20 @@ from kgcp.geometry.calibration import (
 from kgcp.geometry.camera import Camera
 
 CAMERA = Camera(
-    *(1600, 1100, 2306.0, 2302.0, 792.6, 543.9, -0.072, 0.055, 4e-4, -3e-4, 0.01, 0.02, -0.03, 0.01)
+    width=1600,
+    height=1100,
+    fx=2306.0,
+    fy=2302.0,
+    cx=792.6,
+    cy=543.9,
+    k1=-0.072,
+    k2=0.055,
+    p1=4e-4,
+    p2=-3e-4,
+    k3=0.01,
+    k4=0.02,
+    k5=-0.03,
+    k6=0.01,
 )
 
 

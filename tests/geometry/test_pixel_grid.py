@@ -10,7 +10,20 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pixel_grid import normalised_grid, rays_of_window
 
 CAMERA = Camera(
-    *(1600, 1100, 2306.0, 2302.0, 792.6, 543.9, -0.11, 0.07, 8e-4, -6e-4, -0.01, 0.02, 0.01, 0.0)
+    width=1600,
+    height=1100,
+    fx=2306.0,
+    fy=2302.0,
+    cx=792.6,
+    cy=543.9,
+    k1=-0.11,
+    k2=0.07,
+    p1=8e-4,
+    p2=-6e-4,
+    k3=-0.01,
+    k4=0.02,
+    k5=0.01,
+    k6=0.0,
 )
 
 

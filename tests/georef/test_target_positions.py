@@ -108,10 +108,11 @@ def test_scatter_of_perturbed_trajectories_is_the_reported_covariance() -> None:
     )
     base = _straight(0.0, sd_position, sd_attitude)
     tilted = Trajectory(
-        base.time_s,
-        base.position_map,
-        np.tile(attitude, (len(base.time_s), 1)),
-        *(base.sd_position_m, base.sd_attitude_deg),
+        time_s=base.time_s,
+        position_map=base.position_map,
+        attitude_deg=np.tile(attitude, (len(base.time_s), 1)),
+        sd_position_m=base.sd_position_m,
+        sd_attitude_deg=base.sd_attitude_deg,
     )
     target_positions = TargetPositions.of(_CRS, [Target(_RING)], tilted, settings)
     reported = _only_place(target_positions.positions(["A"], [5.0]))

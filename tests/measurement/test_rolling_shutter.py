@@ -23,7 +23,14 @@ from kgcp.simulation.rolling_shutter import RowMotion
 
 READOUT_S = 0.03
 CAMERA = Camera(
-    *(640, 480, 900.0, 902.0, 318.2, 241.7, -0.05, 0.03),
+    width=640,
+    height=480,
+    fx=900.0,
+    fy=902.0,
+    cx=318.2,
+    cy=241.7,
+    k1=-0.05,
+    k2=0.03,
     response=Response.LINEAR,
     readout_s=READOUT_S,
 )

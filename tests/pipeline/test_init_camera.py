@@ -16,8 +16,18 @@ def guessed_fx(header: FrameHeader) -> object:
     folder = Path("nowhere")
     none: tuple[()] = ()
     contents = FolderContents(
-        *(folder, folder, (header.frame,), none, none, none),
-        *(none, none, none, none, none, none),
+        folder=folder,
+        frames_folder=folder,
+        frames=(header.frame,),
+        marks=none,
+        events=none,
+        times=none,
+        trajectories=none,
+        accuracies=none,
+        calibrations=none,
+        targets=none,
+        points=none,
+        references=none,
     )
     (table,) = camera_section(contents, [header]).blocks
     assert isinstance(table, DraftTable)

@@ -37,9 +37,17 @@ def cards() -> list[Card]:
     """Measured at 10, 11, … metres, with one rejected and one unreadable frame at the end."""
     seen = [
         Card(
-            *(f"f_{number:02d}.jpg", "A", 0, "measured", ""),
-            *(f"{10 + number} m", "centre (1.0, 2.0) px"),
-            *(10.0 + number, 0.01 * (number % 7), 20.0, 1.0),
+            frame=f"f_{number:02d}.jpg",
+            target="A",
+            instance=0,
+            status="measured",
+            reason="",
+            headline=f"{10 + number} m",
+            text="centre (1.0, 2.0) px",
+            distance_m=10.0 + number,
+            sd_percent=0.01 * (number % 7),
+            radius_px=20.0,
+            residual_percent=1.0,
             stem=f"{number + 1:06d}-0",
         )
         for number in range(MEASURED)

@@ -44,8 +44,17 @@ def test_no_direction_of_a_mark_is_below_the_floor(
 
 def point(**values: object) -> Gcp:
     plain = Gcp(
-        *("K0001", "a.jpg", "A", 0.0, np.zeros(3), None, np.zeros(2), SHARP),
-        *(80.0, 0.002, None),
+        id="K0001",
+        frame="a.jpg",
+        target="A",
+        time_s=0.0,
+        position_map=np.zeros(3),
+        cov_m2=None,
+        centre_px=np.zeros(2),
+        centre_cov_px2=SHARP,
+        distance_m=80.0,
+        sd_distance_m=0.002,
+        sd_common_distance_m=None,
     )
     return replace(plain, **values)  # type: ignore[arg-type]  # the caller's are of their types
 

@@ -23,8 +23,17 @@ from kgcp.io.formats.calibrations import read_calibration
 from kgcp.io.formats.camera_writers import CAMERA_FORMATS, CalibratedCamera, camera_file
 
 CAMERA = Camera(
-    *(1600, 1100, 1705.513, 1705.513, 811.27, 541.91),
-    *(-0.0613, 0.0431, 0.00071, -0.0011, -0.0092),
+    width=1600,
+    height=1100,
+    fx=1705.513,
+    fy=1705.513,
+    cx=811.27,
+    cy=541.91,
+    k1=-0.0613,
+    k2=0.0431,
+    p1=0.00071,
+    p2=-0.0011,
+    k3=-0.0092,
 )
 RATIONAL = replace(CAMERA, fx=1706.25, k4=0.011, k5=-0.002, k6=0.0003)
 GRID = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.3, 0.3, 7)), -1).reshape(

@@ -102,10 +102,16 @@ def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlaceP
         cov = 1e-8 * np.eye(6)
         cov[:3, :3] += (relative_sd * pose.distance_m) ** 2 * np.outer(along, along)
         return Measurement(
-            *("A", "A", 0, 0.9, pose, camera.project(pose.translation_m), 0.0),
-            Appearance(20.0, 0.1, 0.8, 0.0),
-            None,
-            propagate(camera, pose, cov),
+            target="A",
+            ring="A",
+            instance=0,
+            score=0.9,
+            pose=pose,
+            centre_px=camera.project(pose.translation_m),
+            heading_deg=0.0,
+            appearance=Appearance(20.0, 0.1, 0.8, 0.0),
+            alternative=None,
+            uncertainty=propagate(camera, pose, cov),
         )
 
     check_precision(observed(0.009))

@@ -22,7 +22,17 @@ from kgcp.simulation.imaging import Sensor, ToneCurve
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
 LENS = Camera(
-    *(480, 340, 1310.0, 1306.0, 121.2, 91.7, -0.09, 0.06, 8e-4, -6e-4, -0.01),
+    width=480,
+    height=340,
+    fx=1310.0,
+    fy=1306.0,
+    cx=121.2,
+    cy=91.7,
+    k1=-0.09,
+    k2=0.06,
+    p1=8e-4,
+    p2=-6e-4,
+    k3=-0.01,
     response=Response.LINEAR,
 )
 TARGET = TARGET_PLATE.target

@@ -22,9 +22,16 @@ TARGET = TARGET_PLATE.target
 MAIN, REPLICA = TARGET.rings
 FRAMES = 20_000
 OBSERVATION = Measurement(
-    *("A", "A", 0, 0.95, Pose(Rotation.identity().as_matrix(), np.array([0.0, 0.0, 90.0]))),
-    *(np.array([100.0, 100.0]), 0.0, Appearance(12.0, 0.1, 0.8, 0.0, 0.0, blur_px=0.8)),
-    *(None, None),
+    target="A",
+    ring="A",
+    instance=0,
+    score=0.95,
+    pose=Pose(Rotation.identity().as_matrix(), np.array([0.0, 0.0, 90.0])),
+    centre_px=np.array([100.0, 100.0]),
+    heading_deg=0.0,
+    appearance=Appearance(12.0, 0.1, 0.8, 0.0, 0.0, blur_px=0.8),
+    alternative=None,
+    uncertainty=None,
 )
 
 

@@ -70,22 +70,31 @@ observations = st.builds(
     imaging=st.none()
     | st.builds(
         Imaging,
-        st.sampled_from(ToneBase),
-        *(numbers, numbers, st.tuples(numbers, numbers, numbers)),
-        *(numbers, numbers, numbers),
+        base=st.sampled_from(ToneBase),
+        black=numbers,
+        white=numbers,
+        tone=st.tuples(numbers, numbers, numbers),
+        sharpening=numbers,
+        noise_black=numbers,
+        noise_white=numbers,
     ),
 )
 with_rivals = st.builds(
     lambda seen, other, advantage: replace(seen, rival=RivalTone(other, advantage)),
-    *(observations, observations, numbers),
+    observations,
+    observations,
+    numbers,
 )
 misses = st.builds(Miss, st.text(), st.sampled_from(Reason), st.text(), maybe, st.integers(0, 99))
 candidates = st.builds(
     Considered,
-    *(st.text(), st.text(), st.builds(Ellipse, *[numbers] * 5), numbers),
-    st.booleans(),
-    st.sampled_from(Reason),
-    st.text(),
+    target=st.text(),
+    ring=st.text(),
+    outline=st.builds(Ellipse, *[numbers] * 5),
+    score=numbers,
+    is_match=st.booleans(),
+    reason=st.sampled_from(Reason),
+    detail=st.text(),
 )
 results = st.builds(
     FrameResult,

@@ -88,8 +88,15 @@ def sighted(row: pd.Series[float], frame: str, delta_px: float) -> Comparison:
     centre = np.array([row["x"], row["y"]])
     time_s = 1_781_597_705.0 + 1.5 * row["index"]
     exposure = Exposure(
-        *(row["radius_px"], 0.7, delta_px, row["black"], row["white"], 0.0),
-        *(0.0008 * row["gain"], 100.0, 5.6),
+        radius_px=row["radius_px"],
+        blur_px=0.7,
+        edge_shift_px=delta_px,
+        black=row["black"],
+        white=row["white"],
+        saturated=0.0,
+        exposure_time_s=0.0008 * row["gain"],
+        iso=100.0,
+        f_number=5.6,
     )
     sighting = Sighting(frame, 1, "A", 0, time_s, centre, None, distance, 0.004, None, pose)
     place = np.array([2.0 * row["index"], 30.0, 0.0])
