@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Response
@@ -75,7 +76,7 @@ def _groups(
     return groups
 
 
-def _holes(grey: GreyArray, discs: list[Disc]) -> list[GreyArray]:
+def _holes(grey: GreyArray, discs: list[Disc]) -> list[MatLike]:
     """Return the contours of holes, by levels between those of the discs and of their ground."""
     full = float(np.iinfo(grey.dtype).max)
     inside = float(np.median([disc.inside for disc in discs]))

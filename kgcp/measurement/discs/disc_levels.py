@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 
 import numpy as np
 
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.discs.tone_curve import srgb_table
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.photometry import Tone, srgb_encoded, srgb_slope
 from kgcp.measurement.image_model.sharpening import Mask
 
 
@@ -42,6 +42,7 @@ GEOMETRY_COUNT = 5
 _OF_SHARE = np.array([0, 1, 2, 3, 4, 6, 7, 8])  # rows of a white share's Jacobian
 _FILTERED = np.array([Row.BLACK, Row.WHITE, *range(Row.BLACK), Row.SLOPE_X, Row.SLOPE_Y])
 _BESIDE = 10  # levels about a pixel, their derivatives by light, and by the waves
+_MOST_LIGHT, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
 _WAVES = np.array([Row.WAVE_1, Row.WAVE_2, Row.WAVE_3])
 
 
@@ -71,7 +72,7 @@ class LevelModel:
             self.offsets,
             vector,
             of_tone,
-            srgb_table(),
+            _srgb_table(),
             value,
             jacobian,
             beside,
@@ -107,15 +108,22 @@ class LevelModel:
         return value + strength * detail, jacobian
 
 
+@cache
+def _srgb_table() -> FloatArray:
+    """Return sRGB's curve and its slope (2, 65537) at even steps of light from 0 to 4."""
+    light = np.linspace(0.0, _MOST_LIGHT, _STEPS + 1)
+    return np.stack((srgb_encoded(light), srgb_slope(light)))
+
+
 @inlined
 def _looked_up(light: float, table: FloatArray) -> tuple[float, float]:
     """Return sRGB's grey value and its slope."""
     last = table.shape[1] - 1
-    place = light * (0.25 * last)
+    place = light * (last / _MOST_LIGHT)
     if place <= 0.0:
         return 12.92 * light, 12.92
     if place >= last:
-        return table[0, last] + table[1, last] * (light - 4.0), table[1, last]
+        return table[0, last] + table[1, last] * (light - _MOST_LIGHT), table[1, last]
     low = int(place)
     share = place - low
     return (

@@ -19,12 +19,11 @@ import numpy as np
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.image_model.photometry import Tone, srgb_decoded, srgb_encoded, srgb_slope
+from kgcp.measurement.image_model.photometry import Tone, srgb_decoded, srgb_encoded
 
 WAVES = 3
 _LEAST_SLOPE = 0.35  # of the bent curve relative to the known one, …
 _DARKEST, _BRIGHTEST = 0.05, 0.95  # … between these grey values
-_MOST_LIGHT, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
 _NEWTON_STEPS = 20
 
 
@@ -74,13 +73,6 @@ def steep_enough(waves: FloatArray) -> FloatArray:
 def _slopes_of_waves() -> FloatArray:
     places = np.linspace(_DARKEST, _BRIGHTEST, 33)
     return np.cos(np.pi * np.arange(1, WAVES + 1)[:, None] * places)
-
-
-@cache
-def srgb_table() -> FloatArray:
-    """Return sRGB's curve and its slope (2, 65537) at even steps of light from 0 to 4."""
-    light = np.linspace(0.0, _MOST_LIGHT, _STEPS + 1)
-    return np.stack((srgb_encoded(light), srgb_slope(light)))
 
 
 @compiled

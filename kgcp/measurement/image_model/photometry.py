@@ -44,7 +44,7 @@ class Tone(Enum):
 
     @property
     def is_curved(self) -> bool:
-        """Whether noise, which is that of light, follows the level by a curve."""
+        """Whether a curve lies between light and level, so that noise does not grow evenly."""
         return self in {Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}
 
     @property
@@ -186,8 +186,9 @@ class PhotometricModel:
         """
         value = np.empty(len(share))
         _expose(share, self.offsets, light.values, self._added(added), value)
-        if self._linear_mask is not None:
-            detail = self._linear_detail(self._linear_mask, value, light, added)
+        mask = self._mask_in_light(added)
+        if mask is not None and light.linear_sharpening:
+            detail = mask.detail(value, light.black, light.white)
             value += light.linear_sharpening * detail
         value = encoded(value, self.tone)
         if self.mask is None:
@@ -209,10 +210,13 @@ class PhotometricModel:
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
         return encoded(ink, self.tone), encoded(plate, self.tone)
 
-    @property
-    def _linear_mask(self) -> Mask | None:
-        """The mask of what is sharpened before the tone curve, if that curve is over sRGB's."""
-        return self.mask if self.tone is Tone.UNKNOWN else None
+    def _mask_in_light(self, added: FloatArray | None) -> Mask | None:
+        """Return the mask of what is sharpened before the tone curve; None: nothing is.
+
+        Before a straight line it would be the same as after it, and in uneven light it is not
+        estimated (`without_fine_light`).
+        """
+        return self.mask if self.tone is Tone.UNKNOWN and added is None else None
 
     def _sharpen_levels(
         self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray
@@ -222,7 +226,9 @@ class PhotometricModel:
         if self.tone.is_srgb:
             ink *= srgb_slope(toned(added[0], light.values))
             plate *= srgb_slope(toned(1.0 + added[1], light.values))
-        _sharpen_by_levels(mask, jacobian, ink, plate, light.sharpening)
+        by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
+        by_ink += light.sharpening * mask.detail(by_ink, ink, 0.0)
+        by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate)
 
     def _added(self, added: FloatArray | None) -> FloatArray:
         return _NOTHING if added is None else added
@@ -250,9 +256,11 @@ class PhotometricModel:
             value,
             jacobian,
         )
-        if self._linear_mask is not None:
-            detail = self._linear_detail(self._linear_mask, value, light, added)
-            self._sharpen_in_light(self._linear_mask, jacobian, light, added)
+        mask = self._mask_in_light(added)
+        if mask is not None:
+            detail = mask.detail(value, light.black, light.white)
+            if light.linear_sharpening:
+                self._sharpen_rows(mask, jacobian, (1.0, 1.0), light.linear_sharpening)
             jacobian[Param.LINEAR_SHARPENING] = detail
             value += light.linear_sharpening * detail
         if self.tone.is_srgb:
@@ -279,29 +287,8 @@ class PhotometricModel:
         ink, plate = self.local_levels(light, added)
         return mask.detail(value, ink, plate)
 
-    def _linear_detail(
-        self, mask: Mask, value: FloatArray, light: Light, added: FloatArray | None
-    ) -> FloatArray:
-        """Return what the mask adds to the light at full strength, before the tone curve."""
-        if added is None:
-            return mask.detail(value, light.black, light.white)
-        ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
-        return mask.detail(value, ink, plate)
-
-    def _sharpen_in_light(
-        self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray | None
-    ) -> None:
-        """Sharpen the rows of a Jacobian before the tone curve."""
-        strength = light.linear_sharpening
-        if not strength:
-            return
-        if added is not None:
-            ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
-            _sharpen_by_levels(mask, jacobian, ink, plate, strength)
-        self._sharpen_rows(mask, jacobian, (1.0, 1.0), strength)
-
     def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
-        """Sharpen the rows of a Jacobian."""
+        """Sharpen the rows of a Jacobian after the tone curve."""
         others = (1.0, 1.0)
         if self.tone.is_srgb:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
@@ -311,21 +298,13 @@ class PhotometricModel:
     def _sharpen_rows(
         self, mask: Mask, jacobian: FloatArray, others: tuple[float, float], strength: float
     ) -> None:
+        """Sharpen the rows of a Jacobian; `others` are those of ink and plate off the sample."""
         rows = [*_FILTERED, *(_TONE_ROWS if self.tone.is_shaped else [])]
         of_skew = SKEW_PARAMS if len(jacobian) > PLAIN_COUNT else []
         for row in (*_STREAK_ROWS, Param.LINEAR_SHARPENING, *of_skew):
             if jacobian[row].any():
                 jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0)
         mask.sharpen(jacobian, np.array(rows), others, strength)
-
-
-def _sharpen_by_levels(
-    mask: Mask, jacobian: FloatArray, ink: FloatArray, plate: FloatArray, strength: float
-) -> None:
-    """Sharpen the rows by what is added to ink and plate; ink and plate (n,) are the others'."""
-    by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
-    by_ink += strength * mask.detail(by_ink, ink, 0.0)
-    by_plate += strength * mask.detail(by_plate, 0.0, plate)
 
 
 def share_at(level: float, light: Light, tone: Tone) -> float:
