@@ -32,7 +32,7 @@ from kgcp.network.calibration_records import (
     LensModel,
     PointModel,
 )
-from kgcp.network.camera_network import State, Unknowns, Work
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
 from kgcp.network.covariance import precision
 from kgcp.pipeline.calibration.photographs import Photo
 from kgcp.pipeline.calibration.run import (
@@ -221,7 +221,9 @@ def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
     return dict(zip(names, np.sqrt(np.mean(np.square(ratios), axis=0)).tolist(), strict=True))
 
 
-def _adjusted_part(whole: CameraCalibration, part: IndexArray, unknowns: Unknowns) -> State:
+def _adjusted_part(
+    whole: CameraCalibration, part: IndexArray, unknowns: Unknowns
+) -> AdjustedNetwork:
     """Return the adjustment of some of the photographs."""
     views = tuple(whole.views[index] for index in part.tolist())
     size = (whole.camera.width, whole.camera.height)
@@ -231,8 +233,8 @@ def _adjusted_part(whole: CameraCalibration, part: IndexArray, unknowns: Unknown
         rotations=estimate.rotations[part],
         translations=estimate.translations[part],
     )
-    work = Work(views, whole.field, size, whole.settings)
-    return work.adjusted(whole.camera, start, unknowns)
+    problem = CalibrationProblem(views, whole.field, size, whole.settings)
+    return problem.adjusted(whole.camera, start, unknowns)
 
 
 if __name__ == "__main__":

@@ -38,9 +38,9 @@ _HUBER = 2.0  # in units of the robust deviation of a disc's residual
 _MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
 _LEAST_DEVIATION = 0.1  # of the stated one: discs that fit better than that are no outliers
 _ROUNDS = 12
-_LEAST_DISCS = 6  # of a photograph: fewer, or all in one row, determine no pose
+# Discs of a photograph that are kept whatever their residuals: fewer might determine no pose.
+_LEAST_DISCS, _LEAST_SHARE = 6, 1.0 / 3.0
 _WORST_PHOTOGRAPH = 10.0  # deviation of its discs over that of all
-_LEAST_SHARE = 1.0 / 3.0  # likewise
 
 
 @dataclass(frozen=True, slots=True)

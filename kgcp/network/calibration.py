@@ -18,7 +18,7 @@ from kgcp.network.calibration_records import (
     PointModel,
     rms_px,
 )
-from kgcp.network.camera_network import State, Unknowns, Work
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
 from kgcp.network.parameter_choice import DETERMINED, with_chosen_parameters
@@ -26,7 +26,7 @@ from kgcp.network.start import better_poses, homography_misfits, start_camera_an
 from kgcp.targets.fields.layout import Field
 
 LEAST_VIEWS = 3
-_CENTRE_DETERMINED = 0.1  # likewise, of a principal point: within a hundredth of the frame
+_CENTRE_DETERMINED = 0.1  # as `DETERMINED`, of a principal point: within 1 % of the frame
 _INFLATION = 100.0  # of a variance by other parameters: a deviation ten times larger
 _LEAST_SHARE = 0.6  # of a photograph's discs that must fit
 _MARGIN_PX = 2.0  # within the frame, where a disc is to be found
@@ -85,7 +85,7 @@ def calibrate_camera(
     """
     _require_views(views)
     try:
-        return _calibrated(Work(tuple(views), field, size, settings), start)
+        return _calibrated(CalibrationProblem(tuple(views), field, size, settings), start)
     except np.linalg.LinAlgError as error:
         raise KgcpError(
             "the photographs determine no camera, however its parameters are limited; take some"
@@ -93,47 +93,49 @@ def calibrate_camera(
         ) from error
 
 
-def _calibrated(work: Work, start: CameraCalibration | None) -> CameraCalibration:
-    field, settings = work.field, work.settings
+def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) -> CameraCalibration:
+    field, settings = problem.field, problem.settings
     if start is not None:
-        work = replace(work, field=start.field)
+        problem = replace(problem, field=start.field)
     points = field.points_m()
     # what a former calibration has dropped is all that is dropped now
-    disordered = () if start is not None else _disordered(work)
-    work = replace(work, views=tuple(v for v in work.views if v.photo not in disordered))
-    _require_views(work.views)
-    observations = work.observations()
+    disordered = () if start is not None else _disordered(problem)
+    problem = replace(problem, views=tuple(v for v in problem.views if v.photo not in disordered))
+    _require_views(problem.views)
+    observations = problem.observations()
     unknowns = Unknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
-        camera, estimate = start_camera_and_poses(observations, points, work.size)
-        state = work.adjusted(camera, estimate, replace(unknowns, terms=()))
+        camera, estimate = start_camera_and_poses(observations, points, problem.size)
+        state = problem.adjusted(camera, estimate, replace(unknowns, terms=()))
         for terms in (("k1",), ("k1", "k2")):
-            state = work.with_unknowns(state, replace(unknowns, terms=terms))
+            state = problem.with_unknowns(state, replace(unknowns, terms=terms))
     else:
-        work = replace(work, views=tuple(v for v in work.views if v.photo not in start.dropped))
+        problem = replace(
+            problem, views=tuple(v for v in problem.views if v.photo not in start.dropped)
+        )
         estimate = replace(start.solution.estimate, points=points)  # as they are meant to be
-        state = work.adjusted(start.camera, estimate, unknowns)
-    state = _with_better_twins(work, state)
+        state = problem.adjusted(start.camera, estimate, unknowns)
+    state = _with_better_twins(problem, state)
     if not field.is_diameter_stated and start is None:
-        work = replace(work, field=field.with_diameters(work.radius_scale(state)))
-        state = work.with_estimate(state, state.estimate)
-    work, state, misfits = _without_misfits(work, state)
+        problem = replace(problem, field=field.with_diameters(problem.radius_scale(state)))
+        state = problem.with_estimate(state, state.estimate)
+    problem, state, misfits = _without_misfits(problem, state)
     dropped = (*disordered, *(() if start is None else start.dropped), *misfits)
     dropped = tuple(dict.fromkeys(dropped))
-    _require_views(work.views)
-    fixed = with_chosen_parameters(work, state)
+    _require_views(problem.views)
+    fixed = with_chosen_parameters(problem, state)
     points_used, is_turn_unclear = settings.points, False
     state = fixed
     if settings.points is not PointModel.FIXED:
         own_shape = replace(fixed.unknowns, points=settings.points)
-        state = work.adjusted(fixed.camera, fixed.estimate, own_shape)
-        if any(view.is_symmetric for view in work.views):
-            work, state, is_turn_unclear = with_turns(work, state)
+        state = problem.adjusted(fixed.camera, fixed.estimate, own_shape)
+        if any(view.is_symmetric for view in problem.views):
+            problem, state, is_turn_unclear = with_turns(problem, state)
         if is_turn_unclear:
             state, points_used = fixed, PointModel.FIXED
         else:
-            state = with_chosen_parameters(work, state)
-    return _result(work, state, fixed, dropped, points_used, is_turn_unclear=is_turn_unclear)
+            state = with_chosen_parameters(problem, state)
+    return _result(problem, state, fixed, dropped, points_used, is_turn_unclear=is_turn_unclear)
 
 
 def _require_views(views: Sequence[NamedView]) -> None:
@@ -144,17 +146,17 @@ def _require_views(views: Sequence[NamedView]) -> None:
         )
 
 
-def _disordered(work: Work) -> tuple[str, ...]:
+def _disordered(problem: CalibrationProblem) -> tuple[str, ...]:
     """Return the photographs whose discs do not lie like those of a plane, with these names."""
-    misfits = homography_misfits(work.observations(), work.field.points_m())
+    misfits = homography_misfits(problem.observations(), problem.field.points_m())
     return tuple(
         view.photo
-        for view, misfit in zip(work.views, misfits, strict=True)
+        for view, misfit in zip(problem.views, misfits, strict=True)
         if misfit > _MOST_MISFIT
     )
 
 
-def _with_better_twins(work: Work, state: State) -> State:
+def _with_better_twins(problem: CalibrationProblem, state: AdjustedNetwork) -> AdjustedNetwork:
     """Try the other pose of every photograph with the camera as it is now."""
     kept = state.network.observations.chosen(state.solution.is_used)
     points = state.estimate.points
@@ -163,34 +165,36 @@ def _with_better_twins(work: Work, state: State) -> State:
     if not flipped.any():
         return state
     estimate = replace(state.estimate, rotations=poses.rotations, translations=poses.translations)
-    return work.with_estimate(state, estimate)
+    return problem.with_estimate(state, estimate)
 
 
-def _without_misfits(work: Work, state: State) -> tuple[Work, State, tuple[str, ...]]:
+def _without_misfits(
+    problem: CalibrationProblem, state: AdjustedNetwork
+) -> tuple[CalibrationProblem, AdjustedNetwork, tuple[str, ...]]:
     """Leave out photographs most of whose discs do not lie like the field's."""
     dropped: tuple[str, ...] = ()
     while True:
-        count = len(work.views)
+        count = len(problem.views)
         view = state.network.observations.view
         share = np.bincount(view, state.solution.is_used, count) / np.bincount(view)
         if share.min() >= _LEAST_SHARE or count <= LEAST_VIEWS:
-            return work, state, dropped
+            return problem, state, dropped
         worst = int(share.argmin())
-        dropped = (*dropped, work.views[worst].photo)
+        dropped = (*dropped, problem.views[worst].photo)
         stays = np.arange(count) != worst
-        work = replace(work, views=tuple(np.array(work.views, dtype=object)[stays]))
+        problem = replace(problem, views=tuple(np.array(problem.views, dtype=object)[stays]))
         estimate = replace(
             state.estimate,
             rotations=state.estimate.rotations[stays],
             translations=state.estimate.translations[stays],
         )
-        state = work.with_estimate(state, estimate)
+        state = problem.with_estimate(state, estimate)
 
 
 def _result(
-    work: Work,
-    state: State,
-    fixed: State,
+    problem: CalibrationProblem,
+    state: AdjustedNetwork,
+    fixed: AdjustedNetwork,
     dropped: tuple[str, ...],
     points_used: PointModel,
     *,
@@ -204,21 +208,21 @@ def _result(
     share = np.array([_CENTRE_DETERMINED if n in ("cx", "cy") else DETERMINED for n in model.names])
     weak = np.sqrt(cov.diagonal()) > share * state.network.cameras.sd[0]
     names = np.array(model.names)
-    observed = work.observations()
+    observed = problem.observations()
     return CameraCalibration(
         state.camera,
         CalibrationCovariance(by_unknown @ cov @ by_unknown.T),
-        work.field,
-        work.settings,
-        work.views,
+        problem.field,
+        problem.settings,
+        problem.views,
         dropped,
         state.network,
         state.solution,
         known,
-        work.eccentricity(state.camera, state.estimate, observed),
+        problem.eccentricity(state.camera, state.estimate, observed),
         points_used,
         rms_px(fixed.solution),
-        work.radius_scale(state),
+        problem.radius_scale(state),
         tuple(names[weak].tolist()),
         tangled(model.names, _with_focal_difference(model.names, cov), _INFLATION),
         is_turn_unclear,

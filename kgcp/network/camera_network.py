@@ -48,7 +48,7 @@ class Unknowns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class AdjustedNetwork:
     """An adjusted network, and what was estimated in it."""
 
     camera: Camera
@@ -74,7 +74,7 @@ class State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Work:
+class CalibrationProblem:
     """What all adjustments of one calibration share."""
 
     views: tuple[NamedView, ...]
@@ -92,15 +92,15 @@ class Work:
             np.concatenate([view.covs[:, :2, :2] for view in self.views]),
         )
 
-    def with_unknowns(self, state: State, unknowns: Unknowns) -> State:
+    def with_unknowns(self, state: AdjustedNetwork, unknowns: Unknowns) -> AdjustedNetwork:
         """Return the adjustment of other unknowns."""
         return self.adjusted(state.camera, state.estimate, unknowns)
 
-    def with_estimate(self, state: State, estimate: Estimate) -> State:
+    def with_estimate(self, state: AdjustedNetwork, estimate: Estimate) -> AdjustedNetwork:
         """Return the adjustment from another start."""
         return self.adjusted(state.camera, estimate, state.unknowns)
 
-    def adjusted(self, camera: Camera, estimate: Estimate, unknowns: Unknowns) -> State:
+    def adjusted(self, camera: Camera, estimate: Estimate, unknowns: Unknowns) -> AdjustedNetwork:
         """Return the adjustment once the eccentricities have settled.
 
         The covariances of the discs are made to fit their residuals, so that priors, which are
@@ -133,7 +133,7 @@ class Work:
             cov, before = next_cov, offsets
             if is_settled:
                 break
-        return State(camera, estimate, unknowns, network, solution)
+        return AdjustedNetwork(camera, estimate, unknowns, network, solution)
 
     def eccentricity(
         self, camera: Camera, estimate: Estimate, observed: Observations
@@ -184,7 +184,7 @@ class Work:
             return _TANGENTIAL_SD / corner
         return _RADIAL_SD / corner ** _POWER[name]
 
-    def radius_scale(self, state: State) -> float:
+    def radius_scale(self, state: AdjustedNetwork) -> float:
         """Return the median of measured over expected radii, the latter through the lens."""
         observed = self.observations()
         expected = circle_images(state.camera, self._circles(state.estimate, observed)).moments

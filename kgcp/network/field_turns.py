@@ -8,7 +8,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
-from kgcp.network.camera_network import State, Work
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.start import refined_poses
 
 _CLEAR_TURN = 1.5  # times the sum of squares: the field's own shape tells its ends apart
@@ -23,25 +23,27 @@ class _Turn:
     pose: Pose
 
 
-def with_turns(work: Work, state: State) -> tuple[Work, State, bool]:
+def with_turns(
+    problem: CalibrationProblem, state: AdjustedNetwork
+) -> tuple[CalibrationProblem, AdjustedNetwork, bool]:
     """Turn a symmetric field in photographs where its own shape fits better turned.
 
     Returns
     -------
-    work, state
+    problem, state
         With the discs named accordingly.
     is_unclear : bool
         Whether some photograph fits nearly as well either way.
     """
-    for _ in range(len(work.views)):
-        turns = [_best_turn(work, state, view) for view in range(len(work.views))]
+    for _ in range(len(problem.views)):
+        turns = [_best_turn(problem, state, view) for view in range(len(problem.views))]
         worst = min(range(len(turns)), key=lambda view: turns[view].cost_ratio)
         if turns[worst].cost_ratio >= 1.0:
-            return work, state, turns[worst].cost_ratio < _CLEAR_TURN
-        views = list(work.views)
+            return problem, state, turns[worst].cost_ratio < _CLEAR_TURN
+        views = list(problem.views)
         point = turns[worst].permutation[views[worst].point]
         views[worst] = replace(views[worst], point=point)
-        work = replace(work, views=tuple(views))
+        problem = replace(problem, views=tuple(views))
         rotations, translations = (
             state.estimate.rotations.copy(),
             state.estimate.translations.copy(),
@@ -49,11 +51,11 @@ def with_turns(work: Work, state: State) -> tuple[Work, State, bool]:
         rotations[worst] = turns[worst].pose.rotation
         translations[worst] = turns[worst].pose.translation_m
         estimate = replace(state.estimate, rotations=rotations, translations=translations)
-        state = work.with_estimate(state, estimate)
-    return work, state, True
+        state = problem.with_estimate(state, estimate)
+    return problem, state, True
 
 
-def _best_turn(work: Work, state: State, view: int) -> _Turn:
+def _best_turn(problem: CalibrationProblem, state: AdjustedNetwork, view: int) -> _Turn:
     """Return how else a symmetric field could lie in a photograph."""
     observed = state.network.observations
     own = observed.chosen((observed.view == view) & state.solution.is_used)
@@ -61,9 +63,9 @@ def _best_turn(work: Work, state: State, view: int) -> _Turn:
     points, pose = state.estimate.points, state.poses[view]
     _, cost = refined_poses(state.camera, own, points, [pose])
     turns = []
-    for permutation in work.field.symmetries():
+    for permutation in problem.field.symmetries():
         turned = replace(own, point=permutation[own.point])
-        guess = _turned_pose(pose, work.field.points_m(), permutation)
+        guess = _turned_pose(pose, problem.field.points_m(), permutation)
         refined, other = refined_poses(state.camera, turned, points, [guess])
         turns.append(
             _Turn(

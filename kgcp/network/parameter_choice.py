@@ -11,7 +11,7 @@ from scipy import stats
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.network.adjust import ROBUST, adjust
 from kgcp.network.calibration_records import LensModel
-from kgcp.network.camera_network import State, Unknowns, Work
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
 from kgcp.network.covariance import precision
 from kgcp.network.records import Estimate, Network, Observations, PointPrior
 from kgcp.network.start import refined_poses
@@ -33,28 +33,28 @@ _ASPECT = ("fy",)
 _ADDITIONS: tuple[tuple[str, ...], ...] = (_ASPECT, ("k2",), ("p1", "p2"), ("k3",))
 
 
-def with_chosen_parameters(work: Work, state: State) -> State:
+def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) -> AdjustedNetwork:
     """Return the adjustment with the terms asked for, or with as many as are worth it.
 
     Every lens has k1. Another term, or a second focal length, is worth it if it is significant over
     the photographs, known better than beforehand, and photographs that took no part in its
     estimation fit better with it.
     """
-    settings = work.settings
+    settings = problem.settings
     terms = _TERMS.get(settings.lens, ("k1",))
-    kept = work.with_unknowns(state, replace(state.unknowns, terms=terms, is_same_aspect=True))
+    kept = problem.with_unknowns(state, replace(state.unknowns, terms=terms, is_same_aspect=True))
     if settings.is_same_aspect is False:
-        kept = work.with_unknowns(kept, _with(kept.unknowns, _ASPECT))
+        kept = problem.with_unknowns(kept, _with(kept.unknowns, _ASPECT))
     if settings.lens is not LensModel.AUTO:
         return kept
-    jury = _Jury(kept.network.observations, kept.solution.is_used)
-    misfit = jury.misfit(kept)
+    validation = _CrossValidation(kept.network.observations, kept.solution.is_used)
+    misfit = validation.misfit(kept)
     is_aspect_open = settings.is_same_aspect is None and _is_camera_turned(kept)
     for addition in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
-        trial = work.with_unknowns(kept, _with(kept.unknowns, addition))
-        trial_misfit = jury.misfit(trial)
+        trial = problem.with_unknowns(kept, _with(kept.unknowns, addition))
+        trial_misfit = validation.misfit(trial)
         is_better = trial_misfit < (1.0 - _LEAST_GAIN) * misfit
-        if is_better and _is_worth_it(trial, addition, len(work.views)):
+        if is_better and _is_worth_it(trial, addition, len(problem.views)):
             kept, misfit = trial, trial_misfit
     return kept
 
@@ -65,13 +65,13 @@ def _with(unknowns: Unknowns, addition: tuple[str, ...]) -> Unknowns:
     return replace(unknowns, terms=(*unknowns.terms, *addition))
 
 
-def _is_camera_turned(state: State) -> bool:
+def _is_camera_turned(state: AdjustedNetwork) -> bool:
     across = state.estimate.rotations[:, :2, 0]
     directions = np.arctan2(across[:, 1], across[:, 0])
     return bool(np.abs(np.mean(np.exp(2j * directions))) < _MOST_ALIKE)
 
 
-def _is_worth_it(state: State, addition: Sequence[str], views: int) -> bool:
+def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str], views: int) -> bool:
     limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), views - 1)
     cov = precision(state.network, state.solution).camera_cov
     names = state.network.model.names
@@ -88,7 +88,7 @@ def _is_worth_it(state: State, addition: Sequence[str], views: int) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Jury:
+class _CrossValidation:
     """Photographs that take no part in the estimation, in turns (cross-validation).
 
     All models are judged by the same discs with the same covariances.
@@ -97,7 +97,7 @@ class _Jury:
     observations: Observations
     is_used: BoolArray
 
-    def misfit(self, state: State) -> float:
+    def misfit(self, state: AdjustedNetwork) -> float:
         """Return the mean square of the residuals of photographs that took no part."""
         network, estimate = state.network, state.estimate
         # the field as it is estimated by all: only the camera is on trial
@@ -109,13 +109,13 @@ class _Jury:
             observations=network.observations.chosen(state.solution.is_used),
         )
         measured = replace(network.observations, cov=self.observations.cov)
-        jury = replace(own, observations=measured.chosen(self.is_used))
+        judged = replace(own, observations=measured.chosen(self.is_used))
         misfits: list[FloatArray] = []
         for fold in range(min(_FOLDS, len(views))):
             is_left_out = views % _FOLDS == fold
             start = _part_of_estimate(estimate, ~is_left_out)
             values = adjust(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
-            left = _part(jury, is_left_out).observations
+            left = _part(judged, is_left_out).observations
             poses = [state.poses[view] for view in np.flatnonzero(is_left_out).tolist()]
             camera = state.model.camera(values)
             _, costs = refined_poses(camera, left, estimate.points, poses)
