@@ -39,6 +39,18 @@ def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(map_from_photo).as_euler("XYZ", degrees=True))
 
 
+def rotation_onto(points: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the rotation R (3, 3) that brings points onto others (n, 3): points @ R.T, others.
+
+    Both about their means, by least squares, never a mirror image (Kabsch, Acta Crystallographica
+    A32, 1976). Of points in a line, it is one of many.
+    """
+    here, there = points - points.mean(axis=0), others - others.mean(axis=0)
+    left, _, right = np.linalg.svd(there.T @ here)
+    proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
+    return np.asarray(left @ proper @ right)
+
+
 def down_in_camera(opk_deg: FloatArray) -> FloatArray:
     """Return the vertical (n, 3), downwards, in the camera frame, from omega, phi, kappa (n, 3).
 

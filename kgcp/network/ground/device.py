@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.attitude import rotation_onto
 from kgcp.geometry.camera import Camera
 from kgcp.network.ground.resection import (
     CameraPose,
@@ -94,9 +96,8 @@ def require_distinct(points_m: FloatArray) -> None:
 def _misfit(points_m: FloatArray, others_m: FloatArray) -> float:
     """Return the largest distance of points that are turned, but not mirrored, onto others."""
     here, there = points_m - points_m.mean(axis=0), others_m - others_m.mean(axis=0)
-    left, _, right = np.linalg.svd(here.T @ there)
-    proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-    return float(np.linalg.norm(here @ left @ proper @ right - there, axis=1).max())
+    turned = here @ rotation_onto(points_m, others_m).T
+    return float(np.linalg.norm(turned - there, axis=1).max())
 
 
 def orient_by_device(
@@ -106,7 +107,6 @@ def orient_by_device(
     pixel_cov: FloatArray,
     *,
     sd_focal: float = 0.0,
-    min_margin: float = MIN_MARGIN,
 ) -> DevicePose:
     """Return the camera's pose in the frame of a device, and which point is which.
 
@@ -119,8 +119,6 @@ def orient_by_device(
     pixel_cov : (n, 2, 2) array
     sd_focal : float
         Relative standard deviation of the focal length; 0: it is known.
-    min_margin : float
-        Least ratio of the next best permutation's RMS to the best one's.
 
     Raises
     ------
@@ -141,7 +139,7 @@ def orient_by_device(
     rms, names, pose, cov = fits[0]
     floor = math.sqrt(float(np.mean(np.trace(pixel_cov, axis1=1, axis2=2))) / 2.0)
     margin = fits[1][0] / max(rms, floor) if len(fits) > 1 else math.inf
-    if margin < min_margin:
+    if margin < MIN_MARGIN:
         raise NoPoseError(
             f"two permutations of the device's points fit alike (margin {margin:.1f})"
         )
@@ -161,28 +159,36 @@ def _starts(
     count = len(pixels)
     triple = _widest(pixels)
     others = [i for i in range(count) if i not in triple]
-    focals = [math.exp(sd_focal * step) for step in _FOCALS] if sd_focal else [1.0]
     best: dict[tuple[int, ...], tuple[float, CameraPose]] = {}
-    for focal in focals:
-        rays = camera.undistort(pixels) / focal
-        for chosen in itertools.permutations(range(count), 3):
-            for start in three_point_poses(points_m[list(chosen)], rays[triple]):
-                pose = CameraPose(start.centre_m, start.world_from_camera, focal)
-                in_camera = pose.in_camera(points_m)
-                if not np.all(in_camera[:, 2] > 0.0):
-                    continue
-                projected = in_camera[:, :2] / in_camera[:, 2:]
-                left = [i for i in range(count) if i not in chosen]
-                for order in itertools.permutations(left):
-                    off = projected[list(order)] - rays[others]
-                    misfit = focal * float(np.sum(off**2))
-                    names = np.empty(count, dtype=np.intp)
-                    names[triple], names[others] = chosen, order
-                    key = tuple(names.tolist())
-                    if key not in best or misfit < best[key][0]:
-                        best[key] = (misfit, pose)
+    for chosen, pose in _poses_of_triple(camera, points_m, pixels[triple], sd_focal):
+        in_camera = pose.in_camera(points_m)
+        if not np.all(in_camera[:, 2] > 0.0):
+            continue
+        projected = pose.focal_scale * in_camera[:, :2] / in_camera[:, 2:]
+        gaps = projected[:, None] - camera.undistort(pixels)[others]
+        costs = np.sum(gaps**2, axis=2) / pose.focal_scale
+        left = [i for i in range(count) if i not in chosen]
+        for order in itertools.permutations(left):
+            names = np.empty(count, dtype=np.intp)
+            names[triple], names[others] = chosen, order
+            key = tuple(names.tolist())
+            misfit = float(costs[list(order), range(len(others))].sum())
+            if key not in best or misfit < best[key][0]:
+                best[key] = (misfit, pose)
     ordered = sorted(best.items(), key=lambda item: (item[1][0], item[0]))
     return [(names, pose) for names, (_, pose) in ordered]
+
+
+def _poses_of_triple(
+    camera: Camera, points_m: FloatArray, pixels: FloatArray, sd_focal: float
+) -> Iterator[tuple[tuple[int, ...], CameraPose]]:
+    """Yield the poses in which ordered threes of the device are seen at three pixels (3, 2)."""
+    focals = [math.exp(sd_focal * step) for step in _FOCALS] if sd_focal else [1.0]
+    for focal in focals:
+        rays = camera.undistort(pixels) / focal
+        for chosen in itertools.permutations(range(len(points_m)), 3):
+            for start in three_point_poses(points_m[list(chosen)], rays):
+                yield chosen, CameraPose(start.centre_m, start.world_from_camera, focal)
 
 
 def _widest(pixels: FloatArray) -> list[int]:

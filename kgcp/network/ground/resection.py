@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import cross_matrix
+from kgcp.geometry.attitude import cross_matrix, rotation_onto
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 
@@ -239,13 +239,17 @@ def _aligned_pose(
     directions = np.column_stack((rays, np.ones(len(rays))))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     in_camera = directions * distances_m[:, None]
-    here, there = positions_m.mean(axis=0), in_camera.mean(axis=0)
-    left, sizes, right = np.linalg.svd((positions_m - here).T @ (in_camera - there))
-    if not sizes[1] > 1e-9 * sizes[0]:
+    if _are_in_line(positions_m) or _are_in_line(in_camera):
         return None
-    proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
-    rotation = left @ proper @ right
-    return CameraPose(here - rotation @ there, rotation)
+    rotation = rotation_onto(in_camera, positions_m)
+    return CameraPose(positions_m.mean(axis=0) - rotation @ in_camera.mean(axis=0), rotation)
+
+
+def _are_in_line(points: FloatArray) -> bool:
+    """Tell whether three points (3, 3) lie in a line, but for rounding."""
+    first, second = points[1] - points[0], points[2] - points[0]
+    limit = 1e-9 * float(first @ first + second @ second)
+    return not float(np.linalg.norm(np.cross(first, second))) > limit
 
 
 def _triples(count: int, seed: int) -> list[list[int]]:

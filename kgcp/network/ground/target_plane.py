@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import optimize
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix
@@ -428,11 +429,10 @@ def _excess(
     ratio = squares(0.0) / freedom
     if ratio <= 1.0:
         return 0.0, max(ratio, _LEAST_FACTOR) if freedom >= _MANY else 1.0
-    low, high = 0.0, _MOST_EXTRA_PX
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if squares(middle) > freedom else (low, middle)
-    return high, 1.0
+    if squares(_MOST_EXTRA_PX) > freedom:
+        return _MOST_EXTRA_PX, 1.0
+    sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, _MOST_EXTRA_PX, xtol=1e-12)
+    return float(sd), 1.0
 
 
 def _is_same(first: SpaceCircle, second: SpaceCircle) -> bool:
