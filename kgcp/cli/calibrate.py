@@ -9,7 +9,6 @@ import click
 
 from kgcp.cli.detect_log import log_to_stderr, stopping
 from kgcp.cli.options import json_option
-from kgcp.pipeline.execution.local_processes import start_server
 
 if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
@@ -150,6 +149,8 @@ def command(
     Example: kgcp calibrate photos --field grid:10x8:25mm:15mm --format opencv
     """
     if jobs != 0:
+        from kgcp.pipeline.execution.local_processes import start_server
+
         start_server("kgcp.pipeline.calibration.photographs")  # while this process loads the rest
 
     from kgcp.geometry.camera import Response

@@ -11,7 +11,6 @@ import click
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import flight_place_argument, json_option, out_place_option
 from kgcp.errors import KgcpError
-from kgcp.pipeline.execution.local_processes import start_server
 from kgcp.settings import DetectSettings, Method
 
 if TYPE_CHECKING:
@@ -161,6 +160,8 @@ def command(
     if all_candidates and overlay is None:
         raise click.UsageError("--all-candidates needs a contact sheet: give --overlay DIR, too")
     if jobs != 0 and scheduler is None:
+        from kgcp.pipeline.execution.local_processes import start_server
+
         start_server("kgcp.pipeline.frame_task")  # meanwhile, this process loads what follows
 
     from kgcp.cli.doubts import print_doubts

@@ -12,6 +12,7 @@ from pathlib import Path
 from kgcp import __version__
 from kgcp.errors import KgcpError, Status
 from kgcp.io.files.atomic import whole_file
+from kgcp.report.html_page import page_template
 from kgcp.report.ring_picture import FULL_SCALE, THUMBNAIL_PX, Pictures
 
 PAGE = "index.html"
@@ -121,20 +122,11 @@ def _is_own(page: Path) -> bool:
 
 
 def _render(flight_name: str, cards: Sequence[Card]) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # workers do not need it
-
-    environment = Environment(
-        loader=PackageLoader("kgcp.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     statuses = Counter(card.status for card in cards)
     reasons = Counter(card.reason for card in cards if card.reason)
     missed = Counter(card.reason for card in cards if card.reason and card.status != DROPPED)
     kinds = [*(status.value for status in Status), DROPPED]
-    return environment.get_template("contact_sheet.html").render(
+    return page_template("contact_sheet.html").render(
         name=flight_name,
         version=__version__,
         cards=cards,

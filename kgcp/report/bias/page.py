@@ -9,20 +9,19 @@ from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.io.tables.gcps import BIAS_COLUMNS
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.exposure_effects import QUANTITIES
-from kgcp.quality.number_text import minus
 from kgcp.report.bias import wording
 from kgcp.report.bias.numbers import BiasNumbers
 from kgcp.report.bias.origin import Fact
 from kgcp.report.bias.reexposure import Reexposed
 from kgcp.report.bias.summary import Json, finite
 from kgcp.report.bias.verdict import LIMITS, Verdict
+from kgcp.report.html_page import embedded_pictures, page_template
 from kgcp.report.ring_picture import CLOSEUP_PX
 from kgcp.report.style import MARK_STEPS, Picture
 
@@ -65,33 +64,16 @@ class Content:
 
 def render_page(content: Content) -> str:
     """Return the page."""
-    environment = Environment(
-        loader=PackageLoader("kgcp.report.bias"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["signed"] = lambda value, digits: minus(f"{value:+.{digits}f}")
-    environment.filters["fixed"] = lambda value, digits: f"{value:.{digits}f}"
-    template = environment.get_template("bias_report.html")
-    return template.render(
+    return page_template("bias_report.html").render(
         content=content,
         numbers=content.numbers,
         verdict=content.verdict,
-        images={
-            name: f"data:image/png;base64,{_base64(figure.png)}"
-            for name, figure in content.pictures.items()
-        },
+        images=embedded_pictures({name: each.png for name, each in content.pictures.items()}),
         data=_embedded(_data(content)),
         limits=LIMITS,
         words=wording,
         titles=_TITLES,
     )
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
 
 
 def _embedded(data: Json) -> Markup:
@@ -118,7 +100,7 @@ def _data(content: Content) -> Json:
         "closeup_px": CLOSEUP_PX,
         "closeups": {
             str(row): {
-                "jpeg": _base64(jpeg),
+                "jpeg": base64.b64encode(jpeg).decode("ascii"),
                 "circles": [np.round(curve, 1).ravel().tolist() for curve in curves],
             }
             for row, (jpeg, curves) in content.closeups.items()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera
@@ -23,6 +21,7 @@ from kgcp.quality.calibration_verdict import (
 from kgcp.quality.eccentricity import EccentricitySummary, summarise_eccentricity
 from kgcp.quality.frame_rays import CameraDifference
 from kgcp.quality.number_text import minus
+from kgcp.report.html_page import embedded_pictures, page_template
 
 _PIXELS = 4  # the first parameters are lengths in pixels
 _CLASSES = {Grade.GOOD: "good", Grade.LOOK: "look", Grade.UNUSABLE: "unusable"}
@@ -71,18 +70,7 @@ class ParameterRow:
 
 def render_calibration(page: CalibrationPage) -> str:
     """Return the page."""
-    environment = Environment(
-        # the shell is that of the bias report
-        loader=ChoiceLoader(
-            [PackageLoader("kgcp.report.calibration"), PackageLoader("kgcp.report.bias")]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["fixed"] = lambda value, digits: minus(f"{value:.{digits}f}")
-    return environment.get_template("calibration.html").render(
+    return page_template("calibration.html").render(
         page=page,
         calibration=page.calibration,
         numbers=page.numbers,
@@ -93,10 +81,7 @@ def render_calibration(page: CalibrationPage) -> str:
         eccentricity=_eccentricity(page.calibration),
         neglected=neglected_words(page.calibration),
         ray_sd_px=float(np.sqrt(np.nanmean(page.numbers.ray_sd_px**2))),
-        images={
-            name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
-            for name, png in page.figures.items()
-        },
+        images=embedded_pictures(page.figures),
     )
 
 

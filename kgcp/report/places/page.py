@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-
 from kgcp.network.ground.target_places import Placement
-from kgcp.quality.number_text import minus
 from kgcp.quality.place_sentences import (
     diameter_sentence,
     has_other_diameter,
     lies_elsewhere,
     position_sentence,
 )
+from kgcp.report.html_page import embedded_pictures, page_template
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,16 +29,6 @@ class PlacesPage:
 
 def render_places(page: PlacesPage) -> str:
     """Return the page."""
-    environment = Environment(
-        # the shell is that of the bias report
-        loader=ChoiceLoader(
-            [PackageLoader("kgcp.report.places"), PackageLoader("kgcp.report.bias")]
-        ),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     statements = [
         statement
         for placed in page.placement.targets
@@ -50,14 +37,10 @@ def render_places(page: PlacesPage) -> str:
             (position_sentence(placed), lies_elsewhere(placed)),
         )
     ]
-    environment.filters["fixed"] = lambda value, digits: minus(f"{value:.{digits}f}")
-    return environment.get_template("places.html").render(
+    return page_template("places.html").render(
         page=page,
         placement=page.placement,
         statements=statements,
         is_good=not page.doubts and not any(is_doubtful for _, is_doubtful in statements),
-        images={
-            name: f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
-            for name, png in page.figures.items()
-        },
+        images=embedded_pictures(page.figures),
     )
