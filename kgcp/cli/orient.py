@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from kgcp.io.images.remote import StoredFolder
     from kgcp.pipeline.ground.orient import FlightPoses
 
+_MIN_POINTS = 4
+
 
 @click.command()
 @flight_place_argument
@@ -28,9 +30,8 @@ if TYPE_CHECKING:
     "--min-points",
     metavar="N",
     type=click.IntRange(3),
-    default=4,
-    show_default=True,
-    help="Targets that must agree in a frame; three whose distances are measured are enough.",
+    help="Targets that must agree in a frame; three whose distances are measured are enough."
+    f"  [default: {_MIN_POINTS}]",
 )
 @click.option(
     "--free-focal",
@@ -54,7 +55,7 @@ def command(
     detections: Path | None,
     *,
     patterns: tuple[str, ...],
-    min_points: int,
+    min_points: int | None,
     free_focal: bool,
     device_file: Path | None,
     as_json: bool,
@@ -75,13 +76,18 @@ def command(
       kgcp orient FLIGHT --device device.toml --free-focal
     """  # noqa: D301 - \b is click's mark for lines that stay
     if device_file is not None:
-        _orient_by_device(flight, out, patterns, device_file, free_focal=free_focal)
+        if detections is not None or min_points is not None:
+            raise click.UsageError("--device takes no --detections or --min-points; leave them out")
+        _orient_by_device(
+            flight, out, patterns, device_file, free_focal=free_focal, as_json=as_json
+        )
         return
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
 
-    options = OrientOptions(patterns, min_points, has_free_focal=free_focal)
+    least = _MIN_POINTS if min_points is None else min_points
+    options = OrientOptions(patterns, least, has_free_focal=free_focal)
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         poses = orient_flight(the_flight, detections or workspace.out / DETECTIONS, options)
@@ -122,6 +128,7 @@ def _orient_by_device(
     device_file: Path,
     *,
     free_focal: bool,
+    as_json: bool,
 ) -> None:
     from kgcp.errors import KgcpError
     from kgcp.io.flight.device_file import read_device
@@ -134,6 +141,13 @@ def _orient_by_device(
     device, the_flight = read_device(device_file), read_flight(flight)
     made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)
     path = write_device_poses(made, out or results_folder(flight))
+    if as_json:
+        import json
+
+        oriented = sum(each.pose is not None for each in made)
+        reasons = {each.frame: each.reason for each in made if each.pose is None}
+        counts = {"frames": len(made), "oriented": oriented, "not_oriented": reasons}
+        click.echo(json.dumps({"device": device.name, **counts, "files": [str(path)]}))
     for each in made:
         if each.pose is None:
             click.echo(f"{each.frame}: not oriented: {each.reason}", err=True)

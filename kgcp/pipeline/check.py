@@ -137,7 +137,7 @@ def _calibration_text(flight: Flight) -> str:
     if flight.calibration_covariance is None:
         return (
             "accuracy not stated, so that reported accuracies leave it out; kgcp calibrate computes"
-            " a camera with its covariance, good to 0.005 to 0.02 % of a distance as a rule"
+            " a camera with its covariance"
         )
     sd_px = float(np.sqrt(flight.calibration_covariance.cov[:2, :2].diagonal().mean()))
     share = f", {100.0 * sd_px / flight.camera.mean_focal_px:.2g} % of every distance"

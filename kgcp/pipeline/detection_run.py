@@ -32,12 +32,12 @@ from kgcp.pipeline.frame_task import (
     DetectionJob,
     FrameInput,
     GuidedInput,
+    completed,
     examine_frame,
     examine_frame_again,
     kept_frame,
     lost_frame,
     shows_negative,
-    with_common_uncertainty,
 )
 from kgcp.pipeline.guidance import FrameTracks
 from kgcp.quality.learnt_imaging import LearntImaging, by_base, learn_imaging
@@ -257,7 +257,7 @@ class DetectionRun:
             learnt = weighed_anew(self._job.camera, learnt, preference)
         if learnt is measurement:
             return measurement
-        return with_common_uncertainty(self._job, learnt)
+        return completed(self._job, learnt)
 
     def map_results(
         self, function: Callable[[FrameResult], _Result]

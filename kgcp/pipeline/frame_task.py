@@ -85,7 +85,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
-        outcomes = tuple(with_common_uncertainty(job, one) for one in examination.outcomes)
+        outcomes = tuple(completed(job, one) for one in examination.outcomes)
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
@@ -205,7 +205,7 @@ def _merged(
         )
         instead[target.name] = known
     for name in first.keys() & found.keys():
-        instead[name] = with_common_uncertainty(job, found[name])
+        instead[name] = completed(job, found[name])
     return tuple(
         instead[one.target] if isinstance(one, Miss) else one for one in guided_input.first.outcomes
     )
@@ -235,8 +235,8 @@ def _mid_exposure_s(
     return time_s + reference.to_middle_s(exposure.exposure_time_s)
 
 
-def with_common_uncertainty(job: DetectionJob, outcome: Outcome) -> Outcome:
-    """Return an outcome with what is wrong in all frames alike, and with its eccentricity."""
+def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
+    """Return an outcome with what follows from its pose: common uncertainty and eccentricity."""
     if isinstance(outcome, Miss):
         return outcome
     ring = next(target.ring for target in job.targets if target.name == outcome.target)

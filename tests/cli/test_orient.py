@@ -136,8 +136,11 @@ def device_flight(folder: Path) -> Path:
 
 def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> None:
     device = device_flight(tmp_path / "flight")
-    result = run("orient", tmp_path / "flight", "--device", device, "--free-focal")
+    result = run("orient", tmp_path / "flight", "--device", device, "--free-focal", "--json")
     assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert (summary["frames"], summary["oriented"]) == (2, 1)
+    assert list(summary["not_oriented"]) == ["two.png"]
     assert "two.png: not oriented: no closed region with 5 discs" in result.stderr
     table = pd.read_csv(tmp_path / "flight" / "kgcp" / "device_poses.csv")
     assert table["frame"].tolist() == ["one.png"]
@@ -146,6 +149,12 @@ def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> N
     rotation = rotation_about(np.array([0.35, -0.2, 0.4]))
     centre = -rotation.T @ np.array([-0.12, -0.12, 1.05])
     assert np.abs(table[["x", "y", "z"]].to_numpy()[0] - centre).max() < 0.02
+
+
+def test_options_of_detections_are_not_taken_with_a_device(tmp_path: Path) -> None:
+    result = run("orient", tmp_path, "--device", tmp_path / "device.toml", "--min-points", "5")
+    assert result.exit_code == 2
+    assert "takes no --detections or --min-points" in result.stderr
 
 
 def test_a_symmetric_device_is_refused(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from kgcp.pipeline.frame_task import (
     DetectionJob,
     FrameInput,
     GuidedInput,
+    completed,
     examine_frame,
     examine_frame_again,
-    with_common_uncertainty,
 )
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
@@ -102,12 +102,12 @@ def test_an_ellipse_s_centre_is_off_by_the_eccentricity(folder: Path) -> None:
     assert isinstance(measured, Measurement)
     tilt_rad = 0.6
     tilted = Pose(rotation_about(np.array([0.0, tilt_rad, 0.0])), np.array([0.0, 0.0, 5.0]))
-    changed = with_common_uncertainty(job, replace(measured, pose=tilted))
+    changed = completed(job, replace(measured, pose=tilted))
     assert isinstance(changed, Measurement)
     radius_px = CAMERA.fx * 0.45 / 5.0
     expected = 0.5 * radius_px**2 / CAMERA.fx * np.sin(2.0 * tilt_rad)
     assert changed.eccentricity_px is not None
     assert abs(changed.eccentricity_px[0]) == pytest.approx(expected, rel=0.02)
     assert changed.eccentricity_px[1] == pytest.approx(0.0, abs=1e-9)
-    # the side at +x is turned away from the camera's plane by the sine: -x is the farther one
+    # depth along the plate's x axis is rotation[2, 0] < 0: its side at +x is the nearer one
     assert np.sign(changed.eccentricity_px[0]) == np.sign(-tilted.rotation[2, 0])

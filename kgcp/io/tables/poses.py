@@ -34,9 +34,11 @@ class MapPose:
     @property
     def sd_angle_deg(self) -> float | None:
         """Standard deviation of an angle, as the root of the three's mean square [deg]."""
-        if self.cov is None:
-            return None
-        return math.degrees(math.sqrt(float(np.trace(self.cov[3:, 3:])) / 3.0))
+        return None if self.cov is None else _sd_angle_deg(self.cov)
+
+
+def _sd_angle_deg(cov: FloatArray) -> float:
+    return math.degrees(math.sqrt(float(np.trace(cov[3:6, 3:6])) / 3.0))
 
 
 def on_map(poses: Sequence[FramePose], local_frame: LocalFrame) -> list[MapPose]:
@@ -109,27 +111,52 @@ POSE_COLUMNS: tuple[Column[MapPose], ...] = (
 )
 
 
+POSE_CSV_HEADER = ("frame", *_AXES, *_ANGLES, *(f"sd_{axis}" for axis in _AXES), "sd_angle_deg")
+
+
+def pose_csv_cells(
+    frame: str,
+    position: FloatArray,
+    opk_deg: FloatArray,
+    cov: FloatArray,
+    *,
+    is_geographic: bool = False,
+) -> list[str]:
+    """Return a pose in the columns of reference poses.
+
+    Parameters
+    ----------
+    position : (3,) array
+        In metres, or longitude and latitude in degrees and height in metres.
+    opk_deg : (3,) array
+    cov : (6, 6) array
+        Of position [m] and rotation vector [rad].
+    """
+    decimals = _DEGREES_DECIMALS if is_geographic else 6
+    x, y, z = position.tolist()
+    return [
+        frame,
+        f"{x:.{decimals}f}",
+        f"{y:.{decimals}f}",
+        f"{z:.6f}",
+        *(f"{angle:.9f}" for angle in opk_deg.tolist()),
+        *(f"{sd:.6f}" for sd in np.sqrt(np.diag(cov)[:3]).tolist()),
+        f"{_sd_angle_deg(cov):.7f}",
+    ]
+
+
 def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
     """Return the oriented frames in the columns of reference poses."""
-    decimals = _DEGREES_DECIMALS if is_geographic else 6
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    sds = [f"sd_{a}" for a in _AXES]
-    writer.writerow(["frame", *_AXES, *_ANGLES, *sds, "sd_angle_deg"])
+    writer.writerow(POSE_CSV_HEADER)
     for row in rows:
         if row.position_map is None or row.opk_deg is None or row.cov is None:
             continue
-        x, y, z = row.position_map.tolist()
-        deviations = np.sqrt(np.diag(row.cov)[:3]).tolist()
+        frame = row.frame_pose.frame
         writer.writerow(
-            [
-                row.frame_pose.frame,
-                f"{x:.{decimals}f}",
-                f"{y:.{decimals}f}",
-                f"{z:.6f}",
-                *(f"{angle:.9f}" for angle in row.opk_deg.tolist()),
-                *(f"{sd:.6f}" for sd in deviations),
-                f"{row.sd_angle_deg:.7f}",
-            ]
+            pose_csv_cells(
+                frame, row.position_map, row.opk_deg, row.cov, is_geographic=is_geographic
+            )
         )
     return stream.getvalue()

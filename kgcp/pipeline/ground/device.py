@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from kgcp.errors import KgcpError, Rejection
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
@@ -17,6 +14,7 @@ from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.device_file import EoDevice
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames, matching_frames, read_grey
+from kgcp.io.tables.poses import POSE_CSV_HEADER, pose_csv_cells
 from kgcp.measurement.enclosed_discs import centres_and_covariances, enclosed_discs
 from kgcp.network.ground.device import DevicePose, orient_by_device
 from kgcp.network.ground.resection import NoPoseError
@@ -101,25 +99,15 @@ def write_device_poses(frames: Sequence[DeviceFrame], folder: Path) -> Path:
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(
-        [
-            *("frame", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg"),
-            *("sd_x", "sd_y", "sd_z", "sd_angle_deg", "focal_scale", "rms_px", "margin"),
-        ]
-    )
+    writer.writerow([*POSE_CSV_HEADER, "focal_scale", "rms_px", "margin"])
     for each in frames:
         if each.pose is None:
             continue
-        pose, cov = each.pose.pose, each.pose.cov
-        angles = opk_from_rotation((pose.world_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
-        sd_angle = math.degrees(math.sqrt(float(np.trace(cov[3:6, 3:6])) / 3.0))
+        pose = each.pose.pose
+        opk_deg = opk_from_rotation((pose.world_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
         writer.writerow(
             [
-                each.frame,
-                *(f"{value:.6f}" for value in pose.centre_m.tolist()),
-                *(f"{angle:.7f}" for angle in angles.tolist()),
-                *(f"{sd:.6f}" for sd in np.sqrt(np.diag(cov)[:3]).tolist()),
-                f"{sd_angle:.7f}",
+                *pose_csv_cells(each.frame, pose.centre_m, opk_deg, each.pose.cov),
                 f"{pose.focal_scale:.6f}",
                 f"{each.pose.rms_px:.4f}",
                 f"{each.pose.margin:.1f}",
