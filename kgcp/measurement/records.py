@@ -139,6 +139,27 @@ class Alternative:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ContourSmoothing:
+    """What smoothing along contours, beyond the blur across them, does to a measurement.
+
+    Attributes
+    ----------
+    seen_px2, sd_seen_px2 : float
+        Its variance and standard deviation as this image alone shows them [px²].
+    pose_by_smoothing : (6,) array
+        Derivative of the pose, as `Uncertainty.pose_cov` has it [m/px², rad/px²].
+    taken_px2, sd_taken_px2 : float
+        What the measurement takes it for, which is in its pose and covariance [px²].
+    """
+
+    seen_px2: float
+    sd_seen_px2: float
+    pose_by_smoothing: FloatArray
+    taken_px2: float = 0.0
+    sd_taken_px2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class InitialPose:
     """What the adjustment starts from: the outline that the search has followed, as a pose."""
 
@@ -181,6 +202,8 @@ class Measurement:
         None where the method fits no tone.
     rival : RivalTone or None
         The same by the other base of an unknown tone; None where only one base leads anywhere.
+    smoothing : ContourSmoothing or None
+        None where none is expected: of cameras with a known tone, and in bins.
     eccentricity_px : (2,) array or None
         Centroid of the image of the main ring's outer circle minus `centre_px`: what other
         programs measure is off by this. None where it was not asked for.
@@ -200,6 +223,7 @@ class Measurement:
     is_guided: bool = False
     imaging: Imaging | None = None
     rival: RivalTone | None = None
+    smoothing: ContourSmoothing | None = None
     eccentricity_px: FloatArray | None = None
 
     @property

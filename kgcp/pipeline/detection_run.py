@@ -22,6 +22,7 @@ import numpy as np
 from kgcp.errors import KgcpError, Reason
 from kgcp.georef.neighbouring_normals import Place, preferences_of_neighbours
 from kgcp.io.images.remote import stamps_of
+from kgcp.measurement.adjustment.smoothing import with_smoothing
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.other_pose import weighed_anew
 from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
@@ -250,8 +251,10 @@ class DetectionRun:
 
     def _measured_as_learnt(self, frame: str, measurement: Measurement) -> Outcome:
         learnt = measurement
-        if self.learnt is not None and self.learnt.base is not None:
-            learnt = by_base(learnt, self.learnt.base)
+        if self.learnt is not None:
+            if self.learnt.base is not None:
+                learnt = by_base(learnt, self.learnt.base)
+            learnt = with_smoothing(self._job.camera, learnt, self.learnt.smoothing)
         preference = self._preferences.get((frame, learnt.target, learnt.instance))
         if preference is not None:
             learnt = weighed_anew(self._job.camera, learnt, preference)

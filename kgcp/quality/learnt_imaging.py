@@ -3,7 +3,8 @@
 An unknown tone curve is fitted over two bases, of which one frame alone may take the wrong one. All
 frames have the same: their log-likelihoods are added up. Within a base, tone and sharpening of a
 frame are its own: to know them beforehand would make distances better by 2 % of their standard
-deviations (docs/method.md, "What a flight shares").
+deviations. Smoothing along contours is learnt from all frames (docs/method.md, "What a flight
+shares").
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
+from kgcp.measurement.adjustment.smoothing import CameraSmoothing, camera_smoothing
 from kgcp.measurement.image_model.photometry import Light, Tone, decoded, encoded, toned
 from kgcp.measurement.records import FrameResult, Imaging, Measurement, ToneBase
 
@@ -51,6 +53,8 @@ class LearntImaging:
         The same of the strength of the unsharp mask.
     noise : (m, 2) array
         Grey value and standard deviation of ink and plate of every measurement.
+    smoothing : CameraSmoothing
+        Along contours.
     """
 
     base: ToneBase | None
@@ -61,6 +65,7 @@ class LearntImaging:
     light: FloatArray
     sharpening: FloatArray
     noise: FloatArray
+    smoothing: CameraSmoothing
 
 
 def learn_imaging(results: Iterable[FrameResult]) -> LearntImaging | None:
@@ -98,6 +103,7 @@ def learn_imaging(results: Iterable[FrameResult]) -> LearntImaging | None:
         light=_common_curve(images, grey),
         sharpening=np.percentile(strengths, _BAND),
         noise=np.array([pair for imaging in images for pair in _noise_of(imaging)]),
+        smoothing=camera_smoothing([each.smoothing for each in learnt if each.smoothing]),
     )
 
 

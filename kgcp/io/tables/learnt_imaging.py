@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.measurement.adjustment.smoothing import CameraSmoothing
 from kgcp.measurement.records import ToneBase
 from kgcp.quality.learnt_imaging import LearntImaging
 
@@ -28,6 +30,7 @@ def learnt_text(learnt: LearntImaging) -> str:
             "light": [_plain(percentile) for percentile in learnt.light],
             "sharpening": _plain(learnt.sharpening),
             "noise": [_plain(pair) for pair in learnt.noise],
+            "smoothing": {name: round(x, _DIGITS) for name, x in asdict(learnt.smoothing).items()},
         }
     )
 
@@ -50,6 +53,7 @@ def learnt_from_text(text: str) -> LearntImaging:
         light=np.array(parts["light"], dtype=np.float64),
         sharpening=np.array(parts["sharpening"], dtype=np.float64),
         noise=np.array(parts["noise"], dtype=np.float64).reshape(-1, 2),
+        smoothing=CameraSmoothing(**parts["smoothing"]),
     )
 
 

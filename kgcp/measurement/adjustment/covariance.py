@@ -85,10 +85,9 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     half = root @ (directions * np.sqrt(np.maximum(ratios, 1.0)))
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
     pose_cov = half @ half.T + shifts @ shifts.T
-    field, depth_m = fit.parameters.field, fit.parameters.matrix[2, 3]
-    if field is not None:
-        pose_cov *= _ACROSS_SHADOW if len(field.edges) else _UNDER_UNEVEN_LIGHT
+    pose_cov *= unevenness_factor(fit)
     if fit.parameters.has_skew:
+        depth_m = fit.parameters.matrix[2, 3]
         across_m = _skew_displacement_px(fit) * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     shutter = fit.sample.problem.shutter
@@ -97,6 +96,14 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         turned = inverse[:6] @ (scaled * misfit.weight) @ (by_rotation / fit.sd).T
         pose_cov += turned @ turned.T
     return PoseCovariance(pose_cov, max(1.0, mean))
+
+
+def unevenness_factor(fit: TargetFit) -> float:
+    """Return how many times the variances that residuals show are too small in uneven light."""
+    field = fit.parameters.field
+    if field is None:
+        return 1.0
+    return _ACROSS_SHADOW if len(field.edges) else _UNDER_UNEVEN_LIGHT
 
 
 def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:

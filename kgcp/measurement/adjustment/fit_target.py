@@ -21,6 +21,7 @@ from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
 from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
+from kgcp.measurement.adjustment.smoothing import contour_smoothing, with_smoothing
 from kgcp.measurement.adjustment.two_poses import (
     TwoPoses,
     advantage,
@@ -197,7 +198,7 @@ def _measurement(
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += spread_over_both(pose, other.parameters.pose, ambiguity)
     of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
-    return Measurement(
+    measurement = Measurement(
         target=target.name,
         ring=start.ring,
         instance=0,
@@ -209,4 +210,6 @@ def _measurement(
         imaging=imaging_of(best),
         alternative=Alternative(other.parameters.pose, ambiguity, of_other),
         uncertainty=propagate(camera, pose, pose_cov),
+        smoothing=contour_smoothing(best, covariance.inflation),
     )
+    return with_smoothing(camera, measurement)

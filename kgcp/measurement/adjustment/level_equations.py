@@ -80,6 +80,13 @@ class LevelEquations:
         half = solved(self.root, parts.reshape(-1, 2 * self.count)[:, self.used].T)
         return float(np.sum(half * half))
 
+    def taken_of(self, row: FloatArray, weight: FloatArray) -> float:
+        """Return how much the levels take of the weighted square of a row (n,)."""
+        half = self.half_solved(
+            gather(self.at_knots, self.by_level, row * weight, self.count)[self.used]
+        )
+        return float(half @ half)
+
     def variances(self) -> FloatArray:
         """Return the variances (q,) of the levels, all else being unknown, too."""
         inverse, _ = dpotri(self.root, lower=1)

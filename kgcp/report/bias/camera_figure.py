@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from kgcp.measurement.image_model.photometry import srgb_decoded
 from kgcp.quality.learnt_imaging import LearntImaging
+from kgcp.quality.number_text import minus
 from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
 
 _FULL_SCALE = 255.0
@@ -59,4 +60,9 @@ def learnt_sentence(learnt: LearntImaging) -> str:
         else f"The tone curve departs from {learnt.base.value}; {learnt.overruled} of"
         f" {learnt.measurements} measurements alone would have taken another base."
     )
-    return f"{about} Strength of the camera's sharpening: {middle:.2f} ({low:.2f} to {high:.2f})."
+    smoothing = learnt.smoothing
+    return (
+        f"{about} Strength of the camera's sharpening: {middle:.2f} ({low:.2f} to {high:.2f})."
+        f" Smoothing along contours: {minus(f'{smoothing.mean_px2:.3f}')} px² ±"
+        f" {smoothing.sd_mean_px2:.3f}; single measurements scatter by {smoothing.scatter_px2:.3f}."
+    )

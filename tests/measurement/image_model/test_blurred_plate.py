@@ -14,6 +14,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_incidence
 from kgcp.measurement.image_model.blurred_plate import white_level, white_share
+from kgcp.measurement.image_model.contour_smoothing import smoothing_row
 from kgcp.measurement.image_model.plate import (
     EVEN,
     Circles,
@@ -144,3 +145,32 @@ def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
         for each in (incidence, replace(incidence, circles=closest))
     )
     assert np.abs(chosen - exact).max() < 4e-4
+
+
+def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> None:
+    """Of what is blurred already; on edges that are sharp against their curvature."""
+    sharp = Blur(0.3, 0.36, 0.04)
+    circles = circles_of((RING,)).part(slice(0, 2))
+    rays = rays_of(PIXELS)
+    scale = largest_metres_per_px(POSE, rays)
+    incidence = find_edge_incidence(plate_points(POSE, rays), scale, circles, sharp, EVEN)
+
+    def share_at(pixels: FloatArray) -> FloatArray:
+        return white_level(POSE.matrix, rays_of(pixels), sharp.vector, incidence).value
+
+    step = 0.05
+    along_x, along_y = np.array([step, 0.0]), np.array([0.0, step])
+    middle = share_at(PIXELS)
+    right, left = share_at(PIXELS + along_x), share_at(PIXELS - along_x)
+    down, up = share_at(PIXELS + along_y), share_at(PIXELS - along_y)
+    slope = np.stack((right - left, down - up)) / (2.0 * step)
+    edge = np.hypot(*slope) > 0.2
+    tangents = np.stack((-slope[1], slope[0])).T[edge] / np.hypot(*slope)[edge, None]
+    ahead, behind = np.array(PIXELS, float), np.array(PIXELS, float)
+    ahead[edge] += step * tangents
+    behind[edge] -= step * tangents
+    second = (share_at(ahead) + share_at(behind) - 2.0 * middle)[edge] / step**2
+    row = smoothing_row(POSE.matrix, rays, sharp.total_covariance, incidence)[edge]
+    assert edge.sum() > 100
+    assert np.abs(second).max() > 0.02
+    assert np.sqrt(np.mean((row - 0.5 * second) ** 2)) < 0.06 * np.sqrt(np.mean(row**2))

@@ -19,6 +19,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Attempt, Exposure, Sighting
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.gcps import BIAS_COLUMNS
+from kgcp.measurement.adjustment.smoothing import CameraSmoothing
 from kgcp.measurement.records import ToneBase
 from kgcp.pipeline.bias_report import FIGURE_FILES, FlightBias
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
@@ -69,6 +70,7 @@ LEARNT = LearntImaging(
     light=np.outer([0.98, 1.0, 1.02], GREY**2.2),
     sharpening=np.array([0.35, 0.4, 0.45]),
     noise=np.column_stack((np.repeat([0.1, 0.8], 20), np.linspace(0.006, 0.012, 40))),
+    smoothing=CameraSmoothing(0.081, 0.03, 0.057),
 )
 
 

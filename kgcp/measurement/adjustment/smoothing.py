@@ -1,0 +1,150 @@
+"""Smoothing along contours as one more unknown, linear since it is small.
+
+It is estimated after all others, at their minimum. How it would move the pose is kept with it,
+since all frames of a flight tell it better than one: a camera smooths alike in all of them, but for
+what depends on light and focus. So values scatter about a mean of the camera. Both are estimated
+from all measurements (empirical Bayes), and of one alone they are what cameras have in general.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.adjustment.covariance import propagate, unevenness_factor
+from kgcp.measurement.adjustment.normal_equations import normal_matrix
+from kgcp.measurement.adjustment.solver import TargetFit, added_levels
+from kgcp.measurement.image_model.contour_smoothing import smoothing_row
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.records import ContourSmoothing, Measurement
+
+_SMALL_PX2 = 1e-4  # for a derivative by differences
+# Of eight flights by other programs, smoothing had means of −0.07 to 0.09 px² with scatters of 0 to
+# 0.08 px² about them (docs/method.md, "What a flight shares").
+_SD_OF_CAMERAS_PX2, _SCATTER_PX2 = 0.1, 0.05
+_SCATTERS_PX2 = np.linspace(0.0, 4.0 * _SCATTER_PX2, 41)
+
+
+def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | None:
+    """Return what a fit says of smoothing along contours; None where none is expected.
+
+    Cameras whose tone is unknown are those that make pictures, not measurements. In bins no contour
+    is curved enough.
+
+    Parameters
+    ----------
+    inflation : float
+        Ratio of variances to those of independent residuals.
+    """
+    if fit.sample.problem.tone not in {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}:
+        return None
+    row, weight = _by_smoothing(fit) / fit.sd, fit.misfit.weight
+    own, score = float(row @ (row * weight)), float(row @ fit.misfit.score)
+    if fit.varied is None:
+        scaled = fit.scaled_jacobian
+        normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
+    else:
+        scaled, normal = fit.varied.rows(), fit.varied.normal
+        own -= fit.varied.taken_of(row, weight)
+    mixed = scaled @ (row * weight)
+    moves = np.asarray(-np.linalg.solve(normal, mixed), np.float64)
+    precision = own + float(mixed @ moves)
+    return ContourSmoothing(
+        seen_px2=score / precision,
+        sd_seen_px2=math.sqrt(inflation * unevenness_factor(fit) / precision),
+        pose_by_smoothing=moves[:6],
+    )
+
+
+def _by_smoothing(fit: TargetFit) -> FloatArray:
+    """Return the derivative (n,) of the grey values by smoothing along contours."""
+    sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
+    step = _SMALL_PX2 * smoothing_row(
+        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
+    )
+    added = added_levels(sample, parameters)
+    more, less = (
+        sample.photometry.levels(each, parameters.light, added)
+        for each in (share + step, share - step)
+    )
+    return np.asarray((more - less) / (2.0 * _SMALL_PX2))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSmoothing:
+    """What measurements say together of smoothing along contours."""
+
+    mean_px2: float
+    sd_mean_px2: float
+    scatter_px2: float  # of single measurements about the mean
+
+    def of_one(self, smoothing: ContourSmoothing) -> tuple[float, float]:
+        """Return the smoothing in one measurement among these, and its standard deviation [px²]."""
+        variance, scatter = smoothing.sd_seen_px2**2, self.scatter_px2**2
+        own = scatter / (scatter + variance)
+        value = own * smoothing.seen_px2 + (1.0 - own) * self.mean_px2
+        return value, math.sqrt(own * variance + ((1.0 - own) * self.sd_mean_px2) ** 2)
+
+
+def camera_smoothing(smoothings: Sequence[ContourSmoothing]) -> CameraSmoothing:
+    """Return what measurements say together, with what is known of cameras beforehand.
+
+    The scatter is the root of its mean square under its posterior distribution, over a grid; the
+    mean is that of a normal distribution, given the scatter.
+    """
+    seen = np.array([each.seen_px2 for each in smoothings])
+    variance = np.array([each.sd_seen_px2**2 for each in smoothings])
+    spread = variance + _SCATTERS_PX2[:, None] ** 2
+    precision = np.sum(1.0 / spread, axis=1) + _SD_OF_CAMERAS_PX2**-2
+    pull = np.sum(seen / spread, axis=1)
+    log_density = 0.5 * (
+        pull * pull / precision
+        - np.log(precision)
+        - np.sum(np.log(spread) + seen * seen / spread, axis=1)
+        - (_SCATTERS_PX2 / _SCATTER_PX2) ** 2
+    )
+    density = np.exp(log_density - log_density.max())
+    scatter2 = float(density @ _SCATTERS_PX2**2 / density.sum())
+    precise = float(np.sum(1.0 / (variance + scatter2))) + _SD_OF_CAMERAS_PX2**-2
+    mean = float(np.sum(seen / (variance + scatter2))) / precise
+    return CameraSmoothing(mean, 1.0 / math.sqrt(precise), math.sqrt(scatter2))
+
+
+def with_smoothing(
+    camera: Camera, measurement: Measurement, learnt: CameraSmoothing | None = None
+) -> Measurement:
+    """Return a measurement with its contours as smoothed as all say; None: as it says alone.
+
+    The other pose goes with it, nearer or farther.
+    """
+    smoothing, uncertainty = measurement.smoothing, measurement.uncertainty
+    if smoothing is None or uncertainty is None:
+        return measurement
+    learnt = camera_smoothing([smoothing]) if learnt is None else learnt
+    value, sd = learnt.of_one(smoothing)
+    step = (value - smoothing.taken_px2) * smoothing.pose_by_smoothing
+    added_cov = (sd**2 - smoothing.sd_taken_px2**2) * np.outer(
+        smoothing.pose_by_smoothing, smoothing.pose_by_smoothing
+    )
+    pose, other = measurement.pose.moved(step), measurement.alternative
+    if other is not None:
+        other = replace(
+            other,
+            pose=Pose(other.pose.rotation, other.pose.translation_m + step[:3]),
+            pose_cov=None if other.pose_cov is None else other.pose_cov + added_cov,
+        )
+    return replace(
+        measurement,
+        pose=pose,
+        centre_px=camera.project(pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, pose),
+        alternative=other,
+        uncertainty=propagate(camera, pose, uncertainty.pose_cov + added_cov),
+        smoothing=replace(smoothing, taken_px2=value, sd_taken_px2=sd),
+    )
