@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kgcp.cli.options import json_option
+
+if TYPE_CHECKING:
+    from kgcp.simulation.presets import SimulationSettings
 
 # Named here, not imported, because reading the presets takes numpy and scipy; a test compares.
 PRESET_NAMES = (
@@ -27,10 +30,17 @@ PRESET_NAMES = (
     help="Kind of flight: camera, exposure and geometry.",
 )
 @click.option(
+    "--field",
+    "field_text",
+    metavar="FIELD",
+    help="Simulate photographs of a field of discs instead of a flight, to calibrate a camera from:"
+    " a field.toml, another program's board file, or a shorthand such as grid:10x8:25mm:15mm.",
+)
+@click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
     default=None,
-    help="Number of frames.  [default: the preset's]",
+    help="Number of frames.  [default: the preset's; 14 photographs of a field]",
 )
 @click.option(
     "--seed",
@@ -105,6 +115,7 @@ PRESET_NAMES = (
 def command(
     out: Path,
     preset_name: str,
+    field_text: str | None,
     frames: int | None,
     seed: int,
     jobs: int | None,
@@ -119,33 +130,55 @@ def command(
     above it. Writes frames, flight.toml, frames.csv, vehicle.csv, reference.csv and truth.csv.
     Options from --shadow to --motion add an effect to the preset, or change the preset's own.
 
+    With --field, writes photographs of a field of discs, taken by the preset's camera, field.toml
+    and the truth, which kgcp calibrate is to find.
+
     \b
     Examples:
       kgcp simulate flight_1 --preset consumer --frames 100 --seed 7
       kgcp simulate flight_2 --shadow 0.45 --stripes 1 --coma 0.2
+      kgcp simulate session --field grid:10x8:25mm:15mm --preset consumer
     """  # noqa: D301 - \b is click's mark for lines that stay
-    import time
     from dataclasses import replace
 
-    from tqdm import tqdm
-
+    from kgcp.errors import SettingError
     from kgcp.pipeline.execution.resilient_map import usable_cores
-    from kgcp.pipeline.simulate import write_simulated_flight
     from kgcp.simulation.effects import Effects, with_effects
-    from kgcp.simulation.flight import plan_flight
     from kgcp.simulation.presets import preset
 
     settings = preset(preset_name)
-    if frames is not None:
-        settings = replace(settings, frames=frames)
     given: dict[str, Any] = {key: value for key, value in effects.items() if value is not None}
     settings = with_effects(settings, replace(Effects.of(settings), **given))
+    if field_text is not None:
+        if not survey_errors:
+            raise SettingError(
+                "survey-errors", "are errors of flights, and --field makes none", "leave it out"
+            )
+        _simulate_field(
+            out, field_text, settings, frames, seed, jobs or usable_cores(), as_json=as_json
+        )
+        return
+    if frames is not None:
+        settings = replace(settings, frames=frames)
     if not survey_errors:
         settings = settings.without_survey_errors()
+    _simulate_flight(out, settings, seed, jobs or usable_cores(), as_json=as_json)
+
+
+def _simulate_flight(
+    out: Path, settings: SimulationSettings, seed: int, jobs: int, *, as_json: bool
+) -> None:
+    import time
+
+    from tqdm import tqdm
+
+    from kgcp.pipeline.simulate import write_simulated_flight
+    from kgcp.simulation.flight import plan_flight
+
     start = time.perf_counter()
     plan = plan_flight(settings, seed)
     with tqdm(total=settings.frames, unit="frame") as bar:
-        write_simulated_flight(plan, out, jobs=jobs or usable_cores(), on_frame=bar.update)
+        write_simulated_flight(plan, out, jobs=jobs, on_frame=bar.update)
     summary = {
         "flight": str(out),
         "preset": settings.name,
@@ -164,3 +197,47 @@ def command(
         f" with a decoy) in {summary['seconds']:.1f} s: wrote {out}",
         err=True,
     )
+
+
+def _simulate_field(
+    out: Path,
+    field_text: str,
+    settings: SimulationSettings,
+    frames: int | None,
+    seed: int,
+    jobs: int,
+    *,
+    as_json: bool,
+) -> None:
+    """Write photographs of a field and report what was written."""
+    import time
+    from dataclasses import replace
+
+    from tqdm import tqdm
+
+    from kgcp.io.flight.field_file import read_field
+    from kgcp.pipeline.calibration.simulation import (
+        PHOTOGRAPHS,
+        FieldSimulation,
+        write_field_photographs,
+    )
+
+    count = frames or PHOTOGRAPHS
+    simulation = FieldSimulation(read_field(field_text), replace(settings, frames=count), seed)
+    start = time.perf_counter()
+    with tqdm(total=count, unit="photo") as bar:
+        write_field_photographs(simulation, out, jobs=jobs, on_photograph=bar.update)
+    seconds = time.perf_counter() - start
+    if as_json:
+        import json
+
+        summary = {
+            "folder": str(out),
+            "preset": settings.name,
+            "seed": seed,
+            "photographs": count,
+            "discs": len(simulation.field.names()),
+            "seconds": seconds,
+        }
+        click.echo(json.dumps(summary))
+    click.echo(f"{count} photographs in {seconds:.1f} s: wrote {out}", err=True)

@@ -9,10 +9,11 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image
@@ -28,7 +29,7 @@ from kgcp.pipeline.execution.executor import open_pool
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import VehicleSettings
-from kgcp.simulation.effects import Effects
+from kgcp.simulation.effects import effect_options
 from kgcp.simulation.flight import (
     CRS,
     TARGET_PLATE,
@@ -39,7 +40,8 @@ from kgcp.simulation.flight import (
     render_frame,
 )
 from kgcp.simulation.ground import Ground
-from kgcp.simulation.presets import SimulationSettings, preset
+
+Result = TypeVar("Result")
 
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -109,7 +111,7 @@ def readme(plan: FlightPlan) -> str:
     survey = "" if settings.sd_position_m[0] else " --no-survey-errors"
     command = (
         f"kgcp simulate OUT --preset {settings.name} --frames {settings.frames}"
-        f" --seed {plan.seed}{survey}{_effect_options(settings)}"
+        f" --seed {plan.seed}{survey}{effect_options(settings)}"
     )
     return f"""# A simulated flight: {settings.name}
 
@@ -142,21 +144,6 @@ is exposed; so are the reference poses.
 """
 
 
-def _effect_options(settings: SimulationSettings) -> str:
-    """Return the options by which a flight's effects differ from those of its preset."""
-    wanted, usual = asdict(Effects.of(settings)), asdict(Effects.of(preset(settings.name)))
-    words = []
-    for name, value in wanted.items():
-        if value == usual[name]:
-            continue
-        if isinstance(value, bool):
-            words.append(f" --{name}" if value else f" --no-{name}")
-        elif value is not None:
-            numbers = value if isinstance(value, tuple) else (value,)
-            words.append(f" --{name} " + " ".join(f"{number:g}" for number in numbers))
-    return "".join(words)
-
-
 @single_threaded()
 def write_simulated_flight(
     plan: FlightPlan, out: Path, *, jobs: int, on_frame: Callable[[], object]
@@ -177,24 +164,30 @@ def write_simulated_flight(
     KgcpError
         If `out` is not empty or cannot be written.
     """
+    with new_folder(out) as partial:
+        (partial / "frames").mkdir()
+        write_frame = functools.partial(_write_frame, plan, partial / "frames")
+        render_all(write_frame, len(plan.frames), out, jobs=jobs, on_frame=on_frame)
+        write_texts(plan, partial)
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """Give a folder to write into, which becomes `out` once everything is written.
+
+    Raises
+    ------
+    KgcpError
+        If `out` is not empty or cannot be written.
+    """
     out = out.resolve()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise KgcpError(f"{out}: is not empty; choose a new folder or empty it first")
     partial = out.with_name(f".{out.name}.part")
     try:
         shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
-        (partial / "frames").mkdir(parents=True)
-        write_frame = functools.partial(_write_frame, plan, partial / "frames")
-        with open_pool(0 if jobs == 1 else jobs, math.inf, None, partial) as pool:
-            for index, result in pool.map(write_frame, range(len(plan.frames))):
-                if isinstance(result, TaskFailure):
-                    raise KgcpError(
-                        f"{out}: the process that rendered frame {index} has ended twice; free"
-                        " memory, or use fewer processes",
-                        option="jobs",
-                    )
-                on_frame()
-        write_texts(plan, partial)
+        partial.mkdir(parents=True)
+        yield partial
         if out.exists():
             out.rmdir()
         partial.replace(out)
@@ -204,16 +197,53 @@ def write_simulated_flight(
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def render_all(
+    render: Callable[[int], Result],
+    count: int,
+    out: Path,
+    *,
+    jobs: int,
+    on_frame: Callable[[], object],
+) -> list[Result]:
+    """Return what rendering frames 0 … count - 1 gives, in `jobs` processes.
+
+    Parameters
+    ----------
+    out : Path
+        For messages.
+
+    Raises
+    ------
+    KgcpError
+        If a process ends twice over the same frame.
+    """
+    results: dict[int, Result] = {}
+    with open_pool(0 if jobs == 1 else jobs, math.inf, None, out.parent) as pool:
+        for index, result in pool.map(render, range(count)):
+            if isinstance(result, TaskFailure):
+                raise KgcpError(
+                    f"{out}: the process that rendered frame {index} has ended twice; free"
+                    " memory, or use fewer processes",
+                    option="jobs",
+                )
+            results[index] = result
+            on_frame()
+    return [results[index] for index in range(count)]
+
+
 def encode_frame(plan: FlightPlan, index: int, grey: GreyArray) -> bytes:
     """Return a frame as a PNG or JPEG file, with exposure and time in its EXIF."""
-    quality = plan.settings.jpeg_quality
-    exif = _exif(plan, index)
+    return encode_image(grey, plan.settings.jpeg_quality, _exif(plan, index))
+
+
+def encode_image(grey: GreyArray, jpeg_quality: int | None, exif: bytes = b"") -> bytes:
+    """Return an image as a PNG, or as a JPEG file of some quality."""
     buffer = io.BytesIO()
     image = Image.fromarray(grey)
-    if quality is None:
+    if jpeg_quality is None:
         image.save(buffer, "PNG", compress_level=_PNG_COMPRESSION, exif=exif)
     else:
-        image.save(buffer, "JPEG", quality=quality, exif=exif)
+        image.save(buffer, "JPEG", quality=jpeg_quality, exif=exif)
     return buffer.getvalue()
 
 
@@ -249,13 +279,14 @@ def write_texts(plan: FlightPlan, folder: Path) -> None:
     (folder / "README.md").write_text(readme(plan), encoding="utf-8", newline="\n")
     names = [frame_name(plan.settings, frame.index) for frame in plan.frames]
     times = [format_time(float(time_s)) for time_s in plan.recorded_times_s]
-    _write_csv(folder / "frames.csv", ("frame", "time"), zip(names, times, strict=True))
-    _write_csv(folder / "vehicle.csv", _VEHICLE_COLUMNS, _vehicle_rows(plan))
-    _write_csv(folder / "reference.csv", _REFERENCE_COLUMNS, _reference_rows(plan))
-    _write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(plan))
+    write_csv(folder / "frames.csv", ("frame", "time"), zip(names, times, strict=True))
+    write_csv(folder / "vehicle.csv", _VEHICLE_COLUMNS, _vehicle_rows(plan))
+    write_csv(folder / "reference.csv", _REFERENCE_COLUMNS, _reference_rows(plan))
+    write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(plan))
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table with its columns' names."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(columns)

@@ -6,7 +6,7 @@ astigmatism, 0 for all others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from kgcp.simulation.light_settings import Dirt, Glare, Shadow
 from kgcp.simulation.point_spread import Aberration
@@ -103,3 +103,18 @@ def _as_of_a_phone(settings: SimulationSettings) -> SimulationSettings:
         camera=replace(settings.camera, response=phone.camera.response),
         jpeg_quality=phone.jpeg_quality,
     )
+
+
+def effect_options(settings: SimulationSettings) -> str:
+    """Return the options by which a flight's effects differ from those of its preset."""
+    wanted, usual = asdict(Effects.of(settings)), asdict(Effects.of(preset(settings.name)))
+    words = []
+    for name, value in wanted.items():
+        if value == usual[name]:
+            continue
+        if isinstance(value, bool):
+            words.append(f" --{name}" if value else f" --no-{name}")
+        elif value is not None:
+            numbers = value if isinstance(value, tuple) else (value,)
+            words.append(f" --{name} " + " ".join(f"{number:g}" for number in numbers))
+    return "".join(words)

@@ -11,8 +11,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_irradiance
 from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.phone import Phone
 from kgcp.targets.fields.layout import Field, FieldPolarity
 
 _BORDER = 0.6  # of the pitch, from the outer discs' edges to that of the board
@@ -45,6 +46,8 @@ class FieldSession:
         By how much the light falls off across half the frame's width, in random directions.
     has_edges : bool
         Whether the board ends; the ground is everywhere if not, which is rendered sooner.
+    phone : Phone or None
+        What makes a photograph of the light; None: the sensor alone.
     """
 
     camera: Camera
@@ -55,13 +58,14 @@ class FieldSession:
     gain: float = 1.0
     fall: float = 0.15
     has_edges: bool = True
+    phone: Phone | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldPhotograph:
     """One photograph with its truth."""
 
-    grey: GreyArray
+    grey: GreyArray  # (height, width), or (height, width, 3) of a phone
     pose: Pose  # field → camera
 
 
@@ -75,6 +79,14 @@ def field_photographs(
     session: FieldSession, points_m: FloatArray, rng: np.random.Generator
 ) -> Iterator[FieldPhotograph]:
     """Photograph a field whose discs are at `points_m` (m, 3) from all sides, one after another."""
+    for number in range(session.photographs):
+        yield field_photograph(session, points_m, number, rng)
+
+
+def field_photograph(
+    session: FieldSession, points_m: FloatArray, number: int, rng: np.random.Generator
+) -> FieldPhotograph:
+    """Take one photograph of a field whose discs are at `points_m` (m, 3)."""
     radii, inner = session.field.radii_m().tolist(), session.field.inner_radii_m().tolist()
     discs = tuple(
         FieldDisc((x, y, z), 2.0 * outer, 2.0 * hole)
@@ -83,16 +95,17 @@ def field_photographs(
     is_dark = session.field.polarity is FieldPolarity.DARK
     ground, ink = (_PAPER, _INK) if is_dark else (_INK, _PAPER)
     board_m = _board_m(session.field)
-    for number in range(session.photographs):
-        turn = rng.uniform(0.0, 2.0 * math.pi)
-        fall_per_px = session.fall * rng.uniform() / (0.5 * session.camera.width)
-        gradient = (fall_per_px * math.cos(turn), fall_per_px * math.sin(turn))
-        scene = FieldScene(discs, ground, ink, gradient, board_m if session.has_edges else None)
-        pose = _pose(session.camera, board_m, number, rng)
-        grey = photograph(
-            session.camera, pose, scene, session.optics, session.sensor, rng, session.gain
-        )
-        yield FieldPhotograph(grey, pose)
+    turn = rng.uniform(0.0, 2.0 * math.pi)
+    fall_per_px = session.fall * rng.uniform() / (0.5 * session.camera.width)
+    gradient = (fall_per_px * math.cos(turn), fall_per_px * math.sin(turn))
+    scene = FieldScene(discs, ground, ink, gradient, board_m if session.has_edges else None)
+    pose = _pose(session.camera, board_m, number, rng)
+    light = field_irradiance(session.camera, pose, scene, session.optics)
+    if session.phone is not None:
+        grey = session.phone.photograph(session.sensor, light, session.gain, rng)
+    else:
+        grey = session.sensor.expose(light, session.gain, rng)
+    return FieldPhotograph(grey, pose)
 
 
 def _board_m(board: Field) -> tuple[float, float, float, float]:

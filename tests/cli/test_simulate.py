@@ -9,7 +9,7 @@ from PIL import Image
 
 from kgcp.cli import main
 from kgcp.cli.simulate import PRESET_NAMES
-from kgcp.geometry.camera import Response
+from kgcp.geometry.camera import Camera, Response
 from kgcp.io.flight.flight import read_flight
 from kgcp.simulation.effects import Effects, with_effects
 from kgcp.simulation.presets import PRESETS, preset
@@ -104,3 +104,35 @@ def test_too_much_coma_ends_in_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(main, ["simulate", out, "--preset", "lens", "--coma", "0.4"])
     assert result.exit_code == 1
     assert "give at most 0.24" in result.stderr
+
+
+def test_photographs_of_a_field_are_written_and_summarised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = Camera(240, 180, 250.0, 250.0, 120.0, 90.0)
+    monkeypatch.setitem(PRESETS, "sample", replace(preset("sample"), camera=camera))
+    out = tmp_path / "session"
+    options = ["--field", "grid:3x2:25mm:12mm", "--preset", "sample", "--frames", "1", "--json"]
+    result = CliRunner().invoke(main, ["simulate", str(out), *options, "--jobs", "1"])
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert (summary["photographs"], summary["discs"], summary["seed"]) == (1, 6, 1)
+    assert [path.name for path in (out / "photos").iterdir()] == ["photo_0000.jpg"]
+    command = "kgcp simulate OUT --field field.toml --preset sample --frames 1 --seed 1\n"
+    assert command in (out / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--no-survey-errors"], "are errors of flights"),
+        (["--shadow", "0.5"], "simulated without shadow"),
+    ],
+)
+def test_what_only_flights_have_ends_in_one_line(
+    tmp_path: Path, options: list[str], words: str
+) -> None:
+    arguments = ["simulate", str(tmp_path / "a"), "--field", "grid:3x2:25mm:12mm", *options]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 1
+    assert words in result.stderr

@@ -1,0 +1,208 @@
+"""Simulated photographs of a field of targets, with their truth beside them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
+from kgcp.io.flight.camera_file import camera_toml
+from kgcp.io.flight.field_file import field_toml
+from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.simulate import encode_image, new_folder, render_all, write_csv
+from kgcp.simulation.effects import effect_options
+from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
+from kgcp.simulation.imaging import Optics
+from kgcp.simulation.presets import SimulationSettings
+from kgcp.targets.fields.layout import Field
+
+PHOTOGRAPHS = 14
+"""Of a session, unless something else is said."""
+
+_POINT_COLUMNS = ("name", "x", "y", "z")
+_TRUTH_COLUMNS = (
+    *("photo", "tx_m", "ty_m", "tz_m"),
+    *(f"r{row}{column}" for row in range(3) for column in range(3)),
+    *("gain", "psf_px"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSimulation:
+    """A session to be rendered.
+
+    Attributes
+    ----------
+    field : Field
+        As it is meant to be; every disc is printed off by `flat_sd_m`, at random.
+    settings : SimulationSettings
+        Camera, exposure, blur and what the camera does to grey values are those of a flight;
+        `frames` photographs are taken. Its distances and tilts are not used.
+    seed : int
+        The same seed gives the same photographs.
+
+    Raises
+    ------
+    KgcpError
+        On making one, for light that only plates of a flight can have, and rows that are exposed
+        one after the other.
+    """
+
+    field: Field
+    settings: SimulationSettings
+    seed: int
+
+    def __post_init__(self) -> None:
+        settings = self.settings
+        unlike = {
+            "shadow": settings.shadow is not None,
+            "dirt": settings.dirt is not None,
+            "glare": settings.glare is not None,
+            "rolling": settings.camera.readout_s > 0.0,
+        }
+        for name, is_wanted in unlike.items():
+            if is_wanted:
+                raise KgcpError(
+                    f"{settings.name}: photographs of a field are simulated without {name}; leave"
+                    " it out, or take another preset",
+                    option="preset",
+                )
+
+    @property
+    def photos(self) -> tuple[str, ...]:
+        """Names of the photographs."""
+        suffix = "png" if self.settings.jpeg_quality is None else "jpg"
+        return tuple(f"photo_{number:04d}.{suffix}" for number in range(self.settings.frames))
+
+    def points_m(self) -> FloatArray:
+        """Return where the discs really are (m, 3), in the field's frame [m]."""
+        return printed_points(FieldSession(self.settings.camera, self.field), self._stream("print"))
+
+    def session(self, number: int) -> FieldSession:
+        """Return how one photograph is taken: exposure and blur are drawn anew for each."""
+        settings, rng = self.settings, self._stream("exposure", number)
+        low, high = np.log(settings.gain).tolist()
+        turn, streak_px = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*settings.streak_px)
+        return FieldSession(
+            replace(settings.camera, readout_s=0.0),
+            self.field,
+            settings.frames,
+            Optics(
+                rng.uniform(*settings.psf_px),
+                (streak_px * math.cos(turn), streak_px * math.sin(turn)),
+                settings.lens,
+            ),
+            settings.sensor,
+            math.exp(rng.uniform(low, high)),
+            phone=settings.phone,
+        )
+
+    def _stream(self, purpose: str, number: int = 0) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *purpose.encode(), number])
+
+    def take(self, folder: Path, number: int) -> Pose:
+        """Render a photograph into a folder; return its pose, field → camera."""
+        taken = field_photograph(
+            self.session(number), self.points_m(), number, self._stream("photograph", number)
+        )
+        encoded = encode_image(taken.grey, self.settings.jpeg_quality)
+        (folder / self.photos[number]).write_bytes(encoded)
+        return taken.pose
+
+
+@single_threaded()
+def write_field_photographs(
+    simulation: FieldSimulation, out: Path, *, jobs: int, on_photograph: Callable[[], object]
+) -> None:
+    """Render photographs of a field and write them with their truth: all or nothing.
+
+    Parameters
+    ----------
+    out : Path
+        The folder to be; it must not exist, or be empty.
+    jobs : int
+        Worker processes; 1 works in this one. The files do not depend on it.
+    on_photograph : callable
+        Called after each photograph.
+
+    Raises
+    ------
+    KgcpError
+        If `out` is not empty or cannot be written.
+    """
+    with new_folder(out) as partial:
+        folder = partial / "photos"
+        folder.mkdir()
+        take = functools.partial(simulation.take, folder)
+        count = simulation.settings.frames
+        poses = render_all(take, count, out, jobs=jobs, on_frame=on_photograph)
+        _write_truth(simulation, poses, partial)
+
+
+def _write_truth(simulation: FieldSimulation, poses: Sequence[Pose], folder: Path) -> None:
+    camera = simulation.settings.camera
+    texts = {
+        "field.toml": field_toml(simulation.field),
+        "true_camera.toml": camera_toml(camera, None),
+        "README.md": _readme(simulation),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8", newline="\n")
+    names, points_m = simulation.field.names(), simulation.points_m()
+    rows = (
+        (name, *(f"{value:.9f}" for value in point))
+        for name, point in zip(names, points_m.tolist(), strict=True)
+    )
+    write_csv(folder / "true_field.csv", _POINT_COLUMNS, rows)
+    write_csv(folder / "truth.csv", _TRUTH_COLUMNS, _truth_rows(simulation, poses))
+
+
+def _truth_rows(simulation: FieldSimulation, poses: Sequence[Pose]) -> Iterator[Sequence[str]]:
+    for number, (photo, pose) in enumerate(zip(simulation.photos, poses, strict=True)):
+        session = simulation.session(number)
+        numbers = (
+            *pose.translation_m.tolist(),
+            *pose.rotation.ravel().tolist(),
+            session.gain,
+            session.optics.psf_px,
+        )
+        # Nine decimals: a nanometre, and the same on every processor.
+        yield (photo, *(f"{round(number, 9) + 0.0:.9f}" for number in numbers))
+
+
+def _readme(simulation: FieldSimulation) -> str:
+    """Return a page that says what the folder is and how it was made."""
+    settings = simulation.settings
+    command = (
+        f"kgcp simulate OUT --field field.toml --preset {settings.name} --frames"
+        f" {settings.frames} --seed {simulation.seed}{effect_options(settings)}"
+    )
+    return f"""# Simulated photographs of a field: {simulation.field.name}
+
+{settings.frames} photographs with known truth. Nothing here was photographed: it was rendered by
+
+    {command}
+
+To calibrate the camera from them, and to compare it with the truth:
+
+    kgcp calibrate photos --field field.toml --against true_camera.toml
+
+| file | content |
+|---|---|
+| `photos/` | the photographs |
+| `field.toml` | the field as it is meant to be |
+| `true_camera.toml` | the camera that took them |
+| `true_field.csv` | where the discs really are [m]: off by `flat_sd_m`, at random |
+| `truth.csv` | the pose of each photograph, and how it was exposed |
+
+Columns of `truth.csv`: `tx_m`, `ty_m`, `tz_m` and `r00` … `r22`, translation and rotation (row by
+row) field → camera; `gain` exposure, 1 where white of radiance 1 fills the well; `psf_px` σ of the
+point spread.
+"""
