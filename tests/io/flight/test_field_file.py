@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kgcp.errors import KgcpError
@@ -118,6 +121,71 @@ def test_ros_has_one_larger_dot(tmp_path: Path) -> None:
     (mark,) = field.marks
     assert (mark.column, mark.row) == (0, 9)
     assert mark.diameter_m > field.diameter_m
+
+
+def ringgrid(**changes: object) -> str:
+    """A target.json of schema v4."""
+    values = {
+        "schema": "ringgrid.target.v4",
+        "name": "rings",
+        "pitch_mm": 8.0,
+        "rows": 15,
+        "long_row_cols": 14,
+        "marker_outer_radius_mm": 4.8,
+        "marker_inner_radius_mm": 3.2,
+        "marker_ring_width_mm": 1.152,
+    }
+    return json.dumps({**values, **changes})
+
+
+@pytest.mark.parametrize(("rows", "longest"), [(15, 14), (15, 13), (4, 5), (4, 4), (7, 5)])
+def test_rings_lie_as_ringgrid_prints_them(tmp_path: Path, rows: int, longest: int) -> None:
+    board = ringgrid(rows=rows, long_row_cols=longest)
+    field = read_field(write(tmp_path, "target.json", board))
+    assert (field.diameter_m, field.inner_diameter_m) == pytest.approx((0.010752, 0.008448))
+    counts = [sum(name.startswith(f"r{row}c") for name in field.names()) for row in range(rows)]
+    # ringgrid's rule: the middle row, rows // 2, is a long one if `longest` is odd
+    parity = (rows // 2 + longest + 1) % 2
+    assert counts == [longest - (row + parity) % 2 for row in range(rows)]
+    points_mm = 1e3 * field.points_m()
+    rows_mm = [points_mm[np.array([n.startswith(f"r{r}c") for n in field.names()])] for r in (0, 1)]
+    first, second = rows_mm
+    assert first[1] - first[0] == pytest.approx([8.0 * math.sqrt(3.0), 0.0, 0.0])
+    assert second[0, 1] - first[0, 1] == pytest.approx(12.0)
+    assert first[:, 0].mean() == pytest.approx(second[:, 0].mean())  # both about the middle
+
+
+def test_plain_rings_on_a_square_lattice(tmp_path: Path) -> None:
+    board = {
+        "schema": "ringgrid.target.v5",
+        "name": "plain",
+        "lattice": {"kind": "rect", "rows": 4, "cols": 5, "pitch_mm": 14.0},
+        "marker": {"outer_radius_mm": 5.6, "inner_radius_mm": 2.8},
+        "coding": {"kind": "plain"},
+        "fiducials": {"dot_radius_mm": 1.4, "dots_mm": [[21.0, 21.0]]},
+    }
+    field = read_field(write(tmp_path, "target_spec.json", json.dumps(board)))
+    assert (field.kind, field.columns, field.rows) == (GridKind.SQUARE, 5, 4)
+    sizes = [field.pitch_m, field.diameter_m, field.inner_diameter_m]
+    assert sizes == pytest.approx([0.014, 0.0112, 0.0056])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": "ringgrid.target.v9"}, "has schema 'ringgrid.target.v9'"),
+        ({"rows": 1}, "'rows' is 1; print a board with 2 to 1000"),
+        ({"rows": "many"}, "'rows' is 'many', not a finite number"),
+        ({"pitch_mm": -8.0}, "pitch_m: -0.0138"),
+        ({"marker_inner_radius_mm": None, "marker_outer_radius_mm": 9.0}, "is None, not a finite"),
+        ({"marker_outer_radius_mm": 9.0}, "overlap at 13.8"),
+    ],
+)
+def test_wrong_rings_end_in_one_line(
+    tmp_path: Path, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(KgcpError, match=message):
+        read_field(write(tmp_path, "target.json", ringgrid(**changes)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.fields import boofcv, dice, ros_industrial
+from kgcp.io.formats.fields import boofcv, dice, ringgrid, ros_industrial
 from kgcp.io.formats.registry import Registry
 from kgcp.targets.fields.layout import Field
 
@@ -20,6 +20,7 @@ FORMATS: Registry[Callable[[ForeignFile, float | None], Field]] = Registry(
     {
         "boofcv": (boofcv.matches, boofcv.field),
         "dice": (dice.matches, dice.field),
+        "ringgrid": (ringgrid.matches, ringgrid.field),
         "ros_industrial": (ros_industrial.matches, ros_industrial.field),
     },
 )
