@@ -82,6 +82,14 @@ LATE_MODULES = (
 
 _CAMERA = Camera(FRAME_WIDTH, FRAME_HEIGHT, 50.0, 50.0, 20.0, 15.0)
 _ROW = 64  # grey values
+_LISTING = """diameter_m = 0.01
+[points]
+file = "field.csv"
+[code]
+kind = "ring"
+bits = 14
+ring = [2.1, 3.1]
+"""
 _FRAME = (  # a PNG of 1 x 1 px
     b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x01\0\0\0\x01\x08\0\0\0\0:~\x9bU\0\0\0\nIDATx\x9cc`\0"
     b"\0\0\x02\0\x01H\xaf\xa4q\0\0\0\0IEND\xaeB`\x82"
@@ -171,6 +179,10 @@ def fields(data: bytes, folder: Path) -> None:
     for form in FIELD_FORMATS.names:
         file = ForeignFile(path, "the field")
         _allow(partial(FIELD_FORMATS.reader(file, form), file, 0.001))
+    (folder / "field.csv").write_bytes(data)
+    listing = folder / "listing.toml"
+    listing.write_text(_LISTING, encoding="utf-8")
+    _allow(lambda: read_field(str(listing)))
     toml = folder / "field.toml"
     toml.write_bytes(data)
     field = read_field(str(toml))

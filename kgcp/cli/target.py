@@ -205,14 +205,20 @@ def _draw_field(
     import json
     import warnings
 
-    from kgcp.errors import KgcpWarning
+    from kgcp.errors import KgcpError, KgcpWarning
     from kgcp.io.files.atomic import write_bytes
     from kgcp.io.flight.field_file import field_toml, read_field
     from kgcp.io.print.write import write_sheets
     from kgcp.targets.fields.artwork import draw_field
+    from kgcp.targets.fields.layout import Field
     from kgcp.targets.sheets import lay_out
 
     field = read_field(text)
+    if not isinstance(field, Field):
+        raise KgcpError(
+            f"{text}: is a field of points, which lie where they are; print one on a grid",
+            option="field",
+        )
     sheets = lay_out(draw_field(field), "the field", paper, is_tiled=is_tiled)
     folder = out or Path("targets")
     files = write_sheets(sheets, "field", folder, formats, dpi)

@@ -36,6 +36,14 @@ _SLOPES = _fourier_slopes(POINTS)
 _STEP = 2.0 * np.pi / POINTS
 
 
+def plane_axes(normals: FloatArray) -> FloatArray:
+    """Return two perpendicular unit vectors (n, 3, 2) square to each of n unit vectors (n, 3)."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(normals, first)), axis=-1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Circles3D:
     """n circles in the camera frame."""
@@ -50,10 +58,7 @@ class Circles3D:
         cls, centres_m: FloatArray, normals: FloatArray, radii_m: FloatArray
     ) -> Circles3D:
         """Return circles square to unit normals (n, 3)."""
-        helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-        first = np.cross(normals, helper)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return cls(centres_m, np.stack((first, np.cross(normals, first)), axis=-1), radii_m)
+        return cls(centres_m, plane_axes(normals), radii_m)
 
     def arms_m(self) -> FloatArray:
         """Return points (n, k, 3) of the circles, from their centres [m]."""

@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.calibration import CalibrationCovariance
-from kgcp.geometry.circle_image import Circles3D, circle_images
+from kgcp.geometry.circle_image import Circles3D, circle_images, plane_axes
 from kgcp.network.calibration_records import (
     CalibrationSettings,
     CameraCalibration,
@@ -22,8 +22,9 @@ from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unk
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
 from kgcp.network.parameter_choice import DETERMINED, with_chosen_parameters
+from kgcp.network.space_start import start_in_space
 from kgcp.network.start import better_poses, homography_misfits, start_camera_and_poses
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
 LEAST_VIEWS = 3
 _CENTRE_DETERMINED = 0.1  # as `DETERMINED`, of a principal point: within 1 % of the frame
@@ -49,7 +50,7 @@ def missing_discs(calibration: CameraCalibration) -> dict[str, tuple[IndexArray,
         point = np.setdiff1d(np.arange(len(estimate.points)), view.point)
         rotation, translation = estimate.rotations[index], estimate.translations[index]
         centres = estimate.points[point] @ rotation.T + translation
-        axes = np.broadcast_to(rotation[:, :2], (len(point), 3, 2))
+        axes = rotation @ plane_axes(field.normals()[point])
         images = circle_images(camera, Circles3D(centres, axes, field.radii_m()[point]))
         low, high = images.outlines_px.min(axis=1), images.outlines_px.max(axis=1)
         size = np.array([camera.width, camera.height])
@@ -60,7 +61,7 @@ def missing_discs(calibration: CameraCalibration) -> dict[str, tuple[IndexArray,
 
 def calibrate_camera(
     views: Sequence[NamedView],
-    field: Field,
+    field: AnyField,
     size: tuple[int, int],
     settings: CalibrationSettings,
     start: CameraCalibration | None = None,
@@ -105,7 +106,8 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     observations = problem.observations()
     unknowns = Unknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
-        camera, estimate = start_camera_and_poses(observations, points, problem.size)
+        start_from = start_camera_and_poses if field.is_planar else start_in_space
+        camera, estimate = start_from(observations, points, problem.size)
         state = problem.adjusted(camera, estimate, replace(unknowns, terms=()))
         for terms in (("k1",), ("k1", "k2")):
             state = problem.with_unknowns(state, replace(unknowns, terms=terms))
@@ -148,6 +150,8 @@ def _require_views(views: Sequence[NamedView]) -> None:
 
 def _disordered(problem: CalibrationProblem) -> tuple[str, ...]:
     """Return the photographs whose discs do not lie like those of a plane, with these names."""
+    if not problem.field.is_planar:
+        return ()
     misfits = homography_misfits(problem.observations(), problem.field.points_m())
     return tuple(
         view.photo

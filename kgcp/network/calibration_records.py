@@ -12,7 +12,7 @@ from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Eccentricity
 from kgcp.network.records import Network, Precision, Solution
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
 
 class PointModel(StrEnum):
@@ -60,7 +60,7 @@ class CameraCalibration:
 
     camera: Camera
     covariance: CalibrationCovariance
-    field: Field  # with the diameters that were used
+    field: AnyField  # with the diameters that were used
     settings: CalibrationSettings
     views: tuple[NamedView, ...]  # those that took part
     dropped: tuple[str, ...]  # photographs whose discs do not lie like the field's

@@ -11,7 +11,13 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D, Eccentricity, circle_images, eccentricity
+from kgcp.geometry.circle_image import (
+    Circles3D,
+    Eccentricity,
+    circle_images,
+    eccentricity,
+    plane_axes,
+)
 from kgcp.geometry.pose import Pose
 from kgcp.network.adjust import ROBUST, adjust
 from kgcp.network.calibration_records import CalibrationSettings, NamedView, PointModel
@@ -26,7 +32,7 @@ from kgcp.network.records import (
     ScaleBar,
     Solution,
 )
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
 _CENTRE_SD = 0.1  # of the frame's longer side: how far a principal point may be from the middle
 _FOCAL_SD = 3.0  # of the focal length to start with
@@ -78,7 +84,7 @@ class CalibrationProblem:
     """What all adjustments of one calibration share."""
 
     views: tuple[NamedView, ...]
-    field: Field
+    field: AnyField
     size: tuple[int, int]
     settings: CalibrationSettings
 
@@ -145,8 +151,9 @@ class CalibrationProblem:
         rotations = estimate.rotations[observed.view]
         centres = np.einsum("nij,nj->ni", rotations, estimate.points[observed.point])
         centres += estimate.translations[observed.view]
-        radii = self.field.radii_m()[observed.point]
-        return Circles3D(centres, rotations[:, :, :2], radii)
+        radii, normals = self.field.radii_m(), self.field.normals()
+        axes = np.einsum("nij,njk->nik", rotations, plane_axes(normals)[observed.point])
+        return Circles3D(centres, axes, radii[observed.point])
 
     def point_prior(self, points: PointModel) -> PointPrior:
         """Return what the adjustment knows of the field; unseen points stay where they are."""
@@ -158,11 +165,11 @@ class CalibrationProblem:
             ScaleBar(names.index(bar.first), names.index(bar.second), bar.length_m, bar.sd_m)
             for bar in self.field.bars
         )
-        information = np.diag(np.array(self.field.flat_sd_m) ** -2.0)
+        sds = self.field.point_sds_m()
         if points is PointModel.FREE:
             # a deviation of a tenth of the pitch holds what the photographs hardly see
-            information = np.eye(3) * (0.1 * self.field.pitch_m) ** -2.0
-        return PointPrior(nominal, np.tile(information, (len(nominal), 1, 1)), bars)
+            sds = np.full_like(sds, 0.1 * self.field.pitch_m)
+        return PointPrior(nominal, np.eye(3) * sds[:, None] ** -2.0, bars)
 
     def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CameraPrior:
         """Return what is known of any camera: a principal point in the middle, small distortion."""

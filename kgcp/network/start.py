@@ -9,6 +9,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.homography import homography_between, mapped
 from kgcp.geometry.pose import Pose
 from kgcp.network.adjust import PLAIN, adjust
 from kgcp.network.equations import whitened
@@ -21,7 +22,8 @@ from kgcp.network.records import (
     PointPrior,
 )
 
-_FOCALS = (0.5, 0.8, 1.2, 2.0, 3.2, 5.0, 8.0, 12.0)  # of the longer side of the frame
+FOCALS = (0.5, 0.8, 1.2, 2.0, 3.2, 5.0, 8.0, 12.0)
+"""To try to begin with: multiples of the longer side of the frame."""
 _KNOWN = 1e-9  # standard deviation of what is not to change
 
 
@@ -30,7 +32,7 @@ def start_camera_and_poses(
 ) -> tuple[Camera, Estimate]:
     """Return a camera without distortion and the pose of every photograph.
 
-    The focal length is that of `_FOCALS` or of Zhang's closed form (2000) whose poses fit best,
+    The focal length is that of `FOCALS` or of Zhang's closed form (2000) whose poses fit best,
     with the principal point in the middle. Every planar pose has a twin, of which the better is
     taken.
     """
@@ -41,8 +43,8 @@ def start_camera_and_poses(
     for view in range(count):
         mine = observations.view == view
         flat = points[observations.point[mine], :2]
-        homographies.append(_homography(flat, observations.places[mine] - centre))
-    focals = {share * max(size) for share in _FOCALS}
+        homographies.append(homography_between(flat, observations.places[mine] - centre))
+    focals = {share * max(size) for share in FOCALS}
     closed = _closed_focal(homographies)
     if closed is not None:
         focals.add(min(max(closed, 0.3 * max(size)), 20.0 * max(size)))
@@ -70,8 +72,7 @@ def homography_misfits(observations: Observations, points: FloatArray) -> FloatA
     for view in range(int(observations.view.max()) + 1):
         mine = observations.view == view
         flat, places = points[observations.point[mine], :2], observations.places[mine]
-        mapped = np.column_stack((flat, np.ones(len(flat)))) @ _homography(flat, places).T
-        gaps = places - mapped[:, :2] / mapped[:, 2:]
+        gaps = places - mapped(homography_between(flat, places), flat)
         spread = np.sum((places - places.mean(axis=0)) ** 2)
         misfits.append(math.sqrt(float(np.sum(gaps**2) / spread)))
     return np.array(misfits)
@@ -135,30 +136,6 @@ def _is_in_front(observations: Observations, estimate: Estimate) -> BoolArray:
     count = len(estimate.rotations)
     behind = np.bincount(observations.view[depths <= 0.0], minlength=count)
     return np.asarray(behind == 0)
-
-
-def _homography(flat: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the homography (3, 3) from a plane to the image, by the normalised DLT."""
-    to_plane, to_image = _normalising(flat), _normalising(places)
-    x, y = (flat @ to_plane[:2, :2] + to_plane[:2, 2]).T
-    u, v = (places @ to_image[:2, :2] + to_image[:2, 2]).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows = np.concatenate(
-        (
-            np.stack((x, y, one, zero, zero, zero, -u * x, -u * y, -u), axis=1),
-            np.stack((zero, zero, zero, x, y, one, -v * x, -v * y, -v), axis=1),
-        )
-    )
-    solved = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    return np.asarray(np.linalg.inv(to_image) @ solved @ to_plane)
-
-
-def _normalising(points: FloatArray) -> FloatArray:
-    middle = points.mean(axis=0)
-    scale = math.sqrt(2.0) / float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
-    matrix = np.diag([scale, scale, 1.0])
-    matrix[:2, 2] = -scale * middle
-    return matrix
 
 
 def _closed_focal(homographies: list[FloatArray]) -> float | None:

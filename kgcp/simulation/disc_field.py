@@ -7,7 +7,8 @@ model that measures them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from kgcp.geometry.circle_image import Circles3D
 from kgcp.geometry.pose import Pose
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
-from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
+from kgcp.simulation.regions import AnnularSector, ConvexPolygon, DiscRegion, Region
 
 _SUB_PIXELS_ACROSS = 1200  # of a window
 _FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS = 4, 10  # per pixel and axis
@@ -36,12 +37,32 @@ class FieldDisc:
         Of the disc, and of a hole in it; 0: none [m].
     normal : (3,) tuple of float
         Unit vector square to it; the field's own z axis by default, which points into the board.
+    code : DiscCode or None
+        Sectors of ink around it.
     """
 
     position_m: tuple[float, float, float]
     diameter_m: float
     inner_diameter_m: float = 0.0
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    code: DiscCode | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DiscCode:
+    """A ring of equal sectors around a disc, from its plane's x axis towards its y axis."""
+
+    inner_diameter_m: float
+    outer_diameter_m: float
+    sectors: tuple[bool, ...]  # whether each is inked
+
+    def regions(self) -> Iterator[AnnularSector]:
+        """Yield the sectors of ink."""
+        step = 2.0 * math.pi / len(self.sectors)
+        for number, is_inked in enumerate(self.sectors):
+            if is_inked:
+                inner_m, outer_m = 0.5 * self.inner_diameter_m, 0.5 * self.outer_diameter_m
+                yield AnnularSector(inner_m, outer_m, number * step, (number + 1) * step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +136,8 @@ def field_irradiance(camera: Camera, pose: Pose, scene: FieldScene, optics: Opti
         if disc.inner_diameter_m > 0.0:
             shapes.append(DiscRegion((0.0, 0.0), 0.5 * disc.inner_diameter_m))
         _add(frame, camera, plane, shapes, scene.ink - scene.ground, scene, optics)
+        for sector in disc.code.regions() if disc.code is not None else ():
+            _add(frame, camera, plane, [sector], scene.ink - scene.ground, scene, optics)
     return frame
 
 

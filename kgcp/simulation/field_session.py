@@ -11,10 +11,11 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_irradiance
+from kgcp.simulation.disc_field import DiscCode, FieldDisc, FieldScene, field_irradiance
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.phone import Phone
 from kgcp.targets.fields.layout import Field, FieldPolarity
+from kgcp.targets.fields.points import AnyField, CodeRing, FieldPoint, PointField
 
 _BORDER = 0.6  # of the pitch, from the outer discs' edges to that of the board
 _PAPER, _INK = 0.8, 0.06  # radiance
@@ -35,8 +36,8 @@ class FieldSession:
     ----------
     camera : Camera
         The truth that a calibration is to find.
-    field : Field
-        What is meant to be printed. The discs are printed off by its `flat_sd_m`, at random.
+    field : Field or PointField
+        What is meant to be. The discs are off by `point_sds_m`, at random.
     photographs : int
     optics : Optics
     sensor : Sensor
@@ -45,13 +46,14 @@ class FieldSession:
     fall : float
         By how much the light falls off across half the frame's width, in random directions.
     has_edges : bool
-        Whether the board ends; the ground is everywhere if not, which is rendered sooner.
+        Whether the board ends; the ground is everywhere if not, which is rendered sooner, and
+        around fields of points, which have no board.
     phone : Phone or None
         What makes a photograph of the light; None: the sensor alone.
     """
 
     camera: Camera
-    field: Field
+    field: AnyField
     photographs: int = 14
     optics: Optics = _OPTICS
     sensor: Sensor = _SENSOR
@@ -72,7 +74,7 @@ class FieldPhotograph:
 def printed_points(session: FieldSession, rng: np.random.Generator) -> FloatArray:
     """Return where the discs are on the board (m, 3), in the field's frame [m]."""
     meant = session.field.points_m()
-    return np.asarray(meant + session.field.flat_sd_m * rng.standard_normal(meant.shape))
+    return np.asarray(meant + session.field.point_sds_m() * rng.standard_normal(meant.shape))
 
 
 def field_photographs(
@@ -87,19 +89,16 @@ def field_photograph(
     session: FieldSession, points_m: FloatArray, number: int, rng: np.random.Generator
 ) -> FieldPhotograph:
     """Take one photograph of a field whose discs are at `points_m` (m, 3)."""
-    radii, inner = session.field.radii_m().tolist(), session.field.inner_radii_m().tolist()
-    discs = tuple(
-        FieldDisc((x, y, z), 2.0 * outer, 2.0 * hole)
-        for (x, y, z), outer, hole in zip(points_m.tolist(), radii, inner, strict=True)
-    )
+    discs = _discs(session.field, points_m)
     is_dark = session.field.polarity is FieldPolarity.DARK
     ground, ink = (_PAPER, _INK) if is_dark else (_INK, _PAPER)
+    has_board = session.has_edges and isinstance(session.field, Field)
     board_m = _board_m(session.field)
     turn = rng.uniform(0.0, 2.0 * math.pi)
     fall_per_px = session.fall * rng.uniform() / (0.5 * session.camera.width)
     gradient = (fall_per_px * math.cos(turn), fall_per_px * math.sin(turn))
-    scene = FieldScene(discs, ground, ink, gradient, board_m if session.has_edges else None)
-    pose = _pose(session.camera, board_m, number, rng)
+    scene = FieldScene(discs, ground, ink, gradient, board_m if has_board else None)
+    pose = _pose(session.camera, _corners(session.field, board_m), number, rng)
     light = field_irradiance(session.camera, pose, scene, session.optics)
     if session.phone is not None:
         grey = session.phone.photograph(session.sensor, light, session.gain, rng)
@@ -108,7 +107,42 @@ def field_photograph(
     return FieldPhotograph(grey, pose)
 
 
-def _board_m(board: Field) -> tuple[float, float, float, float]:
+def _discs(field: AnyField, points_m: FloatArray) -> tuple[FieldDisc, ...]:
+    """Return the discs of a field where they are (m, 3)."""
+    codes: list[DiscCode | None] = [None] * len(points_m)
+    if isinstance(field, PointField) and field.code is not None:
+        codes = [_code(point, field.code) for point in field.points]
+    normals = field.normals()
+    normals = np.where(normals[:, 2:] < 0.0, -normals, normals)  # into the board: codes turn by it
+    return tuple(
+        FieldDisc((x, y, z), 2.0 * outer, 2.0 * hole, (u, v, w), code)
+        for (x, y, z), (u, v, w), outer, hole, code in zip(
+            points_m.tolist(),
+            normals.tolist(),
+            field.radii_m().tolist(),
+            field.inner_radii_m().tolist(),
+            codes,
+            strict=True,
+        )
+    )
+
+
+def _code(point: FieldPoint, ring: CodeRing) -> DiscCode | None:
+    if point.code is None:
+        return None
+    bits = tuple(digit == "1" for digit in f"{point.code:0{ring.bits}b}")
+    return DiscCode(ring.inner * point.diameter_m, ring.outer * point.diameter_m, bits)
+
+
+def _corners(field: AnyField, board_m: tuple[float, float, float, float]) -> FloatArray:
+    """Return the corners (n, 3) of what a photograph is to show, in the field's frame [m]."""
+    left, top, right, bottom = board_m
+    flat = [(left, top), (right, top), (right, bottom), (left, bottom)]
+    depths = {0.0} if isinstance(field, Field) else {*field.points_m()[:, 2].tolist()}
+    return np.array([(x, y, z) for z in sorted({min(depths), max(depths)}) for x, y in flat])
+
+
+def _board_m(board: AnyField) -> tuple[float, float, float, float]:
     """Return the edges of the board: x and y of one corner and of the opposite one [m]."""
     points, radii = board.points_m()[:, :2], board.radii_m()[:, None]
     border_m = _BORDER * board.pitch_m
@@ -117,16 +151,8 @@ def _board_m(board: Field) -> tuple[float, float, float, float]:
     return float(left), float(top), float(right), float(bottom)
 
 
-def _pose(
-    camera: Camera,
-    board_m: tuple[float, float, float, float],
-    number: int,
-    rng: np.random.Generator,
-) -> Pose:
-    """Return a pose that shows the whole board, tilted, somewhere in the frame."""
-    left, top, right, bottom = board_m
-    corners = np.array([(left, top, 0.0), (right, top, 0.0), (right, bottom, 0.0)])
-    corners = np.vstack((corners, (left, bottom, 0.0)))
+def _pose(camera: Camera, corners: FloatArray, number: int, rng: np.random.Generator) -> Pose:
+    """Return a pose that shows all corners (n, 3), tilted, somewhere in the frame."""
     middle = corners.mean(axis=0)
     quarter = 90.0 if number % _EVERY_TURNED == _EVERY_TURNED - 1 else 0.0
     turn = math.radians(quarter + _TURN_SD_DEG * rng.standard_normal())
@@ -162,7 +188,7 @@ def _fitting_distance_m(camera: Camera, around: FloatArray) -> float:
 
 
 def _is_in_frame(camera: Camera, corners: FloatArray) -> bool:
-    """Tell whether a quadrangle's corners and the middles of its sides are in the frame."""
+    """Tell whether corners and the middles between one and the next are in the frame."""
     outline = np.vstack((corners, 0.5 * (corners + np.roll(corners, 1, axis=0))))
     if outline[:, 2].min() <= 0.0:
         return False

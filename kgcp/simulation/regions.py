@@ -119,7 +119,57 @@ class ConvexPolygon:
         return normals, np.sum(normals * vertices, axis=1)
 
 
-Region = DiscRegion | Annulus | ConvexPolygon
+@dataclass(frozen=True, slots=True)
+class AnnularSector:
+    """The part of a ring between two directions, less than 180° apart, from +x towards +y [rad]."""
+
+    inner_m: float
+    outer_m: float
+    start_rad: float
+    end_rad: float
+
+    @property
+    def curvature_per_m(self) -> float:
+        """Zero: the curvatures of the arcs have opposite signs and nearly cancel."""
+        return 0.0
+
+    def hull(self) -> FloatArray:
+        """Return points (n, 2) whose convex hull holds the shape [m]."""
+        angles = np.linspace(self.start_rad, self.end_rad, _POINTS_PER_EDGE)
+        arc: FloatArray = np.column_stack((np.cos(angles), np.sin(angles)))
+        over = 1.0 / math.cos(0.5 * (angles[1] - angles[0]))  # chords cut off what is beyond them
+        return np.concatenate((self.inner_m * arc, over * self.outer_m * arc))
+
+    def signed_distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the largest distance to an edge [m]: exact but for the corners' outside."""
+        return np.asarray(self._distances(x, y).max(axis=0))
+
+    def outward(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the unit gradient of the signed distance."""
+        radius = np.maximum(np.sqrt(x * x + y * y), _TINY_M)
+        nearest = self._distances(x, y).argmax(axis=0)
+        is_arc = nearest < 2
+        sign = np.where(nearest == 0, 1.0, -1.0)
+        straight_x = np.where(nearest == 2, math.sin(self.start_rad), -math.sin(self.end_rad))
+        straight_y = np.where(nearest == 2, -math.cos(self.start_rad), math.cos(self.end_rad))
+        return (
+            np.where(is_arc, sign * x / radius, straight_x),
+            np.where(is_arc, sign * y / radius, straight_y),
+        )
+
+    def _distances(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        radius = np.sqrt(x * x + y * y)
+        return np.stack(
+            (
+                radius - self.outer_m,
+                self.inner_m - radius,
+                math.sin(self.start_rad) * x - math.cos(self.start_rad) * y,
+                math.cos(self.end_rad) * y - math.sin(self.end_rad) * x,
+            )
+        )
+
+
+Region = DiscRegion | Annulus | ConvexPolygon | AnnularSector
 
 
 def _circle_about(centre_m: tuple[float, float], radius_m: float) -> FloatArray:

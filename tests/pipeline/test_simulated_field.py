@@ -24,6 +24,7 @@ from kgcp.pipeline.detect import NoProgress
 from kgcp.simulation.phone import Phone
 from kgcp.simulation.presets import preset
 from kgcp.targets.fields.layout import Field, GridKind, Mark
+from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
 
 CAMERA = Camera(320, 240, 330.0, 330.0, 163.0, 117.5, -0.08, response=Response.LINEAR)
 SETTINGS = replace(preset("clean"), camera=CAMERA, frames=5)
@@ -96,3 +97,36 @@ def test_names_and_exposures_follow_the_settings() -> None:
 def test_light_of_plates_is_told_apart(name: str) -> None:
     with pytest.raises(KgcpError, match="without"):
         FieldSimulation(FIELD, preset(name), 1)
+
+
+def coded_field() -> PointField:
+    """Twelve discs with codes, at three depths."""
+    codes = (0b1, 0b11, 0b101, 0b111, 0b1001, 0b1011, 0b1101, 0b1111, 0b10011, 0b10101, 0b10111)
+    points = [
+        FieldPoint(
+            f"p{i}",
+            (0.05 * (i % 4), 0.05 * (i // 4), -0.015 * (i % 3)),
+            *(0.013, 0.0, (0.0, 0.0, 1.0), None),
+            code,
+        )
+        for i, code in enumerate((*codes, 0b11011))
+    ]
+    sds = (1e-5, 1e-5, 1e-5)
+    return PointField("depth", tuple(points), flat_sd_m=sds, code=CodeRing(8, 1.9, 2.9))
+
+
+def test_a_field_with_depth_is_calibrated_with(tmp_path: Path) -> None:
+    field = coded_field()
+    settings = replace(SETTINGS, frames=3)
+    out = tmp_path / "session"
+    write_field_photographs(FieldSimulation(field, settings, 2), out, jobs=1, on_photograph=list)
+    assert read_field(str(out / "field.toml")) == field
+    options = CalibrationOptions(
+        CalibrationSettings(lens=LensModel.RADIAL), Response.LINEAR, Operator.MODEL, jobs=0
+    )
+    photos = find_photos([out / "photos"])
+    made = calibrate_photos(photos, field, tmp_path, options, NoProgress())
+    assert not made.misses
+    assert len(made.calibration.network.observations.view) > 30
+    sd = np.sqrt(made.calibration.covariance.cov.diagonal())
+    assert abs(made.calibration.camera.fx - CAMERA.fx) < 5.0 * sd[0] < 10.0

@@ -11,13 +11,16 @@ from typing import Any
 from kgcp.errors import KgcpError, SettingError
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.flight.point_field_file import POINT_KEYS, point_field, point_lines
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.formats.fields import FORMATS
 from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
+from kgcp.targets.fields.points import AnyField, PointField
 
 FIELD_KEYS = (
     *("name", "polarity", "diameter_m", "inner_diameter_m", "flat_sd_m", "grid", "mark", "bar"),
+    *POINT_KEYS,
 )
 GRID_KEYS = ("kind", "columns", "rows", "pitch_m")
 MARK_KEYS = ("at", "diameter_m", "inner_diameter_m", "missing")
@@ -33,7 +36,7 @@ _USUAL_SHARE = 0.5  # of the pitch: what a diameter is taken for until it is mea
 _EXAMPLE = "grid:10x8:25mm:15mm"
 
 
-def read_field(text: str, unit: str | None = None) -> Field:
+def read_field(text: str, unit: str | None = None) -> AnyField:
     """Return the field that a shorthand or a file describes.
 
     Parameters
@@ -96,24 +99,33 @@ def _length_m(text: str, length: str) -> float:
     return float(match[1]) * _METRES[match[2]]
 
 
-def _from_toml(path: Path) -> Field:
+def _from_toml(path: Path) -> AnyField:
     table, _ = read_toml(path, FIELD_KEYS, "the field")
-    grid = table.table("grid", GRID_KEYS)
-    diameter_m = table.number("diameter_m")
+    name = table.optional("name", table.name) or path.stem
+    polarity = table.optional("polarity", lambda key: table.choice(key, FieldPolarity))
+    polarity = polarity or FieldPolarity.DARK
     values: dict[str, Any] = {}
     if "flat_sd_m" in table:
         values["flat_sd_m"] = table.vector("flat_sd_m")
-    polarity = table.optional("polarity", lambda key: table.choice(key, FieldPolarity))
+    if "points" in table or "point" in table:
+        for key in ("grid", "mark"):
+            if key in table:
+                raise table.error(key, "is given beside points", "give a grid or points, not both")
+        return point_field(table, path.parent, name, polarity, _bars(table))
+    if "code" in table:
+        raise table.error("code", "is given beside a grid", "give codes with points")
+    grid = table.table("grid", GRID_KEYS)
+    diameter_m = table.number("diameter_m")
     with table.located():
         return Field(
-            table.optional("name", table.name) or path.stem,
+            name,
             grid.choice("kind", GridKind),
             grid.integer("columns"),
             grid.integer("rows"),
             grid.number("pitch_m"),
             diameter_m,
             table.number("inner_diameter_m", 0.0),
-            polarity or FieldPolarity.DARK,
+            polarity,
             _marks(table, diameter_m),
             bars=_bars(table),
             **values,
@@ -148,17 +160,31 @@ def _bars(table: TomlTable) -> tuple[FieldBar, ...]:
     )
 
 
-def field_toml(field: Field) -> str:
+def field_toml(field: AnyField) -> str:
     """Return the text of a field.toml, which `read_field` reads back to the same field."""
     lines = [
         f"name = {json.dumps(field.name)}",
         f'polarity = "{field.polarity.value}"',
-        f"diameter_m = {field.diameter_m!r}",
+        f"flat_sd_m = {list(field.flat_sd_m)}",
     ]
+    lines += point_lines(field) if isinstance(field, PointField) else _grid_lines(field)
+    for bar in field.bars:
+        lines += [
+            "",
+            "[[bar]]",
+            f"from = {json.dumps(bar.first)}",
+            f"to = {json.dumps(bar.second)}",
+            f"length_m = {bar.length_m!r}",
+            f"sd_m = {bar.sd_m!r}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _grid_lines(field: Field) -> list[str]:
+    lines = [f"diameter_m = {field.diameter_m!r}"]
     if field.inner_diameter_m:
         lines.append(f"inner_diameter_m = {field.inner_diameter_m!r}")
     lines += [
-        f"flat_sd_m = {list(field.flat_sd_m)}",
         "",
         "[grid]",
         f'kind = "{field.kind.value}"',
@@ -174,13 +200,4 @@ def field_toml(field: Field) -> str:
         lines.append(f"diameter_m = {mark.diameter_m!r}")
         if mark.inner_diameter_m:
             lines.append(f"inner_diameter_m = {mark.inner_diameter_m!r}")
-    for bar in field.bars:
-        lines += [
-            "",
-            "[[bar]]",
-            f"from = {json.dumps(bar.first)}",
-            f"to = {json.dumps(bar.second)}",
-            f"length_m = {bar.length_m!r}",
-            f"sd_m = {bar.sd_m!r}",
-        ]
-    return "\n".join(lines) + "\n"
+    return lines

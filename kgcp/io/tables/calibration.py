@@ -28,7 +28,7 @@ class ObservedDisc:
     vector: FloatArray  # (5,)
     cov: FloatArray  # (5, 5)
     appearance: FloatArray  # (5,): as `PhotoDiscs.appearance`
-    is_guided: bool
+    named_by: str
     residual: FloatArray  # (2,)
     redundancy: float
     weight: float
@@ -90,7 +90,7 @@ def _shift(axis: int, row: PhotoRow) -> float | None:
 OBSERVATION_COLUMNS: tuple[Column[ObservedDisc], ...] = (
     Column("photo", TEXT, lambda disc: disc.photo),
     Column("point", TEXT, lambda disc: disc.point),
-    Column("named_by", TEXT, lambda disc: "guided" if disc.is_guided else "lattice"),
+    Column("named_by", TEXT, lambda disc: disc.named_by),
     Column("x_px", NUMBER, lambda disc: float(disc.vector[0])),
     Column("y_px", NUMBER, lambda disc: float(disc.vector[1])),
     Column("sd_x_px", NUMBER, lambda disc: math.sqrt(disc.cov[0, 0])),
@@ -154,7 +154,7 @@ def observation_rows(
                 view.vectors[index],
                 view.covs[index],
                 measured.appearance[index],
-                bool(measured.is_guided[index]),
+                "guided" if measured.is_guided[index] else calibration.field.named_by,
                 solution.residuals[row],
                 float(known.redundancy[row]),
                 float(solution.weights[row]),

@@ -10,6 +10,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.camera_tone import CameraTone
+from kgcp.measurement.discs.code_rings import read_codes
 from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
@@ -20,7 +21,9 @@ from kgcp.measurement.discs.records import (
     ellipse_of_moments,
 )
 from kgcp.targets.fields.layout import Field
-from kgcp.targets.fields.naming import NamingProblem, SeenDiscs, name_discs
+from kgcp.targets.fields.naming import Naming, NamingProblem, SeenDiscs, name_discs
+from kgcp.targets.fields.point_naming import name_by_codes, name_by_places
+from kgcp.targets.fields.points import AnyField
 
 _LEAST_DISCS = 6
 _LEAST_WIDTH = 0.01  # of their length, of discs that are not in one row
@@ -59,7 +62,7 @@ class PhotoMiss:
 class PhotoTask:
     """What a worker needs to know to measure any photograph."""
 
-    field: Field
+    field: AnyField
     response: Response
     operator: Operator
     camera: CameraTone | None = None  # what all photographs share; None: each says it for itself
@@ -90,7 +93,7 @@ def measure_field(
         if outline.polarity.value == task.field.polarity.value and not outline.is_hole
     ]
     candidates = [outlines[index] for index in own]
-    naming = name_discs(_seen(candidates), task.field)
+    naming = _named(grey, candidates, task.field)
     if isinstance(naming, NamingProblem):
         detail = f"{len(own)} outlines like the field's discs"
         return PhotoMiss(photo, width, height, naming.value, detail)
@@ -129,6 +132,14 @@ def measure_field(
         *_values(discs),
         np.zeros(len(discs)),
     )
+
+
+def _named(grey: GreyArray, outlines: list[DiscOutline], field: AnyField) -> Naming | NamingProblem:
+    if isinstance(field, Field):
+        return name_discs(_seen(outlines), field)
+    if field.code is not None:
+        return name_by_codes(read_codes(grey, outlines, field.code), field, field.code)
+    return name_by_places(_seen(outlines), field)
 
 
 def _are_in_one_row(points_m: FloatArray) -> bool:

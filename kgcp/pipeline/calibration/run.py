@@ -43,7 +43,7 @@ from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 _LEARNED_FROM = 5  # photographs, what the camera does to grey values
@@ -101,7 +101,7 @@ class CalibrationOptions:
 class PhotoCalibration:
     """A calibrated camera, and what became of every photograph."""
 
-    field: Field
+    field: AnyField
     options: CalibrationOptions
     calibration: CameraCalibration
     discs: Mapping[str, PhotoDiscs]  # of the photographs that took part
@@ -143,7 +143,7 @@ def _in_reading_order(name: str) -> list[tuple[int, str]]:
 @single_threaded()
 def calibrate_photos(
     photos: Sequence[Photo],
-    field: Field,
+    field: AnyField,
     out: Path,
     options: CalibrationOptions,
     listener: ProgressListener,
@@ -362,7 +362,7 @@ def _second_pass(
 
 def _outcome(
     photos: Sequence[Photo],
-    field: Field,
+    field: AnyField,
     options: CalibrationOptions,
     results: Sequence[PhotoDiscs | PhotoMiss],
     calibration: CameraCalibration,

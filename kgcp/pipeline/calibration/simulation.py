@@ -21,7 +21,7 @@ from kgcp.simulation.effects import effect_options
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.presets import SimulationSettings
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
 PHOTOGRAPHS = 14
 """Of a session, unless something else is said."""
@@ -40,7 +40,7 @@ class FieldSimulation:
 
     Attributes
     ----------
-    field : Field
+    field : Field or PointField
         As it is meant to be; every disc is printed off by `flat_sd_m`, at random.
     settings : SimulationSettings
         Camera, exposure, blur and what the camera does to grey values are those of a flight;
@@ -55,7 +55,7 @@ class FieldSimulation:
         one after the other.
     """
 
-    field: Field
+    field: AnyField
     settings: SimulationSettings
     seed: int
 

@@ -16,8 +16,8 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.settings import require_range
 
-_LEAST_POINTS = 6  # fewer determine no pose with something to check it
-_MOST_POINTS = 5000
+LEAST_POINTS, MOST_POINTS = 6, 5000
+"""Of a field: fewer determine no pose with something to check it."""
 
 
 class GridKind(StrEnum):
@@ -121,13 +121,13 @@ class Field:
         require_range("diameter_m", self.diameter_m, 0.0, 100.0, unit="m", open_low=True)
         for key, count in (("columns", self.columns), ("rows", self.rows)):
             require_range(key, count, 2, 1000)
-        _require_hole("inner_diameter_m", self.inner_diameter_m, self.diameter_m)
+        require_hole("inner_diameter_m", self.inner_diameter_m, self.diameter_m)
         for sd in self.flat_sd_m:
             require_range("flat_sd_m", sd, 0.0, 1.0, unit="m", open_low=True)
-        if not _LEAST_POINTS <= self.columns * self.rows <= 2 * _MOST_POINTS:
+        if not LEAST_POINTS <= self.columns * self.rows <= 2 * MOST_POINTS:
             raise SettingError(
                 "columns",
-                f"{self.columns} x {self.rows} is no field of {_LEAST_POINTS} to {_MOST_POINTS}"
+                f"{self.columns} x {self.rows} is no field of {LEAST_POINTS} to {MOST_POINTS}"
                 " discs",
                 "correct columns and rows",
             )
@@ -139,18 +139,9 @@ class Field:
                 f"discs of {1e3 * widest:g} mm overlap at {1e3 * self.neighbour_m:g} mm",
                 "give the distance of neighbouring centres, and diameters",
             )
-        if len(self.names()) < _LEAST_POINTS:
+        if len(self.names()) < LEAST_POINTS:
             raise SettingError("mark", "leaves fewer than 6 discs", "delete marks")
-        for bar in self.bars:
-            for key, name in (("from", bar.first), ("to", bar.second)):
-                if name not in self.names():
-                    raise SettingError(
-                        key, f"{name!r} is no disc of the field", "name it as r0c0: row and column"
-                    )
-            if bar.first == bar.second:
-                raise SettingError("to", "is where the bar begins", "name its other end")
-            require_range("length_m", bar.length_m, 0.0, 1000.0, unit="m", open_low=True)
-            require_range("sd_m", bar.sd_m, 0.0, 1.0, unit="m", open_low=True)
+        check_bars(self.bars, self.names())
 
     def _check_marks(self) -> None:
         places = {(mark.column, mark.row) for mark in self.marks}
@@ -166,7 +157,7 @@ class Field:
                 )
             if not mark.is_missing:
                 require_range("diameter_m", mark.diameter_m, 0.0, 100.0, unit="m", open_low=True)
-                _require_hole("inner_diameter_m", mark.inner_diameter_m, mark.diameter_m)
+                require_hole("inner_diameter_m", mark.inner_diameter_m, mark.diameter_m)
 
     def _places(self) -> list[tuple[int, int]]:
         """Return column and row of all places that the grid has, row by row."""
@@ -228,6 +219,24 @@ class Field:
         flat = self.nodes() @ self.basis_m().T
         return np.column_stack((flat, np.zeros(len(flat))))
 
+    def point_sds_m(self) -> FloatArray:
+        """Return how far they may be from there (m, 3): standard deviations [m]."""
+        return np.tile(self.flat_sd_m, (len(self.discs()), 1))
+
+    def normals(self) -> FloatArray:
+        """Return unit vectors (m, 3) square to the discs: the field's z axis."""
+        return np.tile([0.0, 0.0, 1.0], (len(self.discs()), 1))
+
+    @property
+    def named_by(self) -> str:
+        """What gives the discs of a photograph their names."""
+        return "lattice"
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether all discs lie in the plane z = 0."""
+        return True
+
     def radii_m(self) -> FloatArray:
         """Return the outer radii (m,) of the discs [m]."""
         return self._by_disc(self.diameter_m, {m: m.diameter_m for m in self.marks}) / 2.0
@@ -273,7 +282,24 @@ class Field:
         return np.array([special.get(place, usual) for place in self.discs()])
 
 
-def _require_hole(key: str, inner_m: float, outer_m: float) -> None:
+def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...]) -> None:
+    """Raise `SettingError` for bars that are not between two discs with these names."""
+    for bar in bars:
+        for key, name in (("from", bar.first), ("to", bar.second)):
+            if name not in names:
+                raise SettingError(
+                    key,
+                    f"{name!r} is no disc of the field",
+                    f"give the name of one, as {names[0]}",
+                )
+        if bar.first == bar.second:
+            raise SettingError("to", "is where the bar begins", "name its other end")
+        require_range("length_m", bar.length_m, 0.0, 1000.0, unit="m", open_low=True)
+        require_range("sd_m", bar.sd_m, 0.0, 1.0, unit="m", open_low=True)
+
+
+def require_hole(key: str, inner_m: float, outer_m: float) -> None:
+    """Raise `SettingError` unless a hole is inside its disc."""
     if not 0.0 <= inner_m < outer_m:
         raise SettingError(
             key, f"{inner_m:g} m is not inside a disc of {outer_m:g} m", "give a smaller diameter"

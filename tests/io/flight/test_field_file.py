@@ -12,6 +12,7 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.flight.field_file import field_toml, read_field
 from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
+from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
 
 BOOFCV = """\
 # Serialized boofcv.alg.fiducial.calib.ConfigCalibrationTarget
@@ -211,7 +212,7 @@ def test_wrong_shorthands(text: str, message: str) -> None:
         ("at = [2, 2]", "at = [2.5, 2]", "is not column and row"),
         ("at = [2, 2]", "at = [20, 2]", "is no disc of the grid"),
         ("diameter_m = 0.015\n", "", "diameter_m: is missing"),
-        ("[grid]", "[code]\nbits = 14\n[grid]", "code: is not a known key"),
+        ("[grid]", "[code]\nbits = 14\n[grid]", "code: is given beside a grid"),
     ],
 )
 def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -239,3 +240,109 @@ def test_wrong_field_toml(tmp_path: Path, old: str, new: str, message: str) -> N
 def test_damaged_boards_are_one_line(tmp_path: Path, text: str, old: str, new: str) -> None:
     with pytest.raises(KgcpError, match="board"):
         read_field(write(tmp_path, "board", text.replace(old, new, 1)), "mm")
+
+
+POINTS_TOML = """\
+name = "posts"
+diameter_m = 0.02
+flat_sd_m = [0.0001, 0.0001, 0.0002]
+[points]
+file = "field.csv"
+[code]
+kind = "ring"
+bits = 14
+ring = [2.1, 3.1]
+[[bar]]
+from = "B"
+to = "C"
+length_m = 0.1
+sd_m = 0.00001
+"""
+POINTS_CSV = """\
+name,x,y,z,sd_x,sd_y,sd_z,normal_x,normal_y,normal_z,code
+A,0,0,0,1e-5,1e-5,2e-5,0,0,1,3
+B,0.1,0,0,1e-5,1e-5,2e-5,0,0,1,5
+C,0.2,0,0.05,1e-5,1e-5,2e-5,0,0.6,0.8,7
+D,0,0.1,0,1e-5,1e-5,2e-5,0,0,1,-1
+E,0.1,0.1,0,1e-5,1e-5,2e-5,0,0,1,9
+F,0.2,0.1,0,1e-5,1e-5,2e-5,0,0,1,11
+"""
+
+
+def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
+    write(tmp_path, "field.csv", POINTS_CSV)
+    field = read_field(write(tmp_path, "field.toml", POINTS_TOML))
+    assert isinstance(field, PointField)
+    third, fourth = field.points[2:4]
+    assert third == FieldPoint(
+        *("C", (0.2, 0.0, 0.05), 0.02, 0.0, (0.0, 0.6, 0.8), (1e-5, 1e-5, 2e-5), 7)
+    )
+    assert fourth.code is None
+    assert field.code == CodeRing(14, 2.1, 3.1)
+    assert field.bars == (FieldBar("B", "C", 0.1, 0.00001),)
+    copy = write(tmp_path, "copy.toml", field_toml(field))
+    assert read_field(copy) == field
+
+
+@pytest.mark.parametrize(
+    ("toml", "rows", "message"),
+    [
+        (("[points]", "[grid]\n[points]"), ("", ""), "grid: is given beside points"),
+        (("diameter_m = 0.02\n", ""), ("", ""), "has no column diameter_m"),
+        (("ring = [2.1, 3.1]", "ring = [2.1]"), ("", ""), "has 1 numbers instead of 2"),
+        (("bits = 14", "bits = 60"), ("", ""), r"\[code\] bits: 60 is out of range"),
+        (("[code]", "[[code]]"), ("", ""), r"code: is a list; give a table \[code\]"),
+        (("field.csv", "no.csv"), ("", ""), "'no.csv' does not exist"),
+        (("", ""), ("sd_z,", "sd_w,"), "lacks sd_z; give all of sd_x, sd_y, sd_z"),
+        (("", ""), ("A,0,0,0", "A,0,0,much"), "line 2: z is 'much'"),
+        (("", ""), ("A,0", ",0"), "line 2: '' is no name"),
+        (("", ""), ("1,3\n", "1,3.5\n"), "line 2: code 3.5 is not a whole number"),
+        (("", ""), ("B,0.1", "A,0.1"), "A stands 2 times"),
+        (("", ""), ("0,1,5\n", "0,1,3\n"), "code: 3 stands 2 times"),
+    ],
+)
+def test_wrong_points_end_in_one_line(
+    tmp_path: Path, toml: tuple[str, str], rows: tuple[str, str], message: str
+) -> None:
+    write(tmp_path, "field.csv", POINTS_CSV.replace(*rows, 1))
+    with pytest.raises(KgcpError, match=message):
+        read_field(write(tmp_path, "field.toml", POINTS_TOML.replace(*toml, 1)))
+
+
+NXYZ = """\
+% name x y z sd
+1 0 0 0 0.01 0.01 0.02
+2 100 0 0 0.01 0.01 0.02
+3 200 0 50 0.01 0.01 0.02
+4\t0\t100\t0\t0.01\t0.01\t0.02
+5,100,100,0,0.01,0.01,0.02
+6;200;100;0;0;0;0
+"""
+
+
+@pytest.mark.parametrize("head", ["", "Name X Y Z\n"])
+def test_lists_of_points_do_not_say_their_unit(tmp_path: Path, head: str) -> None:
+    path = write(tmp_path, "points.txt", head + NXYZ)
+    with pytest.raises(KgcpError, match="does not say its unit") as caught:
+        read_field(path)
+    assert caught.value.option == "unit"
+    field = read_field(path, "mm")
+    assert isinstance(field, PointField)
+    assert field.points[2].position_m == pytest.approx((0.2, 0.0, 0.05))
+    assert field.points[2].sd_m == pytest.approx((1e-5, 1e-5, 2e-5))
+    assert field.points[5].sd_m is None
+    assert not field.is_diameter_stated
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("5,100,100,0", "5,100,100", "is not a field of targets of a known format"),
+        ("2 100 0 0", "2 0 0 0", "1 and 2 overlap"),
+        ("2 100 0 0", "1 100 0 0", "1 stands 2 times"),
+        ("2 100 0 0", "2 nan 0 0", "is not a field of targets of a known format"),
+    ],
+)
+def test_wrong_lists_end_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(KgcpError, match=message):
+        read_field(write(tmp_path, "points.txt", NXYZ.replace(old, new)), "mm")

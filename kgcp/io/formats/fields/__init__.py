@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.fields import boofcv, dice, ringgrid, ros_industrial
+from kgcp.io.formats.fields import boofcv, dice, nxyz, ringgrid, ros_industrial
 from kgcp.io.formats.registry import Registry
-from kgcp.targets.fields.layout import Field
+from kgcp.targets.fields.points import AnyField
 
-FORMATS: Registry[Callable[[ForeignFile, float | None], Field]] = Registry(
+FORMATS: Registry[Callable[[ForeignFile, float | None], AnyField]] = Registry(
     "a field of targets",
     "describe it in a field.toml",
     {
@@ -22,5 +22,6 @@ FORMATS: Registry[Callable[[ForeignFile, float | None], Field]] = Registry(
         "dice": (dice.matches, dice.field),
         "ringgrid": (ringgrid.matches, ringgrid.field),
         "ros_industrial": (ros_industrial.matches, ros_industrial.field),
+        "nxyz": (nxyz.matches, nxyz.field),
     },
 )

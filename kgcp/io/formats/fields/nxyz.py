@@ -1,0 +1,85 @@
+"""Lists of points as AICON, MicMac and others write them: name, x, y, z and perhaps deviations.
+
+White space, commas or semicolons separate them, and a line of words may stand first. Such a list
+says neither its unit nor how large the discs are.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from kgcp.errors import KgcpError
+from kgcp.io.files.safe_read import is_sound
+from kgcp.io.files.sniff import ForeignFile
+from kgcp.targets.fields.layout import LEAST_POINTS
+from kgcp.targets.fields.points import MOST_DISCS, FieldPoint, PointField, gaps_between
+
+_SEPARATORS = re.compile(r"[\s,;]+")
+_COMMENTS = ("#", "!", "%", "//")
+_DISC = 0.3  # of the distance of neighbours: what a diameter is taken for until it is measured
+_HEAD = 4096  # characters that tell the format
+_COUNTS = (4, 7)  # cells in a row: without and with deviations
+
+
+def matches(file: ForeignFile) -> bool:
+    """Whether the first lines are names with three or six numbers."""
+    lines = file.text[:_HEAD].splitlines()
+    whole = lines[:-1] if len(file.text) > _HEAD else lines
+    rows = list(_cells(enumerate(whole, 1)))
+    if rows and not _are_numbers(rows[0][1][1:]):
+        rows = rows[1:]  # names of columns
+    return len(rows) >= LEAST_POINTS and all(_is_point(cells) for _, cells in rows)
+
+
+def field(file: ForeignFile, unit_m: float | None) -> PointField:
+    """Return the points as a field."""
+    rows = list(_cells(enumerate(file.text.splitlines(), 1)))
+    if rows and not _are_numbers(rows[0][1][1:]):
+        rows = rows[1:]
+    if len(rows) > MOST_DISCS:
+        raise file.error(f"has {len(rows)} points", f"keep at most {MOST_DISCS}")
+    for line, cells in rows:
+        if not _is_point(cells):
+            raise file.error_at(f"line {line}", "is not name, x, y, z", "repair or delete it")
+    if unit_m is None:
+        raise KgcpError(
+            f"{file.path}: does not say its unit; say what its coordinates are in", option="unit"
+        )
+    if not rows:
+        raise file.error("has no points", "name a list of name, x, y, z")
+    values = unit_m * np.array([[float(cell) for cell in cells[1:4]] for _, cells in rows])
+    pitch_m = float(np.median(gaps_between(values).min(axis=1)))
+    if not 0.0 < pitch_m < math.inf:
+        raise file.error("has points at one place", "repair it")
+    points = []
+    for (_, cells), place in zip(rows, values.tolist(), strict=True):
+        sds = [unit_m * float(cell) for cell in cells[4:7]]
+        sd_m = (sds[0], sds[1], sds[2]) if sds and min(sds) > 0.0 else None
+        points.append(
+            FieldPoint(cells[0], (place[0], place[1], place[2]), _DISC * pitch_m, sd_m=sd_m)
+        )
+    return PointField(file.path.stem, tuple(points), is_diameter_stated=False)
+
+
+def _cells(lines: enumerate[str]) -> Iterator[tuple[int, list[str]]]:
+    """Yield the numbers and cells of lines that are neither blank nor comments."""
+    for number, line in lines:
+        text = line.strip()
+        if text and not text.startswith(_COMMENTS):
+            yield number, _SEPARATORS.split(text)
+
+
+def _is_point(cells: list[str]) -> bool:
+    is_named = cells[0] != "" and cells[0].isprintable()
+    return is_named and len(cells) in _COUNTS and _are_numbers(cells[1:])
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    try:
+        return bool(cells) and all(is_sound(float(cell)) for cell in cells)
+    except ValueError:
+        return False

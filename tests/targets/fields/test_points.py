@@ -1,0 +1,87 @@
+"""Fields of points: what can be one, and what cannot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kgcp.errors import SettingError
+from kgcp.targets.fields.layout import FieldBar
+from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField, gaps_between
+
+POINTS = tuple(
+    FieldPoint(f"p{i}", (0.05 * (i % 3), 0.04 * (i // 3), 0.01 * (i % 2)), 0.02) for i in range(6)
+)
+RING = CodeRing(10, 2.0, 3.0)
+
+
+def changed(**values: Any) -> tuple[FieldPoint, ...]:  # noqa: ANN401 - any field of a point
+    return (replace(POINTS[0], **values), *POINTS[1:])
+
+
+def test_a_field_knows_its_discs() -> None:
+    own = replace(POINTS[2], sd_m=(1e-6, 2e-6, 3e-6))
+    field = PointField("f", (*POINTS[:2], own, *POINTS[3:]), flat_sd_m=(1e-4, 1e-4, 2e-4))
+    assert field.names() == ("p0", "p1", "p2", "p3", "p4", "p5")
+    assert field.point_sds_m()[1:3].tolist() == [[1e-4, 1e-4, 2e-4], [1e-6, 2e-6, 3e-6]]
+    assert field.pitch_m == pytest.approx(np.hypot(0.04, 0.01))
+    assert field.with_diameters(1.5).radii_m() == pytest.approx([0.015] * 6)
+    assert gaps_between(field.points_m())[0, :2] == pytest.approx([np.inf, np.hypot(0.05, 0.01)])
+
+
+def test_codes_are_the_least_of_their_turns() -> None:
+    assert RING.canonical(0b1100000000) == 0b11
+    assert RING.canonical(0b1000000101) == 0b1011
+    coded = (replace(POINTS[0], code=0b1100000000), replace(POINTS[1], code=0b101), *POINTS[2:])
+    assert PointField("f", coded, code=RING).named_by == "code"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"points": POINTS[:5]}, "5 is no field of 6 to 2000 discs"),
+        ({"points": (*POINTS, POINTS[0])}, "p0 stands 2 times"),
+        ({"points": changed(diameter_m=0.09)}, "p0 and p3 overlap"),
+        ({"points": changed(diameter_m=0.0)}, "diameter_m of p0: 0 m is out of range"),
+        ({"points": changed(inner_diameter_m=0.02)}, "is not inside a disc"),
+        ({"points": changed(normal=(0.0, 0.0, 2.0))}, "normal of p0: is not of length 1"),
+        ({"points": changed(position_m=(0.0, 0.0, 1e9))}, "of p0 is out of range"),
+        ({"points": changed(sd_m=(0.0, 1e-4, 1e-4))}, "sd of p0"),
+        ({"points": changed(code=3)}, "is missing, and discs have codes"),
+        ({"points": changed(code=1023), "code": RING}, "1023 is not of 10 bits"),
+        (
+            {
+                "points": (
+                    replace(POINTS[0], code=6),
+                    *changed(code=3)[1:5],
+                    replace(POINTS[5], code=3),
+                ),
+                "code": RING,
+            },
+            "3 stands 2 times",
+        ),
+        (
+            {
+                "points": tuple(
+                    replace(p, position_m=(0.05 * i, 0.0, 0.0)) for i, p in enumerate(POINTS)
+                )
+            },
+            "lie in one row",
+        ),
+        ({"bars": (FieldBar("p0", "p9", 0.1, 1e-5),)}, "'p9' is no disc"),
+        ({"flat_sd_m": (0.0, 1e-4, 1e-4)}, "flat_sd_m"),
+    ],
+)
+def test_what_is_no_field(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        PointField(**{"name": "f", "points": POINTS, **values})
+
+
+@pytest.mark.parametrize("ring", [(5, 2.0, 3.0), (10, 1.1, 3.0), (10, 2.0, 2.1), (10, 2.0, 11.0)])
+def test_what_is_no_ring_of_codes(ring: tuple[int, float, float]) -> None:
+    bits, inner, outer = ring
+    with pytest.raises(SettingError):
+        CodeRing(bits, inner, outer)
