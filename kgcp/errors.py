@@ -109,7 +109,7 @@ class Reason(StrEnum):
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
-        "no dark ring with dots between bright disc and plate, other targets' apart",
+        "nothing like the target, other targets' rings apart",
         "none needed if the target is not in the frame; else see the contact sheet",
     )
     CODE_MISMATCH = (
@@ -123,6 +123,30 @@ class Reason(StrEnum):
         Status.NOT_FOUND,
         "other frames or the reference poses predict the target outside the frame",
         "none needed",
+    )
+    NO_PREDICTION = (
+        "no_prediction",
+        Status.NOT_FOUND,
+        "where a plain target must be is not known of this frame, or not well enough",
+        "give [reference] poses of the frames, for example those of kgcp orient",
+    )
+    UNLIKE_PREDICTION = (
+        "unlike_prediction",
+        Status.NOT_FOUND,
+        "what is where a plain target must be has another place, size or shape",
+        "none needed if it is hidden; else correct its diameter, position or normal",
+    )
+    AMBIGUOUS_PLACE = (
+        "ambiguous_place",
+        Status.REJECTED,
+        "two things like a plain target are where it must be",
+        "give better poses, or keep the ground clear",
+    )
+    CROWDED = (
+        "crowded",
+        Status.REJECTED,
+        "too little even ground around a plain target, or between its circles",
+        "give it a wider border, or fly lower",
     )
     CUT = (
         "cut",

@@ -14,7 +14,7 @@ from kgcp.cli import COMMANDS, main
 from kgcp.errors import Reason
 from kgcp.io.flight.camera_table import CAMERA_KEYS
 from kgcp.io.flight.flight import FRAMES_KEYS, REFERENCE_KEYS
-from kgcp.io.flight.target_table import PLATE_KEYS, REPLICA_KEYS
+from kgcp.io.flight.target_table import PLAIN_KEYS, PLATE_KEYS, REPLICA_KEYS
 from kgcp.io.flight.vehicle_table import VEHICLE_KEYS
 from kgcp.io.formats import calibrations, frame_times, orientations, trajectories
 from kgcp.io.tables.columns import Column
@@ -85,7 +85,10 @@ def test_every_cause_of_a_doubt_is_documented_in_its_own_words() -> None:
 @pytest.mark.parametrize(
     "key",
     sorted(
-        {*FRAMES_KEYS, *CAMERA_KEYS, *PLATE_KEYS, *REPLICA_KEYS, *VEHICLE_KEYS, *REFERENCE_KEYS}
+        {
+            *(*FRAMES_KEYS, *CAMERA_KEYS, *PLATE_KEYS, *PLAIN_KEYS, *REPLICA_KEYS),
+            *(*VEHICLE_KEYS, *REFERENCE_KEYS),
+        }
     ),
 )
 def test_every_key_of_flight_toml_is_documented(key: str) -> None:

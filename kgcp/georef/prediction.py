@@ -18,7 +18,7 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Measurement
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 _MIN_FOUND = 4  # frames that the reference is compared with, at least
 _MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
@@ -135,7 +135,7 @@ def _between(
 def reference_states(
     frames: Sequence[str],
     time_s: Sequence[float | None],
-    target: Target,
+    target: AnyTarget,
     poses: ReferencePoses,
     target_positions: TargetPositions,
     camera: Camera,
@@ -158,7 +158,7 @@ def reference_states(
         if isinstance(position, TargetPosition):
             row = rows[frames[index]]
             sight = position.position_m - orientations.centre_m[row]
-            radius_px = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
+            radius_px = 0.5 * target.outer_diameter_m * camera.mean_focal_px
             states[index, :2] = visible_pixel(camera, sight @ orientations.enu_from_camera[row])
             states[index, 2] = np.log(radius_px / np.linalg.norm(sight))
     return states

@@ -8,6 +8,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 
+_NO_HEADING_RAD2 = 1.0  # variance from which on an angle is not known
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
@@ -31,6 +33,14 @@ class Sighting:
     ambiguity: float | None = None  # Δχ² by which the circle's other pose is worse
     # (6, 6): share of calibration and diameter, not in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether it is known how the target is turned in its plane: a plain disc has no mark."""
+        if self.pose is None or self.pose_cov is None:
+            return False
+        normal = self.pose.normal
+        return bool(normal @ self.pose_cov[3:, 3:] @ normal < _NO_HEADING_RAD2)
 
     def row_time_s(self, camera: Camera) -> float | None:
         """Return when the centre's row was exposed, Unix UTC [s].

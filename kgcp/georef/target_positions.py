@@ -17,7 +17,7 @@ from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +132,7 @@ class TargetPositions:
     def of(
         cls,
         crs: str,
-        targets: Sequence[Target],
+        targets: Sequence[AnyTarget],
         trajectory: Trajectory | None,
         settings: VehicleSettings,
     ) -> Self:
@@ -236,7 +236,7 @@ def _utc(unix_s: float) -> str:
 
 
 def _static_positions(
-    targets: Sequence[Target], local_frame: LocalFrame
+    targets: Sequence[AnyTarget], local_frame: LocalFrame
 ) -> dict[str, TargetPosition]:
     positions = {}
     for target in targets:

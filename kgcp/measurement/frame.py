@@ -71,6 +71,8 @@ def examine(
     measured : sequence of Measurement
         Targets of this frame that are already measured.
     """
+    if not targets:
+        return Examination((), ())
     search = paper_outlines if settings.method is Method.PAPER else find_rings
     rings = (ring for target in targets for ring in target.rings)
     candidates = find_dotted(grey, search(grey, settings), rings)

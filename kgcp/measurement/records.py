@@ -183,7 +183,7 @@ class Measurement:
     instance : int
         0, 1, … in order of score among plates of the same code in the frame.
     score : float
-        Normalised cross-correlation of the code.
+        Normalised cross-correlation of the code; NaN of a target without one.
     pose : Pose
         Target → camera.
     centre_px : (2,) array

@@ -17,13 +17,14 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import CommonUncertainty
 from kgcp.targets.layout import Ring
+from kgcp.targets.plain import AnyTarget
 
 _POINTS = 24
 _ALONG_EDGE = 0.05  # weight of residuals along the circle's edge, against 1 across it
 
 
 def common_uncertainty(
-    camera: Camera, calibration: CalibrationCovariance | None, ring: Ring, pose: Pose
+    camera: Camera, calibration: CalibrationCovariance | None, ring: Ring | AnyTarget, pose: Pose
 ) -> CommonUncertainty | None:
     """Propagate calibration and diameter to a measured pose, to first order.
 
@@ -35,8 +36,8 @@ def common_uncertainty(
     ----------
     calibration : CalibrationCovariance or None
         None if it is unknown.
-    ring : Ring
-        The target's main ring.
+    ring : Ring, Target or PlainTarget
+        The target, or its main ring.
     pose : Pose
         As measured.
 

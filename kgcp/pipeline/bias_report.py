@@ -61,7 +61,8 @@ from kgcp.report.bias.verdict import Verdict, assess
 from kgcp.report.ring_picture import RingView, draw_closeup
 from kgcp.report.style import Picture
 from kgcp.settings import DetectSettings
-from kgcp.targets.layout import Ring
+from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 REEXPOSED_FRAMES = 12
 
@@ -232,7 +233,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
             data.reference_poses,
             data.target_positions,
             flight.camera,
-            flight.targets,
+            flight.all_targets,
             settings.method,
         )
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
@@ -271,7 +272,7 @@ def _look(
     """Draw close-ups of some rows and measure some again, where their frames exist."""
     closeups = {}
     reexposed: list[Reexposed] = []
-    targets = {target.name: target for target in flight.targets}
+    targets = {target.name: target for target in flight.all_targets}
     for row in dict.fromkeys([*shown, *again]):
         sighting = numbers.compared[row].attempt.sighting
         if sighting is None:
@@ -283,9 +284,9 @@ def _look(
             continue  # the page says of which frames there is no close-up
         target, radius = targets[sighting.target], float(numbers.data.radius_px[row])
         if row in shown and sighting.pose is not None:
-            view = _view(flight.camera, target.ring, sighting.pose, sighting.centre_px)
+            view = _view(flight.camera, target, sighting.pose, sighting.centre_px)
             closeups[row] = draw_closeup(grey, view)
-        if row in again:
+        if row in again and isinstance(target, Target):
             with defer_interrupts():
                 reexposed += measure_again(
                     grey, flight.camera, target, settings, sighting.centre_px, radius, row
@@ -293,9 +294,9 @@ def _look(
     return closeups, reexposed
 
 
-def _view(camera: Camera, ring: Ring, pose: Pose, centre_px: FloatArray) -> RingView:
-    """Return a ring with both circles and the centre by its pose."""
-    diameters_m = (ring.outer_diameter_m, ring.inner_diameter_m)
+def _view(camera: Camera, target: AnyTarget, pose: Pose, centre_px: FloatArray) -> RingView:
+    """Return a target with its circles and the centre by its pose."""
+    diameters_m = target.diameters_m
     circles = [contour_px(camera, pose, 0.5 * diameter_m) for diameter_m in diameters_m]
     radius_px = 0.5 * float(np.ptp(circles[0], axis=0).max())
     centre = camera.project(pose.transform(np.zeros((1, 3))))

@@ -158,6 +158,9 @@ def _targets_text(flight: Flight) -> str:
         if flight.vehicle is None and target.position_m is None:
             where = "not placed"
         parts.append(f"{target.name} {ring.outer_diameter_m:g} m, dots {dots}°{inside} ({where})")
+    for plain in flight.plain_targets:
+        across = ", ".join(f"{diameter_m:g}" for diameter_m in plain.diameters_m)
+        parts.append(f"{plain.name} {across} m, {plain.polarity} {plain.shape} (static)")
     return "; ".join(parts)
 
 
@@ -233,8 +236,8 @@ def _reference_text(inputs: FlightInputs) -> str:
 
 def _expected_text(inputs: FlightInputs) -> str:
     """Return distances and radii: by the reference, or at a typical distance."""
-    camera, target = inputs.flight.camera, inputs.flight.targets[0]
-    scale = 0.5 * target.ring.outer_diameter_m * camera.mean_focal_px
+    camera, target = inputs.flight.camera, inputs.flight.all_targets[0]
+    scale = 0.5 * target.outer_diameter_m * camera.mean_focal_px
     if inputs.expected_radii_px is None:
         least = DetectSettings().min_radius_px
         return (

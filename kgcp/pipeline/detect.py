@@ -23,7 +23,7 @@ from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_priors import priors_of_frames
+from kgcp.pipeline.frame_priors import plain_of_frames, priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.pipeline.guidance import predict_missing, with_predictions
 from kgcp.pipeline.overlay import draw_overlay
@@ -138,8 +138,10 @@ def detect_flight(
         times = data.frame_times.time_s
         priors = priors_of_frames(flight, data, frames)
         inputs = [
-            FrameInput(frame, times.get(frame), known, flight.may_use_exif_times)
-            for frame, known in zip(frames, priors, strict=True)
+            FrameInput(frame, times.get(frame), known, flight.may_use_exif_times, plain)
+            for frame, known, plain in zip(
+                frames, priors, plain_of_frames(flight, data, frames), strict=True
+            )
         ]
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     job = DetectionJob(
@@ -149,6 +151,7 @@ def detect_flight(
         flight.targets,
         settings,
         keeps_dropped=options.overlay is not None and options.all_candidates,
+        plain_targets=flight.plain_targets,
     )
     table = out / DETECTIONS
     builder = SummaryBuilder(_without(times, set(all_frames).difference(frames)))
@@ -249,7 +252,7 @@ def _making(job: DetectionJob) -> dict[str, str]:
         "the version of kgcp or of a library": to_text(versions()),
         "the settings": to_text(job.settings),
         "the camera": fingerprint(job.camera, job.calibration_covariance),
-        "the targets": fingerprint(job.targets),
+        "the targets": fingerprint(job.all_targets),
         "what is shown of dropped rings": to_text(job.keeps_dropped),
     }
 

@@ -135,7 +135,7 @@ class DetectionRun:
             _key(frame_input, stamp) for frame_input, stamp in zip(inputs, stamps, strict=True)
         ]
         self._stage, self._done, self._total = "", 0, 0
-        self.tracks = FrameTracks(job.targets, [frame_input.frame for frame_input in inputs])
+        self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
         self.learnt: LearntImaging | None = None
         self._preferences: Mapping[Place, float] = {}
@@ -316,7 +316,12 @@ class DetectionRun:
 
 def _key(frame_input: FrameInput, file: tuple[int, int] | None) -> str:
     name = fingerprint(frame_input.frame)[:16]
-    known = (frame_input.time_s, frame_input.may_use_exif_time, frame_input.priors)
+    known = (
+        frame_input.time_s,
+        frame_input.may_use_exif_time,
+        frame_input.priors,
+        frame_input.plain,
+    )
     return f"first-{name}-{fingerprint(file, *known)[:16]}"
 
 

@@ -145,7 +145,7 @@ class FlightInputs:
     @cached_property
     def target_positions(self) -> TargetPositions | None:
         """Where the targets were; None: not known."""
-        is_placed = any(map(self.data.has_position_of, self.flight.targets))
+        is_placed = any(map(self.data.has_position_of, self.flight.all_targets))
         if not is_placed or (self.data.has_trajectory and self.trajectory is None):
             return None
         return self._read(lambda: self.data.target_positions)
@@ -179,7 +179,7 @@ class FlightInputs:
             states = reference_states(
                 self.frames,
                 [self.times_s.get(frame) for frame in self.frames],
-                self.flight.targets[0],
+                self.flight.all_targets[0],
                 poses,
                 positions,
                 camera,
@@ -198,7 +198,7 @@ class FlightInputs:
         flight = self.flight
         found = [
             *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
-            *check_targets(flight.targets),
+            *check_targets(flight.all_targets),
             *check_frames(self.headers, flight.camera),
             *self._doubts_of_places(),
             *self._doubts_of_times(),
@@ -231,7 +231,7 @@ class FlightInputs:
             places.append((self.trajectory.position_map, "the trajectory"))
         places += [
             (np.array([target.position_m]), f"the static target {target.name!r}")
-            for target in self.flight.targets
+            for target in self.flight.all_targets
             if target.position_m is not None
         ]
         if self.reference_poses is not None and len(self.reference_poses.frames):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,8 @@ from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import StoredFolder, at_hand
 from kgcp.measurement.frame import examine, miss_of
 from kgcp.measurement.guided import Prediction, look_again
+from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import (
     Considered,
@@ -35,6 +37,7 @@ from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 _MOST_DROPPED = 24  # rings per frame that are kept to be shown: a texture may have hundreds
 
@@ -50,6 +53,12 @@ class DetectionJob:
     settings: DetectSettings
     # whether the results name the rings that were compared with a target's and dropped
     keeps_dropped: bool = False
+    plain_targets: tuple[PlainTarget, ...] = ()
+
+    @property
+    def all_targets(self) -> tuple[AnyTarget, ...]:
+        """Those with a code, then those without: the order of a frame's outcomes."""
+        return (*self.targets, *self.plain_targets)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +70,8 @@ class FrameInput:
     time_s: float | None
     priors: Mapping[str, PlatePrior]  # what is known of its targets, by their names
     may_use_exif_time: bool = True  # whether EXIF gives the time if the times file does not
+    # where plain targets must be, by their names
+    plain: Mapping[str, PlainPrediction] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +96,13 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
-        outcomes = tuple(completed(job, one) for one in examination.outcomes)
+        plain = _look_for_plain(grey, job, frame_input, examination.outcomes)
+        outcomes = tuple(completed(job, one) for one in (*examination.outcomes, *plain))
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
         outcomes = tuple(
-            Miss(target.name, rejection.reason, rejection.detail) for target in job.targets
+            Miss(target.name, rejection.reason, rejection.detail) for target in job.all_targets
         )
     time_s, time_source = frame_input.time_s, TimeSource.TIMES_FILE
     if time_s is None and frame_input.may_use_exif_time:
@@ -107,6 +119,16 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         exif.time_s,
         dropped,
         TimeSource.NONE if time_s is None else time_source,
+    )
+
+
+def _look_for_plain(
+    grey: GreyArray, job: DetectionJob, frame_input: FrameInput, outcomes: Sequence[Outcome]
+) -> tuple[Outcome, ...]:
+    measured = [one for one in outcomes if isinstance(one, Measurement)]
+    return tuple(
+        look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
+        for target in job.plain_targets
     )
 
 
@@ -163,7 +185,7 @@ def shows_negative(job: DetectionJob, frame_input: FrameInput) -> bool:
 
 def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> FrameResult:
     """Return the result of a frame that cannot be examined without the end of the process."""
-    outcomes = tuple(Miss(target.name, reason) for target in job.targets)
+    outcomes = tuple(Miss(target.name, reason) for target in job.all_targets)
     is_known = job.camera.time_reference is TimeReference.MIDDLE
     time_s = frame_input.time_s if is_known else None
     time_source = TimeSource.NONE if time_s is None else TimeSource.TIMES_FILE
@@ -207,7 +229,8 @@ def _merged(
     for name in first.keys() & found.keys():
         instead[name] = completed(job, found[name])
     return tuple(
-        instead[one.target] if isinstance(one, Miss) else one for one in guided_input.first.outcomes
+        instead.get(one.target, one) if isinstance(one, Miss) else one
+        for one in guided_input.first.outcomes
     )
 
 
@@ -239,13 +262,13 @@ def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
     """Return an outcome with what follows from its pose: common uncertainty and eccentricity."""
     if isinstance(outcome, Miss):
         return outcome
-    ring = next(target.ring for target in job.targets if target.name == outcome.target)
-    common = common_uncertainty(job.camera, job.calibration_covariance, ring, outcome.pose)
+    target = next(target for target in job.all_targets if target.name == outcome.target)
+    common = common_uncertainty(job.camera, job.calibration_covariance, target, outcome.pose)
     pose = outcome.pose
     circle = Circles3D(
         pose.translation_m[None],
         pose.rotation[None, :, :2],
-        np.array([0.5 * ring.outer_diameter_m]),
+        np.array([0.5 * target.outer_diameter_m]),
     )
     off = eccentricity(job.camera, circle).total_px[0]
     return replace(outcome, common=common, eccentricity_px=off)

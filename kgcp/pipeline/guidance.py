@@ -15,7 +15,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 # What a ring that is not the target's may be dropped for.
 _NO_TARGET = {
@@ -39,7 +39,7 @@ class FrameTracks:
         Frames in which any target was measured.
     """
 
-    def __init__(self, targets: Sequence[Target], frames: Sequence[str]) -> None:
+    def __init__(self, targets: Sequence[AnyTarget], frames: Sequence[str]) -> None:
         self.frames = frames
         self.time_s = np.full(len(frames), math.nan)
         self.states = {target.name: np.full((len(frames), 3), math.nan) for target in targets}

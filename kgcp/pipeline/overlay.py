@@ -17,6 +17,7 @@ from kgcp.io.images.frames import read_grey
 from kgcp.io.images.remote import at_hand
 from kgcp.measurement.adjustment.residual_image import contours_px, residual_image_of
 from kgcp.measurement.guided import Prediction
+from kgcp.measurement.image_model.window import contour_px
 from kgcp.measurement.records import Considered, FrameResult, Measurement, Miss, Outcome
 from kgcp.measurement.search.template_match import match_templates, polar_patch
 from kgcp.pipeline.detection_run import DetectionRun
@@ -27,6 +28,7 @@ from kgcp.quality.number_text import minus
 from kgcp.report.contact_sheet import DROPPED, Card, ContactSheet
 from kgcp.report.ring_picture import Pictures, RingView, draw_ring
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import PlainTarget
 
 _LOSSES = {
     TaskFailure.CRASHED: "the process that drew it ended twice",
@@ -153,7 +155,9 @@ def _lost(result: FrameResult, why: str) -> list[Sketch]:
 
 
 def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Considered) -> Sketch:
-    target = next(target for target in job.targets if target.name == ring.target)
+    target = next(target for target in job.all_targets if target.name == ring.target)
+    if isinstance(target, PlainTarget):
+        return _plain_sketch(job, grey, frame, target, ring)
     if not isinstance(ring, Measurement):
         pictures = None
         if ring.outline is not None:
@@ -171,6 +175,20 @@ def _sketch(job: DetectionJob, grey: GreyArray, frame: str, ring: Outcome | Cons
     if residual_image is not None and residual_image.white is not None:
         note = f"uneven light: white from {np.nanmin(residual_image.white):.0%} of its largest"
     return Sketch(_card(frame, ring, share, note), draw_ring(grey, view))
+
+
+def _plain_sketch(
+    job: DetectionJob,
+    grey: GreyArray,
+    frame: str,
+    target: PlainTarget,
+    ring: Outcome | Considered,
+) -> Sketch:
+    if not isinstance(ring, Measurement):
+        return Sketch(_card(frame, ring))
+    curves = tuple(contour_px(job.camera, ring.pose, radius_m) for radius_m in target.radii_m)
+    view = RingView(ring.centre_px, ring.appearance.radius_px, curves)
+    return Sketch(_card(frame, ring), draw_ring(grey, view))
 
 
 def _dropped_view(grey: GreyArray, outline: Ellipse, target: Target) -> RingView:
@@ -257,7 +275,8 @@ def _values(observation: Measurement, residual_percent: float | None) -> list[st
         texts.append(f"edge shift {minus(f'{appearance.edge_shift_px:.2f}')} px")
     texts.append(f"levels {appearance.black:.2f} … {appearance.white:.2f}")
     texts.append(f"clipped {100.0 * appearance.saturated:.0f}\xa0%")
-    texts.append(f"score {observation.score:.2f}")
+    if math.isfinite(observation.score):
+        texts.append(f"score {observation.score:.2f}")
     if residual_percent is not None:
         texts.append(f"residuals {residual_percent:.1f}\xa0%")
     return texts

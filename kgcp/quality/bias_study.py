@@ -17,7 +17,7 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
 from kgcp.georef.sighting import Attempt
 from kgcp.georef.target_positions import NoPosition, TargetPosition, TargetPositions
 from kgcp.settings import Method
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def study_bias(
     poses: ReferencePoses,
     target_positions: TargetPositions,
     camera: Camera,
-    targets: Sequence[Target],
+    targets: Sequence[AnyTarget],
     method: Method,
 ) -> BiasStudy:
     """Compare every attempt with the reference.
@@ -166,7 +166,7 @@ def study_bias(
     ]
     positions = target_positions.positions([attempt.target for attempt in posed], times)
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
-    diameters = {target.name: target.ring.outer_diameter_m for target in targets}
+    diameters = {target.name: target.outer_diameter_m for target in targets}
     placed = [
         (attempt, position, rows[attempt.frame])
         for attempt, position in zip(posed, positions, strict=True)

@@ -15,6 +15,7 @@ from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 _SUB_PIXELS_ACROSS = 1000  # of a window: memory and time are bounded, small targets get most
 
@@ -41,6 +42,53 @@ class PrintedPlate:
             yield DiscRegion((float(x), float(y)), 0.5 * ring.dot_diameter_m), self.white
 
 
+@dataclass(frozen=True, slots=True)
+class PlainPlate:
+    """A plain target with its border, both of one radiance each.
+
+    Attributes
+    ----------
+    target : PlainTarget
+        Without a `border_m`, it lies on the ground as it is.
+    bright, dark : float
+        Radiances under the frame's light, 0…1.
+    """
+
+    target: PlainTarget
+    bright: float = 0.85
+    dark: float = 0.06
+
+    @property
+    def border_m(self) -> float:
+        """Width of the even ground around the target [m]; 0: none."""
+        return self.target.border_m or 0.0
+
+    @property
+    def outline(self) -> DiscRegion:
+        """What hides the ground."""
+        return DiscRegion((0.0, 0.0), self.target.radii_m[0] + self.border_m)
+
+    @property
+    def white(self) -> float:
+        """Radiance of the border, or of the target itself where it has none."""
+        return self._radiance(1) if self.border_m else self._radiance(0)
+
+    def print_layers(self) -> Iterator[tuple[Region, float]]:
+        """Yield what is on the plate, shapes and radiances, in painting order."""
+        for circle, radius_m in enumerate(self.target.radii_m):
+            if circle == 0 and not self.border_m:
+                continue  # it is the plate
+            yield DiscRegion((0.0, 0.0), radius_m), self._radiance(circle)
+
+    def _radiance(self, circle: int) -> float:
+        """Return the radiance within a circle, counted from the outside."""
+        is_bright = (self.target.polarity is PlainPolarity.BRIGHT) == (circle % 2 == 0)
+        return self.bright if is_bright else self.dark
+
+
+Plate = PrintedPlate | PlainPlate
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateImage:
     """Light of a plate in the pixels of a window."""
@@ -65,7 +113,7 @@ class PlateImage:
         piece += self.irradiance[inside]
 
 
-def plate_window(camera: Camera, plate: PrintedPlate, pose: Pose, optics: Optics) -> PixelWindow:
+def plate_window(camera: Camera, plate: Plate, pose: Pose, optics: Optics) -> PixelWindow:
     """Return the window that holds everything the plate sends light to."""
     corner, size = outline_box(camera, pose, plate.outline)
     margin = optics.reach_px
@@ -78,7 +126,7 @@ def plate_window(camera: Camera, plate: PrintedPlate, pose: Pose, optics: Optics
 
 def image_plate(
     camera: Camera,
-    plate: PrintedPlate,
+    plate: Plate,
     pose: Pose,
     optics: Optics,
     window: PixelWindow | None = None,

@@ -14,7 +14,7 @@ from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
-from kgcp.simulation.plate import PrintedPlate, image_plate, plate_window
+from kgcp.simulation.plate import PlainPlate, PrintedPlate, image_plate, plate_window
 from kgcp.simulation.regions import Annulus, ConvexPolygon, DiscRegion, Region, polygon, rectangle
 
 _CLUTTER_PIECES = 70
@@ -36,12 +36,22 @@ class PlatePose:
 
 
 @dataclass(frozen=True, slots=True)
+class PlainPose:
+    """A plain target in front of the camera; `pose` is target → camera."""
+
+    plate: PlainPlate
+    pose: Pose
+    field: PlateLight | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatedScene:
     """Everything that one frame may see."""
 
     ground: Pose  # ground plane (x east, y south, z down) → camera
     carrier: PlatePose | None  # a plate on its vehicle; None: there is no vehicle
     others: tuple[PlatePose, ...]  # plates without a vehicle
+    plain: tuple[PlainPose, ...] = ()  # discs and rings on the ground
 
 
 def render_irradiance(
@@ -59,7 +69,7 @@ def render_irradiance(
         _park_vehicle(patch, light, scene.ground, scene.carrier.pose)
     irradiance = optics.spread(light, 1)
     carried = () if scene.carrier is None else (scene.carrier,)
-    for placed in (*scene.others, *carried):
+    for placed in (*scene.plain, *scene.others, *carried):
         window = plate_window(camera, placed.plate, placed.pose, optics)
         if window.meets(camera):
             if window.exceeds(camera):

@@ -143,6 +143,21 @@ class Target:
         return self.ring.name
 
     @property
+    def diameters_m(self) -> tuple[float, float]:
+        """Of the edges of its main ring [m]."""
+        return self.ring.outer_diameter_m, self.ring.inner_diameter_m
+
+    @property
+    def outer_diameter_m(self) -> float:
+        """Outer diameter of its main ring [m]."""
+        return self.ring.outer_diameter_m
+
+    @property
+    def sd_outer_diameter_m(self) -> float:
+        """How well it is known [m]."""
+        return self.ring.sd_outer_diameter_m
+
+    @property
     def rings(self) -> tuple[Ring, ...]:
         """All rings, the main one first."""
         return (self.ring, *self.replicas)

@@ -14,7 +14,7 @@ from kgcp.io.formats.frame_times import FrameTimes, read_times
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.settings import VehicleSettings
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 
 class FlightData:
@@ -45,7 +45,7 @@ class FlightData:
         vehicle = self._flight.vehicle
         return vehicle is not None and vehicle.trajectory_file.exists()
 
-    def has_position_of(self, target: Target) -> bool:
+    def has_position_of(self, target: AnyTarget) -> bool:
         """Tell whether there is what a target's position is made from."""
         is_placed = target.position_m is not None or self.has_trajectory
         return self._flight.crs is not None and is_placed
@@ -95,7 +95,7 @@ class FlightData:
         """
         flight, crs = self._flight, self._crs
         settings = VehicleSettings() if flight.vehicle is None else flight.vehicle.settings
-        return TargetPositions.of(crs, flight.targets, self.trajectory, settings)
+        return TargetPositions.of(crs, flight.all_targets, self.trajectory, settings)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from kgcp.io.flight.camera_table import (
     read_camera,
     read_plumb_sd_deg,
 )
-from kgcp.io.flight.target_table import read_targets
+from kgcp.io.flight.target_table import read_plain_targets, read_targets
 from kgcp.io.flight.toml_file import read_toml
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.io.flight.vehicle_table import VehicleTable, read_vehicle
@@ -24,6 +25,7 @@ from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations.records import OrientationFileOptions
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 REFERENCE_KEYS = ("poses", "format", "crs", "offset")
 
@@ -63,7 +65,9 @@ class Flight:
         Standard deviation of the camera's optical axis against the vertical, about either
         horizontal axis, in frames without reference attitude [deg]; None: not known.
     targets : tuple of Target
-        In the order of the file.
+        With a code, in the order of the file.
+    plain_targets : tuple of PlainTarget
+        Without one, in the order of the file.
     """
 
     folder: Path
@@ -78,9 +82,15 @@ class Flight:
     is_camera_guessed: bool
     plumb_sd_deg: float | None
     targets: tuple[Target, ...]
+    plain_targets: tuple[PlainTarget, ...]
     vehicle: VehicleTable | None
     reference: Reference | None
     toml_text: str
+
+    @property
+    def all_targets(self) -> tuple[AnyTarget, ...]:
+        """Those with a code, then those without."""
+        return (*self.targets, *self.plain_targets)
 
 
 def read_flight(folder: Path | str) -> Flight:
@@ -101,6 +111,8 @@ def read_flight(folder: Path | str) -> Flight:
     )
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
+    targets = read_targets(table)
+    plain_targets = read_plain_targets(table, _names_of(targets))
     plumb_sd_deg = read_plumb_sd_deg(camera)
     if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
         raise camera.error("plumb_sd_deg", "needs [vehicle] level_sd_deg", "give both or none")
@@ -116,7 +128,8 @@ def read_flight(folder: Path | str) -> Flight:
         calibration_covariance=read_calibration_covariance(camera, folder),
         is_camera_guessed=camera.boolean("guessed", default=False),
         plumb_sd_deg=plumb_sd_deg,
-        targets=read_targets(table),
+        targets=targets,
+        plain_targets=plain_targets,
         vehicle=vehicle,
         reference=_read_reference(table, folder),
         toml_text=text,
@@ -162,6 +175,10 @@ def read_camera_and_targets(
         read_calibration_covariance(camera, folder),
         read_targets(table),
     )
+
+
+def _names_of(targets: Sequence[Target]) -> set[str]:
+    return {ring.name for target in targets for ring in target.rings}
 
 
 def _name_of(folder: Path) -> str:

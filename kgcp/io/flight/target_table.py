@@ -1,27 +1,33 @@
-"""The [[target]] tables of flight.toml: into plates with their rings, and back."""
+"""The [[target]] tables of flight.toml: into plates with their rings or plain targets, and back."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.toml_table import TomlTable
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import PlainPolarity, PlainTarget, Shape
 from kgcp.targets.validation import check_targets
 
 _DIAMETERS = ("outer_diameter_m", "inner_diameter_m", "code_diameter_m", "dot_diameter_m")
 PLATE_KEYS = (
-    *("name", *_DIAMETERS, "code_deg", "sd_outer_diameter_m"),
+    *("name", "shape", *_DIAMETERS, "code_deg", "sd_outer_diameter_m"),
     *("position_m", "sd_position_m"),
 )
+PLAIN_KEYS = (
+    *("name", "shape", "polarity", "diameter_m", "inner_diameter_m", "sd_diameter_m"),
+    *("position_m", "sd_position_m", "normal", "level_sd_deg", "border_m"),
+)
+_LEVEL = "level"
 _MOST_TARGETS = 200  # each is compared with every other
 REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
 
 
 def read_targets(flight: TomlTable) -> tuple[Target, ...]:
-    """Return the plates of a flight in the order of the file, each with its replicas.
+    """Return the coded plates of a flight in the order of the file, each with its replicas.
 
     Raises
     ------
@@ -32,7 +38,11 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
     written = flight.tables("target")
     if len(written) > _MOST_TARGETS:
         raise flight.error("target", f"has {len(written)} tables", f"give at most {_MOST_TARGETS}")
-    tables = [_target_table(flight, index, values) for index, values in enumerate(written, start=1)]
+    tables = [
+        _target_table(flight, index, values)
+        for index, values in enumerate(written, start=1)
+        if not _is_plain(values)
+    ]
     plates = [table for table in tables if "replica_of" not in table]
     replicas = [table for table in tables if "replica_of" in table]
     names = [table.name("name") for table in plates]
@@ -47,11 +57,91 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
     return targets
 
 
+def read_plain_targets(flight: TomlTable, taken: Collection[str]) -> tuple[PlainTarget, ...]:
+    """Return the targets without a code, in the order of the file.
+
+    Parameters
+    ----------
+    taken : collection of str
+        Names of other targets.
+
+    Raises
+    ------
+    KgcpError
+        Naming file, target, key and remedy: if a key or value is wrong, or a name is taken.
+    """
+    targets: list[PlainTarget] = []
+    for index, values in enumerate(flight.tables("target"), start=1):
+        if _is_plain(values):
+            table = _target_table(flight, index, values)
+            target = _read_plain(table)
+            if target.name in {*taken, *(each.name for each in targets)}:
+                problem = f"{target.name!r} is the name of two targets"
+                raise table.error("name", problem, "give each target a name of its own")
+            targets.append(target)
+    return tuple(targets)
+
+
+def _is_plain(values: Mapping[str, object]) -> bool:
+    return values.get("shape", Shape.CODED.value) != Shape.CODED.value
+
+
 def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -> TomlTable:
     """Return a [[target]] table, called by its name or, failing that, by its place."""
     name = values.get("name")
     where = f"{flight.where} [[target]] {name if isinstance(name, str) else index}"
-    return TomlTable(where, values, REPLICA_KEYS if "replica_of" in values else PLATE_KEYS)
+    keys = REPLICA_KEYS if "replica_of" in values else PLATE_KEYS
+    return TomlTable(where, values, PLAIN_KEYS if _is_plain(values) else keys)
+
+
+def _read_plain(table: TomlTable) -> PlainTarget:
+    is_ring = table.choice("shape", Shape) is Shape.RING
+    if is_ring != ("inner_diameter_m" in table):
+        problem, remedy = (
+            ("is missing", "give it, or call the target a disc")
+            if is_ring
+            else ("is of a disc", 'give shape = "ring", or delete it')
+        )
+        raise table.error("inner_diameter_m", problem, remedy)
+    if "position_m" not in table:
+        raise table.error(
+            "position_m", "is missing", "give it: without a code, a target is known by its place"
+        )
+    with table.located():
+        return PlainTarget(
+            name=table.name("name"),
+            diameters_m=(table.number("diameter_m"), *_inner_diameters_m(table)),
+            polarity=table.choice("polarity", PlainPolarity),
+            position_m=table.vector("position_m"),
+            sd_position_m=_read_sd_position_m(table),
+            sd_diameter_m=table.number("sd_diameter_m", 0.0),
+            normal_enu=_read_normal(table),
+            sd_normal_deg=table.number("level_sd_deg", PlainTarget.SD_NORMAL_DEG),
+            border_m=table.number("border_m") if "border_m" in table else None,
+        )
+
+
+def _inner_diameters_m(table: TomlTable) -> tuple[float, ...]:
+    """Return the diameters of a ring's further circles: one number, or a list of them."""
+    if "inner_diameter_m" not in table:
+        return ()
+    if isinstance(table.values["inner_diameter_m"], list):
+        return table.numbers("inner_diameter_m", "[0.4, 0.2]")
+    return (table.number("inner_diameter_m"),)
+
+
+def _read_normal(table: TomlTable) -> tuple[float, float, float]:
+    up = (0.0, 0.0, 1.0)
+    if table.values.get("normal", _LEVEL) == _LEVEL:
+        return up
+    return table.vector("normal", example='[east, north, up] or "level"')
+
+
+def _read_sd_position_m(table: TomlTable) -> tuple[float, float, float]:
+    sd_position_m = table.vector("sd_position_m", (0.0, 0.0, 0.0))
+    if min(sd_position_m) < 0.0:
+        raise table.error("sd_position_m", "is negative", "give standard deviations in metres")
+    return sd_position_m
 
 
 def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
@@ -64,14 +154,11 @@ def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
         )
     if "sd_position_m" in table and "position_m" not in table:
         raise table.error("sd_position_m", "needs position_m", "give both or none")
-    sd_position_m = table.vector("sd_position_m", (0.0, 0.0, 0.0))
-    if min(sd_position_m) < 0.0:
-        raise table.error("sd_position_m", "is negative", "give standard deviations in metres")
     return Target(
         ring=ring,
         replicas=tuple(_read_replicas(ring, replicas)),
         position_m=table.optional("position_m", table.vector),
-        sd_position_m=sd_position_m,
+        sd_position_m=_read_sd_position_m(table),
     )
 
 

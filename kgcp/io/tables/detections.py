@@ -97,6 +97,10 @@ def _alternative(get: Callable[[Alternative], object]) -> _Get:
     return _part(lambda seen: seen.alternative, get)
 
 
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
 def _eccentricity(seen: Measurement) -> FloatArray | None:
     return seen.eccentricity_px
 
@@ -150,7 +154,7 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
     Column("ecc_x_px", NUMBER, _part(_eccentricity, lambda off: float(off[0]))),
     Column("ecc_y_px", NUMBER, _part(_eccentricity, lambda off: float(off[1]))),
-    Column("score", NUMBER, lambda record: record[1].score),
+    Column("score", NUMBER, _outcome(lambda seen: _finite(seen.score), lambda miss: miss.score)),
     Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
     Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),
     Column("edge_shift_px", NUMBER, _measured(lambda seen: seen.appearance.edge_shift_px)),
@@ -211,7 +215,7 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     """
     table = read_detections(path)
     require_current(path, table, flight)
-    strange = sorted(set(table["target"]) - {target.name for target in flight.targets})
+    strange = sorted(set(table["target"]) - {target.name for target in flight.all_targets})
     if strange:
         raise KgcpError(
             f"{path}: has target {strange[0]!r}, which flight.toml does not;"

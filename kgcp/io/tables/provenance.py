@@ -38,6 +38,7 @@ from kgcp.measurement.records import TimeSource
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import PlainTarget
 
 TARGET_TABLE = "[[target]]"
 """What the keys of targets begin with, among those that detections depend on."""
@@ -45,6 +46,7 @@ TARGET_TABLE = "[[target]]"
 _SCALE_DIGITS = 12  # of a replica, which is kept as diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
+_OF_OTHER_USE = {"name", "position_m", "sd_position_m"}  # positions are read anew
 
 
 def detections_provenance(
@@ -108,7 +110,9 @@ def derived_provenance(
     vehicle, reference = flight.vehicle, flight.reference
     parts: dict[str, object] = {
         "detections": _digest_of_file(detections),
-        "targets": [(each.name, each.position_m, each.sd_position_m) for each in flight.targets],
+        "targets": [
+            (each.name, each.position_m, each.sd_position_m) for each in flight.all_targets
+        ],
         "camera": asdict(flight.camera),
         "crs": flight.crs,
         "choices": choices,
@@ -160,11 +164,21 @@ def detection_inputs(flight: Flight) -> dict[str, object]:
             values["[camera] cov"] = cov.ravel().tolist()
     values["[camera] plumb_sd_deg"] = flight.plumb_sd_deg
     values["[vehicle] level_sd_deg"] = None if vehicle is None else vehicle.settings.level_sd_deg
-    for target in flight.targets:
-        for ring in target.rings:
-            for key, value in _target_table(target, ring).items():
-                values[f"{TARGET_TABLE} {ring.name} {key}"] = value
+    tables = {
+        ring.name: _target_table(target, ring) for target in flight.targets for ring in target.rings
+    }
+    tables |= {target.name: _plain_table(target) for target in flight.plain_targets}
+    for name, table in tables.items():
+        values |= {f"{TARGET_TABLE} {name} {key}": value for key, value in table.items()}
     return values
+
+
+def _plain_table(target: PlainTarget) -> dict[str, object]:
+    return {
+        field.name: getattr(target, field.name)
+        for field in fields(PlainTarget)
+        if field.name not in _OF_OTHER_USE
+    }
 
 
 def _target_table(target: Target, ring: Ring) -> dict[str, object]:

@@ -104,13 +104,13 @@ def adjust_disc(
     for _ in range(_ROUNDS):
         window = cut_disc_window(task.grey, geometry, window_reach_px(blur))
         _check_inside(task.grey, geometry)
-        state = state or _start(window, geometry, blur, free, is_dark=task.is_dark)
-        limits = find_censoring(window.levels, window.levels_per_count)
-        if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
-            free = free.without_ink_slope()
         index, is_enough = choose_pixels(window, geometry, blur, task.others)
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
+        state = state or _start(window, index, geometry, blur, free, is_dark=task.is_dark)
+        limits = find_censoring(window.levels, window.levels_per_count)
+        if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
+            free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)
         foreign = _foreign(fit, window, index)
         if foreign is not None:
@@ -139,23 +139,30 @@ def _adjust_on(
 
 
 def _start(
-    window: DiscWindow, geometry: Geometry, blur: Blur, free: Unknowns, *, is_dark: bool
+    window: DiscWindow,
+    index: IndexArray,
+    geometry: Geometry,
+    blur: Blur,
+    free: Unknowns,
+    *,
+    is_dark: bool,
 ) -> DiscState:
     """Return levels from the middle of the disc and the ground around it.
+
+    From pixels that no other edge reaches: in the middle of a ring is its hole.
 
     Raises
     ------
     DiscRejection
         `NO_CONTRAST`.
     """
-    off_px = distances_px(window.places_px(np.arange(len(window.levels))), geometry)
+    off_px, levels = distances_px(window.places_px(index), geometry), window.levels[index]
     order = np.argsort(off_px)
     inmost = order[: max(3, int(np.count_nonzero(off_px < -2.0 * blur.mean_sd_px) // 2))]
     around = (off_px > 1.5 * blur.mean_sd_px) & (off_px < 1.5 * blur.mean_sd_px + 3.0)
-    inside, outside = (
-        float(np.median(window.levels[inmost])),
-        float(np.median(window.levels[around])),
-    )
+    if not around.any():
+        raise DiscRejection(DiscReason.CROWDED, "too little free ground")
+    inside, outside = float(np.median(levels[inmost])), float(np.median(levels[around]))
     dark, bright = (inside, outside) if is_dark else (outside, inside)
     if bright - dark < _LEAST_CONTRAST_COUNTS * window.levels_per_count:
         raise DiscRejection(DiscReason.NO_CONTRAST, f"levels {inside:.3f} and {outside:.3f}")

@@ -235,7 +235,7 @@ def _mean_attitude(attitudes: FloatArray) -> PlateAttitude:
 
 def _is_told_apart(sighting: Sighting) -> bool:
     is_clear = sighting.ambiguity is None or sighting.ambiguity >= MIN_MARGIN
-    return sighting.pose is not None and sighting.pose_cov is not None and is_clear
+    return sighting.has_heading and is_clear
 
 
 def _by_ring(

@@ -25,7 +25,7 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circles
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 _FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose
 _CODED_EDGE_SD_PX = 0.0  # displaced edges are an unknown of every measurement of a coded ring
@@ -157,7 +157,7 @@ class Placement:
 
 def place_targets(
     sightings: Sequence[Sighting],
-    targets: Sequence[Target],
+    targets: Sequence[AnyTarget],
     poses: ReferencePoses,
     local_frame: LocalFrame,
     camera: Camera,
@@ -172,7 +172,7 @@ def place_targets(
     ----------
     sightings : sequence of Sighting
         In the frames' order; second plates with the same code are passed over.
-    targets : sequence of Target
+    targets : sequence of Target or PlainTarget
         That stand still.
     poses : ReferencePoses
         With standard deviations, unless they are to count as exact.
@@ -202,7 +202,7 @@ def place_targets(
             camera,
             [pose for pose, _ in measured],
             [cov for _, cov in measured],
-            0.5 * target.ring.outer_diameter_m,
+            0.5 * target.outer_diameter_m,
         )
         usable.append(target)
         all_frames.append(tuple(each.frame for each in posed))
@@ -301,7 +301,7 @@ def _circles(poses: Sequence[Pose], radius_m: float) -> Circles3D:
 
 
 def _on_the_map(
-    target: Target,
+    target: AnyTarget,
     frames: tuple[str, ...],
     placed: PlacedCircle,
     common_cov: FloatArray,
@@ -342,7 +342,7 @@ def _turned(circle: SpaceCircle, enu_from_map: FloatArray) -> SpaceCircle:
 
 
 def _check(
-    target: Target,
+    target: AnyTarget,
     circle: SpaceCircle,
     cov: FloatArray,
     enu_from_map: FloatArray,
@@ -354,11 +354,11 @@ def _check(
         residual = enu_from_map.T @ (circle.centre_m - stated)
         stated_cov = covariance_along(np.eye(3), np.array(target.sd_position_m))
         residual_cov = cov[:3, :3] + stated_cov
-    diameter_m = target.ring.outer_diameter_m
+    diameter_m = target.outer_diameter_m
     return PlaceCheck(
         residual,
         residual_cov,
         diameter_m,
         2.0 * circle.radius_m - diameter_m,
-        math.hypot(2.0 * math.sqrt(cov[5, 5]), target.ring.sd_outer_diameter_m),
+        math.hypot(2.0 * math.sqrt(cov[5, 5]), target.sd_outer_diameter_m),
     )

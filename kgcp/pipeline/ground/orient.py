@@ -128,7 +128,7 @@ def orient_flight(
         If there is no static target, no crs, no frame of these names, or no frame can be oriented.
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
-    if not any(target.position_m is not None for target in flight.targets):
+    if not any(target.position_m is not None for target in flight.all_targets):
         raise KgcpError(
             f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"
             " that frames are to be oriented by"

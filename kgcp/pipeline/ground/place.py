@@ -42,7 +42,7 @@ from kgcp.quality.place_sentences import (
 )
 from kgcp.report.places.figures import draw_places
 from kgcp.report.places.page import PlacesPage, render_places
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 EXPORTS = "places"
 """Folder of the packages' files, below that of the results."""
@@ -234,8 +234,8 @@ def write_places(
     return tuple(written)
 
 
-def _targets(flight: Flight, names: Sequence[str]) -> list[Target]:
-    known = {target.name: target for target in flight.targets}
+def _targets(flight: Flight, names: Sequence[str]) -> list[AnyTarget]:
+    known = {target.name: target for target in flight.all_targets}
     unknown = [name for name in names if name not in known]
     if unknown:
         raise KgcpError(
@@ -244,7 +244,7 @@ def _targets(flight: Flight, names: Sequence[str]) -> list[Target]:
         )
     if names:
         return [known[name] for name in dict.fromkeys(names)]
-    static = [target for target in flight.targets if target.position_m is not None]
+    static = [target for target in flight.all_targets if target.position_m is not None]
     if not static:
         raise KgcpError(
             f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from kgcp.quality.checks.doubt import Cause, Doubt, grave
-from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 _LARGEST_M, _SMALLEST_M = 8.0, 0.02
 _UNITS = (("inches", 0.0254), ("feet", 0.3048), ("centimetres", 0.01), ("millimetres", 0.001))
 _USUAL_M = 0.15, 3.0
 
 
-def check_targets(targets: Sequence[Target]) -> tuple[Doubt, ...]:
+def check_targets(targets: Sequence[AnyTarget]) -> tuple[Doubt, ...]:
     """Tell diameters that are in other units than metres."""
     doubts = []
     for target in targets:
-        diameter = target.ring.outer_diameter_m
+        diameter = target.outer_diameter_m
         if _SMALLEST_M < diameter < _LARGEST_M:
             continue
         low, high = _USUAL_M

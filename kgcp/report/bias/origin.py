@@ -16,6 +16,7 @@ from kgcp.quality.consistency import Consistency
 from kgcp.quality.number_text import minus
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 _LONGEST = 80  # of a CRS in print
 _DIGITS = 8  # of a file's digest
@@ -31,12 +32,12 @@ class Fact:
 
 def headline(flight: Flight, outcomes: Outcomes | None) -> str:
     """Return one line that identifies the report: program, day, camera, target, CRS."""
-    camera, rings = flight.camera, [target.ring for target in flight.targets]
+    camera = flight.camera
     parts = [f"kgcp {__version__}"]
     if outcomes is not None and outcomes.first_s is not None:
         parts.append(f"flown {format_time(outcomes.first_s)[:10]}")
     parts.append(f"camera {camera.width} × {camera.height} px, f {camera.fx:.0f} px")
-    parts += [f"target {ring.name}, {ring.outer_diameter_m:g} m" for ring in rings]
+    parts += [f"target {each.name}, {each.outer_diameter_m:g} m" for each in flight.all_targets]
     if flight.crs is not None:
         parts.append(_short(flight.crs))
     return " · ".join(parts)
@@ -62,6 +63,7 @@ def facts(
         *_frames(outcomes),
         Fact("Camera", _camera(flight)),
         *(Fact("Target", _target(target)) for target in flight.targets),
+        *(Fact("Target", _plain(target)) for target in flight.plain_targets),
         Fact("CRS", "none" if flight.crs is None else _short(flight.crs)),
         Fact("Files", ", ".join(_files(flight, provenance))),
         Fact("Settings", _settings(settings)),
@@ -112,12 +114,22 @@ def _target(target: Target) -> str:
     ring = target.ring
     dots = ", ".join(f"{angle:g}" for angle in ring.code_deg)
     replicas = f"; with {', '.join(each.name for each in target.replicas)}" * bool(target.replicas)
-    sd = ring.sd_outer_diameter_m
-    known = f"{1000.0 * sd:g} mm" if sd else "not stated"
     return (
         f"{target.name}: {ring.outer_diameter_m:g} m across, inner circle"
-        f" {ring.inner_diameter_m:g} m, dots at {dots}°{replicas}; accuracy of the print {known}"
+        f" {ring.inner_diameter_m:g} m, dots at {dots}°{replicas}; {_accuracy(target)}"
     )
+
+
+def _plain(target: PlainTarget) -> str:
+    across = ", ".join(f"{diameter_m:g}" for diameter_m in target.diameters_m)
+    return (
+        f"{target.name}: {target.polarity} {target.shape}, {across} m across; {_accuracy(target)}"
+    )
+
+
+def _accuracy(target: AnyTarget) -> str:
+    sd = target.sd_outer_diameter_m
+    return f"accuracy of the print {f'{1000.0 * sd:g} mm' if sd else 'not stated'}"
 
 
 def _files(flight: Flight, provenance: Mapping[str, str]) -> Iterator[str]:

@@ -40,7 +40,7 @@ def seen_in(flight: Flight, frame: str) -> tuple[GreyArray, Sighting, float]:
 def test_the_fitted_circles_lie_on_the_edges_of_the_picture(flight: Flight) -> None:
     grey, seen, _ = seen_in(flight, "frame_0001.jpg")
     assert seen.pose is not None
-    view = _view(flight.camera, flight.targets[0].ring, seen.pose, seen.centre_px)
+    view = _view(flight.camera, flight.targets[0], seen.pose, seen.centre_px)
     jpeg, curves = draw_closeup(grey, view)
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None

@@ -1,0 +1,139 @@
+"""The pose of concentric circles from centroids and second moments of their images.
+
+The circles' sizes are known, and roughly how their plane lies. Moments of circles are projected
+through the lens (`geometry.circle_image`), so that the result has neither eccentricity nor
+distortion within the target: its place is that of the circles' centre. The plane's prior is an
+observation like the others. What it leaves open of the centre is therefore in the covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.plate_prior import NormalPrior
+
+_STEPS = 12
+_SETTLED = 1e-9  # of the distance, and radians
+_LARGEST_TURN_RAD = 0.3  # of a step
+_ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an angle of which nothing is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleMoments:
+    """Images of k concentric circles.
+
+    Attributes
+    ----------
+    radii_m : (k,) array
+        Of the circles [m].
+    moments : (k, 5) array
+        Centroids and second moments, as `discs.records.MOMENTS`.
+    covs : (k, 5, 5) array
+        Of each circle's moments.
+    """
+
+    radii_m: FloatArray
+    moments: FloatArray
+    covs: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CirclesFit:
+    """A pose fitted to images of circles.
+
+    Attributes
+    ----------
+    pose : Pose
+        Its x axis is as near to the camera's as the plane allows: circles have no heading.
+    pose_cov : (6, 6) array
+        As in `Uncertainty`; about the normal, the variance of an angle that may have any value.
+    chi2 : float
+        Of all images and of the plane's prior.
+    """
+
+    pose: Pose
+    pose_cov: FloatArray
+    chi2: float
+
+
+def pose_towards(centre_m: FloatArray, normal: FloatArray) -> Pose:
+    """Return the pose of circles about a centre, with their unit normal, both in camera axes."""
+    x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    if np.linalg.norm(x) < 1e-6:  # seen from the side: any axis does
+        x = np.cross(normal, [0.0, 1.0, 0.0])
+    x = x / np.linalg.norm(x)
+    return Pose(np.column_stack((x, np.cross(normal, x), normal)), np.asarray(centre_m))
+
+
+def circles_about(pose: Pose, radii_m: FloatArray) -> Circles3D:
+    """Return concentric circles about a pose's origin."""
+    count = len(radii_m)
+    return Circles3D(
+        np.repeat(pose.translation_m[None], count, axis=0),
+        np.repeat(pose.rotation[None, :, :2], count, axis=0),
+        np.asarray(radii_m, dtype=np.float64),
+    )
+
+
+def fit_circles(
+    camera: Camera, images: CircleMoments, start: Pose, prior: NormalPrior
+) -> CirclesFit:
+    """Adjust a pose to the images of concentric circles, by Gauss and Newton.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the circles leave the space before the camera, or the equations are singular.
+    """
+    roots: FloatArray = np.linalg.cholesky(images.covs).astype(np.float64)
+    pose = start
+    for _ in range(_STEPS):
+        residuals, design, axes = _equations(camera, images, roots, pose, prior)
+        scale = np.array([*(pose.distance_m,) * 3, 1.0, 1.0])
+        normal = (design * scale).T @ (design * scale)
+        step = scale * np.linalg.solve(normal, (design * scale).T @ residuals)
+        turn = axes @ step[3:]
+        turn *= min(1.0, _LARGEST_TURN_RAD / max(float(np.linalg.norm(turn)), 1e-12))
+        moved = pose.moved(np.concatenate((step[:3], turn)))
+        pose = pose_towards(moved.translation_m, moved.normal)
+        if np.abs(step / scale).max() < _SETTLED:
+            break
+    residuals, design, axes = _equations(camera, images, roots, pose, prior)
+    to_six = np.zeros((6, 5))
+    to_six[:3, :3], to_six[3:, 3:] = np.eye(3), axes
+    cov = to_six @ np.linalg.inv(design.T @ design) @ to_six.T
+    cov[3:, 3:] += _ANY_HEADING_RAD2 * np.outer(pose.normal, pose.normal)
+    return CirclesFit(pose, 0.5 * (cov + cov.T), float(residuals @ residuals))
+
+
+def _equations(
+    camera: Camera, images: CircleMoments, roots: FloatArray, pose: Pose, prior: NormalPrior
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return weighted residuals (5k + 2,), the design (5k + 2, 5) and axes of the two turns."""
+    circles = circles_about(pose, images.radii_m)
+    moments, slopes = circle_images(camera, circles).moments, circle_slopes(camera, circles)
+    axes = pose.rotation[:, :2]
+    off = images.moments - moments
+    if not np.isfinite(off).all():
+        raise np.linalg.LinAlgError("circles are not wholly before the camera")
+    by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation @ axes), axis=2)
+    residuals = np.linalg.solve(roots, off[:, :, None])[:, :, 0].ravel()
+    design = np.linalg.solve(roots, by_pose).reshape(-1, 5)
+    turn = axes.T @ _turn_to(pose.normal, prior.direction_camera)
+    weight = 1.0 / math.radians(prior.sd_deg)
+    of_prior = np.hstack((np.zeros((2, 3)), weight * np.eye(2)))
+    return np.concatenate((residuals, weight * turn)), np.vstack((design, of_prior)), axes
+
+
+def _turn_to(direction: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the rotation vector (3,) that turns one unit vector to another [rad]."""
+    axis = np.cross(direction, wanted)
+    sine, cosine = float(np.linalg.norm(axis)), float(direction @ wanted)
+    return np.asarray(axis * (math.atan2(sine, cosine) / sine if sine > 0.0 else 1.0))

@@ -1,0 +1,82 @@
+"""Where a plain target must be in a frame, how large, and how its plane lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.measurement.plate_prior import NormalPrior
+
+SIGMAS = 4.0
+"""How many standard deviations a target may be from its prediction."""
+_FARTHEST = 16.0  # radii that a target may be off: beyond, too much else would be looked at
+_LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlainPrediction:
+    """The image of a plain target, as the frame's orientation and its position make it.
+
+    Attributes
+    ----------
+    centre_px : (2,) array
+        Projected centre [px].
+    cov_px2 : (2, 2) array
+        Of the centre [px²].
+    position_m : (3,) array
+        Of its centre in the camera frame [m].
+    sd_log_distance : float
+        Standard deviation of the logarithm of its distance.
+    normal : NormalPrior
+        How its plane lies.
+    radius_px : float
+        Of its outer circle where it is widest [px].
+    source : str
+        What it was made from, in few words.
+    """
+
+    centre_px: FloatArray
+    cov_px2: FloatArray
+    position_m: FloatArray
+    sd_log_distance: float
+    normal: NormalPrior
+    radius_px: float
+    source: str
+
+    def __str__(self) -> str:
+        """Text for the detail of a row."""
+        x, y = self.centre_px
+        return (
+            f"expected by {self.source} at ({x:.0f}, {y:.0f}) ± {self.sd_px:.1f} px, radius"
+            f" {self.radius_px:.1f} px"
+        )
+
+    @property
+    def sd_px(self) -> float:
+        """Standard deviation of the centre where it is worst [px]."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.cov_px2)[-1]))
+
+    @property
+    def reach_px(self) -> float:
+        """How far the centre may be from its prediction [px]."""
+        return SIGMAS * self.sd_px
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is certain enough to look there."""
+        return self.reach_px <= _FARTHEST * self.radius_px
+
+    def is_from_behind(self) -> bool:
+        """Tell whether its plane turns away from the camera, or is seen edge on."""
+        along = self.position_m / np.linalg.norm(self.position_m)
+        return bool(along @ self.normal.direction_camera < _LEAST_COSINE)
+
+    def is_outside(self, camera: Camera) -> bool:
+        """Tell whether no part of the target can be in the frame."""
+        x, y = self.centre_px
+        reach = self.radius_px + self.reach_px
+        return bool(max(-x, x - camera.width + 1.0, -y, y - camera.height + 1.0) > reach)

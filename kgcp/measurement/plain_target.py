@@ -1,0 +1,379 @@
+"""A plain disc or ring, measured where a frame must show it, if nothing else there can be it.
+
+Its edge alone tells it from what is round as well: so place, size, shape, polarity and grey values
+must all agree with the prediction, and no second edge may do so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kgcp.errors import Reason, Rejection
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.conic import Ellipse
+from kgcp.geometry.pose import Pose, image_heading_deg
+from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
+from kgcp.measurement.discs.adjust_disc import geometry_of
+from kgcp.measurement.discs.covariance import moments_by_stretch
+from kgcp.measurement.discs.measure import measure_disc
+from kgcp.measurement.discs.outlines import follow_outlines
+from kgcp.measurement.discs.records import (
+    Disc,
+    DiscMiss,
+    DiscOutline,
+    DiscReason,
+    Polarity,
+    ellipse_of_moments,
+)
+from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
+from kgcp.measurement.plain_pose import (
+    CircleMoments,
+    CirclesFit,
+    circles_about,
+    fit_circles,
+    pose_towards,
+)
+from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
+from kgcp.measurement.plain_search import edges_like
+from kgcp.measurement.records import Alternative, Appearance, Measurement, Miss, Outcome
+from kgcp.targets.plain import PlainTarget
+
+# Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
+_SMALLEST_PX = 2.0  # radius
+_MOST_TRIES = 8  # edges that are measured per target
+_NEAREST = 2.0  # standard deviations of sizes that are worth measuring, beyond what is accepted
+# How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
+# them), and of the radius (jagged or dirty edges)
+_EDGE_PX, _EDGE = 0.1, 0.01
+_SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
+_PLACE_PX = 0.1  # of a prediction, at least
+_WORST_CHI2 = {2: 18.4, 7: 29.9, 12: 39.1}  # quantiles of 99.99 % by degrees of freedom
+_CHI2_PER_CIRCLE = 9.3  # beyond
+_SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
+_INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
+_REASONS = {
+    DiscReason.CUT: Reason.CUT,
+    DiscReason.CROWDED: Reason.CROWDED,
+    DiscReason.NO_CONTRAST: Reason.NO_CONTRAST,
+    DiscReason.POOR_FIT: Reason.POOR_FIT,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Circles:
+    """All circles of a target, measured."""
+
+    discs: tuple[Disc, ...]
+    images: CircleMoments
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """An edge that agrees with all that is known of the target."""
+
+    circles: _Circles
+    fit: CirclesFit
+    other: CirclesFit | None  # about the other normal
+
+
+def look_for_plain(
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction | None,
+    measured: Sequence[Measurement] = (),
+) -> Outcome:
+    """Measure a plain target in a frame, or say why not.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Raw frame, uint8 or uint16.
+    prediction : PlainPrediction or None
+        Where it must be; None: the frame's orientation is not known.
+    measured : sequence of Measurement
+        Coded targets of this frame: what lies on them is something else.
+    """
+    if prediction is None:
+        return Miss(target.name, Reason.NO_PREDICTION)
+    try:
+        _check_prediction(camera, prediction)
+        expected = _expected_ellipses(camera, target, prediction)
+        edges = edges_like(grey, expected[0], _polarity(target), prediction.reach_px)
+        edges = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
+        candidate = _only_candidate(grey, camera, target, prediction, edges)
+    except Rejection as rejection:
+        return Miss(target.name, rejection.reason, rejection.detail)
+    return _measurement(camera, target, candidate)
+
+
+def _check_prediction(camera: Camera, prediction: PlainPrediction) -> None:
+    if prediction.is_outside(camera):
+        raise Rejection(Reason.OUT_OF_VIEW, f"{prediction}, outside the frame")
+    if prediction.is_from_behind():
+        raise Rejection(Reason.OUT_OF_VIEW, f"{prediction}, seen from behind")
+    if not prediction.is_sure:
+        raise Rejection(Reason.NO_PREDICTION, f"{prediction}: not sure enough to look there")
+    if prediction.radius_px < _SMALLEST_PX:
+        raise Rejection(Reason.TOO_SMALL, f"{prediction}, below {_SMALLEST_PX:g} px")
+
+
+def _only_candidate(
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    edges: Sequence[DiscOutline],
+) -> _Candidate:
+    """Return the only edge that can be the target.
+
+    Raises
+    ------
+    Rejection
+        If there is none, or another one.
+    """
+    accepted: list[_Candidate] = []
+    first: Rejection | None = None
+    for edge in edges[:_MOST_TRIES]:
+        try:
+            accepted.append(_try_edge(grey, camera, target, prediction, edge))
+        except Rejection as rejection:
+            first = first or rejection
+    if len(accepted) > 1:
+        places = " and ".join(
+            f"({each.circles.discs[0].x:.0f}, {each.circles.discs[0].y:.0f})" for each in accepted
+        )
+        raise Rejection(Reason.AMBIGUOUS_PLACE, f"alike at {places}; {prediction}")
+    if accepted:
+        return accepted[0]
+    if first is not None:
+        raise Rejection(first.reason, f"{first.detail}; {prediction}")
+    raise Rejection(Reason.NO_CANDIDATE, str(prediction))
+
+
+def _try_edge(
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    edge: DiscOutline,
+) -> _Candidate:
+    """Measure a target from the edge of its outer circle, and check everything.
+
+    Raises
+    ------
+    Rejection
+    """
+    start = _start(camera, target, prediction, edge.ellipse)
+    _check_size(target, prediction, start, _NEAREST)
+    circles = _measured_circles(grey, camera, target, start, edge)
+    try:
+        tolerant = fit_circles(camera, _tolerated(circles.images), start, prediction.normal)
+        _check_agreement(camera, target, prediction, tolerant, len(circles.discs))
+        fit, other = _best_fits(camera, circles.images, start, prediction)
+    except np.linalg.LinAlgError:
+        raise Rejection(Reason.POOR_FIT, "singular equations") from None
+    return _Candidate(circles, fit, other)
+
+
+def _polarity(target: PlainTarget, circle: int = 0) -> Polarity:
+    """Return the polarity of what is within a circle against what is directly around it."""
+    outer = Polarity(target.polarity.value)
+    return outer if circle % 2 == 0 else outer.other
+
+
+def _ellipses_of(camera: Camera, target: PlainTarget, pose: Pose) -> list[Ellipse]:
+    images = circle_images(camera, circles_about(pose, np.array(target.radii_m)))
+    if not np.isfinite(images.moments).all():
+        raise Rejection(Reason.OUT_OF_VIEW, "not wholly before the camera")
+    return [ellipse_of_moments(each) for each in images.moments]
+
+
+def _expected_ellipses(
+    camera: Camera, target: PlainTarget, prediction: PlainPrediction
+) -> list[Ellipse]:
+    pose = pose_towards(prediction.position_m, prediction.normal.direction_camera)
+    return _ellipses_of(camera, target, pose)
+
+
+def _start(
+    camera: Camera, target: PlainTarget, prediction: PlainPrediction, ellipse: Ellipse
+) -> Pose:
+    """Return the pose that an outline of the outer circle has, if its plane is as expected."""
+    x, y = camera.undistort(ellipse.centre[None])[0].tolist()
+    ray = np.array((x, y, 1.0)) / math.sqrt(x * x + y * y + 1.0)
+    pose = pose_towards(
+        ray * float(np.linalg.norm(prediction.position_m)), prediction.normal.direction_camera
+    )
+    outer = _ellipses_of(camera, target, pose)[0]
+    ratio = outer.mean_radius / ellipse.mean_radius
+    return Pose(pose.rotation, pose.translation_m * ratio)
+
+
+def _measured_circles(
+    grey: GreyArray, camera: Camera, target: PlainTarget, start: Pose, edge: DiscOutline
+) -> _Circles:
+    """Measure the outer circle and those within it.
+
+    Raises
+    ------
+    Rejection
+    """
+    outlines = [edge]
+    ellipses = _ellipses_of(camera, target, start)
+    inner = [
+        DiscOutline.predicted(ellipse, _polarity(target, circle))
+        for circle, ellipse in enumerate(ellipses[1:], start=1)
+    ]
+    reach_px = max(_INNER_REACH * edge.ellipse.mean_radius, _LEAST_INNER_REACH_PX)
+    for followed in follow_outlines(grey, inner, reach_px):
+        if followed is None:
+            raise Rejection(Reason.UNLIKE_PREDICTION, "its inner circle is not there")
+        outlines.append(followed)
+    border = _border(camera, target, start)
+    discs: list[Disc] = []
+    radii_m: list[float] = []
+    for outline, radius_m in zip(outlines, target.radii_m, strict=True):
+        others = [each for each in outlines if each is not outline]
+        outcome = measure_disc(
+            grey, outline, neighbours=[*others, *border], response=camera.response
+        )
+        if isinstance(outcome, DiscMiss):
+            if discs and outcome.reason is DiscReason.CROWDED:
+                continue  # its edge is there, and the outer circle says more
+            raise Rejection(_REASONS[outcome.reason], outcome.detail)
+        discs.append(outcome)
+        radii_m.append(radius_m)
+    images = CircleMoments(
+        np.array(radii_m),
+        np.array([disc.vector for disc in discs]),
+        np.array([disc.cov for disc in discs]),
+    )
+    return _Circles(tuple(discs), images)
+
+
+def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline]:
+    """Return where the even ground ends, as an edge that pixels keep clear of."""
+    if target.border_m is None:
+        return []
+    radius_m = target.radii_m[0] + target.border_m
+    moments = circle_images(camera, circles_about(pose, np.array([radius_m]))).moments
+    if not np.isfinite(moments).all():
+        return []
+    return [DiscOutline.predicted(ellipse_of_moments(moments[0]), _polarity(target, 1))]
+
+
+def _tolerated(images: CircleMoments) -> CircleMoments:
+    """Add to the covariances what edges in the field are off, besides noise."""
+    covs = []
+    for moments, cov in zip(images.moments, images.covs, strict=True):
+        geometry = geometry_of(moments)
+        radius_px = math.sqrt(max(float(geometry[2] * geometry[4] - geometry[3] ** 2), 0.0))
+        edge_px = math.hypot(_EDGE_PX, _EDGE * radius_px)
+        spread = edge_px**2 * np.diag((0.5, 0.5, 1.0, 0.5, 1.0))
+        to_moments = moments_by_stretch(geometry)
+        covs.append(cov + to_moments @ spread @ to_moments.T)
+    return CircleMoments(images.radii_m, images.moments, np.array(covs))
+
+
+def _check_size(
+    target: PlainTarget, prediction: PlainPrediction, pose: Pose, slack: float = 1.0
+) -> None:
+    """Refuse a distance that is not the predicted one.
+
+    Raises
+    ------
+    Rejection
+    """
+    expected_m = float(np.linalg.norm(prediction.position_m))
+    off = math.log(pose.distance_m / expected_m)
+    sd = math.hypot(
+        prediction.sd_log_distance,
+        _SIZE,
+        _SIZE_PX / prediction.radius_px,
+        target.sd_diameter_m / target.outer_diameter_m,
+    )
+    if abs(off) > slack * SIGMAS * sd:
+        raise Rejection(Reason.UNLIKE_PREDICTION, f"{math.exp(-off) - 1.0:+.0%} in size")
+
+
+def _check_agreement(
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    fit: CirclesFit,
+    circles: int,
+) -> None:
+    """Refuse what has another place, size or shape than the prediction.
+
+    Raises
+    ------
+    Rejection
+    """
+    _check_size(target, prediction, fit.pose)
+    off_px = camera.project(fit.pose.translation_m[None])[0] - prediction.centre_px
+    cov_px2 = prediction.cov_px2 + _PLACE_PX**2 * np.eye(2)
+    if float(off_px @ np.linalg.solve(cov_px2, off_px)) > SIGMAS**2:
+        detail = f"{float(np.linalg.norm(off_px)):.1f} px off"
+        raise Rejection(Reason.UNLIKE_PREDICTION, detail)
+    freedom = 5 * circles - 3
+    worst = _WORST_CHI2.get(freedom, _CHI2_PER_CIRCLE * circles + 10.0)
+    if fit.chi2 > worst:
+        raise Rejection(Reason.UNLIKE_PREDICTION, f"shape: χ² {fit.chi2:.0f} of {freedom}")
+
+
+def _best_fits(
+    camera: Camera, images: CircleMoments, start: Pose, prediction: PlainPrediction
+) -> tuple[CirclesFit, CirclesFit | None]:
+    """Return the better of both normals' fits, and the other one if it is another."""
+    fits = [fit_circles(camera, images, start, prediction.normal)]
+    mirrored = fits[0].pose.mirrored()
+    begin = pose_towards(mirrored.translation_m, mirrored.normal)
+    try:
+        fits.append(fit_circles(camera, images, begin, prediction.normal))
+    except np.linalg.LinAlgError:
+        return fits[0], None
+    best, other = sorted(fits, key=lambda each: each.chi2)
+    if float(best.pose.normal @ other.pose.normal) > _SAME_NORMAL:
+        return best, None
+    return best, other
+
+
+def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Measurement:
+    fit, other, pose = candidate.fit, candidate.other, candidate.fit.pose
+    pose_cov, alternative = fit.pose_cov.copy(), None
+    if other is not None:
+        ambiguity = other.chi2 - fit.chi2
+        pose_cov[:3, :3] += spread_over_both(pose, other.pose, ambiguity)
+        alternative = Alternative(other.pose, ambiguity)
+    return Measurement(
+        target=target.name,
+        ring=target.name,
+        instance=0,
+        score=math.nan,
+        pose=pose,
+        centre_px=camera.project(pose.translation_m[None])[0],
+        heading_deg=image_heading_deg(camera, pose),
+        appearance=_appearance(camera, target, candidate),
+        alternative=alternative,
+        uncertainty=propagate(camera, pose, pose_cov),
+    )
+
+
+def _appearance(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Appearance:
+    outer = candidate.circles.discs[0]
+    black, white = sorted((outer.inside, outer.outside))
+    contour = contour_px(camera, candidate.fit.pose, target.radii_m[0])
+    return Appearance(
+        radius_px=semi_major_axis_px(contour),
+        black=min(max(black, 0.0), 1.0),
+        white=min(max(white, 0.0), 1.0),
+        saturated=outer.clipped,
+        blur_px=outer.blur_px,
+    )

@@ -1,0 +1,128 @@
+"""Targets without a code: plain discs, and rings of concentric circles.
+
+They look like many other things. Only their place tells them from these: a plain target stands
+still at a known position, and is measured only where a frame must show it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from typing import ClassVar
+
+from kgcp.errors import SettingError
+from kgcp.settings import require_range
+from kgcp.targets.layout import Target
+
+_MOST_CIRCLES = 8
+_NARROWEST = 0.95  # an inner circle's diameter over the next outer one's
+_SQUARE = 1e-6  # length of a normal that points nowhere
+
+
+class Shape(StrEnum):
+    """What is on a target."""
+
+    CODED = "coded"  # ring with dots, by which it is told from others
+    DISC = "disc"
+    RING = "ring"  # concentric circles without dots
+
+
+class PlainPolarity(StrEnum):
+    """Whether the area within the outer circle is darker or brighter than the ground."""
+
+    DARK = "dark"
+    BRIGHT = "bright"
+
+
+@dataclass(frozen=True, slots=True)
+class PlainTarget:
+    """A disc, or concentric circles whose areas are dark and bright by turns.
+
+    Attributes
+    ----------
+    name : str
+        As in flight.toml.
+    diameters_m : tuple of float
+        Of its circles, the outermost first [m]: one of a disc, more of a ring.
+    polarity : PlainPolarity
+        Of the area directly within the outer circle, against the ground.
+    position_m, sd_position_m : tuple of float
+        Position in the flight's CRS, and its standard deviations [m].
+    sd_diameter_m : float
+        How well the outer diameter is known [m]; the others are wrong by the same factor.
+    normal_enu : (3,) tuple of float
+        Unit normal, out of its front, in local axes east, north, up.
+    sd_normal_deg : float
+        Standard deviation of the normal about either axis square to it [deg].
+    border_m : float or None
+        Width of the even ground around it [m]; None: as even as it happens to be.
+
+    Raises
+    ------
+    SettingError
+        On making one, for what cannot be a target.
+    """
+
+    SD_NORMAL_DEG: ClassVar[float] = 3.0  # of what somebody has laid on the ground
+
+    name: str
+    diameters_m: tuple[float, ...]
+    polarity: PlainPolarity
+    position_m: tuple[float, float, float]
+    sd_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sd_diameter_m: float = 0.0
+    normal_enu: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    sd_normal_deg: float = SD_NORMAL_DEG
+    border_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.diameters_m) <= _MOST_CIRCLES:
+            raise SettingError(
+                "inner_diameter_m",
+                f"makes {len(self.diameters_m)} circles",
+                f"give at most {_MOST_CIRCLES}",
+            )
+        for diameter in self.diameters_m:
+            require_range("diameter_m", diameter, 0.0, 100.0, unit="m", open_low=True)
+        for outer, inner in pairwise(self.diameters_m):
+            if inner > _NARROWEST * outer:
+                raise SettingError(
+                    "inner_diameter_m",
+                    f"{inner:g} m is not below {_NARROWEST:.0%} of the next circle's {outer:g} m",
+                    "give diameters from the outside to the inside",
+                )
+        require_range("sd_diameter_m", self.sd_diameter_m, 0.0, 1.0, unit="m")
+        require_range("level_sd_deg", self.sd_normal_deg, 0.0, 90.0, unit="deg", open_low=True)
+        if self.border_m is not None:
+            require_range("border_m", self.border_m, 0.0, 100.0, unit="m", open_low=True)
+        length = math.hypot(*self.normal_enu)
+        if length < _SQUARE:
+            raise SettingError("normal", "has no direction", 'give [east, north, up] or "level"')
+        x, y, z = (component / length for component in self.normal_enu)
+        object.__setattr__(self, "normal_enu", (x, y, z))
+
+    @property
+    def shape(self) -> Shape:
+        """Disc or ring."""
+        return Shape.DISC if len(self.diameters_m) == 1 else Shape.RING
+
+    @property
+    def outer_diameter_m(self) -> float:
+        """Diameter of the outer circle [m]."""
+        return self.diameters_m[0]
+
+    @property
+    def sd_outer_diameter_m(self) -> float:
+        """How well it is known [m]."""
+        return self.sd_diameter_m
+
+    @property
+    def radii_m(self) -> tuple[float, ...]:
+        """Of its circles, the outermost first [m]."""
+        return tuple(0.5 * diameter for diameter in self.diameters_m)
+
+
+AnyTarget = Target | PlainTarget
+"""With a code or without."""

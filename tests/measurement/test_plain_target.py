@@ -1,0 +1,171 @@
+"""Plain targets in one rendered frame: found where they must be, and refused elsewhere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.errors import Reason
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.covariance import propagate
+from kgcp.measurement.plain_pose import (
+    CircleMoments,
+    circles_about,
+    fit_circles,
+    pose_towards,
+)
+from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.records import Measurement, Miss, Outcome
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import PlainPlate, image_plate
+from kgcp.targets.plain import PlainPolarity, PlainTarget
+
+CAMERA = Camera(200, 160, 900.0, 900.0, 101.3, 78.4, k1=-0.08, response=Response.LINEAR)
+NORMAL = np.array([math.sin(0.4), 0.0, math.cos(0.4)])
+DISC = PlainTarget("W", (0.4,), PlainPolarity.BRIGHT, (0.0, 0.0, 0.0), border_m=0.4)
+RING = replace(DISC, diameters_m=(0.8, 0.4), polarity=PlainPolarity.DARK)
+RADIUS_PX = 10.0
+
+
+def pose_at(x_px: float, y_px: float, target: PlainTarget = DISC) -> Pose:
+    """The pose of a target seen at a pixel, with its radius in the image as given."""
+    ray = np.append(CAMERA.undistort(np.array([[x_px, y_px]]))[0], 1.0)
+    distance_m = CAMERA.fx * target.radii_m[0] / RADIUS_PX
+    return pose_towards(ray / np.linalg.norm(ray) * distance_m, NORMAL)
+
+
+def frame_with(*placed: tuple[PlainTarget, Pose], seed: int = 1) -> GreyArray:
+    light: FloatArray = np.full((CAMERA.height, CAMERA.width), 0.3)
+    for target, pose in placed:
+        image_plate(CAMERA, PlainPlate(target), pose, Optics(0.6)).paste(light)
+    return Sensor().expose(light, 1.0, np.random.default_rng(seed))
+
+
+def prediction_of(
+    pose: Pose, off_px: tuple[float, float] = (0.0, 0.0), size: float = 1.0
+) -> PlainPrediction:
+    """A prediction that is good to 3 px, and as wrong as that."""
+    centre_px = CAMERA.project(pose.translation_m[None])[0] + off_px
+    return PlainPrediction(
+        centre_px,
+        9.0 * np.eye(2),
+        pose.translation_m * size,
+        0.003,
+        NormalPrior(NORMAL, 3.0),
+        RADIUS_PX / size,
+        "a test",
+    )
+
+
+def looked(
+    grey: GreyArray, prediction: PlainPrediction | None, target: PlainTarget = DISC
+) -> Outcome:
+    return look_for_plain(grey, CAMERA, target, prediction)
+
+
+@pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
+def test_true_centre_within_its_deviations(target: PlainTarget) -> None:
+    pose = pose_at(90.4, 71.7, target)
+    outcome = looked(frame_with((target, pose)), prediction_of(pose, (5.0, -4.0)), target)
+    assert isinstance(outcome, Measurement)
+    assert outcome.uncertainty is not None
+    off_px = outcome.centre_px - CAMERA.project(pose.translation_m[None])[0]
+    sd_px = np.sqrt(np.diag(outcome.uncertainty.centre_cov_px2))
+    assert np.all(np.abs(off_px) < 4.0 * sd_px)
+    assert np.all((sd_px > 0.001) & (sd_px < 0.02))
+    off_m = outcome.distance_m - pose.distance_m
+    assert abs(off_m) < 4.0 * outcome.uncertainty.sd_distance_m
+    assert outcome.uncertainty.sd_distance_m < 0.003 * pose.distance_m
+    assert outcome.uncertainty.sd_heading_deg > 90.0
+    assert math.isnan(outcome.score)
+
+
+@pytest.mark.parametrize(
+    ("off_px", "size"), [((25.0, 0.0), 1.0), ((0.0, 0.0), 1.2), ((0.0, 0.0), 0.8)]
+)
+def test_refuses_another_place_or_size(off_px: tuple[float, float], size: float) -> None:
+    pose = pose_at(90.4, 71.7)
+    outcome = looked(frame_with((DISC, pose)), prediction_of(pose, off_px, size))
+    assert isinstance(outcome, Miss)
+    assert outcome.reason in {Reason.UNLIKE_PREDICTION, Reason.NO_CANDIDATE}
+
+
+def test_refuses_the_other_polarity_and_another_shape() -> None:
+    pose = pose_at(90.4, 71.7)
+    grey = frame_with((DISC, pose))
+    for other in (
+        replace(DISC, polarity=PlainPolarity.DARK),
+        replace(DISC, diameters_m=(0.4, 0.2)),
+    ):
+        outcome = looked(grey, prediction_of(pose), other)
+        assert isinstance(outcome, Miss), other
+    upright = replace(prediction_of(pose), normal=NormalPrior(np.array([0.0, 0.0, 1.0]), 2.0))
+    outcome = looked(frame_with((DISC, pose_tilted(pose))), upright)
+    assert isinstance(outcome, Miss)
+    assert outcome.reason is Reason.UNLIKE_PREDICTION
+
+
+def pose_tilted(pose: Pose) -> Pose:
+    return pose_towards(pose.translation_m, np.array([math.sin(0.9), 0.0, math.cos(0.9)]))
+
+
+def test_two_alike_are_ambiguous() -> None:
+    small = replace(DISC, border_m=None)
+    pose = pose_at(80.0, 70.0)
+    grey = frame_with((small, pose), (small, pose_at(110.0, 70.0)))
+    outcome = looked(grey, replace(prediction_of(pose, (15.0, 0.0)), cov_px2=36.0 * np.eye(2)))
+    assert isinstance(outcome, Miss)
+    assert outcome.reason is Reason.AMBIGUOUS_PLACE
+    outcome = looked(grey, prediction_of(pose))
+    assert isinstance(outcome, Measurement)
+
+
+def test_looks_only_where_it_is_told() -> None:
+    pose = pose_at(90.4, 71.7)
+    grey = frame_with((DISC, pose))
+    sure = prediction_of(pose)
+    for prediction, reason in (
+        (None, Reason.NO_PREDICTION),
+        (replace(sure, cov_px2=1e4 * np.eye(2)), Reason.NO_PREDICTION),
+        (prediction_of(pose, (300.0, 0.0)), Reason.OUT_OF_VIEW),
+        (replace(sure, normal=NormalPrior(-NORMAL, 3.0)), Reason.OUT_OF_VIEW),
+        (replace(sure, radius_px=1.0, cov_px2=np.eye(2)), Reason.TOO_SMALL),
+    ):
+        outcome = looked(grey, prediction)
+        assert isinstance(outcome, Miss)
+        assert outcome.reason is reason
+
+
+def test_fit_returns_what_was_projected() -> None:
+    pose = pose_at(150.0, 30.0, RING)
+    radii = np.array(RING.radii_m)
+    moments = circle_images(CAMERA, circles_about(pose, radii)).moments
+    images = CircleMoments(radii, moments, np.array([1e-4 * np.eye(5)] * 2))
+    begin = np.array([math.sin(0.3), 0.0, math.cos(0.3)])
+    start = pose_towards(1.03 * pose.translation_m + 0.01, begin)
+    fit = fit_circles(CAMERA, images, start, NormalPrior(NORMAL, 3.0))
+    assert np.allclose(fit.pose.translation_m, pose.translation_m, atol=1e-8)
+    assert np.allclose(fit.pose.normal, NORMAL, atol=1e-8)
+    assert fit.chi2 < 1e-10
+
+
+@pytest.mark.parametrize("sd_deg", [0.3, 3.0])
+def test_unknown_normal_widens_the_centre(sd_deg: float) -> None:
+    """(R²/f) σ: by so much a turn displaces the centre against the ellipse, seen squarely."""
+    along = pose_at(100.0, 80.0).translation_m
+    normal = along / np.linalg.norm(along)
+    pose, radii = pose_towards(along, normal), np.array(DISC.radii_m)
+    moments = circle_images(CAMERA, circles_about(pose, radii)).moments
+    # the place of the outline is known, its shape hardly
+    images = CircleMoments(radii, moments, np.array([np.diag([1e-12, 1e-12, 9.0, 9.0, 9.0])]))
+    fit = fit_circles(CAMERA, images, pose, NormalPrior(normal, sd_deg))
+    sd_px = propagate(CAMERA, fit.pose, fit.pose_cov).centre_cov_px2[0, 0] ** 0.5
+    assert sd_px == pytest.approx(RADIUS_PX**2 / CAMERA.fx * math.radians(sd_deg), rel=0.02)

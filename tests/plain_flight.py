@@ -1,0 +1,141 @@
+"""A small rendered flight over static plain targets, as a folder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.georef.local_frame import LocalFrame
+from kgcp.simulation.ground import Ground
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import PlainPlate
+from kgcp.simulation.scene import PlainPose, SimulatedScene, render_irradiance
+from kgcp.targets.plain import PlainPolarity, PlainTarget
+
+CRS = "EPSG:25832"
+ORIGIN_MAP = np.array([689_412.0, 5_336_208.0, 545.0])
+CAMERA = Camera(480, 360, 700.0, 700.0, 241.2, 178.1, k1=-0.05, response=Response.LINEAR)
+_GROUND_FROM_ENU = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def plain_target(
+    name: str, offset_m: tuple[float, float], *diameters_m: float, polarity: str = "bright"
+) -> PlainTarget:
+    """A target on the ground, so far east and north of the origin."""
+    x, y, z = (ORIGIN_MAP + np.append(offset_m, 0.0)).tolist()
+    return PlainTarget(
+        name, diameters_m, PlainPolarity(polarity), (x, y, z), (0.002,) * 3, border_m=0.5
+    )
+
+
+TARGETS = (
+    plain_target("white", (-4.0, -3.0), 0.8),
+    plain_target("black", (4.0, -2.5), 0.9, polarity="dark"),
+    plain_target("ring", (3.5, 3.0), 1.2, 0.6, polarity="dark"),
+)
+
+
+@dataclass(frozen=True)
+class PlainFlight:
+    """Where everything is; `write` renders it."""
+
+    targets: tuple[PlainTarget, ...] = TARGETS
+    frames: int = 3
+    seed: int = 3
+    height_m: float = 25.0
+    sd_position_m: float = 0.02
+    sd_angle_deg: float = 0.02
+
+    def cameras(self) -> tuple[FloatArray, FloatArray]:
+        """Projection centres (n, 3) and rotations ENU ← camera (n, 3, 3), exact."""
+        rng = np.random.default_rng(self.seed)
+        centres, rotations = [], []
+        for _ in range(self.frames):
+            turn = rotation_about(np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * math.pi)]))
+            tilt = rotation_about(np.append(rng.uniform(-0.15, 0.15, 2), 0.0))
+            centres.append(np.append(rng.uniform(-1.0, 1.0, 2), self.height_m))
+            rotations.append(turn @ _GROUND_FROM_ENU.T @ tilt)
+        return np.array(centres), np.array(rotations)
+
+    def centres_m(self, frame: int) -> FloatArray:
+        """Centres (k, 3) of the targets in a frame's camera axes [m]."""
+        local_frame = LocalFrame.at(CRS, ORIGIN_MAP)
+        places = local_frame.enu_from_map(np.array([each.position_m for each in self.targets]))
+        centres, rotations = self.cameras()
+        return np.asarray((places - centres[frame]) @ rotations[frame])
+
+    def write(self, folder: Path) -> Path:
+        """Write flight.toml, frames and reference.csv."""
+        (folder / "frames").mkdir(parents=True)
+        rng = np.random.default_rng(self.seed + 1)
+        ground = Ground.grown(rng, 500.0)
+        centres, rotations = self.cameras()
+        for frame in range(self.frames):
+            camera_from_enu = rotations[frame].T
+            lying = camera_from_enu @ _GROUND_FROM_ENU.T
+            scene = SimulatedScene(
+                Pose(lying, -camera_from_enu @ centres[frame]),
+                None,
+                (),
+                tuple(
+                    PlainPose(PlainPlate(target), Pose(lying, centre))
+                    for target, centre in zip(self.targets, self.centres_m(frame), strict=True)
+                ),
+            )
+            irradiance = render_irradiance(CAMERA, ground, scene, Optics(0.6), rng)
+            cv2.imwrite(
+                str(folder / "frames" / f"f_{frame}.png"), Sensor().expose(irradiance, 1.0, rng)
+            )
+        self._write_reference(folder / "reference.csv", rng)
+        (folder / "flight.toml").write_text(self._toml(), encoding="utf-8")
+        return folder
+
+    def _write_reference(self, path: Path, rng: np.random.Generator) -> None:
+        local_frame = LocalFrame.at(CRS, ORIGIN_MAP)
+        centres, rotations = self.cameras()
+        centres = centres + self.sd_position_m * rng.standard_normal(centres.shape)
+        turns = math.radians(self.sd_angle_deg) * rng.standard_normal((self.frames, 3))
+        rotations = rotations @ np.array([rotation_about(turn) for turn in turns])
+        on_map = local_frame.map_from_enu(centres)
+        to_map = np.swapaxes(local_frame.grid_rotation(centres), 1, 2)
+        angles = opk_from_rotation(to_map @ rotations @ CAMERA_FROM_PHOTO)
+        lines = ["frame,x,y,z,omega_deg,phi_deg,kappa_deg,sd_x,sd_y,sd_z,sd_angle_deg"]
+        sds = (*(self.sd_position_m,) * 3, self.sd_angle_deg)
+        for frame, (place, opk) in enumerate(zip(on_map, angles, strict=True)):
+            numbers = (f"{value:.9f}" for value in (*place, *opk, *sds))
+            lines.append(",".join((f"f_{frame}.png", *numbers)))
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def _toml(self) -> str:
+        keys = ("width", "height", "fx", "fy", "cx", "cy", "k1")
+        lines = [
+            'name = "plain"',
+            f'crs = "{CRS}"',
+            "[camera]",
+            *(f"{key} = {getattr(CAMERA, key)!r}" for key in keys),
+            'response = "linear"',
+            "[reference]",
+            'poses = "reference.csv"',
+        ]
+        for target in self.targets:
+            lines += [
+                "[[target]]",
+                f'name = "{target.name}"',
+                f'shape = "{target.shape}"',
+                f'polarity = "{target.polarity}"',
+                f"diameter_m = {target.outer_diameter_m!r}",
+                f"position_m = {list(target.position_m)}",
+                f"sd_position_m = {list(target.sd_position_m)}",
+                f"border_m = {target.border_m!r}",
+            ]
+            if len(target.diameters_m) > 1:
+                lines.append(f"inner_diameter_m = {list(target.diameters_m[1:])}")
+        return "\n".join(lines) + "\n"
