@@ -18,6 +18,7 @@ from kgcp.io.print import write
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoTask, measure_field
 from kgcp.measurement.discs.records import Operator
 from kgcp.targets.code_design import LEAST_DISTANCE
+from kgcp.targets.fields.layout import Field
 from kgcp.targets.layout import Target
 from kgcp.targets.sheets import Paper
 
@@ -151,6 +152,7 @@ def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     assert "looks the same when it is turned" in result.stderr
     assert json.loads(result.stdout)["discs"] == 54
     field = read_field(str(tmp_path / "field.toml"))
+    assert isinstance(field, Field)
     assert (field.columns, field.rows) == (9, 6)
     grey = cv2.imread(str(tmp_path / "target_field.png"), cv2.IMREAD_GRAYSCALE)
     assert grey is not None

@@ -14,6 +14,13 @@ from kgcp.io.flight.field_file import field_toml, read_field
 from kgcp.targets.fields.layout import Field, FieldBar, FieldPolarity, GridKind, Mark
 from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
 
+
+def read_grid(text: str, unit: str | None = None) -> Field:
+    field = read_field(text, unit)
+    assert isinstance(field, Field)
+    return field
+
+
 BOOFCV = """\
 # Serialized boofcv.alg.fiducial.calib.ConfigCalibrationTarget
 BoofCV.GIT_SHA: a9ab9041d1703a9c09c31999043382e870554729
@@ -84,16 +91,16 @@ def test_a_field_toml_is_read_back_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_marks_take_the_diameter_of_all(tmp_path: Path) -> None:
-    field = read_field(write(tmp_path, "field.toml", TOML))
+    field = read_grid(write(tmp_path, "field.toml", TOML))
     assert field.marks == (Mark(2, 2, 0.015, 0.006),)
     assert field.flat_sd_m == (0.00005, 0.00005, 0.0003)
 
 
 def test_shorthands() -> None:
-    grid = read_field("grid:10x8:25mm:15mm")
+    grid = read_grid("grid:10x8:25mm:15mm")
     assert (grid.kind, grid.columns, grid.rows) == (GridKind.SQUARE, 10, 8)
     assert [grid.pitch_m, grid.diameter_m] == pytest.approx([0.025, 0.015])
-    bright = read_field("asymmetric:4x11:2cm:bright")
+    bright = read_grid("asymmetric:4x11:2cm:bright")
     assert (bright.kind, bright.polarity) == (GridKind.ASYMMETRIC, FieldPolarity.BRIGHT)
     assert grid.is_diameter_stated
     assert not bright.is_diameter_stated
@@ -104,20 +111,20 @@ def test_boofcv_does_not_say_its_unit(tmp_path: Path) -> None:
     with pytest.raises(KgcpError, match="does not say its unit") as caught:
         read_field(path)
     assert caught.value.option == "unit"
-    field = read_field(path, "cm")
+    field = read_grid(path, "cm")
     assert (field.kind, field.columns, field.rows) == (GridKind.HEXAGONAL, 28, 24)
     assert [field.pitch_m, field.diameter_m] == pytest.approx([0.012, 0.01])
 
 
 def test_dice_counts_from_below_and_both_ends(tmp_path: Path) -> None:
-    field = read_field(write(tmp_path, "input.xml", DICE))
+    field = read_grid(write(tmp_path, "input.xml", DICE))
     assert field.polarity is FieldPolarity.BRIGHT
     assert {(mark.column, mark.row) for mark in field.marks} == {(2, 7), (11, 7), (2, 2)}
     assert not field.is_diameter_stated
 
 
 def test_ros_has_one_larger_dot(tmp_path: Path) -> None:
-    field = read_field(write(tmp_path, "cal_data.yaml", ROS))
+    field = read_grid(write(tmp_path, "cal_data.yaml", ROS))
     assert (field.columns, field.rows, field.pitch_m) == (7, 10, 0.0254)
     (mark,) = field.marks
     assert (mark.column, mark.row) == (0, 9)
@@ -142,7 +149,7 @@ def ringgrid(**changes: object) -> str:
 @pytest.mark.parametrize(("rows", "longest"), [(15, 14), (15, 13), (4, 5), (4, 4), (7, 5)])
 def test_rings_lie_as_ringgrid_prints_them(tmp_path: Path, rows: int, longest: int) -> None:
     board = ringgrid(rows=rows, long_row_cols=longest)
-    field = read_field(write(tmp_path, "target.json", board))
+    field = read_grid(write(tmp_path, "target.json", board))
     assert (field.diameter_m, field.inner_diameter_m) == pytest.approx((0.010752, 0.008448))
     counts = [sum(name.startswith(f"r{row}c") for name in field.names()) for row in range(rows)]
     # ringgrid's rule: the middle row, rows // 2, is a long one if `longest` is odd
@@ -165,7 +172,7 @@ def test_plain_rings_on_a_square_lattice(tmp_path: Path) -> None:
         "coding": {"kind": "plain"},
         "fiducials": {"dot_radius_mm": 1.4, "dots_mm": [[21.0, 21.0]]},
     }
-    field = read_field(write(tmp_path, "target_spec.json", json.dumps(board)))
+    field = read_grid(write(tmp_path, "target_spec.json", json.dumps(board)))
     assert (field.kind, field.columns, field.rows) == (GridKind.SQUARE, 5, 4)
     sizes = [field.pitch_m, field.diameter_m, field.inner_diameter_m]
     assert sizes == pytest.approx([0.014, 0.0112, 0.0056])
