@@ -17,6 +17,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,11 +33,13 @@ _REPEATS = 3  # the least of them counts: whatever else the machine does only ad
 _HEADER = "set                       frames   Mpx  decode ms     kgcp  AprilTag   ArUco"
 
 
+@cache
 def _april_tags() -> Callable[[GreyArray], object] | None:
     try:
         detector = importlib.import_module("pupil_apriltags").Detector
     except ModuleNotFoundError:
         return None
+    # one for all sets, since it frees what it does not own when a second one ends
     made = detector(families="tag36h11", nthreads=1, quad_decimate=2.0)
     return made.detect  # type: ignore[no-any-return]  # it has no types
 

@@ -308,23 +308,22 @@ def examine_or_die(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
 
 
 def test_a_frame_that_kills_its_worker_costs_no_other(
-    flight: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """But for what frames say of each other: the lost one is missing there."""
+    settings = DetectSettings(is_guided=False, is_learning=False)
     with monkeypatch.context() as patch:
         patch.setattr("kgcp.pipeline.detection_run.examine_frame", examine_or_die)
-        settings = DetectSettings(is_guided=False)  # a second look would start more processes
         detect_flight(read_flight(flight), settings, options=RunOptions(jobs=1))
-    table_path = flight / "kgcp" / "detections.parquet"
-    rows = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
+    detect_flight(read_flight(flight), settings, out=tmp_path, options=RunOptions(jobs=0))
+    rows, others = (
+        read_table(folder / "detections.parquet", DETECTION_COLUMNS).set_index("frame")
+        for folder in (flight / "kgcp", tmp_path)
+    )
     assert rows.index[rows["status"] == "unreadable"].to_list() == ["f_8.png"]
     assert rows.loc["f_8.png", "reason"] == "worker_died"
-    table_path.write_bytes(undisturbed)
-    others = read_table(table_path, DETECTION_COLUMNS).set_index("frame")
-    measured = (others["status"] == "measured") & ~others["guided"].astype(bool)
-    first = others.index[measured & (others.index != "f_8.png")]
-    assert len(first) > FRAMES // 3
-    # all but equal: what all frames share of the camera was learnt without the one that is lost
-    pd.testing.assert_frame_equal(rows.loc[first], others.loc[first], rtol=1e-3, atol=1e-4)
+    assert (others["status"] == "measured").sum() > FRAMES // 3
+    pd.testing.assert_frame_equal(rows.drop("f_8.png"), others.drop("f_8.png"))
 
 
 def test_who_is_lost_is_tried_again_by_the_next_run(
