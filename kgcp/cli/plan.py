@@ -12,6 +12,7 @@ from kgcp.cli.options import flight_argument
 
 if TYPE_CHECKING:
     from kgcp.simulation.outlook import Conditions, Outlook
+    from kgcp.targets.plain import AnyTarget
 
 
 @click.command()
@@ -131,7 +132,7 @@ def command(
     if as_json:
         _print_json(target.name, conditions, outlooks)
     else:
-        for line in _table(target.name, conditions, outlooks):
+        for line in _table(target, conditions, outlooks):
             click.echo(line)
     if plot is not None:
         from kgcp.report.plan_figure import write_plan_figure
@@ -170,11 +171,14 @@ _GROUND_COLUMNS = (
 )
 
 
-def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
+def _table(target: AnyTarget, conditions: Conditions, outlooks: Sequence[Outlook]) -> Iterator[str]:
     """Yield the lines of the table and of the notes on its columns."""
-    from kgcp.simulation.outlook import OBLIQUE_DEG, SURE_PX, TILT_DEG
+    from kgcp.simulation.outlook import OBLIQUE_DEG, SURE_PX, TILT_DEG, least_plain_px
+    from kgcp.targets.plain import PlainTarget
 
-    yield f"Target {name}"
+    plain = target if isinstance(target, PlainTarget) else None
+    least_px = SURE_PX if plain is None else least_plain_px(plain)
+    yield f"Target {target.name}"
     yield from _aligned(_COLUMNS, map(_cells, outlooks))
     blur = f"{conditions.blur_px:g} px"
     yield f"σ: one well exposed frame, target in its middle, plate tilted by {TILT_DEG:g}°,"
@@ -183,8 +187,10 @@ def _table(name: str, conditions: Conditions, outlooks: Sequence[Outlook]) -> It
     yield f"speed: over ground, the largest that blurs by {blur} in {conditions.exposure_s:g} s."
     yield (
         f"diameter: the smallest for a σ of {conditions.accuracy_percent:g} % of the distance"
-        f" and a radius of {SURE_PX:g} px."
+        f" and a radius of {least_px:.3g} px."
     )
+    if plain is not None:
+        yield "found: where the frame's pose puts it, on even ground in contrast to it."
     yield ""
     yield from _aligned(_GROUND_COLUMNS, map(_ground_cells, outlooks))
     yield (

@@ -11,14 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
+from kgcp.measurement.adjustment.covariance import propagate
 from kgcp.measurement.discs.adjust_disc import geometry_of
 from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.measure import measure_disc
@@ -45,9 +46,8 @@ from kgcp.measurement.records import Alternative, Appearance, Measurement, Miss,
 from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
-_SMALLEST_PX = 2.0  # radius
+_SMALLEST_PX = 3.0  # radius: below, pebbles and clods are as round
 _MOST_TRIES = 8  # edges that are measured per target
-_NEAREST = 2.0  # standard deviations of sizes that are worth measuring, beyond what is accepted
 # How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
 # them), and of the radius (jagged or dirty edges)
 _EDGE_PX, _EDGE = 0.1, 0.01
@@ -55,6 +55,10 @@ _SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
 _PLACE_PX = 0.1  # of a prediction, at least
 _WORST_CHI2 = {2: 18.4, 7: 29.9, 12: 39.1}  # quantiles of 99.99 % by degrees of freedom
 _CHI2_PER_CIRCLE = 9.3  # beyond
+# The variances on ground that is not known to be even: its texture displaces edges over longer
+# stretches than the arcs that the covariance is made from.
+_BARE = 3.0
+_SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
 _SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
 _INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
 _REASONS = {
@@ -106,7 +110,8 @@ def look_for_plain(
         _check_prediction(camera, prediction)
         expected = _expected_ellipses(camera, target, prediction)
         edges = edges_like(grey, expected[0], _polarity(target), prediction.reach_px)
-        edges = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
+        free = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
+        edges = _alike(free, expected[0], prediction)
         candidate = _only_candidate(grey, camera, target, prediction, edges)
     except Rejection as rejection:
         return Miss(target.name, rejection.reason, rejection.detail)
@@ -171,7 +176,6 @@ def _try_edge(
     Rejection
     """
     start = _start(camera, target, prediction, edge.ellipse)
-    _check_size(target, prediction, start, _NEAREST)
     circles = _measured_circles(grey, camera, target, start, edge)
     try:
         tolerant = fit_circles(camera, _tolerated(circles.images), start, prediction.normal)
@@ -180,6 +184,30 @@ def _try_edge(
     except np.linalg.LinAlgError:
         raise Rejection(Reason.POOR_FIT, "singular equations") from None
     return _Candidate(circles, fit, other)
+
+
+def _alike(
+    edges: Sequence[DiscOutline], expected: Ellipse, prediction: PlainPrediction
+) -> list[DiscOutline]:
+    """Return the edges that are like the expected one in both axes, before they are measured.
+
+    Raises
+    ------
+    Rejection
+        If there are edges, and none is.
+    """
+    tolerance_px = math.hypot(_SHAPE_PX, _SHAPE * expected.a)
+    alike = [
+        edge
+        for edge in edges
+        if abs(edge.ellipse.a - expected.a) < tolerance_px
+        and abs(edge.ellipse.b - expected.b) < tolerance_px
+    ]
+    if edges and not alike:
+        a, b = edges[0].ellipse.a, edges[0].ellipse.b
+        detail = f"semi-axes {a:.1f} and {b:.1f} px, not {expected.a:.1f} and {expected.b:.1f}"
+        raise Rejection(Reason.UNLIKE_PREDICTION, f"{detail}; {prediction}")
+    return alike
 
 
 def _polarity(target: PlainTarget, circle: int = 0) -> Polarity:
@@ -253,7 +281,7 @@ def _measured_circles(
     images = CircleMoments(
         np.array(radii_m),
         np.array([disc.vector for disc in discs]),
-        np.array([disc.cov for disc in discs]),
+        np.array([disc.cov for disc in discs]) * (1.0 if border else _BARE),
     )
     return _Circles(tuple(discs), images)
 
@@ -282,9 +310,7 @@ def _tolerated(images: CircleMoments) -> CircleMoments:
     return CircleMoments(images.radii_m, images.moments, np.array(covs))
 
 
-def _check_size(
-    target: PlainTarget, prediction: PlainPrediction, pose: Pose, slack: float = 1.0
-) -> None:
+def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:
     """Refuse a distance that is not the predicted one.
 
     Raises
@@ -299,7 +325,7 @@ def _check_size(
         _SIZE_PX / prediction.radius_px,
         target.sd_diameter_m / target.outer_diameter_m,
     )
-    if abs(off) > slack * SIGMAS * sd:
+    if abs(off) > SIGMAS * sd:
         raise Rejection(Reason.UNLIKE_PREDICTION, f"{math.exp(-off) - 1.0:+.0%} in size")
 
 
@@ -346,12 +372,7 @@ def _best_fits(
 
 
 def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Measurement:
-    fit, other, pose = candidate.fit, candidate.other, candidate.fit.pose
-    pose_cov, alternative = fit.pose_cov.copy(), None
-    if other is not None:
-        ambiguity = other.chi2 - fit.chi2
-        pose_cov[:3, :3] += spread_over_both(pose, other.pose, ambiguity)
-        alternative = Alternative(other.pose, ambiguity)
+    pose, pose_cov, alternative = _over_both(candidate.fit, candidate.other)
     return Measurement(
         target=target.name,
         ring=target.name,
@@ -364,6 +385,25 @@ def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> 
         alternative=alternative,
         uncertainty=propagate(camera, pose, pose_cov),
     )
+
+
+def _over_both(
+    fit: CirclesFit, other: CirclesFit | None
+) -> tuple[Pose, FloatArray, Alternative | None]:
+    """Return pose, covariance and the other pose, where either normal may be the right one.
+
+    Between the two the centre is where its mean square error is least, at their mean, weighted by
+    their probabilities p and q: the difference d of the two adds p q d dᵀ.
+    """
+    if other is None:
+        return fit.pose, fit.pose_cov, None
+    ambiguity = other.chi2 - fit.chi2
+    share = float(expit(-0.5 * ambiguity))
+    apart_m = other.pose.translation_m - fit.pose.translation_m
+    pose_cov = fit.pose_cov.copy()
+    pose_cov[:3, :3] += share * (1.0 - share) * np.outer(apart_m, apart_m)
+    pose = Pose(fit.pose.rotation, fit.pose.translation_m + share * apart_m)
+    return pose, pose_cov, Alternative(other.pose, ambiguity)
 
 
 def _appearance(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Appearance:

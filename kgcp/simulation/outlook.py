@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -26,9 +27,10 @@ from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.settings import require_range
 from kgcp.simulation.crlb import Shot, bound_of
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.plate import PlainPlate, PrintedPlate
 from kgcp.simulation.regions import regular_polygon
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 TILT_DEG = 6.0
 """Tilt of the plate against the viewing ray: more hardly matters, frontal views are better."""
@@ -47,6 +49,16 @@ FOUND = ((6.0, 52, 52), (7.0, 54, 54), (8.0, 44, 44), (9.0, 300, 300))
 `python -m benchmarks.accuracy.planning`, seed 1, 150 frames each of the sets small, middle and
 large.
 """
+PLAIN_SCATTER = (1.7, 1.15)
+"""The same of plain discs, over their edges' bound with known blur.
+
+`python -m benchmarks.ground.plain_targets`: white and black discs of 3 to 20 px, linear response.
+"""
+PLAIN_FOUND = (400, 400)
+"""Plain discs found and shown from `PLAIN_LEAST_PX` on, by the same benchmark; rings with as much
+between their circles."""
+PLAIN_LEAST_PX = 3.0
+"""Least radius of a disc, least distance of a ring's circles and radius of its innermost [px]."""
 SURE_PX = 9.0
 """Radius to plan for [px]: below, blur that is not foreseen leaves little of the dots."""
 LARGEST_SHARE = 0.46
@@ -146,13 +158,17 @@ def _at(logarithm: PchipInterpolator, radius_px: float) -> float:
     return math.exp(float(logarithm(math.log(inside))))
 
 
-def usual_heights(camera: Camera, target: Target) -> tuple[float, ...]:
+def usual_heights(camera: Camera, target: AnyTarget) -> tuple[float, ...]:
     """Return round heights from which some ring of a target can be measured [m].
 
     They span a factor of fifty at most: a replica can be measured from nearer than any flight.
     """
-    px_m = [0.5 * ring.outer_diameter_m * camera.mean_focal_px for ring in target.rings]
-    farthest = max(px_m) / FOUND[0][0]
+    if isinstance(target, PlainTarget):
+        diameters_m, least_px = [target.outer_diameter_m], least_plain_px(target)
+    else:
+        diameters_m, least_px = [ring.outer_diameter_m for ring in target.rings], FOUND[0][0]
+    px_m = [0.5 * diameter_m * camera.mean_focal_px for diameter_m in diameters_m]
+    farthest = max(px_m) / least_px
     nearest = min(px_m) / (LARGEST_SHARE * min(camera.width, camera.height))
     nearest = max(nearest, farthest / _SPAN)
     decades = range(math.floor(math.log10(nearest)), math.ceil(math.log10(farthest)) + 1)
@@ -163,7 +179,7 @@ def usual_heights(camera: Camera, target: Target) -> tuple[float, ...]:
 def look_ahead(
     camera: Camera,
     calibration: CalibrationCovariance | None,
-    target: Target,
+    target: AnyTarget,
     heights_m: Sequence[float],
     conditions: Conditions,
 ) -> tuple[Outlook, ...]:
@@ -178,6 +194,11 @@ def look_ahead(
         require_range("height", height_m, 0.0, 1e5, unit="m", open_low=True)
     if not heights_m:
         raise SettingError("height", "is missing", "no usual one suits this camera and target")
+    if isinstance(target, PlainTarget):
+        return tuple(
+            _plain_outlook(camera, calibration, target, height_m, conditions)
+            for height_m in heights_m
+        )
     accuracy = _accuracy(camera, _of_unit_size(target.ring), conditions.blur_px, conditions.psf_px)
     wanted_px = max(accuracy.radius_for(0.01 * conditions.accuracy_percent), SURE_PX)
     return tuple(
@@ -220,6 +241,78 @@ def _outlook(
     )
 
 
+def _plain_outlook(
+    camera: Camera,
+    calibration: CalibrationCovariance | None,
+    target: PlainTarget,
+    height_m: float,
+    conditions: Conditions,
+) -> Outlook:
+    metre_px = camera.mean_focal_px / height_m
+    radius_px, least_px = target.radii_m[0] * metre_px, least_plain_px(target)
+    is_whole = radius_px <= LARGEST_SHARE * min(camera.width, camera.height)
+    is_found = is_whole and radius_px >= least_px
+    found, low, high = _wilson(*PLAIN_FOUND) if is_found else (0.0, 0.0, 0.0)
+    by_distance, by_centre = _plain_accuracy(camera, target, radius_px, conditions)
+    # relative deviations of distances fall with R^(-3/2)
+    wanted = 0.01 * conditions.accuracy_percent
+    wanted_px = radius_px * (by_distance / wanted) ** (2.0 / 3.0) if wanted else math.inf
+    common = common_uncertainty(camera, calibration, target, _pose(camera, height_m))
+    return Outlook(
+        height_m=height_m,
+        ring=target.name if is_whole else None,
+        radius_px=radius_px,
+        found=found,
+        found_low=low,
+        found_high=high,
+        sd_distance_m=height_m * by_distance if found else None,
+        sd_centre_px=by_centre if found else None,
+        sd_common_distance_m=None if common is None else common.sd_distance_m,
+        largest_speed_mps=conditions.blur_px / metre_px / conditions.exposure_s,
+        smallest_diameter_m=2.0 * max(wanted_px, least_px) / metre_px,
+        gsd_m=1.0 / metre_px,
+        footprint_m=(camera.width / metre_px, camera.height / metre_px),
+        frames_per_pass=max(0.0, camera.height / metre_px - target.outer_diameter_m)
+        / (conditions.speed_mps * conditions.interval_s),
+        eccentricity_px=_eccentricity_px(camera, radius_px),
+    )
+
+
+def least_plain_px(target: PlainTarget) -> float:
+    """Return the least radius at which all circles of a plain target are told apart [px]."""
+    radii = (*target.radii_m, 0.0)
+    narrowest_m = min(outer - inner for outer, inner in pairwise(radii))
+    return PLAIN_LEAST_PX * target.radii_m[0] / narrowest_m
+
+
+def _plain_accuracy(
+    camera: Camera, target: PlainTarget, radius_px: float, conditions: Conditions
+) -> tuple[float, float]:
+    """Return the deviations of the distance, relative, and of the centre per axis [px].
+
+    The centre of a disc of radius R is known to σ_c = (σ_n / C) √(2 s / (√π R)) by its edge, spread
+    by s, its radius to σ_c / √2, and a semi-axis to √1.5 σ_c. What is not known of the normal, by
+    its prior and by the axes, displaces the centre by (R² / f) σ.
+    """
+    sensor = Sensor()
+    plate = PlainPlate(target)
+    bright, dark = GAIN * plate.bright, GAIN * plate.dark
+    electrons = sensor.full_well_e * 0.5 * (bright + dark) + sensor.read_noise_e**2
+    noise = math.hypot(math.sqrt(electrons) / sensor.full_well_e, 1.0 / math.sqrt(12.0) / 255.0)
+    edge_px = math.sqrt(conditions.psf_px**2 + (conditions.blur_px**2 / 2.0 + 1.0) / 12.0)
+    shares = [radius_m / target.radii_m[0] for radius_m in target.radii_m]
+    centre_px = noise / (bright - dark)
+    centre_px *= math.sqrt(2.0 * edge_px / (math.sqrt(math.pi) * radius_px * sum(shares)))
+    # a circle's radius says R_i² as much of the scale as one of unit radius
+    scale = centre_px / math.sqrt(2.0) / radius_px
+    scale *= math.sqrt(sum(shares) / sum(share**3 for share in shares))
+    by_axes = math.sqrt(1.5) * centre_px / (radius_px * math.sin(math.radians(TILT_DEG)))
+    normal = 1.0 / math.hypot(1.0 / by_axes, 1.0 / math.radians(target.sd_normal_deg))
+    turned_px = radius_px**2 / camera.mean_focal_px * normal
+    by_distance, by_centre = PLAIN_SCATTER
+    return by_distance * scale, by_centre * math.hypot(centre_px, turned_px)
+
+
 def _eccentricity_px(camera: Camera, radius_px: float) -> float:
     angle_rad = math.radians(OBLIQUE_DEG)
     circle = Circles3D.with_normals(
@@ -245,7 +338,10 @@ def chance_to_find(radius_px: float) -> tuple[float, float, float]:
     bands = [(found, shown) for low_px, found, shown in FOUND if low_px <= radius_px]
     if not bands:
         return 0.0, 0.0, 0.0
-    found, shown = bands[-1]
+    return _wilson(*bands[-1])
+
+
+def _wilson(found: int, shown: int) -> tuple[float, float, float]:
     # Loaded here because it takes long, and only plans need it.
     from scipy.stats import binomtest
 

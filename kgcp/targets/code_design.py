@@ -7,6 +7,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.settings import require_range
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import AnyTarget
 from kgcp.targets.validation import check_targets, rotations_coincide, same_shape
+
+_Kind = TypeVar("_Kind", bound=AnyTarget)
 
 LEAST_DISTANCE = 2.0
 """Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
@@ -286,7 +290,7 @@ def _search(field: _Candidates, start: int, count: int) -> tuple[list[int], floa
     return chosen, float(min(field.own[chosen].min(), between.min()))
 
 
-def chosen_targets(known: Sequence[Target], names: Sequence[str]) -> tuple[Target, ...]:
+def chosen_targets(known: Sequence[_Kind], names: Sequence[str]) -> tuple[_Kind, ...]:
     """Return the targets of these names, or all.
 
     Raises

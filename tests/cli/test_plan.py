@@ -140,3 +140,35 @@ def test_a_flight_without_camera_is_told_so(flight: Path) -> None:
     result = run(flight)
     assert result.exit_code == 1
     assert "camera: is missing" in result.stderr
+
+
+PLAIN = """
+[[target]]
+name = "ring"
+shape = "ring"
+polarity = "dark"
+diameter_m = 0.6
+inner_diameter_m = 0.3
+position_m = [1.0, 2.0, 3.0]
+"""
+
+
+def test_plans_for_a_plain_target(flight: Path) -> None:
+    text = (flight / "flight.toml").read_text(encoding="utf-8")
+    (flight / "flight.toml").write_text(text + PLAIN, encoding="utf-8")
+    heights = [option for height in (20, 95, 96) for option in ("--height", str(height))]
+    result = CliRunner().invoke(
+        main, ["plan", str(flight), "--target", "ring", "--blur", "0", "--json", *heights]
+    )
+    assert result.exit_code == 0, result.output
+    near, far, beyond = json.loads(result.stdout)["heights"]
+    # circles 3 px apart, which is a radius of 6 px, at 95.1 m
+    assert near["found"] == far["found"] == 1.0
+    assert beyond["found"] == 0.0
+    assert beyond["sd_distance_m"] is None
+    # R = 28.5 and 6.0 px: the centre improves by R^(1/2), the distance by R^(3/2)
+    assert 0.0015 < near["sd_centre_px"] < far["sd_centre_px"] < 0.006
+    ratio = far["sd_distance_m"] / 95.0 / (near["sd_distance_m"] / 20.0)
+    assert math.isclose(ratio, (95.0 / 20.0) ** 1.5, rel_tol=1e-6)
+    shown = CliRunner().invoke(main, ["plan", str(flight), "--target", "ring"])
+    assert "a radius of 6 px" in shown.output

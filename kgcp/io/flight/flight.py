@@ -144,7 +144,11 @@ def read_printed_targets(folder: Path) -> tuple[Target, ...]:
     KgcpError
         As `read_flight`, for what is wrong with the targets.
     """
-    return read_targets(_read_flight_toml(folder)[0])
+    table, _ = _read_flight_toml(folder)
+    targets = read_targets(table)
+    if not targets:
+        raise table.error("target", "has no code in any table", "describe the target to be drawn")
+    return targets
 
 
 def read_target_tables(path: Path) -> tuple[Target, ...]:
@@ -160,7 +164,7 @@ def read_target_tables(path: Path) -> tuple[Target, ...]:
 
 def read_camera_and_targets(
     folder: Path,
-) -> tuple[Camera, CalibrationCovariance | None, tuple[Target, ...]]:
+) -> tuple[Camera, CalibrationCovariance | None, tuple[AnyTarget, ...]]:
     """Read the camera, how well it is known, and the targets of a flight without frames yet.
 
     Raises
@@ -170,10 +174,11 @@ def read_camera_and_targets(
     """
     table, _ = _read_flight_toml(folder)
     camera = table.table("camera", CAMERA_KEYS)
+    targets = read_targets(table)
     return (
         read_camera(camera, folder),
         read_calibration_covariance(camera, folder),
-        read_targets(table),
+        (*targets, *read_plain_targets(table, _names_of(targets))),
     )
 
 
