@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +15,14 @@ from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.flight.target_table import target_lines
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics, Sensor
-from kgcp.simulation.plate import PlainPlate
-from kgcp.simulation.scene import PlainPose, SimulatedScene, render_irradiance
-from kgcp.targets.plain import PlainPolarity, PlainTarget
+from kgcp.simulation.plate import PlainPlate, PrintedPlate
+from kgcp.simulation.regions import regular_polygon
+from kgcp.simulation.scene import PlainPose, PlatePose, SimulatedScene, render_irradiance
+from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import AnyTarget, PlainPolarity, PlainTarget
 
 CRS = "EPSG:25832"
 ORIGIN_MAP = np.array([689_412.0, 5_336_208.0, 545.0])
@@ -43,11 +47,26 @@ TARGETS = (
 )
 
 
+def coded_target(name: str, offset_m: tuple[float, float], code: tuple[float, ...]) -> Target:
+    """A coded target on the ground, of the usual proportions and 1.3 m across."""
+    ring = Ring(name, 1.3, 0.65, 1.3 / 1.4, 1.3 / 7.0, code)
+    x, y, z = (ORIGIN_MAP + np.append(offset_m, 0.0)).tolist()
+    return Target(ring, position_m=(x, y, z), sd_position_m=(0.002,) * 3)
+
+
+CODED = (
+    coded_target("A", (-1.8, 1.8), (0, 43, 78, 180)),
+    coded_target("B", (1.8, 0.6), (0, 60, 150, 270)),
+    coded_target("C", (0.0, -2.8), (0, 35, 120, 200)),
+)
+
+
 @dataclass(frozen=True)
 class PlainFlight:
     """Where everything is; `write` renders it."""
 
     targets: tuple[PlainTarget, ...] = TARGETS
+    coded: tuple[Target, ...] = ()
     frames: int = 3
     seed: int = 3
     height_m: float = 25.0
@@ -66,9 +85,14 @@ class PlainFlight:
         return np.array(centres), np.array(rotations)
 
     def centres_m(self, frame: int) -> FloatArray:
-        """Centres (k, 3) of the targets in a frame's camera axes [m]."""
+        """Centres (k, 3) of the plain targets in a frame's camera axes [m]."""
+        return self._in_camera(frame, self.targets)
+
+    def _in_camera(self, frame: int, targets: Sequence[AnyTarget]) -> FloatArray:
+        if not targets:
+            return np.empty((0, 3))
         local_frame = LocalFrame.at(CRS, ORIGIN_MAP)
-        places = local_frame.enu_from_map(np.array([each.position_m for each in self.targets]))
+        places = local_frame.enu_from_map(np.array([each.position_m for each in targets]))
         centres, rotations = self.cameras()
         return np.asarray((places - centres[frame]) @ rotations[frame])
 
@@ -84,7 +108,12 @@ class PlainFlight:
             scene = SimulatedScene(
                 Pose(lying, -camera_from_enu @ centres[frame]),
                 None,
-                (),
+                tuple(
+                    PlatePose(PrintedPlate(target, regular_polygon(4, 0.9)), Pose(lying, centre))
+                    for target, centre in zip(
+                        self.coded, self._in_camera(frame, self.coded), strict=True
+                    )
+                ),
                 tuple(
                     PlainPose(PlainPlate(target), Pose(lying, centre))
                     for target, centre in zip(self.targets, self.centres_m(frame), strict=True)
@@ -138,4 +167,5 @@ class PlainFlight:
             ]
             if len(target.diameters_m) > 1:
                 lines.append(f"inner_diameter_m = {list(target.diameters_m[1:])}")
+        lines += [line for target in self.coded for line in target_lines(target)]
         return "\n".join(lines) + "\n"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.attitude import ReferencePoses
+from kgcp.geometry.attitude import ReferencePoses, cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.georef.exterior_orientation import ExteriorOrientations, visible_pixel
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.plate_prior import NormalPrior
@@ -20,78 +22,109 @@ _FLOOR_PX, _FLOOR_LOG = 1.0, 0.002  # least standard deviations, whatever is sta
 # Of poses that state none: those of a block that was adjusted are better, those of a navigation
 # receiver alone much worse, and are not enough to look for plain targets.
 _UNSTATED_PX, _UNSTATED_LOG = 5.0, 0.01
-_SOURCE = "the reference"
 
 Predictions = Mapping[str, PlainPrediction]
 """By the target's name."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameOrientation:
+    """The exterior orientation of one frame, as far as predictions need it.
+
+    Attributes
+    ----------
+    centre_m : (3,) array
+        Projection centre in the ENU frame [m].
+    enu_from_camera : (3, 3) array
+        Camera axes in the ENU frame, as columns.
+    cov : (6, 6) array or None
+        Of centre [m] and left rotation vector [rad], ENU axes; None: not stated.
+    source : str
+        Who says so, in few words.
+    """
+
+    centre_m: FloatArray
+    enu_from_camera: FloatArray
+    cov: FloatArray | None
+    source: str
+
+    @property
+    def sd_angle_deg(self) -> float:
+        """Standard deviation of an angle, as the root of the three's mean square [deg]."""
+        if self.cov is None:
+            return 0.0
+        return math.degrees(math.sqrt(float(np.trace(self.cov[3:, 3:])) / 3.0))
+
+
+def reference_orientations(
+    poses: ReferencePoses, local_frame: LocalFrame
+) -> dict[str, FrameOrientation]:
+    """Return reference poses by their frames."""
+    orientations = ExteriorOrientations.of(poses, local_frame)
+    made = {}
+    for row, frame in enumerate(poses.frames):
+        cov = None
+        if orientations.cov_m2 is not None:
+            sd_deg = 0.0 if poses.sd_angle_deg is None else float(poses.sd_angle_deg[row])
+            turn = math.radians(sd_deg) ** 2 * np.eye(3)
+            zero = np.zeros((3, 3))
+            cov = np.block([[orientations.cov_m2[row], zero], [zero, turn]])
+        made[frame] = FrameOrientation(
+            orientations.centre_m[row], orientations.enu_from_camera[row], cov, "the reference"
+        )
+    return made
+
+
 def predict_plain(
-    frames: Sequence[str],
     targets: Sequence[PlainTarget],
-    poses: ReferencePoses,
+    orientation: FrameOrientation,
     positions: TargetPositions,
     camera: Camera,
-) -> list[Predictions]:
-    """Return for each frame where its plain targets must be; nothing of frames without a pose.
+) -> Predictions:
+    """Return where a frame's plain targets must be, but for those behind the camera.
 
-    The deviations follow from those of the pose and of the target's position.
+    The deviations follow from those of the frame's orientation and of the target's position.
     """
-    rows = {frame: row for row, frame in enumerate(poses.frames)}
-    orientations = ExteriorOrientations.of(poses, positions.local_frame)
-    predictions: list[Predictions] = []
-    for frame in frames:
-        row = rows.get(frame)
-        if row is None:
-            predictions.append({})
-            continue
-        made = {
-            target.name: _predicted(target, row, poses, orientations, positions, camera)
-            for target in targets
-        }
-        predictions.append({name: one for name, one in made.items() if one is not None})
-    return predictions
+    made = {target.name: _predicted(target, orientation, positions, camera) for target in targets}
+    return {name: one for name, one in made.items() if one is not None}
 
 
 def _predicted(
     target: PlainTarget,
-    row: int,
-    poses: ReferencePoses,
-    orientations: ExteriorOrientations,
+    orientation: FrameOrientation,
     positions: TargetPositions,
     camera: Camera,
 ) -> PlainPrediction | None:
-    """Return one prediction; None where the target is behind the camera."""
     place = positions.static[target.name]
-    enu_from_camera = orientations.enu_from_camera[row]
-    sight_m = (place.position_m - orientations.centre_m[row]) @ enu_from_camera
+    camera_from_enu = orientation.enu_from_camera.T
+    from_centre_m = place.position_m - orientation.centre_m
+    sight_m = camera_from_enu @ from_centre_m
     centre_px = visible_pixel(camera, sight_m)
     if not np.isfinite(centre_px).all():
         return None
-    level = positions.local_frame.level_rotations(place.position_m[None])[0]
-    into_plate = -(level @ np.array(target.normal_enu)) @ enu_from_camera
-    sd_angle_deg = 0.0 if poses.sd_angle_deg is None else float(poses.sd_angle_deg[row])
-    distance_m = float(np.linalg.norm(sight_m))
     cov_m2 = np.zeros((3, 3)) if place.cov_m2 is None else place.cov_m2
     floor_px, floor_log = _UNSTATED_PX, _UNSTATED_LOG
-    if orientations.cov_m2 is not None:
+    if orientation.cov is not None:
         floor_px, floor_log = _FLOOR_PX, _FLOOR_LOG
-        cov_m2 = cov_m2 + orientations.cov_m2[row]
-    cov_m2 = enu_from_camera.T @ cov_m2 @ enu_from_camera
-    turned_m = math.radians(sd_angle_deg) * distance_m
-    along = sight_m / distance_m
-    across_m2 = cov_m2 + turned_m**2 * (np.eye(3) - np.outer(along, along))
-    by_place = _pixel_slopes(camera, sight_m)
+        # with p = Rᵀ (X − C), errors of C and of a left turn α give Rᵀ (−δC + (X − C) × α)
+        by_pose = np.hstack((-np.eye(3), cross_matrix(from_centre_m)))
+        cov_m2 = cov_m2 + by_pose @ orientation.cov @ by_pose.T
+    cov_m2 = camera_from_enu @ cov_m2 @ camera_from_enu.T
+    distance_m = float(np.linalg.norm(sight_m))
+    along, by_place = sight_m / distance_m, _pixel_slopes(camera, sight_m)
+    sd_along = math.sqrt(max(0.0, float(along @ cov_m2 @ along))) / distance_m
+    level = positions.local_frame.level_rotations(place.position_m[None])[0]
     return PlainPrediction(
         centre_px=centre_px,
-        cov_px2=by_place @ across_m2 @ by_place.T + floor_px**2 * np.eye(2),
+        cov_px2=by_place @ cov_m2 @ by_place.T + floor_px**2 * np.eye(2),
         position_m=sight_m,
-        sd_log_distance=math.hypot(
-            math.sqrt(float(along @ cov_m2 @ along)) / distance_m, floor_log
+        sd_log_distance=math.hypot(sd_along, floor_log),
+        normal=NormalPrior(
+            -camera_from_enu @ level @ np.array(target.normal_enu),
+            math.hypot(target.sd_normal_deg, orientation.sd_angle_deg),
         ),
-        normal=NormalPrior(into_plate, math.hypot(target.sd_normal_deg, sd_angle_deg)),
         radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
-        source=_SOURCE,
+        source=orientation.source,
     )
 
 

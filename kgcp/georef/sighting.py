@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.records import Measurement
 
 _NO_HEADING_RAD2 = 1.0  # variance from which on an angle is not known
 
@@ -55,6 +56,34 @@ class Sighting:
     def rows_since_middle(self, camera: Camera) -> float:
         """Return how far below the middle row the centre lies, in frames: -0.5 … 0.5 inside."""
         return float(self.centre_px[1]) / (camera.height - 1) - 0.5
+
+
+def sighting_of(frame: str, number: int, time_s: float | None, seen: Measurement) -> Sighting:
+    """Return what was measured, as its place on the ground needs it.
+
+    Parameters
+    ----------
+    number : int
+        Of the frame among all frames of the flight, from 1.
+    """
+    own, common = seen.uncertainty, seen.common
+    return Sighting(
+        frame=frame,
+        number=number,
+        target=seen.target,
+        instance=seen.instance,
+        time_s=time_s,
+        centre_px=seen.centre_px,
+        centre_cov_px2=None if own is None else own.centre_cov_px2,
+        distance_m=seen.distance_m,
+        sd_distance_m=None if own is None else own.sd_distance_m,
+        sd_common_distance_m=None if common is None else common.sd_distance_m,
+        pose=seen.pose,
+        pose_cov=None if own is None else own.pose_cov,
+        score=seen.score,
+        ambiguity=None if seen.alternative is None else seen.alternative.ambiguity,
+        common_pose_cov=None if common is None else common.pose_cov,
+    )
 
 
 @dataclass(frozen=True, slots=True)

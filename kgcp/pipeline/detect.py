@@ -23,9 +23,14 @@ from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.threads import single_threaded
-from kgcp.pipeline.frame_priors import plain_of_frames, priors_of_frames
+from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
-from kgcp.pipeline.guidance import predict_missing, with_predictions
+from kgcp.pipeline.guidance import (
+    plain_by_reference,
+    plain_by_targets,
+    predict_missing,
+    with_predictions,
+)
 from kgcp.pipeline.overlay import draw_overlay
 from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilder
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -140,7 +145,7 @@ def detect_flight(
         inputs = [
             FrameInput(frame, times.get(frame), known, flight.may_use_exif_times, plain)
             for frame, known, plain in zip(
-                frames, priors, plain_of_frames(flight, data, frames), strict=True
+                frames, priors, plain_by_reference(flight, data, frames), strict=True
             )
         ]
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
@@ -170,10 +175,10 @@ def detect_flight(
                 run.first_pass()
             predictions: Mapping[int, Mapping[str, Prediction]] = {}
             guide_problem = None
-            if settings.is_guided:
-                with stopwatch.stage("second look"):
+            with stopwatch.stage("second look"):
+                if settings.is_guided:
                     predictions, guide_problem = predict_missing(flight, data, run.tracks)
-                    run.guided_pass(predictions)
+                run.guided_pass(predictions, plain_by_targets(flight, data, run.results()))
             with stopwatch.stage("learning"):
                 run.learn()
             likely_cause = None

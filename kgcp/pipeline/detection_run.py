@@ -25,6 +25,7 @@ from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.adjustment.smoothing import with_smoothing
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.other_pose import weighed_anew
+from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
@@ -177,13 +178,17 @@ class DetectionRun:
                             f" all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"
                         )
 
-    def guided_pass(self, predictions: Mapping[int, Mapping[str, Prediction]]) -> None:
+    def guided_pass(
+        self,
+        predictions: Mapping[int, Mapping[str, Prediction]],
+        plain: Mapping[int, Mapping[str, PlainPrediction]],
+    ) -> None:
         """Look again at the readable frames in which a missing target must be visible.
 
         Parameters
         ----------
-        predictions : mapping of mappings
-            By row and target.
+        predictions, plain : mapping of mappings
+            By row and target, of those with a code and of those without.
         """
         visible: dict[int, dict[str, Prediction]] = {}
         for row, by_target in predictions.items():
@@ -193,7 +198,8 @@ class DetectionRun:
                 if named:
                     visible[row] = named
         keys = {
-            row: f"again-{fingerprint(self._keys[row], named)}" for row, named in visible.items()
+            row: f"again-{fingerprint(self._keys[row], visible.get(row, {}), plain.get(row, {}))}"
+            for row in sorted({*visible, *plain})
         }
         todo = []
         for row, key in keys.items():
@@ -204,7 +210,15 @@ class DetectionRun:
                 self._keys[row] = key
                 self.tracks.add(row, kept)
         self._begin("second look", len(keys) - len(todo), len(keys))
-        guided_inputs = (self._guided_input(row, visible[row]) for row in todo)
+        guided_inputs = (
+            GuidedInput(
+                self._inputs[row],
+                self._journal.read(self._keys[row]),
+                visible.get(row, {}),
+                plain.get(row, {}),
+            )
+            for row in todo
+        )
         with closing(
             self._pool.map(partial(examine_frame_again, self._job), guided_inputs)
         ) as results:
@@ -271,9 +285,6 @@ class DetectionRun:
             for result, one in made:
                 self._advance()
                 yield self._rows[result.frame], result, one
-
-    def _guided_input(self, row: int, predictions: Mapping[str, Prediction]) -> GuidedInput:
-        return GuidedInput(self._inputs[row], self._journal.read(self._keys[row]), predictions)
 
     def _keep(self, row: int, result: FrameResult) -> None:
         self._journal.add(self._keys[row], result)

@@ -9,7 +9,6 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.georef.exterior_orientation import ExteriorOrientations
-from kgcp.georef.plain_prediction import Predictions, predict_plain
 from kgcp.georef.plate_priors import CameraAttitudes, normal_priors
 from kgcp.georef.scene_rotation import combine, rotations_between_frames
 from kgcp.georef.target_positions import TargetPosition, Vehicle
@@ -55,21 +54,6 @@ def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) ->
         }
         priors.append({name: prior for name, prior in known.items() if prior != PlatePrior()})
     return priors
-
-
-def plain_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[Predictions]:
-    """Return for each frame where its plain targets must be, as reference poses say it.
-
-    Raises
-    ------
-    KgcpError
-        If there are plain targets, and the reference poses cannot be read or there is no crs.
-    """
-    if not flight.plain_targets or not data.has_reference:
-        return [{}] * len(frames)
-    return predict_plain(
-        frames, flight.plain_targets, data.reference_poses, data.target_positions, flight.camera
-    )
 
 
 def _normals(

@@ -82,6 +82,8 @@ class GuidedInput:
     first: FrameResult  # of the first look
     # by the name of the target, which must be visible; those that are looked for
     predictions: Mapping[str, Prediction]
+    # where plain targets must be, as the targets of the first look say it
+    plain: Mapping[str, PlainPrediction] = field(default_factory=dict)
 
 
 @single_threaded()
@@ -163,7 +165,7 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
             considered += more
             if seen is not None:
                 found[target.name] = seen
-    outcomes = _merged(job, guided_input, grey, found, considered)
+    outcomes = _with_plain(job, guided_input, grey, found, considered)
     dropped = guided_input.first.dropped
     if job.keeps_dropped:
         dropped = _best_dropped((*dropped, *considered))
@@ -203,6 +205,32 @@ def kept_frame(guided_input: GuidedInput, reason: Reason) -> FrameResult:
         for one in guided_input.first.outcomes
     )
     return replace(guided_input.first, outcomes=outcomes)
+
+
+def _with_plain(
+    job: DetectionJob,
+    guided_input: GuidedInput,
+    grey: GreyArray,
+    found: Mapping[str, Measurement],
+    considered: Sequence[Considered],
+) -> tuple[Outcome, ...]:
+    """Merge what was found, and look for plain targets that nothing else has predicted."""
+    outcomes = _merged(job, guided_input, grey, found, considered)
+    measured = [one for one in outcomes if isinstance(one, Measurement)]
+    plain: dict[str, Outcome] = {}
+    for target in job.plain_targets:
+        prediction = guided_input.plain.get(target.name)
+        if prediction is not None:
+            outcome = look_for_plain(grey, job.camera, target, prediction, measured)
+            if isinstance(outcome, Measurement):
+                outcome = completed(job, replace(outcome, is_guided=True))
+            plain[target.name] = outcome
+    return tuple(
+        plain.get(one.target, one)
+        if isinstance(one, Miss) and one.reason is Reason.NO_PREDICTION
+        else one
+        for one in outcomes
+    )
 
 
 def _merged(

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
 from kgcp.geometry.camera import Camera
+from kgcp.georef.plain_prediction import (
+    FrameOrientation,
+    Predictions,
+    predict_plain,
+    reference_orientations,
+)
 from kgcp.georef.prediction import Track, predict_position, reference_states, state_of
+from kgcp.georef.sighting import Sighting, sighting_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
+from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
+from kgcp.network.ground.frame_poses import orient_frames
 from kgcp.targets.plain import AnyTarget
 
 # What a ring that is not the target's may be dropped for.
@@ -94,6 +102,70 @@ def predict_missing(
             if one is not None and one.is_sure:
                 predictions.setdefault(row, {})[target.name] = one
     return predictions, problem
+
+
+def plain_by_reference(
+    flight: Flight, data: FlightData, frames: Sequence[str]
+) -> list[Predictions]:
+    """Return for each frame where its plain targets must be, as reference poses say it.
+
+    Raises
+    ------
+    KgcpError
+        If there are plain targets, and the reference poses cannot be read or there is no crs.
+    """
+    if not flight.plain_targets or not data.has_reference:
+        return [{}] * len(frames)
+    positions = data.static_positions
+    orientations = reference_orientations(data.reference_poses, positions.local_frame)
+    return [
+        predict_plain(flight.plain_targets, orientations[frame], positions, flight.camera)
+        if frame in orientations
+        else {}
+        for frame in frames
+    ]
+
+
+def plain_by_targets(
+    flight: Flight, data: FlightData, results: Iterable[FrameResult]
+) -> dict[int, Predictions]:
+    """Return by row where plain targets must be, as the coded static targets of frames say it.
+
+    Of frames in which nothing else says it.
+
+    Parameters
+    ----------
+    results : iterable of FrameResult
+        Of all frames, in their order.
+    """
+    static = {target.name for target in flight.targets if target.position_m is not None}
+    if not flight.plain_targets or not static or flight.crs is None:
+        return {}
+    rows: dict[str, int] = {}
+    sightings: list[Sighting] = []
+    for row, result in enumerate(results):
+        if not any(map(_lacks_prediction, result.outcomes)):
+            continue
+        rows[result.frame] = row
+        sightings += [
+            sighting_of(result.frame, row + 1, result.time_s, one)
+            for one in result.outcomes
+            if isinstance(one, Measurement) and one.target in static
+        ]
+    positions = data.static_positions
+    made = {}
+    for one in orient_frames([*rows], sightings, positions.static, flight.camera):
+        if one.pose is not None:
+            orientation = FrameOrientation(
+                one.pose.centre_m, one.pose.world_from_camera, one.cov, "the frame's other targets"
+            )
+            targets = flight.plain_targets
+            made[rows[one.frame]] = predict_plain(targets, orientation, positions, flight.camera)
+    return made
+
+
+def _lacks_prediction(outcome: Outcome) -> bool:
+    return isinstance(outcome, Miss) and outcome.reason is Reason.NO_PREDICTION
 
 
 def with_predictions(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kgcp.georef.plain_prediction import predict_plain
+from kgcp.geometry.attitude import cross_matrix
+from kgcp.georef.plain_prediction import predict_plain, reference_orientations
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
 from tests.plain_flight import CAMERA, TARGETS, PlainFlight
@@ -20,14 +21,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
-    flight, names = read_flight(made), ["f_0.png", "f_1.png"]
-    data = FlightData(flight, names)
-    poses, positions = data.reference_poses, data.target_positions
-    with_pose, without = predict_plain(names, flight.plain_targets, poses, positions, CAMERA)
-    assert without == {}
+    flight = read_flight(made)
+    data = FlightData(flight, ["f_0.png"])
+    positions = data.static_positions
+    orientations = reference_orientations(data.reference_poses, positions.local_frame)
+    assert [*orientations] == ["f_0.png"]
+    named = predict_plain(flight.plain_targets, orientations["f_0.png"], positions, CAMERA)
     centres_m = PlainFlight(frames=1).centres_m(0)
     for target, centre_m in zip(TARGETS, centres_m, strict=True):
-        one = with_pose[target.name]
+        one = named[target.name]
         off_px = one.centre_px - CAMERA.project(centre_m[None])[0]
         assert np.abs(off_px).max() < 4.0 * one.sd_px
         # 2 cm at 25 m and 0.02° make 0.6 px, besides 1 px at least
@@ -40,6 +42,27 @@ def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
 def test_poses_without_deviations_are_trusted_less(made: Path) -> None:
     flight = read_flight(made)
     data = FlightData(flight, ["f_0.png"])
+    positions = data.static_positions
     bare = replace(data.reference_poses, sd_position_m=None, sd_angle_deg=None)
-    (named,) = predict_plain(["f_0.png"], flight.plain_targets, bare, data.target_positions, CAMERA)
+    orientation = reference_orientations(bare, positions.local_frame)["f_0.png"]
+    named = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
     assert all(4.0 < one.sd_px < 6.0 for one in named.values())
+
+
+def test_correlated_errors_of_a_pose_cancel(made: Path) -> None:
+    """A turn about the target, as resections are unsure of, moves it little in the image."""
+    flight = read_flight(made)
+    data = FlightData(flight, ["f_0.png"])
+    positions = data.static_positions
+    orientation = reference_orientations(data.reference_poses, positions.local_frame)["f_0.png"]
+    arm_m = positions.static["white"].position_m - orientation.centre_m
+    # the camera moves round the target by δC = −ω × arm while it turns by ω
+    about = np.vstack((cross_matrix(arm_m), np.eye(3)))
+    cov = 1e-4 * about @ about.T
+    made_of = [
+        predict_plain(flight.plain_targets, replace(orientation, cov=one), positions, CAMERA)
+        for one in (cov, np.diag(np.diag(cov)))
+    ]
+    correlated, not_correlated = (named["white"].sd_px for named in made_of)
+    assert correlated == pytest.approx(1.0, abs=0.1)
+    assert not_correlated > 5.0

@@ -98,6 +98,17 @@ class FlightData:
         return TargetPositions.of(crs, flight.all_targets, self.trajectory, settings)
 
     @cached_property
+    def static_positions(self) -> TargetPositions:
+        """Where the targets are that stand still. The trajectory is not read.
+
+        Raises
+        ------
+        KgcpError
+            If flight.toml has no crs, its crs is unusable, or no target stands still.
+        """
+        return TargetPositions.of(self._crs, self._flight.all_targets, None, VehicleSettings())
+
+    @cached_property
     def trajectory(self) -> Trajectory | None:
         """The vehicle's trajectory; None: no target is carried by a vehicle.
 
