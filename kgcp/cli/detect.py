@@ -82,6 +82,13 @@ _DEFAULTS = DetectSettings()
     help="Learn from all frames together what an unknown tone curve of the camera is near to.",
 )
 @click.option(
+    "--places",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Look for plain discs and rings where they are marked by hand, in frames without a pose:"
+    " CSV with frame,target,x_px,y_px; two static targets of a frame at least.",
+)
+@click.option(
     "--overlay",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
@@ -135,6 +142,7 @@ def command(
     false_alarm: float,
     frame_timeout: float,
     *,
+    places: Path | None,
     overlay: Path | None,
     all_candidates: bool,
     scheduler: str | None,
@@ -199,6 +207,7 @@ def command(
                 all_candidates=all_candidates,
                 stored_frames=stored_frames,
                 frame_patterns=frame_patterns,
+                places=places,
             )
             summary = detect_flight(
                 the_flight, settings, out=workspace.out, options=options, listener=log

@@ -23,8 +23,21 @@ _FLOOR_PX, _FLOOR_LOG = 1.0, 0.002  # least standard deviations, whatever is sta
 # receiver alone much worse, and are not enough to look for plain targets.
 _UNSTATED_PX, _UNSTATED_LOG = 5.0, 0.01
 
+# Of what is marked: how far a camera that looks down does not, and distances from marks.
+_DOWN_SD_DEG, _MARKED_LOG = 10.0, 0.08
+_LEVEL = 0.95  # upward component of a normal that counts as level
+
 Predictions = Mapping[str, PlainPrediction]
 """By the target's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkedPlace:
+    """Where somebody has marked a target in a frame."""
+
+    x_px: float
+    y_px: float
+    sd_px: float  # standard deviation of either coordinate [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +139,60 @@ def _predicted(
         radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
         source=orientation.source,
     )
+
+
+def predict_marked(
+    targets: Sequence[PlainTarget],
+    places: Mapping[str, MarkedPlace],
+    positions: TargetPositions,
+    camera: Camera,
+) -> Predictions:
+    """Return where level plain targets must be that are marked in a frame that looks down.
+
+    How far they are, the distances of all marks tell: two at least. That it looks down is good to
+    some degrees, and so are these.
+
+    Parameters
+    ----------
+    places : mapping
+        Of static targets, by their names.
+    """
+    depth_m = _depth_of_marks(places, positions, camera)
+    if depth_m is None:
+        return {}
+    predictions = {}
+    for target in targets:
+        place = places.get(target.name)
+        if place is None or target.normal_enu[2] < _LEVEL:
+            continue
+        centre_px = np.array([place.x_px, place.y_px])
+        position_m = depth_m * np.append(camera.undistort(centre_px[None])[0], 1.0)
+        predictions[target.name] = PlainPrediction(
+            centre_px=centre_px,
+            cov_px2=place.sd_px**2 * np.eye(2),
+            position_m=position_m,
+            sd_log_distance=_MARKED_LOG,
+            normal=NormalPrior(np.array([0.0, 0.0, 1.0]), _DOWN_SD_DEG),
+            radius_px=target.radii_m[0] * camera.mean_focal_px / float(np.linalg.norm(position_m)),
+            source="a mark",
+        )
+    return predictions
+
+
+def _depth_of_marks(
+    places: Mapping[str, MarkedPlace], positions: TargetPositions, camera: Camera
+) -> float | None:
+    """Return how far marked targets are along the camera's axis [m]; None: too few are marked."""
+    if len(places) < 2:
+        return None
+    pixels = np.array([(place.x_px, place.y_px) for place in places.values()])
+    plane = camera.undistort(pixels)
+    on_ground = np.array([positions.static[name].position_m[:2] for name in places])
+    first, second = np.triu_indices(len(places), 1)
+    apart_m = np.linalg.norm(on_ground[first] - on_ground[second], axis=1)
+    apart = np.linalg.norm(plane[first] - plane[second], axis=1)
+    usable = (apart > 0.0) & (apart_m > 0.0)
+    return float(np.median(apart_m[usable] / apart[usable])) if usable.any() else None
 
 
 def _pixel_slopes(camera: Camera, point_m: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.marks import Mark, read_marks
 from kgcp.io.images.frames import RESULTS_NAME, matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
@@ -40,7 +41,7 @@ from kgcp.settings import DetectSettings
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """How a flight is worked on. The table depends on `frame_patterns` alone.
+    """How a flight is worked on. The table depends on `frame_patterns` and `places` alone.
 
     Attributes
     ----------
@@ -65,6 +66,9 @@ class RunOptions:
     frame_patterns : tuple of str
         Of the frames that are wanted, see `matching_frames`; empty: all. The table has these alone
         and says so.
+    places : Path or None
+        File of static targets that were marked by hand, see `read_marks`: plain targets are looked
+        for there in frames without a pose.
     """
 
     jobs: int | None = None
@@ -76,6 +80,7 @@ class RunOptions:
     all_candidates: bool = False
     stored_frames: StoredFolder | None = None
     frame_patterns: tuple[str, ...] = ()
+    places: Path | None = None
 
 
 class NoProgress:
@@ -148,6 +153,7 @@ def detect_flight(
                 frames, priors, plain_by_reference(flight, data, frames), strict=True
             )
         ]
+        marks = _marks(flight, all_frames, options.places)
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     job = DetectionJob(
         frames_folder,
@@ -178,13 +184,11 @@ def detect_flight(
             with stopwatch.stage("second look"):
                 if settings.is_guided:
                     predictions, guide_problem = predict_missing(flight, data, run.tracks)
-                run.guided_pass(predictions, plain_by_targets(flight, data, run.results()))
+                plain = plain_by_targets(flight, data, run.results(), marks)
+                run.guided_pass(predictions, plain)
             with stopwatch.stage("learning"):
                 run.learn()
-            likely_cause = None
-            if run.tracks.is_readable.any() and not run.tracks.found:
-                with stopwatch.stage("trial of negatives"):
-                    likely_cause = _NEGATIVE if run.is_negative() else None
+            likely_cause = _likely_cause(run, stopwatch)
             if sheet is not None:
                 sheet.clear()
             with stopwatch.stage("table"):
@@ -224,8 +228,25 @@ def detect_flight(
     return summary
 
 
+def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:
+    """Return why no target was found in any frame, if a trial tells."""
+    if not run.tracks.is_readable.any() or run.tracks.found:
+        return None
+    with stopwatch.stage("trial of negatives"):
+        return _NEGATIVE if run.is_negative() else None
+
+
 def _without(times: Mapping[str, float], left_out: Collection[str]) -> dict[str, float]:
     return {name: time_s for name, time_s in times.items() if name not in left_out}
+
+
+def _marks(
+    flight: Flight, frames: Sequence[str], places: Path | None
+) -> Mapping[str, Sequence[Mark]]:
+    if places is None:
+        return {}
+    static = {target.name for target in flight.all_targets if target.position_m is not None}
+    return read_marks(places, set(frames), static)
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:

@@ -13,6 +13,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import (
     FrameOrientation,
     Predictions,
+    predict_marked,
     predict_plain,
     reference_orientations,
 )
@@ -20,6 +21,7 @@ from kgcp.georef.prediction import Track, predict_position, reference_states, st
 from kgcp.georef.sighting import Sighting, sighting_of
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
+from kgcp.io.formats.marks import Mark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames
@@ -127,40 +129,47 @@ def plain_by_reference(
 
 
 def plain_by_targets(
-    flight: Flight, data: FlightData, results: Iterable[FrameResult]
+    flight: Flight,
+    data: FlightData,
+    results: Iterable[FrameResult],
+    marks: Mapping[str, Sequence[Mark]],
 ) -> dict[int, Predictions]:
-    """Return by row where plain targets must be, as the coded static targets of frames say it.
+    """Return by row where plain targets must be, in frames in which no reference pose says it.
 
-    Of frames in which nothing else says it.
+    Coded static targets orient the frame; else marks tell the places of those that are marked.
 
     Parameters
     ----------
     results : iterable of FrameResult
-        Of all frames, in their order.
+        Of all frames, in their order: the coded targets that were measured.
+    marks : mapping
+        Static targets that were marked by hand, by frame.
     """
     static = {target.name for target in flight.targets if target.position_m is not None}
-    if not flight.plain_targets or not static or flight.crs is None:
+    if not flight.plain_targets or not (static or marks) or flight.crs is None:
         return {}
     rows: dict[str, int] = {}
     sightings: list[Sighting] = []
     for row, result in enumerate(results):
-        if not any(map(_lacks_prediction, result.outcomes)):
-            continue
-        rows[result.frame] = row
-        sightings += [
-            sighting_of(result.frame, row + 1, result.time_s, one)
-            for one in result.outcomes
-            if isinstance(one, Measurement) and one.target in static
-        ]
-    positions = data.static_positions
-    made = {}
-    for one in orient_frames([*rows], sightings, positions.static, flight.camera):
+        if any(map(_lacks_prediction, result.outcomes)):
+            rows[result.frame] = row
+            sightings += [
+                sighting_of(result.frame, row + 1, result.time_s, one)
+                for one in result.outcomes
+                if isinstance(one, Measurement) and one.target in static
+            ]
+    positions, camera, targets = data.static_positions, flight.camera, flight.plain_targets
+    made: dict[int, Predictions] = {}
+    for frame, row in rows.items():
+        places = {mark.target: mark.place for mark in marks.get(frame, ())}
+        if predicted := predict_marked(targets, places, positions, camera):
+            made[row] = predicted
+    for one in orient_frames([*rows], sightings, positions.static, camera):
         if one.pose is not None:
             orientation = FrameOrientation(
                 one.pose.centre_m, one.pose.world_from_camera, one.cov, "the frame's other targets"
             )
-            targets = flight.plain_targets
-            made[rows[one.frame]] = predict_plain(targets, orientation, positions, flight.camera)
+            made[rows[one.frame]] = predict_plain(targets, orientation, positions, camera)
     return made
 
 

@@ -1,0 +1,62 @@
+"""Places of targets in frames that somebody has marked by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from kgcp.errors import KgcpError
+from kgcp.georef.plain_prediction import MarkedPlace
+from kgcp.io.files.csv_columns import read_csv_columns
+from kgcp.io.files.safe_read import is_file
+
+_TEXTS, _NUMBERS, _SD = ("frame", "target"), ("x_px", "y_px"), "sd_px"
+_USUAL_SD_PX = 2.0  # of what is marked by hand
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """One target marked in one frame."""
+
+    target: str
+    place: MarkedPlace
+
+
+def read_marks(
+    path: Path, frames: Collection[str], targets: Collection[str]
+) -> Mapping[str, tuple[Mark, ...]]:
+    """Read marks, CSV with the columns frame, target, x_px, y_px and perhaps sd_px, by frame.
+
+    Parameters
+    ----------
+    frames, targets : collection of str
+        Names that may stand in the file.
+
+    Raises
+    ------
+    KgcpError
+        Naming the line: the file is missing, or a cell is wrong, names no frame or target of this
+        flight, or marks a target twice in a frame.
+    """
+    if not is_file(path):
+        raise KgcpError(f"{path}: does not exist; name a file of marked places", option="places")
+    table = read_csv_columns(path, _TEXTS, _NUMBERS, (_SD,), "places")
+    places = table.block(_NUMBERS).tolist()
+    sds = table.block((_SD,))[:, 0].tolist() if _SD in table.names else [_USUAL_SD_PX] * len(places)
+    marks: dict[str, dict[str, Mark]] = {}
+    rows = zip(table.lines, *(table.texts[name] for name in _TEXTS), places, sds, strict=True)
+    for line, text, target, (x_px, y_px), sd_px in rows:
+        frame, where = text.replace("\\", "/"), f"{path}, line {line}"
+        if frame not in frames:
+            problem = f"{text!r} is no frame; write its path below the frames folder"
+            raise KgcpError(f"{where}: {problem}")
+        if target not in targets:
+            listed = ", ".join(sorted(targets))
+            raise KgcpError(f"{where}: {target!r} stands still nowhere; name one of {listed}")
+        if not sd_px > 0.0:
+            raise KgcpError(f"{where}: sd_px is {sd_px:g}; give a standard deviation above 0")
+        if target in marks.setdefault(frame, {}):
+            raise KgcpError(f"{where}: {target!r} is marked twice in {frame}; keep one of them")
+        marks[frame][target] = Mark(target, MarkedPlace(x_px, y_px, sd_px))
+    return {frame: tuple(named.values()) for frame, named in marks.items()}
