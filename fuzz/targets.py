@@ -37,6 +37,7 @@ from kgcp.io.formats.exclusions import read_exclusions
 from kgcp.io.formats.fields import FORMATS as FIELD_FORMATS
 from kgcp.io.formats.frame_times import FORMATS as TIMES_FORMATS
 from kgcp.io.formats.frame_times import read_times
+from kgcp.io.formats.marks import read_marks
 from kgcp.io.formats.orientations import FORMATS as POSE_FORMATS
 from kgcp.io.formats.orientations import read_reference_poses
 from kgcp.io.formats.orientations.records import OrientationFileOptions
@@ -48,10 +49,14 @@ from kgcp.io.images.frames import read_grey
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import Operator
+from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_target import look_for_plain
+from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.execution.journal import from_text
 from kgcp.pipeline.init import draft_flight
 from kgcp.pipeline.init_records import InitOptions
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 CRS = "EPSG:25832"
 FRAME_WIDTH, FRAME_HEIGHT = 40, 30
@@ -212,6 +217,30 @@ def discs(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
         measure_discs(form, find_outlines(form), response=_chosen(data, tuple(Response)))
 
 
+def plain_targets(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
+    """Look for plain discs and rings in the bytes as grey values, 64 in a row."""
+    grey = np.frombuffer(data[: len(data) // _ROW * _ROW], np.uint8).reshape(-1, _ROW)
+    if len(grey) < 2:
+        return  # no camera has such frames
+    camera = Camera(_ROW, len(grey), 100.0, 100.0, 31.5, 0.5 * len(grey))
+    for place, diameters_m in ((32.0, (0.2,)), (3.0, (0.3, 0.1))):
+        target = PlainTarget(
+            "P", diameters_m, _chosen(data, tuple(PlainPolarity)), (0.0, 0.0, 0.0), border_m=0.1
+        )
+        centre_px = np.array([place, 0.5 * len(grey)])
+        position_m = np.append(camera.undistort(centre_px[None])[0], 1.0)
+        normal = NormalPrior(np.array([0.0, 0.0, 1.0]), 10.0)
+        prediction = PlainPrediction(
+            centre_px, 9.0 * np.eye(2), position_m, 0.1, normal, 50.0 * diameters_m[0], "fuzzing"
+        )
+        look_for_plain(grey, camera, target, prediction)
+
+
+def marks(data: bytes, folder: Path) -> None:
+    """Read marks made by hand."""
+    read_marks(_written(folder, data), {"f_0.png", "f_1.png"}, {"white", "black"})
+
+
 def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets
     """Read the result of a frame that an interrupted run has left in the flight's folder."""
     try:
@@ -224,7 +253,7 @@ TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
         *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
-        *(fields, devices, frames, discs, journal),
+        *(fields, devices, frames, discs, plain_targets, marks, journal),
     )
 }
 
