@@ -27,6 +27,9 @@ from kgcp.targets.plain import AnyTarget, PlainPolarity, PlainTarget
 CRS = "EPSG:25832"
 ORIGIN_MAP = np.array([689_412.0, 5_336_208.0, 545.0])
 CAMERA = Camera(480, 360, 700.0, 700.0, 241.2, 178.1, k1=-0.05, response=Response.LINEAR)
+_START_S = 1_781_597_700.0
+# a level plate on the vehicle: its x axis to the right, south, its y axis backwards, west
+_ENU_FROM_PLATE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _GROUND_FROM_ENU = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -47,9 +50,14 @@ TARGETS = (
 )
 
 
+def coded_ring(name: str, code: tuple[float, ...]) -> Ring:
+    """A ring of the usual proportions, 1.3 m across."""
+    return Ring(name, 1.3, 0.65, 1.3 / 1.4, 1.3 / 7.0, code)
+
+
 def coded_target(name: str, offset_m: tuple[float, float], code: tuple[float, ...]) -> Target:
-    """A coded target on the ground, of the usual proportions and 1.3 m across."""
-    ring = Ring(name, 1.3, 0.65, 1.3 / 1.4, 1.3 / 7.0, code)
+    """A coded target on the ground."""
+    ring = coded_ring(name, code)
     x, y, z = (ORIGIN_MAP + np.append(offset_m, 0.0)).tolist()
     return Target(ring, position_m=(x, y, z), sd_position_m=(0.002,) * 3)
 
@@ -67,6 +75,7 @@ class PlainFlight:
 
     targets: tuple[PlainTarget, ...] = TARGETS
     coded: tuple[Target, ...] = ()
+    moving: Target | None = None  # on a vehicle that drives east, 1 m from frame to frame
     frames: int = 3
     seed: int = 3
     height_m: float = 25.0
@@ -88,6 +97,28 @@ class PlainFlight:
         """Centres (k, 3) of the plain targets in a frame's camera axes [m]."""
         return self._in_camera(frame, self.targets)
 
+    def _vehicle_enu_m(self, after_s: FloatArray) -> FloatArray:
+        """Places (n, 3) of the moving target, in seconds after the first frame."""
+        after_s = np.asarray(after_s, dtype=np.float64)
+        still = np.zeros_like(after_s)
+        return np.stack((after_s - 1.0, still + 0.3, still), axis=-1)
+
+    def _moving_pose(self, frame: int) -> Pose:
+        centres, rotations = self.cameras()
+        place = self._vehicle_enu_m(np.array(float(frame)))
+        camera_from_enu = rotations[frame].T
+        return Pose(camera_from_enu @ _ENU_FROM_PLATE, camera_from_enu @ (place - centres[frame]))
+
+    def _plates(self, frame: int, lying: FloatArray) -> tuple[PlatePose, ...]:
+        plates = [
+            (target, Pose(lying, centre))
+            for target, centre in zip(self.coded, self._in_camera(frame, self.coded), strict=True)
+        ]
+        if self.moving is not None:
+            plates.append((self.moving, self._moving_pose(frame)))
+        outline = regular_polygon(4, 0.9)
+        return tuple(PlatePose(PrintedPlate(target, outline), pose) for target, pose in plates)
+
     def _in_camera(self, frame: int, targets: Sequence[AnyTarget]) -> FloatArray:
         if not targets:
             return np.empty((0, 3))
@@ -108,12 +139,7 @@ class PlainFlight:
             scene = SimulatedScene(
                 Pose(lying, -camera_from_enu @ centres[frame]),
                 None,
-                tuple(
-                    PlatePose(PrintedPlate(target, regular_polygon(4, 0.9)), Pose(lying, centre))
-                    for target, centre in zip(
-                        self.coded, self._in_camera(frame, self.coded), strict=True
-                    )
-                ),
+                self._plates(frame, lying),
                 tuple(
                     PlainPose(PlainPlate(target), Pose(lying, centre))
                     for target, centre in zip(self.targets, self.centres_m(frame), strict=True)
@@ -124,6 +150,9 @@ class PlainFlight:
                 str(folder / "frames" / f"f_{frame}.png"), Sensor().expose(irradiance, 1.0, rng)
             )
         self._write_reference(folder / "reference.csv", rng)
+        self._write_times(folder / "frames.csv")
+        if self.moving is not None:
+            self._write_trajectory(folder / "vehicle.csv")
         (folder / "flight.toml").write_text(self._toml(), encoding="utf-8")
         return folder
 
@@ -141,6 +170,20 @@ class PlainFlight:
         for frame, (place, opk) in enumerate(zip(on_map, angles, strict=True)):
             numbers = (f"{value:.9f}" for value in (*place, *opk, *sds))
             lines.append(",".join((f"f_{frame}.png", *numbers)))
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def _write_times(self, path: Path) -> None:
+        lines = [f"f_{frame}.png,{_START_S + frame}" for frame in range(self.frames)]
+        path.write_text("\n".join(["frame,time", *lines]) + "\n", encoding="utf-8")
+
+    def _write_trajectory(self, path: Path) -> None:
+        after_s = np.arange(-2.0, self.frames + 2.0, 0.1)
+        on_map = LocalFrame.at(CRS, ORIGIN_MAP).map_from_enu(self._vehicle_enu_m(after_s))
+        lines = ["time,x,y,z,roll_deg,pitch_deg,heading_deg,sd_x,sd_y,sd_z"]
+        lines += [
+            f"{_START_S + time:.3f},{x:.6f},{y:.6f},{z:.6f},0,0,90,0.01,0.01,0.01"
+            for time, (x, y, z) in zip(after_s, on_map, strict=True)
+        ]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def _toml(self) -> str:
@@ -167,5 +210,8 @@ class PlainFlight:
             ]
             if len(target.diameters_m) > 1:
                 lines.append(f"inner_diameter_m = {list(target.diameters_m[1:])}")
-        lines += [line for target in self.coded for line in target_lines(target)]
+        moving = () if self.moving is None else (self.moving,)
+        lines += [line for target in (*self.coded, *moving) for line in target_lines(target)]
+        if moving:
+            lines += ["[vehicle]", 'trajectory = "vehicle.csv"', "lever_arm_m = [0.0, 0.0, 0.0]"]
         return "\n".join(lines) + "\n"

@@ -28,9 +28,10 @@ HERE = "sample_flight"
 BARE = ("my_photos",)  # folders without a flight.toml, for kgcp init
 # Not run here: there is no cluster and no store, and tests/cli/test_simulate.py simulates, and
 # tests/cli/test_calibrate.py calibrates, and test_place.py and test_orient.py have
-# static targets.
+# static targets, tests/pipeline/test_plain_flight.py marked ones.
 READ_ONLY = {
     "--scheduler",
+    "--places",
     "simulate",
     "calibrate",
     "place",
