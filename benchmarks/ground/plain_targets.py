@@ -397,7 +397,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run both experiments and print their figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--real", type=Path, help="folder of photographs of ground")
-    parser.add_argument("--count", type=int, default=100, help="targets per line")
+    parser.add_argument("--count", type=int, default=40, help="targets per line")
     parser.add_argument("--windows", type=int, default=2000)
     parser.add_argument("--kind", choices=[*_KINDS], action="append")
     chosen = parser.parse_args(arguments)
