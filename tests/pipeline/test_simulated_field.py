@@ -29,7 +29,12 @@ from kgcp.targets.fields.points import CodeRing, FieldPoint, PointField
 CAMERA = Camera(320, 240, 330.0, 330.0, 163.0, 117.5, -0.08, response=Response.LINEAR)
 SETTINGS = replace(preset("clean"), camera=CAMERA, frames=5)
 FIELD = Field(
-    *("board", GridKind.SQUARE, 5, 4, 0.03, 0.016),
+    "board",
+    GridKind.SQUARE,
+    columns=5,
+    rows=4,
+    pitch_m=0.03,
+    diameter_m=0.016,
     marks=(Mark(1, 1, 0.016, 0.007),),
     flat_sd_m=(1e-5, 1e-5, 3e-5),
 )
@@ -106,8 +111,8 @@ def coded_field() -> PointField:
         FieldPoint(
             f"p{i}",
             (0.05 * (i % 4), 0.05 * (i // 4), -0.015 * (i % 3)),
-            *(0.013, 0.0, (0.0, 0.0, 1.0), None),
-            code,
+            0.013,
+            code=code,
         )
         for i, code in enumerate((*codes, 0b11011))
     ]

@@ -67,7 +67,7 @@ def _code_ring(table: TomlTable) -> CodeRing:
     if len(ring) != 2:
         raise code.error("ring", f"has {len(ring)} numbers instead of 2", "give it as [2.1, 3.1]")
     with code.located():
-        return CodeRing(code.integer("bits"), *ring)
+        return CodeRing(code.integer("bits"), ring[0], ring[1])
 
 
 def _from_table(

@@ -38,7 +38,7 @@ _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 _PRIOR_SD = {
     Row.BLUR_DIFFERENCE: 0.3,  # px²
     Row.BLUR_XY: 0.3,
-    Row.SLOPE_X: 0.1,
+    Row.SLOPE_X: 0.1,  # at most: see `Unknowns.in_light`
     Row.SLOPE_Y: 0.1,
     Row.WAVE_1: 0.3,
     Row.WAVE_2: 0.4,
@@ -47,9 +47,11 @@ _PRIOR_SD = {
     Row.INK_SLOPE_X: 0.05,
     Row.INK_SLOPE_Y: 0.05,
 }
+_FALL = 0.7  # of the light, from the middle of a photograph to its end
 _WHITE, _WHITE_SD = 1.0, 0.4  # burnt levels of unknown tone: lest level and tone drift together
 _ALWAYS = (*range(GEOMETRY_COUNT), Row.BLUR_MEAN, Row.BLUR_DIFFERENCE, Row.BLUR_XY)
 _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
+_SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 _WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
 _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
@@ -124,6 +126,17 @@ class Unknowns:
     def without_ink_slope(self) -> Unknowns:
         """Return the unknowns without a gradient of the darker level's own."""
         return replace(self, rows=self.rows[self.rows < Row.INK_SLOPE_X])
+
+    def in_light(self, radius_px: float, frame_px: int) -> Unknowns:
+        """Return the unknowns of a disc of some size in a photograph of some size.
+
+        Light falls off over a photograph, and so by little over a small disc. Where the ground is
+        burnt, nothing else keeps its gradient from explaining whatever makes opposite edges differ.
+        """
+        sd = min(_FALL * radius_px / (0.5 * frame_px), _PRIOR_SD[Row.SLOPE_X])
+        precision = self.precision.copy()
+        precision[_SLOPES, _SLOPES] = sd**-2
+        return replace(self, precision=precision)
 
     def penalty(self, vector: FloatArray) -> float:
         """Return the priors' part of the negative log-likelihood of a vector (18,)."""
@@ -304,7 +317,7 @@ def fit_disc(sample: DiscSample, start: DiscState, free: Unknowns) -> DiscFit:
     NoFit
         If the equations cannot be solved.
     """
-    state = start
+    state, free = start, free.in_light(sample.radius_px, sample.window.frame_px)
     sd = noise_at(sample, state).sd
     for _ in range(_NOISE_ROUNDS):
         fit = _minimise(sample, state, free, sd)

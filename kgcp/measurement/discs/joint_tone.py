@@ -108,7 +108,7 @@ def _minimised(
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
         return [
-            fit_at(sample, state, free, sd)
+            fit_at(sample, state, free.in_light(sample.radius_px, sample.window.frame_px), sd)
             for sample, state, sd in zip(samples, places, sds, strict=True)
         ]
 

@@ -282,7 +282,12 @@ def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
     assert isinstance(field, PointField)
     third, fourth = field.points[2:4]
     assert third == FieldPoint(
-        *("C", (0.2, 0.0, 0.05), 0.02, 0.0, (0.0, 0.6, 0.8), (1e-5, 1e-5, 2e-5), 7)
+        "C",
+        (0.2, 0.0, 0.05),
+        0.02,
+        normal=(0.0, 0.6, 0.8),
+        sd_m=(1e-5, 1e-5, 2e-5),
+        code=7,
     )
     assert fourth.code is None
     assert field.code == CodeRing(14, 2.1, 3.1)

@@ -11,6 +11,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.discs import fit_disc
 from kgcp.measurement.discs.measure import measure_disc, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
@@ -174,3 +175,25 @@ def test_what_cannot_be_measured_says_why(dark: Rendered) -> None:
     assert reason(outline, (around,)) is DiscReason.CROWDED
     swapped = replace(outline, polarity=Polarity.BRIGHT)
     assert reason(swapped) is DiscReason.NO_CONTRAST
+
+
+def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the ground is burnt, only that keeps its gradient from displacing the centre."""
+    discs = tuple(
+        FieldDisc((0.012 * i, 0.012 * j, 0.0), 0.006) for j in range(-2, 3) for i in range(-3, 4)
+    )
+    pose, rng = Pose(np.eye(3), np.array([0.0, 0.0, 0.6])), np.random.default_rng(4)
+    photo = photograph(CAMERA, pose, FieldScene(discs, 1.5, 0.15), Optics(0.6), Sensor(), rng)
+    truth = circle_images(CAMERA, field_circles(pose, discs)).moments
+    outlines = find_outlines(photo)
+
+    def rms_px() -> float:
+        measured = measure_discs(photo, outlines, response=Response.LINEAR)
+        vectors = np.array([each.vector for each in measured if isinstance(each, Disc)])
+        assert len(vectors) > 0.9 * len(discs)
+        off = vectors[:, :2] - truth[nearest(vectors[:, :2], truth), :2]
+        return float(np.sqrt(np.mean(off**2)))
+
+    own = rms_px()
+    monkeypatch.setattr(fit_disc, "_FALL", 100.0)
+    assert 0.005 < own < 0.8 * rms_px()
