@@ -111,13 +111,13 @@ def coded_field() -> PointField:
         FieldPoint(
             f"p{i}",
             (0.05 * (i % 4), 0.05 * (i // 4), -0.015 * (i % 3)),
-            0.013,
+            0.016,
             code=code,
         )
         for i, code in enumerate((*codes, 0b11011))
     ]
     sds = (1e-5, 1e-5, 1e-5)
-    return PointField("depth", tuple(points), flat_sd_m=sds, code=CodeRing(8, 1.9, 2.9))
+    return PointField("depth", tuple(points), flat_sd_m=sds, code=CodeRing(8, 2.1, 2.9))
 
 
 def test_a_field_with_depth_is_calibrated_with(tmp_path: Path) -> None:
@@ -133,5 +133,6 @@ def test_a_field_with_depth_is_calibrated_with(tmp_path: Path) -> None:
     made = calibrate_photos(photos, field, tmp_path, options, NoProgress())
     assert not made.misses
     assert len(made.calibration.network.observations.view) > 30
+    assert 0.001 < made.calibration.rms_px < 0.02  # codes are kept away from the discs
     sd = np.sqrt(made.calibration.covariance.cov.diagonal())
     assert abs(made.calibration.camera.fx - CAMERA.fx) < 5.0 * sd[0] < 10.0

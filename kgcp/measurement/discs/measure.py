@@ -45,6 +45,7 @@ def measure_discs(
     response: Response = Response.UNKNOWN,
     operator: Operator = Operator.MODEL,
     camera: CameraTone | None = None,
+    ground: float = math.inf,
 ) -> list[Disc | DiscMiss]:
     """Measure many discs of one photograph: one outcome for each outline, in their order.
 
@@ -59,12 +60,17 @@ def measure_discs(
     camera : CameraTone, optional
         What the camera does to all discs, an unknown tone curve and sharpening, as `learn_camera`
         says; by default, it is learned from the largest of these.
+    ground : float
+        How far the bare ground around a disc reaches from its middle, in radii: to a ring of code.
     """
-    return _measured(_tasks(grey, outlines), response, operator, camera)
+    return _measured(_tasks(grey, outlines, ground), response, operator, camera)
 
 
 def learn_camera(
-    photographs: Iterable[tuple[GreyArray, Sequence[DiscOutline]]], response: Response
+    photographs: Iterable[tuple[GreyArray, Sequence[DiscOutline]]],
+    response: Response,
+    *,
+    ground: float = math.inf,
 ) -> CameraTone:
     """Learn what a camera does to all discs from several photographs with their outlines.
 
@@ -74,8 +80,11 @@ def learn_camera(
         Grey values of 8 or 16 bits, and outlines by `find_outlines`.
     response : Response
         How grey values follow light.
+    ground : float
+        As for `measure_discs`.
     """
-    return learn_tone([_tasks(grey, outlines) for grey, outlines in photographs], response)
+    tasks = [_tasks(grey, outlines, ground) for grey, outlines in photographs]
+    return learn_tone(tasks, response)
 
 
 def measure_disc(
@@ -99,11 +108,14 @@ def measure_disc(
     return _measured([task], response, operator, None)[0]
 
 
-def _tasks(grey: GreyArray, outlines: Sequence[DiscOutline]) -> list[DiscTask]:
-    return [
-        DiscTask(grey, outline, _others(outline, [outlines[j] for j in near]))
-        for outline, near in zip(outlines, _neighbours(outlines), strict=True)
-    ]
+def _tasks(grey: GreyArray, outlines: Sequence[DiscOutline], ground: float) -> list[DiscTask]:
+    tasks = []
+    for outline, near in zip(outlines, _neighbours(outlines), strict=True):
+        others = _others(outline, [outlines[j] for j in near])
+        if math.isfinite(ground):
+            others.append(outline_geometry(outline) * np.array((1.0, 1.0, *[ground] * 3)))
+        tasks.append(DiscTask(grey, outline, others))
+    return tasks
 
 
 def _measured(

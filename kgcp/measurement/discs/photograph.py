@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -77,7 +78,7 @@ def learn_from_fields(greys: Iterable[GreyArray], task: PhotoTask) -> CameraTone
         outlines = find_outlines(grey)
         own = [each for each in outlines if each.polarity.value == task.field.polarity.value]
         photographs.append((grey, own))
-    camera = learn_camera(photographs, task.response)
+    camera = learn_camera(photographs, task.response, ground=_ground(task.field))
     return None if camera.known is None else camera
 
 
@@ -104,6 +105,7 @@ def measure_field(
         response=task.response,
         operator=task.operator,
         camera=task.camera,
+        ground=_ground(task.field),
     )
     named = [
         (point, disc)
@@ -140,6 +142,13 @@ def _named(grey: GreyArray, outlines: list[DiscOutline], field: AnyField) -> Nam
     if field.code is not None:
         return name_by_codes(read_codes(grey, outlines, field.code), field, field.code)
     return name_by_places(_seen(outlines), field)
+
+
+def _ground(field: AnyField) -> float:
+    """Return how far the bare ground around each disc reaches from its middle, in radii."""
+    if isinstance(field, Field) or field.code is None:
+        return math.inf
+    return field.code.inner
 
 
 def _are_in_one_row(points_m: FloatArray) -> bool:
@@ -180,6 +189,7 @@ def measure_more(
         response=task.response,
         operator=task.operator,
         camera=task.camera,
+        ground=_ground(task.field),
     )
     more = [
         (int(point[index]), disc)
