@@ -40,7 +40,7 @@ def diameter_sentence(placed: PlacedTarget) -> str:
     ratio = _diameter_ratio(placed)
     verdict = "which is not what" if has_other_diameter(placed) else "as"
     return (
-        f"{placed.target}: the ring of {check.stated_diameter_m:g} m measures"
+        f"{placed.target}: the diameter of {check.stated_diameter_m:g} m measures"
         f" {placed.diameter_m:.{decimals}f} ± {sd:.{decimals}f} m"
         f" ({minus(f'{check.diameter_permille:+.2f}')} ‰, {ratio:.1f} standard deviations),"
         f" {verdict} flight.toml says"
