@@ -238,6 +238,9 @@ class Outcomes:
     # times of the first and the last frame, Unix UTC [s]; None: no frame has one
     first_s: float | None
     last_s: float | None
+    # median and largest distance between the centroid of a target's image and the image of its
+    # centre [px]; None: no target was measured
+    eccentricity_px: tuple[float, float] | None = None
 
 
 def read_outcomes(path: Path) -> Outcomes:
@@ -251,6 +254,8 @@ def read_outcomes(path: Path) -> Outcomes:
     table = read_detections(path)
     reasons = Counter(table["reason"][table["status"] != Status.MEASURED.value])
     times = table["time"].dropna()
+    off_px = table[["ecc_x_px", "ecc_y_px"]].dropna().to_numpy(np.float64)
+    lengths_px = np.hypot(*off_px.T)
     return Outcomes(
         frames=table["frame"].nunique(),
         rows=len(table),
@@ -258,6 +263,9 @@ def read_outcomes(path: Path) -> Outcomes:
         reasons=tuple(reasons.most_common()),
         first_s=None if times.empty else times.min().timestamp(),
         last_s=None if times.empty else times.max().timestamp(),
+        eccentricity_px=(
+            (float(np.median(lengths_px)), float(lengths_px.max())) if len(lengths_px) else None
+        ),
     )
 
 

@@ -90,6 +90,14 @@ def _frames(outcomes: Outcomes | None) -> Iterator[Fact]:
     if outcomes.first_s is not None and outcomes.last_s is not None:
         first, last = format_time(outcomes.first_s), format_time(outcomes.last_s)
         yield Fact("Time of the frames", f"{_minute(first)} to {_minute(last)} UTC")
+    if outcomes.eccentricity_px is not None:
+        median_px, largest_px = outcomes.eccentricity_px
+        yield Fact(
+            "Eccentricity",
+            f"centroids of the targets' images lie {median_px:.3f} px (median) to"
+            f" {largest_px:.3f} px from the images of their centres, which are reported;"
+            " programs that measure centroids are off by as much",
+        )
 
 
 def _minute(text: str) -> str:

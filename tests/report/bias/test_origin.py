@@ -13,7 +13,9 @@ from kgcp.report.bias.origin import agreement, facts, headline
 from kgcp.settings import DetectSettings, Method
 
 SAMPLE = Path(__file__).resolve().parents[3] / "sample_flight"
-OUTCOMES = Outcomes(24, 24, 21, (("out_of_view", 3),), 1_781_597_705.0, 1_781_597_739.5)
+OUTCOMES = Outcomes(
+    24, 24, 21, (("out_of_view", 3),), 1_781_597_705.0, 1_781_597_739.5, (0.0123, 0.456)
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +38,9 @@ def test_every_part_is_named(flight: Flight) -> None:
         "Program": "kgcp 0.1.0",
         "Frames": "24: 21 measured, 3 out of view",
         "Time of the frames": "2026-06-16 08:15:05 to 2026-06-16 08:15:39 UTC",
+        "Eccentricity": "centroids of the targets' images lie 0.012 px (median) to 0.456 px from"
+        " the images of their centres, which are reported; programs that measure centroids are off"
+        " by as much",
         "Camera": "1200 × 900 px; fx 1903, fy 1901, cx 606.2, cy 446.1 px; k1 −0.081, k2 0.064,"
         " p1 0.0003, p2 0.0005; response linear; accuracy of the calibration not stated"
         " (kgcp calibrate states it)",
@@ -64,6 +69,7 @@ def test_what_is_not_known_is_left_out(flight: Flight) -> None:
     timeless = Outcomes(24, 24, 21, (), None, None)
     labels = [fact.label for fact in facts(flight, DetectSettings(), timeless, {})]
     assert "Time of the frames" not in labels
+    assert "Eccentricity" not in labels
     assert "Frames" not in [fact.label for fact in facts(flight, DetectSettings(), None, {})]
     assert "flown" not in headline(flight, timeless)
     assert agreement(None).startswith("Not examined: it takes ten frames")
