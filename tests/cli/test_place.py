@@ -33,7 +33,7 @@ def test_targets_are_placed_and_their_diameters_measured(tmp_path: Path) -> None
     assert 0.2 < np.sqrt(np.mean(diameters**2)) < 2.0
     assert (table["tilt_deg"] < 4.0 * table["sd_normal_deg"]).all()
     assert (table["ambiguity"] > 100.0).all()
-    assert "the ring of 0.9 m measures 0.899" in result.stderr
+    assert "the diameter of 0.9 m measures 0.899" in result.stderr
     assert "‰, " in result.stderr
     assert "which is not what flight.toml says" in result.stderr
     summary = json.loads(result.stdout)
