@@ -238,7 +238,7 @@ def plain_targets(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all t
 
 def marks(data: bytes, folder: Path) -> None:
     """Read marks made by hand."""
-    read_marks(_written(folder, data), {"f_0.png", "f_1.png"}, {"white", "black"})
+    read_marks(_written(folder, data), {"f_0.png", "f_1.png"}, {"white", "black"}, _CAMERA)
 
 
 def journal(data: bytes, folder: Path) -> None:  # noqa: ARG001 - as all targets

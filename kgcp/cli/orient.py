@@ -138,6 +138,8 @@ def _orient_by_device(
 
     if not isinstance(flight, Path) or (out is not None and not isinstance(out, Path)):
         raise KgcpError(f"{flight}: frames with a device are read from a disk; copy them there")
+    if not device_file.is_file():
+        raise KgcpError(f"{device_file}: does not exist; name a device's file", option="device")
     device, the_flight = read_device(device_file), read_flight(flight)
     made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)
     path = write_device_poses(made, out or results_folder(flight))

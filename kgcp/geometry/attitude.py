@@ -40,13 +40,13 @@ def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
 
 
 def rotation_onto(points: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the rotation R (3, 3) that brings points onto others (n, 3): points @ R.T, others.
+    """Return the rotation R (3, 3) by which `points @ R.T` comes nearest to `others`, both (n, 3).
 
     Both about their means, by least squares, never a mirror image (Kabsch, Acta Crystallographica
     A32, 1976). Of points in a line, it is one of many.
     """
-    here, there = points - points.mean(axis=0), others - others.mean(axis=0)
-    left, _, right = np.linalg.svd(there.T @ here)
+    before, after = points - points.mean(axis=0), others - others.mean(axis=0)
+    left, _, right = np.linalg.svd(after.T @ before)
     proper = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))])
     return np.asarray(left @ proper @ right)
 

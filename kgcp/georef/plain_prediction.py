@@ -19,8 +19,8 @@ from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.targets.plain import PlainTarget
 
 _FLOOR_PX, _FLOOR_LOG = 1.0, 0.002  # least standard deviations, whatever is stated
-# Of poses that state none: those of a block that was adjusted are better, those of a navigation
-# receiver alone much worse, and are not enough to look for plain targets.
+# Of poses that do not state both: those of a block that was adjusted are better, those of a
+# navigation receiver alone much worse, and are not enough to look for plain targets.
 _UNSTATED_PX, _UNSTATED_LOG = 5.0, 0.01
 
 # Of what is marked: how far a camera that looks down does not, and distances from marks.
@@ -77,9 +77,8 @@ def reference_orientations(
     made = {}
     for row, frame in enumerate(poses.frames):
         cov = None
-        if orientations.cov_m2 is not None:
-            sd_deg = 0.0 if poses.sd_angle_deg is None else float(poses.sd_angle_deg[row])
-            turn = math.radians(sd_deg) ** 2 * np.eye(3)
+        if orientations.cov_m2 is not None and poses.sd_angle_deg is not None:
+            turn = math.radians(float(poses.sd_angle_deg[row])) ** 2 * np.eye(3)
             zero = np.zeros((3, 3))
             cov = np.block([[orientations.cov_m2[row], zero], [zero, turn]])
         made[frame] = FrameOrientation(

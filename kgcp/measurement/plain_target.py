@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import chdtri, expit
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
@@ -53,8 +53,7 @@ _MOST_TRIES = 8  # edges that are measured per target
 _EDGE_PX, _EDGE = 0.1, 0.01
 _SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
 _PLACE_PX = 0.1  # of a prediction, at least
-_WORST_CHI2 = {2: 18.4, 7: 29.9, 12: 39.1}  # quantiles of 99.99 % by degrees of freedom
-_CHI2_PER_CIRCLE = 9.3  # beyond
+_UNLIKELY = 1e-4  # that a target's own shape has so large a χ²
 # The variances on ground that is not known to be even: its texture displaces edges over longer
 # stretches than the arcs that the covariance is made from.
 _BARE = 3.0
@@ -150,6 +149,10 @@ def _only_candidate(
             accepted.append(_try_edge(grey, camera, target, prediction, edge))
         except Rejection as rejection:
             first = first or rejection
+    if accepted and len(edges) > _MOST_TRIES:
+        raise Rejection(
+            Reason.AMBIGUOUS_PLACE, f"{len(edges)} edges of its size and shape; {prediction}"
+        )
     if len(accepted) > 1:
         places = " and ".join(
             f"({each.circles.discs[0].x:.0f}, {each.circles.discs[0].y:.0f})" for each in accepted
@@ -349,8 +352,7 @@ def _check_agreement(
         detail = f"{float(np.linalg.norm(off_px)):.1f} px off"
         raise Rejection(Reason.UNLIKE_PREDICTION, detail)
     freedom = 5 * circles - 3
-    worst = _WORST_CHI2.get(freedom, _CHI2_PER_CIRCLE * circles + 10.0)
-    if fit.chi2 > worst:
+    if fit.chi2 > chdtri(freedom, _UNLIKELY):
         raise Rejection(Reason.UNLIKE_PREDICTION, f"shape: χ² {fit.chi2:.0f} of {freedom}")
 
 

@@ -184,7 +184,11 @@ def detect_flight(
             with stopwatch.stage("second look"):
                 if settings.is_guided:
                     predictions, guide_problem = predict_missing(flight, data, run.tracks)
-                plain = plain_by_targets(flight, data, run.results(), marks)
+                plain = (
+                    plain_by_targets(flight, data, run.results(), marks)
+                    if settings.is_guided or marks
+                    else {}
+                )
                 run.guided_pass(predictions, plain)
             with stopwatch.stage("learning"):
                 run.learn()
@@ -200,6 +204,7 @@ def detect_flight(
                     data.frame_times,
                     run.learnt,
                     options.frame_patterns,
+                    options.places,
                 )
                 write_table(table, DETECTION_COLUMNS, rows, about)
             if sheet is not None:
@@ -245,8 +250,14 @@ def _marks(
 ) -> Mapping[str, Sequence[Mark]]:
     if places is None:
         return {}
+    if not flight.plain_targets or flight.crs is None:
+        lacks = "crs" if flight.plain_targets else "target without a code, which marks are for"
+        raise KgcpError(
+            f"{flight.folder / 'flight.toml'}: has no {lacks}; give one, or no marked places",
+            option="places",
+        )
     static = {target.name for target in flight.all_targets if target.position_m is not None}
-    return read_marks(places, set(frames), static)
+    return read_marks(places, set(frames), static, flight.camera)
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:

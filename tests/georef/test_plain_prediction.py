@@ -39,11 +39,19 @@ def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
         assert "the reference" in str(one)
 
 
-def test_poses_without_deviations_are_trusted_less(made: Path) -> None:
+@pytest.mark.parametrize("stated", [(), ("sd_position_m",), ("sd_angle_deg",)])
+def test_poses_without_both_deviations_are_trusted_less(
+    made: Path, stated: tuple[str, ...]
+) -> None:
     flight = read_flight(made)
     data = FlightData(flight, ["f_0.png"])
     positions = data.static_positions
-    bare = replace(data.reference_poses, sd_position_m=None, sd_angle_deg=None)
+    poses = data.reference_poses
+    bare = replace(
+        poses,
+        sd_position_m=poses.sd_position_m if "sd_position_m" in stated else None,
+        sd_angle_deg=poses.sd_angle_deg if "sd_angle_deg" in stated else None,
+    )
     orientation = reference_orientations(bare, positions.local_frame)["f_0.png"]
     named = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
     assert all(4.0 < one.sd_px < 6.0 for one in named.values())

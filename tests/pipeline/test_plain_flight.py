@@ -97,6 +97,19 @@ def test_they_are_among_the_targets_of_a_check(folder: Path) -> None:
     assert "0.8 m, bright disc (static)" in run("check", folder)
 
 
+def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) -> None:
+    """Its place is all that tells a plain target from others: points would be mixed up."""
+    text = (folder / "flight.toml").read_text(encoding="utf-8")
+    places = [line for line in text.splitlines() if line.startswith("position_m")]
+    swapped = text.replace(places[0], "@").replace(places[1], places[0]).replace("@", places[1])
+    assert swapped != text
+    for name in ("frames", "vehicle.csv", "reference.csv", "kgcp"):
+        (tmp_path / name).symlink_to(folder / name)
+    (tmp_path / "flight.toml").write_text(swapped, encoding="utf-8")
+    with pytest.raises(KgcpError, match=r"changed since 'kgcp detect': .* position_m"):
+        make_gcps(read_flight(tmp_path))
+
+
 def test_without_poses_nothing_is_looked_for(folder: Path, tmp_path: Path) -> None:
     text = (folder / "flight.toml").read_text(encoding="utf-8")
     (tmp_path / "frames").symlink_to(folder / "frames")
@@ -149,6 +162,12 @@ def test_marks_by_hand_tell_where_they_are(bare: Path) -> None:
         ("frame,target,x_px,y_px\nf_0.png,red,1,2", "line 2: 'red' stands still nowhere"),
         ("frame,target,x_px,y_px,sd_px\nf_0.png,white,1,2,0", "line 2: sd_px is 0"),
         ("frame,target,x_px,y_px" + 2 * "\nf_0.png,white,1,2", "line 3: 'white' is marked twice"),
+        ("frame,target,x_px,y_px\nf_0.png,white,-1,2", "line 2: (-1, 2) is outside the frame"),
+        ("frame,target,x_px,y_px\nf_0.png,white,1,2", "f_0.png has one mark"),
+        (
+            "frame,target,x_px,y_px\nf_0.png,white,1,2\nf_0.png,black,1,2",
+            "f_0.png has two marks at one place",
+        ),
     ],
 )
 def test_one_line_for_wrong_marks(bare: Path, text: str, message: str) -> None:

@@ -96,7 +96,7 @@ def _target_table(flight: TomlTable, index: int, values: Mapping[str, object]) -
 
 def _read_plain(table: TomlTable) -> PlainTarget:
     is_ring = table.choice("shape", Shape) is Shape.RING
-    if is_ring != ("inner_diameter_m" in table):
+    if is_ring != bool(_inner_diameters_m(table)):
         problem, remedy = (
             ("is missing", "give it, or call the target a disc")
             if is_ring

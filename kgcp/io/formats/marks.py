@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kgcp.errors import KgcpError
+from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import MarkedPlace
 from kgcp.io.files.csv_columns import read_csv_columns
 from kgcp.io.files.safe_read import is_file
@@ -24,7 +25,7 @@ class Mark:
 
 
 def read_marks(
-    path: Path, frames: Collection[str], targets: Collection[str]
+    path: Path, frames: Collection[str], targets: Collection[str], camera: Camera
 ) -> Mapping[str, tuple[Mark, ...]]:
     """Read marks, CSV with the columns frame, target, x_px, y_px and perhaps sd_px, by frame.
 
@@ -37,7 +38,8 @@ def read_marks(
     ------
     KgcpError
         Naming the line: the file is missing, or a cell is wrong, names no frame or target of this
-        flight, or marks a target twice in a frame.
+        flight, marks a target twice in a frame or beyond its border; or a frame has fewer than two
+        marks, whose distance tells its scale, or two at one place.
     """
     if not is_file(path):
         raise KgcpError(f"{path}: does not exist; name a file of marked places", option="places")
@@ -54,9 +56,18 @@ def read_marks(
         if target not in targets:
             listed = ", ".join(sorted(targets))
             raise KgcpError(f"{where}: {target!r} stands still nowhere; name one of {listed}")
+        if not (0.0 <= x_px <= camera.width - 1.0 and 0.0 <= y_px <= camera.height - 1.0):
+            raise KgcpError(f"{where}: ({x_px:g}, {y_px:g}) is outside the frame; correct it")
         if not sd_px > 0.0:
             raise KgcpError(f"{where}: sd_px is {sd_px:g}; give a standard deviation above 0")
         if target in marks.setdefault(frame, {}):
             raise KgcpError(f"{where}: {target!r} is marked twice in {frame}; keep one of them")
         marks[frame][target] = Mark(target, MarkedPlace(x_px, y_px, sd_px))
+    for frame, named in marks.items():
+        apart = {(mark.place.x_px, mark.place.y_px) for mark in named.values()}
+        if len(apart) < max(2, len(named)):
+            problem = "has one mark" if len(named) < 2 else "has two marks at one place"
+            raise KgcpError(
+                f"{path}: {frame} {problem}; mark two static targets or more in a frame"
+            )
     return {frame: tuple(named.values()) for frame, named in marks.items()}

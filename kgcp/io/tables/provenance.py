@@ -46,7 +46,6 @@ TARGET_TABLE = "[[target]]"
 _SCALE_DIGITS = 12  # of a replica, which is kept as diameters
 _DIGITS = 32  # of a digest: 128 bits
 _PREFIX = b"kgcp."  # of the keys of Parquet's metadata
-_OF_OTHER_USE = {"name", "position_m", "sd_position_m"}  # positions are read anew
 
 
 def detections_provenance(
@@ -56,6 +55,7 @@ def detections_provenance(
     times: FrameTimes,
     learnt: LearntImaging | None,
     frame_patterns: Sequence[str] = (),
+    places: Path | None = None,
 ) -> dict[str, str]:
     """Return the metadata of a table of detections.
 
@@ -67,6 +67,8 @@ def detections_provenance(
         Entries of no frame are passed over.
     frame_patterns : sequence of str
         Which frames the table has; empty: all.
+    places : Path, optional
+        File of static targets that were marked by hand.
     """
     values = detection_inputs(flight)
     by_part: dict[str, dict[str, object]] = defaultdict(dict)
@@ -78,6 +80,7 @@ def detections_provenance(
         "frames": frame_sizes,
         "settings": asdict(settings),
         "version": __version__,
+        **({} if places is None else {"places": _digest_of_file(places)}),
     }
     return {
         **_program_and_flight(flight),
@@ -174,10 +177,18 @@ def detection_inputs(flight: Flight) -> dict[str, object]:
 
 
 def _plain_table(target: PlainTarget) -> dict[str, object]:
+    """Return what flight.toml says of a target without a code; its place tells it from others."""
+    outer_m, *inner_m = target.diameters_m
     return {
-        field.name: getattr(target, field.name)
-        for field in fields(PlainTarget)
-        if field.name not in _OF_OTHER_USE
+        "shape": target.shape.value,
+        "polarity": target.polarity.value,
+        "diameter_m": outer_m,
+        "inner_diameter_m": inner_m,
+        "sd_diameter_m": target.sd_diameter_m,
+        "position_m": target.position_m,
+        "normal": target.normal_enu,
+        "level_sd_deg": target.sd_normal_deg,
+        "border_m": target.border_m,
     }
 
 
