@@ -103,11 +103,11 @@ def test_another_position_makes_it_another_target(folder: Path, tmp_path: Path) 
     places = [line for line in text.splitlines() if line.startswith("position_m")]
     swapped = text.replace(places[0], "@").replace(places[1], places[0]).replace("@", places[1])
     assert swapped != text
-    for name in ("frames", "vehicle.csv", "reference.csv", "kgcp"):
+    for name in ("frames", "vehicle.csv", "reference.csv"):
         (tmp_path / name).symlink_to(folder / name)
     (tmp_path / "flight.toml").write_text(swapped, encoding="utf-8")
     with pytest.raises(KgcpError, match=r"changed since 'kgcp detect': .* position_m"):
-        make_gcps(read_flight(tmp_path))
+        make_gcps(read_flight(tmp_path), folder / "kgcp" / "detections.parquet")
 
 
 def test_without_poses_nothing_is_looked_for(folder: Path, tmp_path: Path) -> None:
