@@ -353,6 +353,9 @@ def test_lists_of_points_do_not_say_their_unit(tmp_path: Path, head: str) -> Non
         ("2 100 0 0", "2 0 0 0", "1 and 2 overlap"),
         ("2 100 0 0", "1 100 0 0", "1 stands 2 times"),
         ("2 100 0 0", "2 nan 0 0", "is not a field of targets of a known format"),
+        ("1 0 0 0", "P1 0 O 0", "is not a field of targets of a known format"),
+        ("100 0 0 0.01 0.01", "100 0 0 0 0.01", "sd of 2: 0 m is out of range"),
+        ("100 0 0 0.01 0.01", "100 0 0 -0.01 0.01", "sd of 2: -1e-05 m is out of range"),
     ],
 )
 def test_wrong_lists_end_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -1,7 +1,7 @@
 """Lists of points as AICON, MicMac and others write them: name, x, y, z and perhaps deviations.
 
-White space, commas or semicolons separate them, and a line of words may stand first. Such a list
-says neither its unit nor how large the discs are.
+White space, commas or semicolons separate them, and a line of words may stand first. Three
+deviations of 0 say nothing. Such a list says neither its unit nor how large the discs are.
 """
 
 from __future__ import annotations
@@ -29,17 +29,13 @@ def matches(file: ForeignFile) -> bool:
     """Whether the first lines are names with three or six numbers."""
     lines = file.text[:_HEAD].splitlines()
     whole = lines[:-1] if len(file.text) > _HEAD else lines
-    rows = list(_cells(enumerate(whole, 1)))
-    if rows and not _are_numbers(rows[0][1][1:]):
-        rows = rows[1:]  # names of columns
+    rows = _below_heading(list(_cells(enumerate(whole, 1))))
     return len(rows) >= LEAST_POINTS and all(_is_point(cells) for _, cells in rows)
 
 
 def field(file: ForeignFile, unit_m: float | None) -> PointField:
     """Return the points as a field."""
-    rows = list(_cells(enumerate(file.text.splitlines(), 1)))
-    if rows and not _are_numbers(rows[0][1][1:]):
-        rows = rows[1:]
+    rows = _below_heading(list(_cells(enumerate(file.text.splitlines(), 1))))
     if len(rows) > MOST_DISCS:
         raise file.error(f"has {len(rows)} points", f"keep at most {MOST_DISCS}")
     for line, cells in rows:
@@ -58,7 +54,7 @@ def field(file: ForeignFile, unit_m: float | None) -> PointField:
     points = []
     for (_, cells), place in zip(rows, values.tolist(), strict=True):
         sds = [unit_m * float(cell) for cell in cells[4:7]]
-        sd_m = (sds[0], sds[1], sds[2]) if sds and min(sds) > 0.0 else None
+        sd_m = (sds[0], sds[1], sds[2]) if any(sds) else None
         points.append(
             FieldPoint(cells[0], (place[0], place[1], place[2]), _DISC * pitch_m, sd_m=sd_m)
         )
@@ -73,13 +69,24 @@ def _cells(lines: enumerate[str]) -> Iterator[tuple[int, list[str]]]:
             yield number, _SEPARATORS.split(text)
 
 
+def _below_heading(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Return the rows without names of columns: a first row in which no cell is a number."""
+    has_heading = bool(rows) and not any(map(_is_number, rows[0][1]))
+    return rows[1:] if has_heading else rows
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
 def _is_point(cells: list[str]) -> bool:
     is_named = cells[0] != "" and cells[0].isprintable()
     return is_named and len(cells) in _COUNTS and _are_numbers(cells[1:])
 
 
 def _are_numbers(cells: list[str]) -> bool:
-    try:
-        return bool(cells) and all(is_sound(float(cell)) for cell in cells)
-    except ValueError:
-        return False
+    return all(_is_number(cell) and is_sound(float(cell)) for cell in cells)
