@@ -163,6 +163,13 @@ def test_rings_lie_as_ringgrid_prints_them(tmp_path: Path, rows: int, longest: i
     assert first[:, 0].mean() == pytest.approx(second[:, 0].mean())  # both about the middle
 
 
+@pytest.mark.parametrize(("name", "called"), [("", "target"), ("a\nb", "target"), ("a b", "a b")])
+def test_names_of_rings_can_be_written(tmp_path: Path, name: str, called: str) -> None:
+    field = read_grid(write(tmp_path, "target.json", ringgrid(name=name)))
+    assert field.name == called
+    assert read_grid(write(tmp_path, "field.toml", field_toml(field))).name == called
+
+
 def test_plain_rings_on_a_square_lattice(tmp_path: Path) -> None:
     board = {
         "schema": "ringgrid.target.v5",

@@ -44,6 +44,8 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - a
         outer_mm, inner_mm = outer_mm + 0.5 * width_mm, outer_mm - 0.5 * width_mm
     sizes_m = (2.0 * _MM * outer_mm, 2.0 * _MM * inner_mm)
     name, pitch_m = board.text("name")[:100], _MM * lattice.number("pitch_mm")
+    if not name.strip() or not name.isprintable():
+        name = file.path.stem  # no field.toml could hold it
     rows = _count(lattice, "rows")
     kind = "hex" if is_flat else lattice.text("kind")
     if kind == "rect":
