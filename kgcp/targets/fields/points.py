@@ -147,10 +147,10 @@ class PointField:
 
     def _check_codes(self) -> None:
         codes = [point.code for point in self.points if point.code is not None]
-        if not codes:
-            return
         if self.code is None:
-            raise SettingError("code", "is missing, and discs have codes", "add a table [code]")
+            if codes:
+                raise SettingError("code", "is missing, and discs have codes", "add a table [code]")
+            return
         for code in codes:
             if not 0 < code < (1 << self.code.bits) - 1:
                 raise SettingError(
@@ -158,6 +158,12 @@ class PointField:
                     f"{code} is not of {self.code.bits} bits, some of them 1 and some 0",
                     "correct it or bits",
                 )
+        if len(codes) < LEAST_POINTS:
+            raise SettingError(
+                "code",
+                f"{len(codes)} of the discs have one, and names need {LEAST_POINTS}",
+                "say the codes of the others, or delete [code] and all codes",
+            )
         _require_once("code", [str(self.code.canonical(code)) for code in codes])
 
     def _check_places(self) -> None:

@@ -22,6 +22,13 @@ def changed(**values: Any) -> tuple[FieldPoint, ...]:  # noqa: ANN401 - any fiel
     return (replace(POINTS[0], **values), *POINTS[1:])
 
 
+def coded(*codes: int | None) -> tuple[FieldPoint, ...]:
+    """All points, small enough for codes around them."""
+    return tuple(
+        replace(p, diameter_m=0.01, code=code) for p, code in zip(POINTS, codes, strict=True)
+    )
+
+
 def test_a_field_knows_its_discs() -> None:
     own = replace(POINTS[2], sd_m=(1e-6, 2e-6, 3e-6))
     field = PointField("f", (*POINTS[:2], own, *POINTS[3:]), flat_sd_m=(1e-4, 1e-4, 2e-4))
@@ -35,8 +42,7 @@ def test_a_field_knows_its_discs() -> None:
 def test_codes_are_the_least_of_their_turns() -> None:
     assert RING.canonical(0b1100000000) == 0b11
     assert RING.canonical(0b1000000101) == 0b1011
-    coded = (replace(POINTS[0], code=0b1100000000), replace(POINTS[1], code=0b101), *POINTS[2:])
-    assert PointField("f", coded, code=RING).named_by == "code"
+    assert PointField("f", coded(0b1100000000, 5, 7, 9, 11, 13), code=RING).named_by == "code"
 
 
 @pytest.mark.parametrize(
@@ -52,17 +58,9 @@ def test_codes_are_the_least_of_their_turns() -> None:
         ({"points": changed(sd_m=(0.0, 1e-4, 1e-4))}, "sd of p0"),
         ({"points": changed(code=3)}, "is missing, and discs have codes"),
         ({"points": changed(code=1023), "code": RING}, "1023 is not of 10 bits"),
-        (
-            {
-                "points": (
-                    replace(POINTS[0], code=6),
-                    *changed(code=3)[1:5],
-                    replace(POINTS[5], code=3),
-                ),
-                "code": RING,
-            },
-            "3 stands 2 times",
-        ),
+        ({"points": coded(6, 5, 7, 9, 11, 3), "code": RING}, "3 stands 2 times"),
+        ({"code": RING}, "0 of the discs have one, and names need 6"),
+        ({"points": coded(3, 5, 7, 9, 11, None), "code": RING}, "5 of the discs have one"),
         (
             {
                 "points": tuple(
