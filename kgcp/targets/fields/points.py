@@ -27,6 +27,7 @@ MOST_DISCS = 2000
 """Of a field of points."""
 
 _LEAST_WIDTH = 0.02  # of its length, of a field that is no line
+_ALIKE = 0.9  # cosine of the angle between normals of discs that face the same way
 _UNIT_OFF = 1e-3  # of a normal's length
 _FARTHEST_M = 1e6
 _BITS = (6, 24)
@@ -167,10 +168,10 @@ class PointField:
         _require_once("code", [str(self.code.canonical(code)) for code in codes])
 
     def _check_places(self) -> None:
-        centres, radii = self.points_m(), self.radii_m()
-        gaps = gaps_between(centres)
-        first, second = np.unravel_index(int(gaps.argmin()), gaps.shape)
-        if gaps[first, second] <= radii[first] + radii[second]:
+        centres = self.points_m()
+        free_m = gaps_between(centres) - self._reaches_m()
+        first, second = np.unravel_index(int(free_m.argmin()), free_m.shape)
+        if free_m[first, second] <= 0.0:
             names = (self.points[int(first)].name, self.points[int(second)].name)
             raise SettingError(
                 "points", f"{names[0]} and {names[1]} overlap", "correct their places or diameters"
@@ -180,6 +181,18 @@ class PointField:
             raise SettingError(
                 "points", "lie in one row, which determines no camera", "add some beside it"
             )
+
+    def _reaches_m(self) -> FloatArray:
+        """Return how far (m, m) centres must be apart [m].
+
+        Codes count where two discs face the same way: across an edge they may come closer.
+        """
+        radii, codes = self.radii_m(), self.radii_m()
+        if self.code is not None:
+            codes[[point.code is not None for point in self.points]] *= self.code.outer
+        normals = self.normals()
+        is_alike = np.abs(normals @ normals.T) > _ALIKE
+        return np.where(is_alike, codes[:, None] + codes, radii[:, None] + radii)
 
     @property
     def named_by(self) -> str:

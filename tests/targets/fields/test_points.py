@@ -45,12 +45,27 @@ def test_codes_are_the_least_of_their_turns() -> None:
     assert PointField("f", coded(0b1100000000, 5, 7, 9, 11, 13), code=RING).named_by == "code"
 
 
+def test_codes_may_come_closer_across_an_edge() -> None:
+    points = coded(3, 5, 7, 9, 11, 13)
+    upright = tuple(replace(point, normal=(0.0, 1.0, 0.0)) for point in points[:3])
+    ring = CodeRing(10, 2.0, 5.0)
+    assert PointField("f", (*upright, *points[3:]), code=ring).code == ring
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"points": POINTS[:5]}, "5 is no field of 6 to 2000 discs"),
         ({"points": (*POINTS, POINTS[0])}, "p0 stands 2 times"),
         ({"points": changed(diameter_m=0.09)}, "p0 and p3 overlap"),
+        (  # which are not the nearest two
+            {"points": (*changed(diameter_m=0.1), FieldPoint("near", (0.1, 0.075, 0.01), 0.002))},
+            "p0 and p3 overlap",
+        ),
+        (
+            {"points": coded(3, 5, 7, 9, 11, 13), "code": CodeRing(10, 2.0, 5.0)},
+            "p0 and p3 overlap",
+        ),
         ({"points": changed(diameter_m=0.0)}, "diameter_m of p0: 0 m is out of range"),
         ({"points": changed(inner_diameter_m=0.02)}, "is not inside a disc"),
         ({"points": changed(normal=(0.0, 0.0, 2.0))}, "normal of p0: is not of length 1"),
