@@ -354,6 +354,12 @@ def test_lists_of_points_do_not_say_their_unit(tmp_path: Path, head: str) -> Non
     assert not field.is_diameter_stated
 
 
+def test_points_of_a_list_may_lie_close_together(tmp_path: Path) -> None:
+    close = "7 210 100 0 0.01 0.01 0.02\n"
+    field = read_field(write(tmp_path, "points.txt", NXYZ + close), "mm")
+    assert field.radii_m() == pytest.approx(np.full(7, 0.0025))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -21,6 +21,7 @@ from kgcp.targets.fields.points import MOST_DISCS, FieldPoint, PointField, gaps_
 _SEPARATORS = re.compile(r"[\s,;]+")
 _COMMENTS = ("#", "!", "%", "//")
 _DISC = 0.3  # of the distance of neighbours: what a diameter is taken for until it is measured
+_LARGEST_DISC = 0.5  # of the least distance
 _HEAD = 4096  # characters that tell the format
 _COUNTS = (4, 7)  # cells in a row: without and with deviations
 
@@ -48,16 +49,18 @@ def field(file: ForeignFile, unit_m: float | None) -> PointField:
     if not rows:
         raise file.error("has no points", "name a list of name, x, y, z")
     values = unit_m * np.array([[float(cell) for cell in cells[1:4]] for _, cells in rows])
-    pitch_m = float(np.median(gaps_between(values).min(axis=1)))
+    gaps_m = gaps_between(values).min(axis=1)
+    pitch_m, least_m = float(np.median(gaps_m)), float(gaps_m.min())
     if not 0.0 < pitch_m < math.inf:
         raise file.error("has points at one place", "repair it")
+    diameter_m = _DISC * pitch_m
+    if least_m > 0.0:  # two at one place overlap, whatever their diameter
+        diameter_m = min(diameter_m, _LARGEST_DISC * least_m)
     points = []
     for (_, cells), place in zip(rows, values.tolist(), strict=True):
         sds = [unit_m * float(cell) for cell in cells[4:7]]
         sd_m = (sds[0], sds[1], sds[2]) if any(sds) else None
-        points.append(
-            FieldPoint(cells[0], (place[0], place[1], place[2]), _DISC * pitch_m, sd_m=sd_m)
-        )
+        points.append(FieldPoint(cells[0], (place[0], place[1], place[2]), diameter_m, sd_m=sd_m))
     return PointField(file.path.stem, tuple(points), is_diameter_stated=False)
 
 
