@@ -141,7 +141,6 @@ def command(
     """  # noqa: D301 - \b is click's mark for lines that stay
     from dataclasses import replace
 
-    from kgcp.errors import SettingError
     from kgcp.pipeline.execution.resilient_map import usable_cores
     from kgcp.simulation.effects import Effects, with_effects
     from kgcp.simulation.presets import preset
@@ -151,9 +150,7 @@ def command(
     settings = with_effects(settings, replace(Effects.of(settings), **given))
     if field_text is not None:
         if not survey_errors:
-            raise SettingError(
-                "survey-errors", "are errors of flights, and --field makes none", "leave it out"
-            )
+            raise click.UsageError("--no-survey-errors concerns flights; leave it out with --field")
         _simulate_field(
             out, field_text, settings, frames, seed, jobs or usable_cores(), as_json=as_json
         )

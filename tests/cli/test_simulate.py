@@ -123,16 +123,18 @@ def test_photographs_of_a_field_are_written_and_summarised(
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "words", "code"),
     [
-        (["--no-survey-errors"], "are errors of flights"),
-        (["--shadow", "0.5"], "simulated without shadow"),
+        (["--no-survey-errors"], "--no-survey-errors concerns flights; leave it out", 2),
+        (["--shadow", "0.5"], "simulated without shadows", 1),
+        (["--rolling", "0.02"], "simulated without a rolling shutter", 1),
+        (["--motion", "30", "-40"], "simulated without motion of the image", 1),
     ],
 )
 def test_what_only_flights_have_ends_in_one_line(
-    tmp_path: Path, options: list[str], words: str
+    tmp_path: Path, options: list[str], words: str, code: int
 ) -> None:
     arguments = ["simulate", str(tmp_path / "a"), "--field", "grid:3x2:25mm:12mm", *options]
     result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 1
+    assert result.exit_code == code
     assert words in result.stderr

@@ -20,7 +20,7 @@ from kgcp.pipeline.simulate import encode_image, new_folder, render_all, write_c
 from kgcp.simulation.effects import effect_options
 from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.simulation.imaging import Optics
-from kgcp.simulation.presets import SimulationSettings
+from kgcp.simulation.presets import SimulationSettings, preset
 from kgcp.targets.fields.points import AnyField
 
 PHOTOGRAPHS = 14
@@ -51,8 +51,8 @@ class FieldSimulation:
     Raises
     ------
     KgcpError
-        On making one, for light that only plates of a flight can have, and rows that are exposed
-        one after the other.
+        On making one, for light that only plates of a flight can have, rows that are exposed one
+        after the other, and motion of the image meanwhile that is not the preset's.
     """
 
     field: AnyField
@@ -62,10 +62,11 @@ class FieldSimulation:
     def __post_init__(self) -> None:
         settings = self.settings
         unlike = {
-            "shadow": settings.shadow is not None,
+            "shadows": settings.shadow is not None,
             "dirt": settings.dirt is not None,
             "glare": settings.glare is not None,
-            "rolling": settings.camera.readout_s > 0.0,
+            "a rolling shutter": settings.camera.readout_s > 0.0,
+            "motion of the image": settings.motion != preset(settings.name).motion,
         }
         for name, is_wanted in unlike.items():
             if is_wanted:
@@ -167,14 +168,14 @@ def _write_truth(simulation: FieldSimulation, poses: Sequence[Pose], folder: Pat
 def _truth_rows(simulation: FieldSimulation, poses: Sequence[Pose]) -> Iterator[Sequence[str]]:
     for number, (photo, pose) in enumerate(zip(simulation.photos, poses, strict=True)):
         session = simulation.session(number)
-        numbers = (
+        values = (
             *pose.translation_m.tolist(),
             *pose.rotation.ravel().tolist(),
             session.gain,
             session.optics.psf_px,
         )
         # Nine decimals: a nanometre, and the same on every processor.
-        yield (photo, *(f"{round(number, 9) + 0.0:.9f}" for number in numbers))
+        yield (photo, *(f"{round(value, 9) + 0.0:.9f}" for value in values))
 
 
 def _readme(simulation: FieldSimulation) -> str:
