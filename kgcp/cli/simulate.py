@@ -11,6 +11,7 @@ from kgcp.cli.options import json_option
 
 if TYPE_CHECKING:
     from kgcp.simulation.presets import SimulationSettings
+    from kgcp.targets.fields.points import AnyField
 
 # Named here, not imported, because reading the presets takes numpy and scipy; a test compares.
 PRESET_NAMES = (
@@ -35,6 +36,11 @@ PRESET_NAMES = (
     metavar="FIELD",
     help="Simulate photographs of a field of discs instead of a flight, to calibrate a camera from:"
     " a field.toml, another program's board file, or a shorthand such as grid:10x8:25mm:15mm.",
+)
+@click.option(
+    "--unit",
+    type=click.Choice(("mm", "cm", "m", "in")),
+    help="With --field: unit of a board file that does not say its unit, as BoofCV's.",
 )
 @click.option(
     "--frames",
@@ -116,6 +122,7 @@ def command(
     out: Path,
     preset_name: str,
     field_text: str | None,
+    unit: str | None,
     frames: int | None,
     seed: int,
     jobs: int | None,
@@ -141,6 +148,7 @@ def command(
     """  # noqa: D301 - \b is click's mark for lines that stay
     from dataclasses import replace
 
+    from kgcp.io.flight.field_file import read_field
     from kgcp.pipeline.execution.resilient_map import usable_cores
     from kgcp.simulation.effects import Effects, with_effects
     from kgcp.simulation.presets import preset
@@ -151,10 +159,11 @@ def command(
     if field_text is not None:
         if not survey_errors:
             raise click.UsageError("--no-survey-errors concerns flights; leave it out with --field")
-        _simulate_field(
-            out, field_text, settings, frames, seed, jobs or usable_cores(), as_json=as_json
-        )
+        field = read_field(field_text, unit)
+        _simulate_field(out, field, settings, frames, seed, jobs or usable_cores(), as_json=as_json)
         return
+    if unit is not None:
+        raise click.UsageError("--unit concerns the file of --field; leave it out")
     if frames is not None:
         settings = replace(settings, frames=frames)
     if not survey_errors:
@@ -198,7 +207,7 @@ def _simulate_flight(
 
 def _simulate_field(
     out: Path,
-    field_text: str,
+    field: AnyField,
     settings: SimulationSettings,
     frames: int | None,
     seed: int,
@@ -212,7 +221,6 @@ def _simulate_field(
 
     from tqdm import tqdm
 
-    from kgcp.io.flight.field_file import read_field
     from kgcp.pipeline.calibration.simulation import (
         PHOTOGRAPHS,
         FieldSimulation,
@@ -220,7 +228,7 @@ def _simulate_field(
     )
 
     count = frames or PHOTOGRAPHS
-    simulation = FieldSimulation(read_field(field_text), replace(settings, frames=count), seed)
+    simulation = FieldSimulation(field, replace(settings, frames=count), seed)
     start = time.perf_counter()
     with tqdm(total=count, unit="photo") as bar:
         write_field_photographs(simulation, out, jobs=jobs, on_photograph=bar.update)

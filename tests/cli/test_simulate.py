@@ -122,6 +122,21 @@ def test_photographs_of_a_field_are_written_and_summarised(
     assert command in (out / "README.md").read_text(encoding="utf-8")
 
 
+def test_lists_of_points_take_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(240, 180, 250.0, 250.0, 120.0, 90.0)
+    monkeypatch.setitem(PRESETS, "sample", replace(preset("sample"), camera=camera))
+    path, out = tmp_path / "points.txt", tmp_path / "session"
+    path.write_text("".join(f"P{i} {50 * (i % 3)} {40 * (i // 3)} 0\n" for i in range(6)))
+    only = ["--preset", "sample", "--frames", "1", "--jobs", "1"]
+    arguments = ["simulate", str(out), "--field", str(path), *only]
+    assert CliRunner().invoke(main, arguments).stderr.endswith("(--unit)\n")
+    result = CliRunner().invoke(main, [*arguments, "--unit", "mm"])
+    assert result.exit_code == 0, result.output
+    assert "position_m = [0.05, 0.04, 0.0]" in (out / "field.toml").read_text(encoding="utf-8")
+    without = CliRunner().invoke(main, ["simulate", str(tmp_path / "flight"), "--unit", "mm"])
+    assert without.exit_code == 2
+
+
 @pytest.mark.parametrize(
     ("options", "words", "code"),
     [
