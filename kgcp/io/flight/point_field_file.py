@@ -53,8 +53,11 @@ def point_field(
     if "points" in table:
         points = _from_file(table, folder, diameter_m, inner_m)
     else:
-        rows = table.tables("point")
-        points = tuple(_from_table(table, row, diameter_m, inner_m) for row in rows)
+        rows = enumerate(table.tables("point"), start=1)
+        points = tuple(
+            _from_table(_point_table(table, number, row), diameter_m, inner_m)
+            for number, row in rows
+        )
     with table.located():
         made = PointField(name, points, polarity, bars=bars, code=ring)
         return replace(made, flat_sd_m=table.vector("flat_sd_m", made.flat_sd_m))
@@ -70,10 +73,14 @@ def _code_ring(table: TomlTable) -> CodeRing:
         return CodeRing(code.integer("bits"), ring[0], ring[1])
 
 
-def _from_table(
-    whole: TomlTable, values: Mapping[str, object], diameter_m: float | None, inner_m: float
-) -> FieldPoint:
-    table = TomlTable(f"{whole.where} [[point]]", values, _ONE_KEYS)
+def _point_table(whole: TomlTable, number: int, values: Mapping[str, object]) -> TomlTable:
+    """Return a [[point]] table, called by its name or, failing that, by its place."""
+    name = values.get("name")
+    called = name if isinstance(name, str) else number
+    return TomlTable(f"{whole.where} [[point]] {called}", values, _ONE_KEYS)
+
+
+def _from_table(table: TomlTable, diameter_m: float | None, inner_m: float) -> FieldPoint:
     return FieldPoint(
         table.name("name"),
         table.vector("position_m"),

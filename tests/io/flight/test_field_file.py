@@ -329,6 +329,21 @@ def test_wrong_points_end_in_one_line(
         read_field(write(tmp_path, "field.toml", POINTS_TOML.replace(*toml, 1)))
 
 
+@pytest.mark.parametrize(
+    ("point", "message"),
+    [
+        ('name = "B"\nposition_m = [0, 0]', "B position_m: has 2 numbers"),
+        ("position_m = [0, 0, 0]", "2 name: is missing"),
+        ('name = "B"\nplace = [0, 0, 0]', "B place: is not a known key"),
+    ],
+)
+def test_wrong_points_of_a_field_toml_are_named(tmp_path: Path, point: str, message: str) -> None:
+    first = '[[point]]\nname = "A"\nposition_m = [0, 0, 0]\n'
+    text = f'name = "f"\ndiameter_m = 0.02\n{first}[[point]]\n{point}\n'
+    with pytest.raises(KgcpError, match=rf"field.toml: \[\[point\]\] {message}"):
+        read_field(write(tmp_path, "field.toml", text))
+
+
 NXYZ = """\
 % name x y z sd
 1 0 0 0 0.01 0.01 0.02
