@@ -84,8 +84,8 @@ class FieldPoint:
     sd_m : (3,) tuple of float or None
         Standard deviations of its coordinates [m]; None: those of the field.
     code : int or None
-        The least number that a turn of its ring of sectors makes, read clockwise from the front;
-        None: it has none.
+        Any of the numbers that the turns of its ring of sectors make, read clockwise from the
+        front; None: it has none.
     """
 
     name: str
