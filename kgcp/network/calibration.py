@@ -106,7 +106,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     observations = problem.observations()
     unknowns = Unknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
-        start_from = start_camera_and_poses if field.is_planar else start_in_space
+        start_from = start_camera_and_poses if field.starts_from_homographies else start_in_space
         camera, estimate = start_from(observations, points, problem.size)
         state = problem.adjusted(camera, estimate, replace(unknowns, terms=()))
         for terms in (("k1",), ("k1", "k2")):
@@ -150,7 +150,7 @@ def _require_views(views: Sequence[NamedView]) -> None:
 
 def _disordered(problem: CalibrationProblem) -> tuple[str, ...]:
     """Return the photographs whose discs do not lie like those of a plane, with these names."""
-    if not problem.field.is_planar:
+    if not problem.field.starts_from_homographies:
         return ()
     misfits = homography_misfits(problem.observations(), problem.field.points_m())
     return tuple(

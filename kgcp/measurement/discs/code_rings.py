@@ -69,7 +69,7 @@ def _read(values: np.ndarray, outline: DiscOutline, ring: CodeRing) -> int | Non
     )
     margins = np.abs(sectors - 0.5).min(axis=1)
     best = int(margins.argmax())
-    is_one = sectors[best] > 0.5
-    if margins[best] < _LEAST_MARGIN or is_one.all() or not is_one.any():
+    bits = sectors[best] > 0.5
+    if margins[best] < _LEAST_MARGIN or bits.all() or not bits.any():
         return None
-    return ring.canonical(int("".join("1" if one else "0" for one in is_one), 2))
+    return ring.canonical(int("".join("1" if bit else "0" for bit in bits), 2))

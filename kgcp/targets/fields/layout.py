@@ -233,8 +233,8 @@ class Field:
         return "lattice"
 
     @property
-    def is_planar(self) -> bool:
-        """Whether all discs lie in the plane z = 0."""
+    def starts_from_homographies(self) -> bool:
+        """Whether photographs are first taken for those of the plane z = 0."""
         return True
 
     def radii_m(self) -> FloatArray:
@@ -252,7 +252,7 @@ class Field:
         """
         points, radii, holes = self.points_m()[:, :2], self.radii_m(), self.inner_radii_m()
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        found = []
+        permutations = []
         for step in range(1, self.turns):
             angle = 2.0 * math.pi * step / self.turns
             cosine, sine = math.cos(angle), math.sin(angle)
@@ -261,8 +261,8 @@ class Field:
             turn = gaps.argmin(axis=1)
             is_onto = gaps.min(axis=1).max() < 0.01 * self.pitch_m
             if is_onto and np.all(radii[turn] == radii) and np.all(holes[turn] == holes):
-                found.append(turn)
-        return found
+                permutations.append(turn)
+        return permutations
 
     def with_diameters(self, scale: float) -> Field:
         """Return the field with all diameters multiplied, as they were measured."""

@@ -200,8 +200,8 @@ class PointField:
         return "places" if self.code is None else "code"
 
     @property
-    def is_planar(self) -> bool:
-        """Whether all discs lie in the plane z = 0: nothing is made of it if they do."""
+    def starts_from_homographies(self) -> bool:
+        """Whether photographs are first taken for those of the plane z = 0: never, of points."""
         return False
 
     @property
