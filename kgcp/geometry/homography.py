@@ -26,7 +26,8 @@ def homography_between(flat: FloatArray, places: FloatArray) -> FloatArray:
             np.stack((zero, zero, zero, x, y, one, -v * x, -v * y, -v), axis=1),
         )
     )
-    solved = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    is_short = len(rows) < rows.shape[1]  # then the last vector is only among all of them
+    solved = np.linalg.svd(rows, full_matrices=is_short)[2][-1].reshape(3, 3)
     by_points = np.linalg.inv(to_image) @ solved @ to_plane
     depth = float(by_points[2] @ (*flat.mean(axis=0), 1.0))
     return np.asarray(by_points / depth if depth else by_points)

@@ -20,9 +20,9 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import ComplexArray, FloatArray, GreyArray
 from kgcp.settings import require_range
-from kgcp.simulation.point_spread import Aberration, ComplexArray
+from kgcp.simulation.point_spread import Aberration
 from kgcp.simulation.rolling_shutter import RowMotion
 
 _WHITE_LEVEL = 255.0

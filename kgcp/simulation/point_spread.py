@@ -14,14 +14,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import j0
 
 from kgcp.errors import SettingError
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import ComplexArray, FloatArray
 from kgcp.settings import require_range
-
-ComplexArray = npt.NDArray[np.complex128]
 
 _NEGLIGIBLE = 1e-7  # of the transfer
 _MOST_COMA = 0.5  # of psf³, with equal axes: a fifth of the variance is left to the Gaussian

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import ComplexArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.settings import require_range
-from kgcp.simulation.point_spread import ComplexArray
 
 
 @dataclass(frozen=True, slots=True)

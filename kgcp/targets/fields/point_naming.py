@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import ComplexArray, FloatArray, IndexArray
 from kgcp.geometry.homography import homography_between, mapped
 from kgcp.targets.fields.layout import LEAST_POINTS
 from kgcp.targets.fields.naming import Naming, NamingProblem, SeenDiscs
@@ -63,11 +63,13 @@ def name_by_places(seen: SeenDiscs, field: PointField) -> Naming | NamingProblem
     """
     if len(seen.centres) < LEAST_POINTS:
         return NamingProblem.TOO_FEW
+    surroundings = _surroundings(field)
     guesses = sorted(
-        (guess for seed in _seeds(seen) for guess in _guesses(seen, field, seed)),
+        (guess for seed in _seeds(seen) for guess in _guesses(seen, surroundings, seed)),
         key=lambda guess: -guess.score,
     )
-    namings = [_followed(seen, field, guess) for guess in guesses[:_FOLLOWED]]
+    points_m, pitch_m = field.points_m(), field.pitch_m
+    namings = [_followed(seen, points_m, pitch_m, guess) for guess in guesses[:_FOLLOWED]]
     namings = [naming for naming in namings if len(naming) >= LEAST_POINTS]
     if not namings:
         return NamingProblem.NO_LATTICE
@@ -78,6 +80,15 @@ def name_by_places(seen: SeenDiscs, field: PointField) -> Naming | NamingProblem
             return NamingProblem.AMBIGUOUS
     disc, point = np.array(sorted(best.items())).T
     return Naming(disc, point, 0, is_symmetric=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surrounding:
+    """A disc of the field, and where its neighbours are in its plane, from one side."""
+
+    point: int  # of the field
+    plane: FloatArray  # (2, 3): two directions of the disc's plane, as the image has them
+    flat: ComplexArray  # (n,) [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,15 +108,10 @@ def _seeds(seen: SeenDiscs) -> list[int]:
     return [int(disc) for disc in np.argsort(off, kind="stable")[:_SEEDS]]
 
 
-def _guesses(seen: SeenDiscs, field: PointField, seed: int) -> list[_Guess]:
-    """Return the best guess for each disc of the field that a disc of a photograph could be."""
-    stretch = seen.stretches[seed]
-    steps = (seen.centres - seen.centres[seed]) @ np.linalg.inv(stretch).T  # a circle's plane
-    distances = np.linalg.norm(steps, axis=1)
-    near = np.argsort(distances, kind="stable")[1 : 2 * _NEIGHBOURS + 1]
-    targets = steps[near] @ (1.0, 1j)  # plane vectors as complex numbers: turns are products
+def _surroundings(field: PointField) -> list[tuple[_Surrounding, _Surrounding]]:
+    """Return each disc that has neighbours in its plane, seen from either side."""
     points, gaps = field.points_m(), gaps_between(field.points_m())
-    guesses = []
+    surroundings = []
     for point, normal in enumerate(field.normals()):
         around = np.argsort(gaps[point], kind="stable")[:_NEIGHBOURS]
         offsets = points[around] - points[point]
@@ -113,22 +119,42 @@ def _guesses(seen: SeenDiscs, field: PointField, seed: int) -> list[_Guess]:
         if np.count_nonzero(is_flat) < 3:
             continue
         first, second = _plane(normal)
+        front, back = np.stack((first, second)), np.stack((first, -second))
+        surroundings.append(
+            (
+                _Surrounding(point, front, (offsets[is_flat] @ front.T) @ (1.0, 1j)),
+                _Surrounding(point, back, (offsets[is_flat] @ back.T) @ (1.0, 1j)),
+            )
+        )
+    return surroundings
+
+
+def _guesses(
+    seen: SeenDiscs, surroundings: Sequence[tuple[_Surrounding, _Surrounding]], seed: int
+) -> list[_Guess]:
+    """Return the best guess for each disc of the field that a disc of a photograph could be."""
+    stretch = seen.stretches[seed]
+    steps = (seen.centres - seen.centres[seed]) @ np.linalg.inv(stretch).T  # a circle's plane
+    distances = np.linalg.norm(steps, axis=1)
+    near = np.argsort(distances, kind="stable")[1 : 2 * _NEIGHBOURS + 1]
+    targets = steps[near] @ (1.0, 1j)  # plane vectors as complex numbers: turns are products
+    guesses = []
+    for sides in surroundings:
         best: _Guess | None = None
-        for side in (1.0, -1.0):  # from which side the disc is seen
-            plane = np.stack((first, side * second))
-            flat = (offsets[is_flat] @ plane.T) @ (1.0, 1j)
-            for target in targets[:_PARTNERS]:
-                turned = np.multiply.outer(target / flat, flat)  # (own neighbour, all)
-                misses = np.abs(turned[:, :, None] - targets).min(axis=2)
-                nearest = np.abs(turned).min(axis=1)
-                scores = np.mean(misses < _TOLERANCE * nearest[:, None], axis=1)
-                top = int(scores.argmax())
-                if best is None or scores[top] > best.score:
-                    factor = target / flat[top]
-                    turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-                    best = _Guess(
-                        float(scores[top]), point, plane, seen.centres[seed], stretch @ turn
-                    )
+        for side in sides:
+            factors = targets[:_PARTNERS, None] / side.flat  # turn and scale
+            turned = factors[:, :, None] * side.flat  # (partner, own neighbour, all)
+            misses = np.abs(turned[..., None] - targets).min(axis=3)
+            nearest = np.abs(turned).min(axis=2)
+            scores = np.mean(misses < _TOLERANCE * nearest[..., None], axis=2).ravel()
+            top = int(scores.argmax())
+            if best is None or scores[top] > best.score:
+                factor = factors.ravel()[top]
+                turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+                by_plane = stretch @ turn
+                best = _Guess(
+                    float(scores[top]), side.point, side.plane, seen.centres[seed], by_plane
+                )
         if best is not None:
             guesses.append(best)
     return guesses
@@ -142,16 +168,18 @@ def _plane(normal: FloatArray) -> FloatArray:
     return np.stack((first, np.cross(normal, first)))
 
 
-def _followed(seen: SeenDiscs, field: PointField, guess: _Guess) -> dict[int, int]:
+def _followed(
+    seen: SeenDiscs, points_m: FloatArray, pitch_m: float, guess: _Guess
+) -> dict[int, int]:
     """Return which disc of the field each disc of a photograph is, by a guess for one of them.
 
     The map from the plane of that one is widened step by step, to all discs that are about in it.
     """
-    offsets = field.points_m() - field.points_m()[guess.point]
+    offsets = points_m - points_m[guess.point]
     distances = np.linalg.norm(offsets, axis=1)
     height = np.abs(offsets @ np.cross(guess.plane[0], guess.plane[1]))
     flat = offsets @ guess.plane.T
-    candidates = np.flatnonzero(height <= _FLAT * np.maximum(distances, field.pitch_m))
+    candidates = np.flatnonzero(height <= _FLAT * np.maximum(distances, pitch_m))
     order = candidates[np.argsort(distances[candidates], kind="stable")]
     homography = np.eye(3)
     homography[:2, :2], homography[:2, 2] = guess.by_plane, guess.centre
@@ -180,7 +208,8 @@ def _in_view(seen: SeenDiscs, places: FloatArray) -> int:
 def _matched(seen: SeenDiscs, places: FloatArray) -> tuple[IndexArray, IndexArray]:
     """Return the discs that are where some must be (n, 2), and which of these they are."""
     room = gaps_between(places).min(axis=1)
-    gaps = np.linalg.norm(places[:, None] - seen.centres, axis=2)
+    offsets_x, offsets_y = places.T[:, :, None] - seen.centres.T[:, None]
+    gaps = np.sqrt(offsets_x**2 + offsets_y**2)
     nearest, owner = gaps.argmin(axis=1), gaps.argmin(axis=0)
     index = np.arange(len(places))
     is_matched = (gaps[index, nearest] < _TOLERANCE * room) & (owner[nearest] == index)
