@@ -47,7 +47,7 @@ from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
 _SMALLEST_PX = 3.0  # radius: below, pebbles and clods are as round
-_MOST_TRIES = 8  # edges that are measured per target
+_MOST_TRIES = 24  # edges that are measured per target
 # How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
 # them), and of the radius (jagged or dirty edges)
 _EDGE_PX, _EDGE = 0.1, 0.01
