@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -97,7 +98,10 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(
     assert 1 <= done < FRAMES
     result = run(flight, tmp_path)
     assert result.exit_code == 1, "there is no target to measure"
-    assert f"results of {done} of {FRAMES} frames are kept, 0 have" in result.stderr
+    kept = re.search(rf"results of (\d+) of {FRAMES} frames are kept, 0 have", result.stderr)
+    assert kept is not None
+    # a signal may come when a result is kept and not counted yet
+    assert done <= int(kept[1]) <= done + 1
     assert f"{FRAMES} frames in" in result.stderr
 
 
