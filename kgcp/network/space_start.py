@@ -28,6 +28,7 @@ def start_in_space(
     width, height = size
 
     def at(focal: float) -> tuple[float, Camera, Estimate]:
+        """Return the typical misfit of the photographs at a focal length, with camera and poses."""
         camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
         count = int(observations.view.max()) + 1
         poses = [_resected(camera, observations, points, view) for view in range(count)]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
+from kgcp.georef.plain_prediction import Predictions
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -146,13 +147,7 @@ def detect_flight(
         frames = matching_frames(all_frames, options.frame_patterns)
         data = FlightData(flight, all_frames)
         times = data.frame_times.time_s
-        priors = priors_of_frames(flight, data, frames)
-        inputs = [
-            FrameInput(frame, times.get(frame), known, flight.may_use_exif_times, plain)
-            for frame, known, plain in zip(
-                frames, priors, plain_by_reference(flight, data, frames), strict=True
-            )
-        ]
+        inputs = _frame_inputs(flight, data, frames)
         marks = _marks(flight, all_frames, options.places)
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     job = DetectionJob(
@@ -179,17 +174,8 @@ def detect_flight(
             run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
             with stopwatch.stage("first look"):
                 run.first_pass()
-            predictions: Mapping[int, Mapping[str, Prediction]] = {}
-            guide_problem = None
             with stopwatch.stage("second look"):
-                if settings.is_guided:
-                    predictions, guide_problem = predict_missing(flight, data, run.tracks)
-                plain = (
-                    plain_by_targets(flight, data, run.results(), marks)
-                    if settings.is_guided or marks
-                    else {}
-                )
-                run.guided_pass(predictions, plain)
+                predictions, guide_problem = _look_again(run, flight, data, settings, marks)
             with stopwatch.stage("learning"):
                 run.learn()
             likely_cause = _likely_cause(run, stopwatch)
@@ -231,6 +217,48 @@ def detect_flight(
         write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
+
+
+def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:
+    """Return the frames with what is known of each before it is read."""
+    times = data.frame_times.time_s
+    known = zip(
+        frames,
+        priors_of_frames(flight, data, frames),
+        plain_by_reference(flight, data, frames),
+        strict=True,
+    )
+    return [
+        FrameInput(frame, times.get(frame), priors, flight.may_use_exif_times, plain)
+        for frame, priors, plain in known
+    ]
+
+
+def _look_again(
+    run: DetectionRun,
+    flight: Flight,
+    data: FlightData,
+    settings: DetectSettings,
+    marks: Mapping[str, Sequence[Mark]],
+) -> tuple[Mapping[int, Mapping[str, Prediction]], str | None]:
+    """Look where the first look, or marks, say that targets must be.
+
+    Returns
+    -------
+    predictions : mapping of mappings
+        Of coded targets, by row and name.
+    problem : str or None
+        What is wrong with what they are predicted by.
+    """
+    predictions: Mapping[int, Mapping[str, Prediction]] = {}
+    problem = None
+    if settings.is_guided:
+        predictions, problem = predict_missing(flight, data, run.tracks)
+    plain: Mapping[int, Predictions] = {}
+    if settings.is_guided or marks:
+        plain = plain_by_targets(flight, data, run.results(), marks)
+    run.guided_pass(predictions, plain)
+    return predictions, problem
 
 
 def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:

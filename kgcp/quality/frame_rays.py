@@ -57,6 +57,7 @@ class _Rays:
 
     @classmethod
     def of(cls, camera: Camera) -> _Rays:
+        """Return the rays of a camera on an even grid of pixels."""
         rows = max(2, round(_GRID * camera.height / camera.width))
         across = np.linspace(0.0, camera.width - 1.0, _GRID)
         x, y = np.meshgrid(across, np.linspace(0.0, camera.height - 1.0, rows))

@@ -13,7 +13,7 @@ import numpy as np
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
-from kgcp.measurement.image_model.ray_plate import VIEW_ROWS, meet_plate
+from kgcp.measurement.image_model.ray_plate import VIEW_ROWS, across_edge, meet_plate
 
 SKEW_ROWS = 4
 
@@ -59,11 +59,7 @@ def _add_skew(
         for m in range(starts[c], starts[c + 1]):
             i = members[m]
             x, y = views[0, i] - circles[c, 0], views[1, i] - circles[c, 1]
-            out_m = max(math.sqrt(x * x + y * y), 1e-9)
-            right = (x * views[2, i] + y * views[4, i]) / out_m
-            down = (x * views[3, i] + y * views[5, i]) / out_m
-            per_px = math.sqrt(right * right + down * down)
-            nx, ny = right / per_px, down / per_px
+            out_m, per_px, nx, ny = across_edge(views, i, x, y)
             sd = math.sqrt(xx * nx * nx + 2.0 * xy * nx * ny + yy * ny * ny)
             z = (radius_m - out_m) / (per_px * sd)
             density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)

@@ -162,6 +162,7 @@ def _grown(seen: SeenDiscs, free: IndexArray, seed: int, basis: FloatArray) -> _
     queue: list[tuple[float, int, tuple[int, int], tuple[int, int]]] = []
 
     def propose(node: tuple[int, int]) -> None:
+        """Put what may be the neighbours of a node into the queue, the surest first."""
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
             step = (sign, 0) if axis == 0 else (0, sign)
             there = (node[0] + step[0], node[1] + step[1])
