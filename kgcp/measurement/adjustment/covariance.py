@@ -37,10 +37,12 @@ _VECTOR = 4  # numbers that the processor takes at once
 # Of a circle's edge as a whole: no print and no pixel is known better, …
 _EDGE_FLOOR_PX = 0.0005
 _TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
-# The variance where levels vary, by what residuals show of it, with and without a shadow's edge
-# across the plate: the errors of 240 simulated plates (R 14-100 px; shadows, dirt, highlights).
-_ACROSS_SHADOW, _UNDER_UNEVEN_LIGHT = 3.5, 1.4
-_SKEW_SHARE = 0.25  # of what a skew spread displaces: beyond its third moment nothing is known
+# The variance where levels vary without a shadow's edge, by what residuals show of it: dirt and
+# highlights on 100 simulated plates (R 13-110 px). With an edge residuals show it all.
+_UNDER_UNEVEN_LIGHT = 1.4
+# Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
+# take part of it, and so does noise reduction.
+_SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.25, 0.5
 _COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
@@ -101,9 +103,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
 def unevenness_factor(fit: TargetFit) -> float:
     """Return how many times the variances that residuals show are too small in uneven light."""
     field = fit.parameters.field
-    if field is None:
-        return 1.0
-    return _ACROSS_SHADOW if len(field.edges) else _UNDER_UNEVEN_LIGHT
+    return 1.0 if field is None or len(field.edges) else _UNDER_UNEVEN_LIGHT
 
 
 def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
@@ -121,11 +121,12 @@ def _skew_displacement_px(fit: TargetFit) -> float:
     """Return the standard deviation of the centre by what skew spreads displace it [px].
 
     A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
-    not known, so that holds but for about a quarter of it.
+    not known, so that holds but for about a quarter of it, or half in uneven light.
     """
     blur = fit.parameters.blur
     largest = max(abs(value) for value in blur.skew)
-    return _SKEW_SHARE * largest / (6.0 * blur.mean_sd_px**2)
+    share = _SKEW_SHARE if fit.varied is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
+    return share * largest / (6.0 * blur.mean_sd_px**2)
 
 
 def _common_displacement_px(fit: TargetFit) -> float:

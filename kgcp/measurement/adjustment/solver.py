@@ -20,6 +20,8 @@ from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, white_share
+from kgcp.measurement.image_model.light_across_edges import spread_share_gradient
+from kgcp.measurement.image_model.light_field import LightField
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
 from kgcp.measurement.image_model.photometry import Param
 from kgcp.measurement.image_model.skew import skew_rows
@@ -42,6 +44,7 @@ _NEGLIGIBLE = 1e-6
 _AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
 _MAX_DAMPING = 1e6
+_LEAST_CONTRAST = 0.1  # of the mean over the plate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +85,10 @@ def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
     share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
     if parameters.has_skew:
         share = _skewed(share, sample, parameters)
-    levels = sample.photometry.levels(
-        share.value, parameters.light, added_levels(sample, parameters)
-    )
+    added = added_levels(sample, parameters)
+    if parameters.field is not None and added is not None:
+        share = _in_light(share, sample, parameters, parameters.field, added)
+    levels = sample.photometry.levels(share.value, parameters.light, added)
     return PredictedImage(share.points_m, share.value, levels)
 
 
@@ -98,6 +102,8 @@ def linearise(sample: Sample, parameters: Parameters) -> tuple[PredictedImage, F
     if parameters.has_skew:
         share = _skewed(share, sample, parameters)
     added = added_levels(sample, parameters)
+    if parameters.field is not None and added is not None:
+        share = _in_light(share, sample, parameters, parameters.field, added)
     levels, jacobian = sample.photometry.linearised(share, parameters.light, added)
     return PredictedImage(share.points_m, share.value, levels), jacobian
 
@@ -113,6 +119,26 @@ def _skewed(share: WhiteShare, sample: Sample, parameters: Parameters) -> WhiteS
     value = share.value + parameters.vector[Param.SKEW_XXX :] @ rows
     jacobian = np.vstack((share.jacobian, rows)) if len(share.jacobian) else share.jacobian
     return WhiteShare(share.points_m, value, jacobian)
+
+
+def _in_light(
+    share: WhiteShare,
+    sample: Sample,
+    parameters: Parameters,
+    field: LightField,
+    added: FloatArray,
+) -> WhiteShare:
+    """Add what light that changes across an edge does to the white share under blur.
+
+    The derivatives stay as they are.
+    """
+    spread = spread_share_gradient(
+        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
+    )
+    gradient = field.contrast_gradient(sample.problem.window.pixels(sample.index))
+    contrast = np.maximum(1.0 + added[1] - added[0], _LEAST_CONTRAST)
+    value = share.value + np.sum(gradient * spread, axis=0) / contrast
+    return WhiteShare(share.points_m, value, share.jacobian)
 
 
 def added_levels(sample: Sample, parameters: Parameters) -> FloatArray | None:

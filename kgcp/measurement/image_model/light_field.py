@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
 SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
@@ -77,16 +77,62 @@ def _weigh(
     (x0, y0), (columns, rows) = corner, counts
     along_x, along_y = np.empty(3), np.empty(3)
     for i in range(pixels.shape[1]):
-        x, y = (pixels[0, i] - x0) / spacing, (pixels[1, i] - y0) / spacing
-        column = min(max(int(np.floor(x)), 0), columns - 3)
-        row = min(max(int(np.floor(y)), 0), rows - 3)
-        for along, t in ((along_x, x - column), (along_y, y - row)):
-            along[0], along[2] = 0.5 * (1.0 - t) * (1.0 - t), 0.5 * t * t
-            along[1] = 1.0 - along[0] - along[2]
+        column, across = _cell(pixels[0, i], x0, spacing, columns)
+        row, down = _cell(pixels[1, i], y0, spacing, rows)
+        _fill_spline(across, along_x)
+        _fill_spline(down, along_y)
         for r in range(3):
             for c in range(3):
                 knots[i, 3 * r + c] = first + (row + r) * columns + column + c
                 weights[i, 3 * r + c] = along_y[r] * along_x[c]
+
+
+@compiled
+def _add_gradient(
+    pixels: FloatArray,
+    corner: tuple[float, float],
+    spacing: float,
+    counts: tuple[int, int],
+    values: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add the gradient of Σ weights · values over one grid."""
+    (x0, y0), (columns, rows) = corner, counts
+    along_x, along_y = np.empty(3), np.empty(3)
+    slopes_x, slopes_y = np.empty(3), np.empty(3)
+    for i in range(pixels.shape[1]):
+        column, across = _cell(pixels[0, i], x0, spacing, columns)
+        row, down = _cell(pixels[1, i], y0, spacing, rows)
+        _fill_spline(across, along_x)
+        _fill_spline(down, along_y)
+        _fill_slopes(across, spacing, slopes_x)
+        _fill_slopes(down, spacing, slopes_y)
+        for r in range(3):
+            for c in range(3):
+                value = values[(row + r) * columns + column + c]
+                gradient[0, i] += value * along_y[r] * slopes_x[c]
+                gradient[1, i] += value * slopes_y[r] * along_x[c]
+
+
+@inlined
+def _cell(at_px: float, first_px: float, spacing: float, count: int) -> tuple[int, float]:
+    """Return the first of the three knots in reach along an axis, and where in its cell."""
+    t = (at_px - first_px) / spacing
+    knot = min(max(int(np.floor(t)), 0), count - 3)
+    return knot, t - knot
+
+
+@inlined
+def _fill_spline(t: float, weights: FloatArray) -> None:
+    """Fill in the weights (3,) of the knots in reach: a quadratic spline."""
+    weights[0], weights[2] = 0.5 * (1.0 - t) * (1.0 - t), 0.5 * t * t
+    weights[1] = 1.0 - weights[0] - weights[2]
+
+
+@inlined
+def _fill_slopes(t: float, spacing: float, slopes: FloatArray) -> None:
+    """Fill in the derivatives (3,) of the weights [1/px]."""
+    slopes[0], slopes[1], slopes[2] = (t - 1.0) / spacing, (1.0 - 2.0 * t) / spacing, t / spacing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +156,23 @@ class LightField:
     def added(self, pixels: FloatArray) -> FloatArray:
         """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
         return added_by_knots(*self.knots.weights(pixels), self.values) + self.of_edges(pixels)
+
+    def contrast_gradient(self, pixels: FloatArray) -> FloatArray:
+        """Return the gradient (2, n) [1/px] of the contrast between plate and ink."""
+        gradient = np.zeros((2, pixels.shape[1]))
+        first, contrasts = 0, self.values[1] - self.values[0]
+        for g, spacing in enumerate(self.knots.spacings_px):
+            counts = self.knots.columns[g], self.knots.rows[g]
+            corner = self.knots.x0, self.knots.y0
+            _add_gradient(pixels, corner, spacing, counts, contrasts[first:], gradient)
+            first += self.knots.counts[g]
+        for edge in self.edges:
+            z = beyond(edge, pixels - self.centre_px[:, None])
+            density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+            slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * density
+            gradient[0] += math.cos(edge[ANGLE]) * slope
+            gradient[1] += math.sin(edge[ANGLE]) * slope
+        return gradient
 
     def of_edges(self, pixels: FloatArray) -> FloatArray:
         """Return the part of the shadows' edges."""

@@ -88,3 +88,21 @@ def test_a_shadow_is_half_as_deep_at_its_edge_and_whole_beyond() -> None:
     added = replace(_field(), edges=edge).added(pixels)
     assert added[1] == pytest.approx([-0.25, -0.5, 0.0], abs=1e-6)
     assert added[0] == pytest.approx([-0.015, -0.03, 0.0], abs=1e-6)
+
+
+def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
+    rng = np.random.default_rng(5)
+    field = _field()
+    coarse = knots_over(100.0, 200.0, 64, 48, (2.5 * _SPACING_PX, _SPACING_PX))
+    field = replace(
+        field,
+        knots=coarse,
+        values=rng.normal(0.0, 0.2, (2, sum(coarse.counts))),
+        edges=np.array([[0.7, 3.0, 0.9, -0.05, -0.5]]),
+    )
+    pixels = np.array([[100.0], [200.0]]) + rng.uniform(2.0, 40.0, (2, 50))
+    step, by_steps = 1e-4, np.empty((2, 50))
+    for axis, towards in enumerate(np.eye(2)[:, :, None]):
+        change = field.added(pixels + step * towards) - field.added(pixels - step * towards)
+        by_steps[axis] = (change[1] - change[0]) / (2.0 * step)
+    np.testing.assert_allclose(field.contrast_gradient(pixels), by_steps, rtol=0, atol=1e-7)
