@@ -1,4 +1,4 @@
-"""Cramér-Rao bound of a disc's centroid, from the exact rendering.
+"""Cramér-Rao bound of the centroid of a disc or a ring, from the exact rendering.
 
 Unknown besides the centroid: diameter and tilt, point spread, two levels, the light's gradient, and
 two bends of the tone curve where the camera's response is unknown. Pixels farther from the edge
@@ -52,12 +52,15 @@ def centroid_bound(
 
     step_m = _STEP_PX / camera.fx
     x, y, z = disc.position_m
+    hole = disc.inner_diameter_m / disc.diameter_m  # which grows with it
     columns = [
         slope(of_disc(position_m=(x + step_m, y, z)), of_disc(position_m=(x - step_m, y, z))),
         slope(of_disc(position_m=(x, y + step_m, z)), of_disc(position_m=(x, y - step_m, z))),
         slope(
-            of_disc(diameter_m=disc.diameter_m + step_m),
-            of_disc(diameter_m=disc.diameter_m - step_m),
+            *(
+                of_disc(diameter_m=diameter_m, inner_diameter_m=hole * diameter_m)
+                for diameter_m in (disc.diameter_m + step_m, disc.diameter_m - step_m)
+            )
         ),
     ]
     if disc.normal[2] < 0.999:  # else its tilt changes nothing to first order

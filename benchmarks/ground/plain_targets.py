@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from benchmarks.calibrate.bound import centroid_bound
+from benchmarks.calibrate.bound import AROUND_PX, centroid_bound
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
@@ -51,6 +51,7 @@ _BORDER_PX = 9.0
 _RADII_PX = (3.0, 4.0, 6.0, 10.0, 20.0)
 _TILTS_DEG = (0.0, 12.5, 25.0, 37.5, 50.0)
 _DIAMETER_M = 0.5
+_APART_PX = AROUND_PX  # edges of a ring: farther apart, each has pixels of its own
 _EVEN = 0.2  # scatter of the ground about a bare disc, of the contrast, at most
 _BRIGHT, _DARK = 0.7, 0.06
 _KINDS = {  # shape, polarity, and whether it has a border
@@ -218,8 +219,9 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     """Return the least covariances (k, 5, 5) of the circles' centres and stretches [px²].
 
     By the bound of the centre: an edge that is displaced by cos φ tells the centre, by cos² φ the
-    first element of the stretch, and so on, all by the same information per length. A ring's
-    circles count as if they knew nothing of each other.
+    first element of the stretch, and so on, all by the same information per length. Of a ring
+    whose edges are near to each other, the inner circle moves and grows with the outer one. Those
+    that are far apart count as if they knew nothing of each other.
     """
     shares, polarity, _ = _KINDS[kind]
     camera = Camera(81, 81, 200_000.0, 200_000.0, 40.0, 40.0)
@@ -229,9 +231,13 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     c, s = np.cos(angle), np.sin(angle)
     moved = np.stack((c, s, c * c, 2.0 * c * s, s * s))
     pattern = np.linalg.inv(moved @ moved.T / 180.0)  # the centre's has the variance 1
+    outer_m, *inner_m = (2.0 * share * radius_px / camera.fx for share in shares)
+    if radius_px * (1.0 - min(shares)) < _APART_PX:
+        discs = [FieldDisc((0.0, 0.0, 0.0), outer_m, sum(inner_m))]
+    else:
+        discs = [FieldDisc((0.0, 0.0, 0.0), diameter_m) for diameter_m in (outer_m, *inner_m)]
     covs = []
-    for share in shares:
-        disc = FieldDisc((0.0, 0.0, 0.0), 2.0 * share * radius_px / camera.fx)
+    for disc in discs:
         scene = FieldScene((disc,), ground=outside, ink=inside)
         bound = centroid_bound(camera, scene, _OPTICS, _SENSOR, 1.0, tone_is_unknown=False)
         covs.append(0.5 * float(np.trace(bound)) * pattern)
@@ -243,7 +249,7 @@ def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, stated: FloatA
 
     Of the edges, and of the normal: what its prior leaves open, and which of both it is.
     """
-    radii = np.array(target.radii_m)
+    radii = np.array(target.radii_m[: len(edges)])
     moments = circle_images(_CAMERA, circles_about(pose, radii)).moments
     slopes = [moments_by_stretch(geometry_of(one)) for one in moments]
     covs = np.array([slope @ cov @ slope.T for slope, cov in zip(slopes, edges, strict=True)])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri, expit
@@ -60,6 +61,10 @@ _BARE = 3.0
 _SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
 _SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
 _INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
+# Edges nearer to each other than this leave each other too few pixels, and are measured as one. On
+# larger rings errors of the print are larger than those of the edges, and circles apart tell the
+# normal: each is measured by itself.
+_NARROW_PX, _LARGE_PX = 4.0, 30.0
 _REASONS = {
     DiscReason.CUT: Reason.CUT,
     DiscReason.CROWDED: Reason.CROWDED,
@@ -256,8 +261,10 @@ def _measured_circles(
     ------
     Rejection
     """
-    outlines = [edge]
     ellipses = _ellipses_of(camera, target, start)
+    if _is_narrow(ellipses):
+        return _measured_whole(grey, camera, target, start, edge, ellipses)
+    outlines = [edge]
     inner = [
         DiscOutline.predicted(ellipse, _polarity(target, circle))
         for circle, ellipse in enumerate(ellipses[1:], start=1)
@@ -287,6 +294,45 @@ def _measured_circles(
         np.array([disc.cov for disc in discs]) * (1.0 if border else _BARE),
     )
     return _Circles(tuple(discs), images)
+
+
+def _is_narrow(ellipses: Sequence[Ellipse]) -> bool:
+    """Tell whether circles are too near to each other for each to be measured by itself."""
+    is_near = any(outer.b - inner.b < _NARROW_PX for outer, inner in pairwise(ellipses))
+    return is_near and ellipses[0].a < _LARGE_PX
+
+
+def _measured_whole(
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    start: Pose,
+    edge: DiscOutline,
+    ellipses: Sequence[Ellipse],
+) -> _Circles:
+    """Measure the outer circle of a ring whose others move and grow with it.
+
+    Raises
+    ------
+    Rejection
+    """
+    to_unit = np.linalg.inv(ellipses[0].stretch)
+    inner = [
+        (
+            *(to_unit @ (each.centre - ellipses[0].centre)),
+            each.mean_radius / ellipses[0].mean_radius,
+        )
+        for each in ellipses[1:]
+    ]
+    border = _border(camera, target, start)
+    outcome = measure_disc(
+        grey, edge, neighbours=border, inner=np.array(inner), response=camera.response
+    )
+    if isinstance(outcome, DiscMiss):
+        raise Rejection(_REASONS[outcome.reason], outcome.detail)
+    cov = outcome.cov * (1.0 if border else _BARE)
+    images = CircleMoments(np.array(target.radii_m[:1]), outcome.vector[None], cov[None])
+    return _Circles((outcome,), images)
 
 
 def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline]:

@@ -88,6 +88,32 @@ def test_true_centre_within_its_deviations(target: PlainTarget) -> None:
     assert math.isnan(outcome.score)
 
 
+def test_a_far_ring_is_measured_as_a_whole() -> None:
+    target = replace(RING, border_m=0.9)
+    pose = pose_towards(2.5 * pose_at(90.4, 71.7, RING).translation_m, NORMAL)
+    expected = replace(prediction_of(pose, (5.0, -4.0)), radius_px=4.0)
+    outcome = looked(frame_with((target, pose)), expected, target)
+    assert isinstance(outcome, Measurement)
+    assert outcome.uncertainty is not None
+    off_px = outcome.centre_px - CAMERA.project(pose.translation_m[None])[0]
+    sd_px = np.sqrt(np.diag(outcome.uncertainty.centre_cov_px2))
+    assert np.all(np.abs(off_px) < 4.0 * sd_px)
+    assert np.all((sd_px > 0.002) & (sd_px < 0.02))
+    disc, other = (replace(target, diameters_m=diameters) for diameters in ((0.8,), (0.8, 0.64)))
+    for shown, wanted in ((disc, target), (target, disc), (other, target), (target, other)):
+        outcome = looked(frame_with((shown, pose)), expected, wanted)
+        assert isinstance(outcome, Miss), (shown, wanted)
+    of_disc, of_ring = (frame_with((each, pose)).astype(np.float64) for each in (disc, target))
+    for ratio in (0.7, 0.9):  # how bright its hole is
+        grey = np.rint((1.0 - ratio) * of_disc + ratio * of_ring).astype(np.uint8)
+        outcome = looked(grey, expected, target)
+        assert isinstance(outcome, Measurement) is (ratio == 0.9)
+    assert isinstance(outcome, Measurement)
+    assert outcome.uncertainty is not None
+    off_m = outcome.distance_m - pose.distance_m
+    assert abs(off_m) < 2.0 * outcome.uncertainty.sd_distance_m < 0.01 * pose.distance_m
+
+
 @pytest.mark.parametrize(
     ("off_px", "size"), [((25.0, 0.0), 1.0), ((0.0, 0.0), 1.2), ((0.0, 0.0), 0.8)]
 )

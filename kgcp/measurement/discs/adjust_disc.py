@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
-from kgcp.measurement.discs.affine_model import Geometry, distances_px
+from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, distances_px
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -63,6 +63,7 @@ class DiscTask:
     grey: GreyArray
     outline: DiscOutline
     others: Sequence[Geometry]  # edges whose pixels are left out
+    inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as of `DiscPixels`
 
     @property
     def is_dark(self) -> bool:
@@ -104,10 +105,12 @@ def adjust_disc(
     for _ in range(_ROUNDS):
         window = cut_disc_window(task.grey, geometry, window_reach_px(blur))
         _check_inside(task.grey, geometry)
-        index, is_enough = choose_pixels(window, geometry, blur, task.others)
+        index, is_enough = choose_pixels(
+            window, geometry, blur, task.others, is_thinned=not len(task.inner)
+        )
         if not is_enough:
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
-        state = state or _start(window, index, geometry, blur, free, is_dark=task.is_dark)
+        state = state or _start(task, window, index, geometry, blur, free)
         limits = find_censoring(window.levels, window.levels_per_count)
         if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
             free = free.without_ink_slope()
@@ -133,32 +136,44 @@ def _adjust_on(
     free: Unknowns,
 ) -> DiscFit:
     sample = DiscSample.of(
-        window, index, state, limits, free, is_dark=task.is_dark, radius_px=task.radius_px
+        window,
+        index,
+        state,
+        limits,
+        free,
+        is_dark=task.is_dark,
+        radius_px=task.radius_px,
+        inner=task.inner,
     )
     return fit_disc(sample, state, free)
 
 
 def _start(
+    task: DiscTask,
     window: DiscWindow,
     index: IndexArray,
     geometry: Geometry,
     blur: Blur,
     free: Unknowns,
-    *,
-    is_dark: bool,
 ) -> DiscState:
     """Return levels from the middle of the disc and the ground around it.
 
-    From pixels that no other edge reaches: in the middle of a ring is its hole.
+    From pixels that no other edge reaches: in the middle of a ring is its hole. If its circles are
+    adjusted with it, from those that are the most between its edges.
 
     Raises
     ------
     DiscRejection
         `NO_CONTRAST`.
     """
-    off_px, levels = distances_px(window.places_px(index), geometry), window.levels[index]
+    places_px, levels, is_dark = window.places_px(index), window.levels[index], task.is_dark
+    off_px = distances_px(places_px, geometry)
     order = np.argsort(off_px)
     inmost = order[: max(3, int(np.count_nonzero(off_px < -2.0 * blur.mean_sd_px) // 2))]
+    if len(task.inner):
+        ring = DiscPixels.of(places_px, geometry, blur, is_dark=True, inner=task.inner)
+        order = np.argsort(ring.white_share(geometry, blur).value)
+        inmost = order[: max(3, int(np.count_nonzero(off_px < 0.0) // 4))]
     around = (off_px > 1.5 * blur.mean_sd_px) & (off_px < 1.5 * blur.mean_sd_px + 3.0)
     if not around.any():
         raise DiscRejection(DiscReason.CROWDED, "too little free ground")
@@ -190,6 +205,8 @@ def _foreign(fit: DiscFit, window: DiscWindow, index: IndexArray) -> BoolArray |
     clips = fit.sample.censoring
     model = np.clip(fit.levels, clips.low, clips.high)
     off = np.abs(fit.sample.levels - model) > limit
+    if len(fit.sample.pixels.inner):  # what its circles do not explain there speaks against them
+        off &= distances_px(fit.sample.pixels.places_px, fit.state.geometry) > 0.0
     if not off.any():
         return None
     mask = np.zeros(len(window.levels), np.uint8)

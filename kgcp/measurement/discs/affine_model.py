@@ -28,35 +28,54 @@ _LEAST_SEMI_AXIS_PX = 0.4
 # x, y [px] and the stretch xx, xy, yy [px]
 Geometry = FloatArray
 
+NO_INNER = np.empty((0, 3))
+"""Of a disc: no circles within its edge."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscPixels:
-    """n pixels of a photograph, as an edge of a disc divides them."""
+    """n pixels of a photograph, as the edge of a disc divides them, or the edges of a ring."""
 
     places_px: FloatArray  # (2, n)
-    is_dark: bool  # whether the disc is darker than the ground
+    is_dark: bool  # whether the area within the outer edge is darker than the ground
+    # (k, 3): circles within the outer edge, where that is the unit circle: centre and radius
+    inner: FloatArray
     # (n,): white share of the pixels that the edge does not reach
     background: FloatArray
-    starts: IndexArray  # (2,): 0, and the number of those that it reaches
-    members: IndexArray  # which these are
-    rule: float  # of integration
+    circles: FloatArray  # (k + 1, 5): as `render` takes them
+    starts: IndexArray  # (k + 2,): where the pixels begin that a circle reaches, …
+    members: IndexArray  # … among these
 
     @classmethod
     def of(
-        cls, places_px: FloatArray, geometry: Geometry, blur: Blur, *, is_dark: bool
+        cls,
+        places_px: FloatArray,
+        geometry: Geometry,
+        blur: Blur,
+        *,
+        is_dark: bool,
+        inner: FloatArray = NO_INNER,
     ) -> DiscPixels:
-        """Find which pixels (2, n) feel the edge."""
+        """Find which pixels (2, n) feel an edge."""
         smallest, largest = semi_axes(geometry)
         sd_px = blur.largest_sd_px
-        rule = quadrature_for(np.array([smallest / sd_px]), np.array([largest / sharpest_px(blur)]))
+        circles = np.zeros((len(inner) + 1, 5))
+        circles[0, 2], circles[1:, :3] = 1.0, inner
+        circles[::2, 3], circles[1::2, 3] = (-1.0, 1.0) if is_dark else (1.0, -1.0)
+        radii = circles[:, 2]
+        circles[:, 4] = quadrature_for(
+            smallest * radii / sd_px, largest * radii / sharpest_px(blur)
+        )
         reach_px = REACH_SIGMAS * sd_px + _SLACK_PX
         off_px = distances_px(places_px, geometry)
-        members = np.flatnonzero(np.abs(off_px) <= reach_px)
+        is_member = off_px <= reach_px if len(inner) else np.abs(off_px) <= reach_px
+        members = np.flatnonzero(is_member)
         inside = (off_px < -reach_px).astype(np.float64)
         background = 1.0 - inside if is_dark else inside
         background[members] = 1.0 if is_dark else 0.0
-        starts = np.array([0, len(members)])
-        return cls(places_px, is_dark, background, starts, members, float(rule[0]))
+        starts = len(members) * np.arange(len(circles) + 1)
+        members = np.tile(members, len(circles))
+        return cls(places_px, is_dark, inner, background, circles, starts, members)
 
     def white_share(self, geometry: Geometry, blur: Blur) -> WhiteShare:
         """Return the share of the brighter level in every pixel, with derivatives.
@@ -68,11 +87,23 @@ class DiscPixels:
         _meet_disc(geometry, self.places_px, inverse, views)
         on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
         on_disc[0] = self.background
-        circle = np.array([[0.0, 0.0, 1.0, -1.0 if self.is_dark else 1.0, self.rule]])
-        render(views, blur.vector, circle, self.starts, self.members, on_disc)
+        render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
         slopes = np.empty((SLOPE_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)
         return WhiteShare(views[:2], on_disc[0], slopes)
+
+    def shares_within(self, geometry: Geometry, blur: Blur) -> FloatArray:
+        """Return how much (k + 1, n) of every pixel each of a ring's circles covers."""
+        views, inverse = np.empty((_VIEW_ROWS, self.places_px.shape[1])), np.empty(3)
+        _meet_disc(geometry, self.places_px, inverse, views)
+        shares = np.zeros((len(self.circles), 1, views.shape[1]))
+        for circle, begin, end, share in zip(
+            self.circles, self.starts[:-1], self.starts[1:], shares, strict=True
+        ):
+            alone = np.where(np.arange(5) == 3, 1.0, circle)[None]
+            reached = np.array([0, end - begin])
+            render(views, blur.vector, alone, reached, self.members[begin:end], share)
+        return shares[:, 0]
 
 
 def semi_axes(geometry: Geometry) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dposv
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_products
-from kgcp.measurement.discs.affine_model import DiscPixels, Geometry, limited
+from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, limited
 from kgcp.measurement.discs.disc_levels import COUNT, GEOMETRY_COUNT, LevelModel, Row
 from kgcp.measurement.discs.pixel_choice import DiscWindow
 from kgcp.measurement.discs.tone_curve import DiscTone, steep_enough
@@ -241,14 +241,15 @@ class DiscSample:
         *,
         is_dark: bool,
         radius_px: float,
+        inner: FloatArray = NO_INNER,
     ) -> DiscSample:
         """Take pixels of a window, by their flat indices."""
         places = window.places_px(index)
-        pixels = DiscPixels.of(places, state.geometry, state.blur, is_dark=is_dark)
+        pixels = DiscPixels.of(places, state.geometry, state.blur, is_dark=is_dark, inner=inner)
         offsets = (places - state.geometry[:2, None]) / radius_px
         mask = None
         if free.sharpening_px:
-            mask = _mask(window, index, state, free.sharpening_px, is_dark=is_dark)
+            mask = _mask(window, index, state, free.sharpening_px, pixels)
         censoring = replace(limits, at_high=limits.at_high[index], at_low=limits.at_low[index])
         return cls(
             pixels,
@@ -262,7 +263,7 @@ class DiscSample:
 
     def by(self, tone: Tone, sharpening_px: float, state: DiscState) -> DiscSample:
         """Return the same pixels for another tone curve and another mask of the camera's."""
-        mask = _mask(self.window, self.index, state, sharpening_px, is_dark=self.pixels.is_dark)
+        mask = _mask(self.window, self.index, state, sharpening_px, self.pixels)
         return replace(self, level_model=replace(self.level_model, tone=tone, mask=mask))
 
 
@@ -271,12 +272,16 @@ def _mask(
     index: IndexArray,
     state: DiscState,
     sharpening_px: float,
-    *,
-    is_dark: bool,
+    pixels: DiscPixels,
 ) -> Mask:
-    """Return the mask of the camera's sharpening about a disc."""
-    everywhere = window.places_px(np.arange(len(window.levels)))
-    whole = DiscPixels.of(everywhere, state.geometry, state.blur, is_dark=is_dark)
+    """Return the mask of the camera's sharpening about the disc of some pixels."""
+    whole = DiscPixels.of(
+        window.places_px(np.arange(len(window.levels))),
+        state.geometry,
+        state.blur,
+        is_dark=pixels.is_dark,
+        inner=pixels.inner,
+    )
     share = whole.white_share(state.geometry, state.blur).value
     return unsharp_mask((window.height, window.width), index, share, sharpening_px)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.adjust_disc import (
     DiscRejection,
@@ -19,11 +19,17 @@ from kgcp.measurement.discs.adjust_disc import (
     geometry_of,
     outline_geometry,
 )
-from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.discs.affine_model import NO_INNER, Geometry
 from kgcp.measurement.discs.camera_tone import CameraTone, first_blur_px, learn_tone, unknowns_of
 from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
-from kgcp.measurement.discs.covariance import DiscScatter, inflations, scatter_of
+from kgcp.measurement.discs.covariance import (
+    DiscScatter,
+    inflations,
+    moments_by_stretch,
+    scatter_of,
+)
 from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
+from kgcp.measurement.discs.hole_level import HoleLevel
 from kgcp.measurement.discs.records import (
     Disc,
     DiscMiss,
@@ -92,10 +98,11 @@ def measure_disc(
     outline: DiscOutline,
     *,
     neighbours: Sequence[DiscOutline] = (),
+    inner: FloatArray = NO_INNER,
     response: Response = Response.UNKNOWN,
     operator: Operator = Operator.MODEL,
 ) -> Disc | DiscMiss:
-    """Measure one disc, or one edge of a ring.
+    """Measure one disc, or one edge of a ring, or a ring as a whole.
 
     Parameters
     ----------
@@ -103,8 +110,12 @@ def measure_disc(
         As for `measure_discs`.
     neighbours : sequence of DiscOutline
         Other edges that may be near: their pixels are left out.
+    inner : (k, 3) array
+        Of a ring that is measured as a whole: its circles within the outline, from the outside to
+        the inside, as centre and radius where the outline is the unit circle. They move and grow
+        with it.
     """
-    task = DiscTask(grey, outline, _others(outline, neighbours))
+    task = DiscTask(grey, outline, _others(outline, neighbours), inner)
     return _measured([task], response, operator, None)[0]
 
 
@@ -138,11 +149,28 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
     try:
         fit = adjust_disc(task, unknowns_of(task, camera), blur_px=first_blur_px(task, camera))
         check_fit(fit, task.outline)
-        return fit, scatter_of(fit)
+        return (fit, scatter_of(fit)) if not len(task.inner) else _with_hole(fit)
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
+
+
+def _with_hole(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
+    """Return a ring whose areas within are as bright as they are, and not as the ground is.
+
+    Raises
+    ------
+    DiscRejection
+        `POOR_FIT`.
+    """
+    hole, scatter = HoleLevel.of(fit), scatter_of(fit)
+    if not hole.is_seen:
+        detail = f"an inner circle is not there, or steps by {hole.ratio:.0%} of the outer one"
+        raise DiscRejection(DiscReason.POOR_FIT, detail)
+    to_moments = moments_by_stretch(fit.state.geometry)
+    common = scatter.common + to_moments @ hole.cov @ to_moments.T
+    return replace(fit, state=hole.moved(fit.state)), replace(scatter, common=common)
 
 
 def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import ncx2
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.discs.affine_model import DiscPixels, distances_px
+from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, distances_px
 from kgcp.measurement.image_model.blur import Blur
 
 SHAPES = {
@@ -27,6 +27,7 @@ def places(size: int = 41) -> FloatArray:
 def test_share_is_that_of_a_blurred_ellipse(name: str, *, is_dark: bool) -> None:
     """A blur of the ellipse's own shape is round where the ellipse is the unit circle."""
     geometry, sd = SHAPES[name]
+    inner = np.array([[0.1, -0.05, 0.5]])
     stretch = geometry[[2, 3, 3, 4]].reshape(2, 2)
     relative = sd / np.sqrt(np.linalg.det(stretch))
     (xx, xy), (_, yy) = relative**2 * stretch @ stretch
@@ -36,13 +37,22 @@ def test_share_is_that_of_a_blurred_ellipse(name: str, *, is_dark: bool) -> None
     offset = np.linalg.inv(stretch) @ (places() - geometry[:2, None])
     expected = ncx2.cdf(1.0 / relative**2, 2, np.sum(offset**2, axis=0) / relative**2)
     assert value == pytest.approx(1.0 - expected if is_dark else expected, abs=3e-4)
+    ring = DiscPixels.of(places(), geometry, blur, is_dark=is_dark, inner=inner)
+    hole = ncx2.cdf(
+        (0.5 / relative) ** 2, 2, np.sum((offset - inner[0, :2, None]) ** 2, axis=0) / relative**2
+    )
+    value = ring.white_share(geometry, blur).value
+    assert value == pytest.approx(1.0 - expected + hole if is_dark else expected - hole, abs=6e-4)
+    assert ring.shares_within(geometry, blur)[1] == pytest.approx(hole, abs=3e-4)
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_derivatives_are_those_of_the_share(name: str) -> None:
+@pytest.mark.parametrize("is_ring", [False, True])
+def test_derivatives_are_those_of_the_share(name: str, *, is_ring: bool) -> None:
     geometry, sd = SHAPES[name]
     blur, step = Blur(sd * sd, 1.1 * sd * sd, 0.05), 1e-4
-    pixels = DiscPixels.of(places(), geometry, blur, is_dark=True)
+    inner = np.array([[0.1, -0.05, 0.5]]) if is_ring else NO_INNER
+    pixels = DiscPixels.of(places(), geometry, blur, is_dark=True, inner=inner)
     slopes = pixels.white_share(geometry, blur).jacobian
     blurs = {6: (1.0, 1.0, 0.0), 7: (1.0, -1.0, 0.0), 8: (0.0, 0.0, 1.0)}
     for row in (*range(5), *blurs):
