@@ -131,6 +131,15 @@ class PlainFlight:
         """Write flight.toml, frames and reference.csv."""
         (folder / "frames").mkdir(parents=True)
         rng = np.random.default_rng(self.seed + 1)
+        self._write_frames(folder / "frames", rng)
+        self._write_reference(folder / "reference.csv", rng)
+        self._write_times(folder / "frames.csv")
+        if self.moving is not None:
+            self._write_trajectory(folder / "vehicle.csv")
+        (folder / "flight.toml").write_text(self._toml(), encoding="utf-8")
+        return folder
+
+    def _write_frames(self, folder: Path, rng: np.random.Generator) -> None:
         ground = Ground.grown(rng, 500.0)
         centres, rotations = self.cameras()
         for frame in range(self.frames):
@@ -146,15 +155,7 @@ class PlainFlight:
                 ),
             )
             irradiance = render_irradiance(CAMERA, ground, scene, Optics(0.6), rng)
-            cv2.imwrite(
-                str(folder / "frames" / f"f_{frame}.png"), Sensor().expose(irradiance, 1.0, rng)
-            )
-        self._write_reference(folder / "reference.csv", rng)
-        self._write_times(folder / "frames.csv")
-        if self.moving is not None:
-            self._write_trajectory(folder / "vehicle.csv")
-        (folder / "flight.toml").write_text(self._toml(), encoding="utf-8")
-        return folder
+            cv2.imwrite(str(folder / f"f_{frame}.png"), Sensor().expose(irradiance, 1.0, rng))
 
     def _write_reference(self, path: Path, rng: np.random.Generator) -> None:
         local_frame = LocalFrame.at(CRS, ORIGIN_MAP)

@@ -88,8 +88,10 @@ def predict_by_reference(track: Track, predicted: FloatArray) -> list[Prediction
     ]
 
 
-def predict_between(track: Track) -> list[Prediction | None]:
+def predict_between(track: Track, longest_gap: float = np.inf) -> list[Prediction | None]:
     """Interpolate between the found frames before and after.
+
+    These are at most `longest_gap` times as far apart as found frames nearby usually are.
 
     The target moves on a straight line with an unknown acceleration α, so that at a time τ between
     a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
@@ -113,6 +115,9 @@ def predict_between(track: Track) -> list[Prediction | None]:
             track.time_s[index, None], time[before], time[later], state[before], state[later]
         )
         near = np.argsort(np.abs(time[1:-1] - now), kind="stable")[:_TRIPLES]
+        usual_s = 0.5 * float(np.median(time[near + 2] - time[near]))
+        if time[after] - time[after - 1] > longest_gap * usual_s:
+            continue
         sd = arm[0] * np.sqrt(acceleration2[near].mean(axis=0))
         predictions[index] = Prediction(
             state_now[0, :2],

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
-from kgcp.georef.plain_prediction import Predictions
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -29,7 +28,7 @@ from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
 from kgcp.pipeline.guidance import (
     plain_by_reference,
-    plain_by_targets,
+    plain_by_results,
     predict_missing,
     with_predictions,
 )
@@ -100,6 +99,7 @@ _NEGATIVE = (
     "black and white are swapped in the frames or on the plate; give frames that are not negatives,"
     " or print the ring black on white"
 )
+_MOST_LOOKS = 4  # for plain targets, each by what the last one has found
 _STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
 
 
@@ -254,11 +254,30 @@ def _look_again(
     problem = None
     if settings.is_guided:
         predictions, problem = predict_missing(flight, data, run.tracks)
-    plain: Mapping[int, Predictions] = {}
+    run.guided_pass(predictions, {})
     if settings.is_guided or marks:
-        plain = plain_by_targets(flight, data, run.results(), marks)
-    run.guided_pass(predictions, plain)
+        _look_for_plain(run, flight, data, marks, _MOST_LOOKS if settings.is_guided else 1)
     return predictions, problem
+
+
+def _look_for_plain(
+    run: DetectionRun,
+    flight: Flight,
+    data: FlightData,
+    marks: Mapping[str, Sequence[Mark]],
+    looks: int,
+) -> None:
+    """Look for plain targets where the frames' results say that they must be, until nothing is new.
+
+    What is found in a frame tells where others are, in this one and in those beside it.
+    """
+    tried: set[tuple[int, str]] = set()
+    for _ in range(looks):
+        plain = plain_by_results(flight, data, run.results(), run.tracks.time_s, marks, tried)
+        if not plain:
+            return
+        tried |= {(row, name) for row, predictions in plain.items() for name in predictions}
+        run.guided_pass({}, plain)
 
 
 def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.georef.plain_neighbours import PlainTracks
 from kgcp.georef.plain_prediction import (
     FrameOrientation,
     Predictions,
@@ -19,6 +21,7 @@ from kgcp.georef.plain_prediction import (
 )
 from kgcp.georef.prediction import Track, predict_position, reference_states, state_of
 from kgcp.georef.sighting import Sighting, sighting_of
+from kgcp.georef.target_positions import TargetPositions
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark
@@ -128,48 +131,83 @@ def plain_by_reference(
     ]
 
 
-def plain_by_targets(
+def plain_by_results(
     flight: Flight,
     data: FlightData,
     results: Iterable[FrameResult],
+    time_s: FloatArray,
     marks: Mapping[str, Sequence[Mark]],
+    tried: Collection[tuple[int, str]] = (),
 ) -> dict[int, Predictions]:
-    """Return by row where plain targets must be, in frames in which no reference pose says it.
+    """Return by row where plain targets must be of which nothing else has said it so far.
 
-    Coded static targets orient the frame; else marks tell the places of those that are marked.
+    The frame's other static targets orient it; else marks tell the places of those that are marked;
+    else the frames before and after do.
 
     Parameters
     ----------
     results : iterable of FrameResult
-        Of all frames, in their order: the coded targets that were measured.
+        Of all n frames, in their order: what was measured so far.
+    time_s : (n,) array
+        Mid-exposures [s]; NaN: not known.
     marks : mapping
         Static targets that were marked by hand, by frame.
+    tried : collection of tuple
+        Rows and targets that were looked for in such a way before.
     """
-    static = {target.name for target in flight.targets if target.position_m is not None}
-    if not flight.plain_targets or not (static or marks) or flight.crs is None:
+    if not flight.plain_targets or flight.crs is None:
         return {}
+    static = {target.name for target in flight.all_targets if target.position_m is not None}
+    tracks = PlainTracks(flight.plain_targets, time_s)
     rows: dict[str, int] = {}
+    lacking: dict[int, set[str]] = {}
     sightings: list[Sighting] = []
     for row, result in enumerate(results):
-        if any(map(_lacks_prediction, result.outcomes)):
-            rows[result.frame] = row
+        tracks.add(row, result)
+        names = {one.target for one in result.outcomes if _lacks_prediction(one)}
+        names = {name for name in names if (row, name) not in tried}
+        if names:
+            rows[result.frame], lacking[row] = row, names
             sightings += [
                 sighting_of(result.frame, row + 1, result.time_s, one)
                 for one in result.outcomes
                 if isinstance(one, Measurement) and one.target in static
             ]
-    positions, camera, targets = data.static_positions, flight.camera, flight.plain_targets
+    by_neighbours = tracks.predictions(flight.camera)
+    by_targets = _by_own_targets(flight, data.static_positions, [*rows], sightings)
     made: dict[int, Predictions] = {}
     for frame, row in rows.items():
         places = {mark.target: mark.place for mark in marks.get(frame, ())}
-        if predicted := predict_marked(targets, places, positions, camera):
-            made[row] = predicted
-    for one in orient_frames([*rows], sightings, positions.static, camera):
+        by_marks = predict_marked(
+            flight.plain_targets, places, data.static_positions, flight.camera
+        )
+        # later sources are better ones, if they are sure
+        sources = (by_neighbours.get(row, {}), by_marks, by_targets.get(frame, {}))
+        best = {
+            name: each
+            for is_sure in (False, True)
+            for source in sources
+            for name, each in source.items()
+            if name in lacking[row] and each.is_sure is is_sure
+        }
+        if best:
+            made[row] = best
+    return made
+
+
+def _by_own_targets(
+    flight: Flight, positions: TargetPositions, frames: Sequence[str], sightings: Sequence[Sighting]
+) -> dict[str, Predictions]:
+    """Return by frame where plain targets must be, as other static targets orient it."""
+    made: dict[str, Predictions] = {}
+    for one in orient_frames(frames, sightings, positions.static, flight.camera):
         if one.pose is not None:
             orientation = FrameOrientation(
                 one.pose.centre_m, one.pose.world_from_camera, one.cov, "the frame's other targets"
             )
-            made[rows[one.frame]] = predict_plain(targets, orientation, positions, camera)
+            made[one.frame] = predict_plain(
+                flight.plain_targets, orientation, positions, flight.camera
+            )
     return made
 
 

@@ -59,6 +59,15 @@ def test_an_even_motion_is_known_to_the_floor() -> None:
     assert (one.sd_px, one.sd_log_radius) == pytest.approx((0.5, 0.02))
 
 
+def test_gaps_are_bridged_that_are_not_much_longer_than_what_tells_the_motion() -> None:
+    time_s = np.arange(30.0)
+    state = np.column_stack((30.0 * time_s, 7.0 * time_s, np.full(30, 3.0)))
+    track = Track(time_s, without(state, np.array([4, 5, 6, *range(12, 20)])))
+    rows = [row for row, one in enumerate(predict_between(track, 4.0)) if one is not None]
+    assert rows == [4, 5, 6]
+    assert sum(one is not None for one in predict_between(track)) == 11
+
+
 def test_a_wild_motion_is_not_sure() -> None:
     rng = np.random.default_rng(2)
     time_s = np.arange(40.0)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,14 +14,18 @@ from click.testing import CliRunner
 from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import rotation_about
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
+from kgcp.measurement.plain_pose import pose_towards
 from kgcp.pipeline.bias_report import bias_study
 from kgcp.pipeline.detect import RunOptions, detect_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.pipeline.ground.orient import orient_flight, write_poses
 from kgcp.pipeline.ground.place import PlaceOptions, place_flight
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.layout import Target
 from tests.plain_flight import CAMERA, CODED, TARGETS, PlainFlight, coded_ring, plain_target
 
@@ -152,6 +158,52 @@ def test_marks_by_hand_tell_where_they_are(bare: Path) -> None:
     rows = detections(bare).set_index("target")
     assert set(rows["status"]) == {"measured"}
     assert_at(rows, centres_m, largest_sd_px=0.04)  # how the frame looks is hardly known
+
+
+@dataclass(frozen=True)
+class Passage(PlainFlight):
+    """The camera passes over targets on even ground, ever faster, and turns a little."""
+
+    def cameras(self) -> tuple[FloatArray, FloatArray]:
+        after_s = np.arange(float(self.frames))
+        centres = np.stack((0.3 * after_s + 0.01 * after_s**2 - 2.0, 0.1 * after_s, 25.0 + after_s))
+        down = np.diag((1.0, -1.0, -1.0))
+        turns = [rotation_about(np.array([0.0, 0.02, 0.03]) * after) for after in after_s]
+        return centres.T, np.array([down @ turn for turn in turns])
+
+    def _write_frames(self, folder: Path, rng: np.random.Generator) -> None:
+        _, rotations = self.cameras()
+        for frame, enu_from_camera in enumerate(rotations):
+            light: FloatArray = np.full((CAMERA.height, CAMERA.width), 0.3)
+            for target, centre_m in zip(self.targets, self.centres_m(frame), strict=True):
+                pose = pose_towards(centre_m, -enu_from_camera[2])
+                image_plate(CAMERA, PlainPlate(target), pose, Optics(0.6)).paste(light)
+            cv2.imwrite(str(folder / f"f_{frame}.png"), Sensor().expose(light, 1.0, rng))
+
+
+def test_frames_before_and_after_tell_where_they_are(tmp_path: Path) -> None:
+    targets = (plain_target("white", (-2.0, -1.5), 0.8), plain_target("black", (2.0, 1.5), 0.9))
+    made = Passage(targets=targets, frames=6)
+    made.write(tmp_path)
+    (tmp_path / "reference.csv").unlink()
+    missing = {2}
+    marks = ["frame,target,x_px,y_px"]
+    for frame in set(range(made.frames)) - missing:
+        places = CAMERA.project(made.centres_m(frame))
+        marks += [
+            f"f_{frame}.png,{target.name},{x:.0f},{y:.0f}"
+            for target, (x, y) in zip(targets, places, strict=True)
+        ]
+    (tmp_path / "places.csv").write_text("\n".join(marks), encoding="utf-8")
+    run("detect", tmp_path, "--jobs", "0", "--places", str(tmp_path / "places.csv"))
+    table = detections(tmp_path)
+    assert set(table["status"]) == {"measured"}
+    for frame in missing:
+        rows = table[table["frame"] == f"f_{frame}.png"].set_index("target")
+        assert rows["guided"].all()
+        rows = rows.loc[[target.name for target in targets]]
+        off_px = rows[["x_px", "y_px"]].to_numpy() - CAMERA.project(made.centres_m(frame))
+        assert np.abs(off_px / rows[["sd_x_px", "sd_y_px"]].to_numpy()).max() < 4.0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,101 @@
+"""Where plain targets must be in a frame, as the frames before and after it show them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.georef.plain_prediction import Predictions
+from kgcp.georef.prediction import Track, predict_between
+from kgcp.measurement.guided import Prediction
+from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.records import FrameResult, Measurement
+from kgcp.targets.plain import PlainTarget
+
+# Image places are interpolated over gaps as long as those that tell how a target moves, or little
+# longer: the camera may turn round meanwhile.
+_LONGEST_GAP = 4.0
+_FLOOR_PX, _FLOOR_DEG = 1.0, 2.0  # least standard deviations, whatever neighbours agree on
+
+
+class PlainTracks:
+    """The plain targets of a flight through its n frames.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Mid-exposures [s]; NaN: not known.
+    """
+
+    def __init__(self, targets: Sequence[PlainTarget], time_s: FloatArray) -> None:
+        self._targets = targets
+        self._found: dict[str, dict[int, Measurement]] = {target.name: {} for target in targets}
+        # frames without any times are at least in order, and how evenly, the targets tell
+        in_order = np.arange(len(time_s), dtype=np.float64)
+        self._time_s = time_s if np.isfinite(time_s).any() else in_order
+
+    def add(self, row: int, result: FrameResult) -> None:
+        """Take what was measured in a frame."""
+        for outcome in result.outcomes:
+            if isinstance(outcome, Measurement) and outcome.target in self._found:
+                self._found[outcome.target][row] = outcome
+
+    def predictions(self, camera: Camera) -> Mapping[int, Predictions]:
+        """Return by row where targets must be that were not found, as far as neighbours tell."""
+        made: dict[int, dict[str, PlainPrediction]] = {}
+        for target in self._targets:
+            found = self._found[target.name]
+            state = np.full((len(self._time_s), 3), math.nan)
+            for row, each in found.items():
+                state[row] = (*each.centre_px, math.log(each.distance_m))
+            for row, one in enumerate(predict_between(Track(self._time_s, state), _LONGEST_GAP)):
+                if one is not None:
+                    prediction = self._prediction(target, row, one, camera)
+                    made.setdefault(row, {})[target.name] = prediction
+        return made
+
+    def _prediction(
+        self, target: PlainTarget, row: int, between: Prediction, camera: Camera
+    ) -> PlainPrediction:
+        """Return the prediction for a place between; its radius is a distance here."""
+        distance_m = between.radius_px
+        sight = np.append(camera.undistort(between.centre_px[None])[0], 1.0)
+        position_m = distance_m / float(np.linalg.norm(sight)) * sight
+        return PlainPrediction(
+            centre_px=between.centre_px,
+            cov_px2=(between.sd_px**2 + _FLOOR_PX**2) * np.eye(2),
+            position_m=position_m,
+            sd_log_distance=between.sd_log_radius,
+            normal=self._normal(target, row),
+            radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
+            source=between.source,
+        )
+
+    def _normal(self, target: PlainTarget, row: int) -> NormalPrior:
+        """Return the mean of the normals before and after, as uncertain as they are and differ."""
+        now, found = self._time_s[row], self._found[target.name]
+        before = max((each for each in found if self._time_s[each] < now), key=self._when)
+        after = min((each for each in found if self._time_s[each] > now), key=self._when)
+        both = found[before], found[after]
+        first, second = (each.pose.normal for each in both)
+        mean = (first + second) / np.linalg.norm(first + second)
+        apart_deg = math.degrees(math.acos(min(1.0, float(first @ second))))
+        sd_deg = max(map(_sd_normal_deg, both))
+        return NormalPrior(mean, math.hypot(sd_deg, apart_deg, _FLOOR_DEG))
+
+    def _when(self, row: int) -> float:
+        return float(self._time_s[row])
+
+
+def _sd_normal_deg(measurement: Measurement) -> float:
+    """Return the standard deviation of a normal about the axis about which it is worst."""
+    if measurement.uncertainty is None:
+        return 0.0
+    axes: FloatArray = measurement.pose.rotation[:, :2]
+    cov = axes.T @ measurement.uncertainty.pose_cov[3:, 3:] @ axes
+    return math.degrees(math.sqrt(max(float(np.linalg.eigvalsh(cov)[-1]), 0.0)))
