@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
+import pytest
 from click.testing import CliRunner, Result
 
 from benchmarks.ground.orient import DEVICE_M
@@ -71,6 +73,40 @@ def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["rejected_targets"] == {"f_002.png": ["B"]}
     assert "f_002.png: B left out" in result.stderr
+
+
+def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> None:
+    folder = GroundFlight(frames=6).write(tmp_path / "flight", sd_position_m=0.002)
+    path = folder / "kgcp" / "detections.parquet"
+    table = read_detections(path)
+    in_frame = table["frame"] == "f_002.png"
+    exchanged = table.loc[in_frame, "target"].map({"A": "B", "B": "A", "C": "C", "D": "D"})
+    table.loc[in_frame, "target"] = exchanged
+    write_rows(path, table)
+    result = run("orient", folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["oriented"] == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda table: table.iloc[:0], "has no readable frame"),
+        (lambda table: pd.concat((table, table)), "has target 'A' of 'f_000.png' twice"),
+        (lambda table: table.assign(distance_m=0.0), "distance_m is 0"),
+        (lambda table: table.assign(x_px=1e300), "x_px is empty"),
+    ],
+)
+def test_one_line_for_detections_that_cannot_be(
+    tmp_path: Path, change: Callable[[pd.DataFrame], pd.DataFrame], problem: str
+) -> None:
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
+    path = folder / "kgcp" / "detections.parquet"
+    write_rows(path, change(read_detections(path)))
+    result = run("orient", folder)
+    assert result.exit_code == 1
+    assert problem in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_an_unknown_focal_length_is_found_where_the_ground_is_not_flat(tmp_path: Path) -> None:

@@ -75,6 +75,29 @@ def test_deviations_of_poses_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("is_shifted", "problem"),
+    [
+        (True, "the poses do not fit the images, by 100 px or more"),
+        (False, "all rays start at one place"),
+    ],
+)
+def test_poses_of_other_frames_are_no_poses(
+    tmp_path: Path, problem: str, *, is_shifted: bool
+) -> None:
+    folder = GroundFlight(frames=4).write(tmp_path / "flight")
+    path = folder / "reference.csv"
+    head, *lines = path.read_text(encoding="utf-8").splitlines()
+    frames, poses = zip(*(line.split(",", 1) for line in lines), strict=True)
+    others = [*poses[1:], poses[0]] if is_shifted else [poses[0]] * len(poses)
+    lines = [f"{frame},{pose}" for frame, pose in zip(frames, others, strict=True)]
+    path.write_text("\n".join((head, *lines)), encoding="utf-8")
+    result = run(folder)
+    assert result.exit_code == 1
+    assert problem in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
     ("arguments", "problem"),
     [
         (("--targets", "A,Z"), "'Z': is not in flight.toml"),

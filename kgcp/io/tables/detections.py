@@ -52,6 +52,7 @@ from kgcp.settings import DetectSettings, Method
 
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
+_LARGEST = 1e12  # of any number in a table, in its unit: beyond, as if it were infinite
 _Part = TypeVar("_Part")
 _Record = tuple[FrameResult, Outcome]
 _Get = Callable[[_Record], object]
@@ -221,6 +222,13 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
             f"{path}: has target {strange[0]!r}, which flight.toml does not;"
             " run 'kgcp detect' on this flight again"
         )
+    twice = table[table.duplicated(["frame", "target", "instance"])]
+    if len(twice):
+        frame, target = twice.iloc[0][["frame", "target"]]
+        raise KgcpError(
+            f"{path}: has target {target!r} of {frame!r} twice; run 'kgcp detect' on this flight"
+            " again"
+        )
     numbers = {frame: number for number, frame in enumerate(sorted(set(table["frame"])), start=1)}
     readable = table[table["status"] != Status.UNREADABLE.value]
     ordered = readable.sort_values(["frame", "target", "instance"])
@@ -321,6 +329,12 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
     if sd_x is not None and sd_y is not None:
         cov_xy = cov_xy or 0.0
         cov = np.array([[sd_x**2, cov_xy], [cov_xy, sd_y**2]])
+    distance_m = _known(row, "distance_m")
+    if distance_m <= 0.0:
+        raise KgcpError(
+            f"detections of {row['frame']!r}: distance_m is {distance_m:g};"
+            " run 'kgcp detect' on this flight again"
+        )
     return Sighting(
         frame=str(row["frame"]),
         number=number,
@@ -329,7 +343,7 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
         time_s=time_s,
         centre_px=np.array([_known(row, "x_px"), _known(row, "y_px")]),
         centre_cov_px2=cov,
-        distance_m=_known(row, "distance_m"),
+        distance_m=distance_m,
         sd_distance_m=_number(row, "sd_distance_m"),
         sd_common_distance_m=_number(row, "sd_common_distance_m"),
         pose=_pose(row),
@@ -364,7 +378,7 @@ def _square(row: _Cells, name: str, size: int) -> FloatArray | None:
 
 def _number(row: _Cells, name: str) -> float | None:
     value = row[name]
-    return float(value) if isinstance(value, float) and np.isfinite(value) else None
+    return float(value) if isinstance(value, float) and abs(value) < _LARGEST else None
 
 
 def _known(row: _Cells, name: str) -> float:

@@ -61,8 +61,8 @@ def _meeting_point(camera: Camera, views: CircleViews) -> FloatArray:
     weights = np.ones(len(views))
     for _ in range(_ROUNDS):
         normal = np.einsum("n,nij->ij", weights, square)
-        if not np.linalg.cond(normal) < 1e10:
-            raise NoCircleError("all rays are parallel: the frames are at one place")
+        if not np.isfinite(normal).all() or not np.linalg.cond(normal) < 1e10:
+            raise NoCircleError("all rays start at one place, or are parallel")
         point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, square, views.camera_m))
         sights = point - views.camera_m
         distance = np.linalg.norm(sights, axis=1)

@@ -35,6 +35,7 @@ FOCAL_SCALES = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 _SD_FOCAL = 0.7  # of the logarithm: a factor of two
 _DETERMINED = 0.05  # of a focal length that is determined
 _LEAST_PLATE_FRAMES = 3  # that tell how a plate lies
+_AGREEING_CHI2 = 25.0  # of three coordinates, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,14 +245,25 @@ def _by_ring(
     positions: Mapping[str, TargetPosition],
     plates: Mapping[str, PlateAttitude],
 ) -> FramePose:
-    """Return the pose by the best of a frame's rings; the frame as it was, if there is none."""
+    """Return the pose by the best of a frame's rings; the frame as it was, if there is none.
+
+    Most other targets must be where it puts them: the ring may have another one's name.
+    """
     options = []
     for each in sightings:
         if each.target not in plates or not _is_told_apart(each):
             continue
         made = _pose_by_ring(each, positions[each.target], plates[each.target])
-        if made is not None:
-            pose, cov = made
+        if made is None:
+            continue
+        pose, cov = made
+        agreeing = [
+            _agrees(other, positions[other.target], pose, cov)
+            for other in sightings
+            if other is not each
+        ]
+        known = [agrees for agrees in agreeing if agrees is not None]
+        if not known or 2 * sum(known) > len(known):
             options.append((float(np.trace(cov[:3, :3])), each, pose, cov))
     if not options:
         return failed
@@ -266,6 +278,24 @@ def _by_ring(
         is_by_one_ring=True,
         margin=ring.ambiguity,
     )
+
+
+def _agrees(
+    sighting: Sighting, place: TargetPosition, pose: CameraPose, cov: FloatArray
+) -> bool | None:
+    """Tell whether a measured target is at its place by a frame's pose; None: it cannot be told."""
+    if sighting.pose is None or sighting.pose_cov is None:
+        return None
+    rotation, sight = pose.world_from_camera, pose.world_from_camera @ sighting.pose.translation_m
+    off_m = pose.centre_m + sight - place.position_m
+    by_pose = np.hstack((np.eye(3), -cross_matrix(sight)))
+    own = sighting.pose_cov
+    if sighting.common_pose_cov is not None:
+        own = own + sighting.common_pose_cov
+    total = by_pose @ cov @ by_pose.T + rotation @ own[:3, :3] @ rotation.T
+    if place.cov_m2 is not None:
+        total = total + place.cov_m2
+    return bool(off_m @ np.linalg.solve(total, off_m) < _AGREEING_CHI2)
 
 
 def _pose_by_ring(

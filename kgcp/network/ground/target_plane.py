@@ -47,7 +47,9 @@ _MEDIAN_CHI2 = 4.351  # of five numbers
 _SAME_NORMAL_DEG = 0.5
 _LEAST_KEPT = 0.5  # share of the frames: if fewer agree, none is believed
 _EXTRA_ROUNDS = 2
-_MOST_EXTRA_PX = 100.0
+MOST_EXTRA_PX = 100.0
+"""Largest deviation that is estimated [px]; where it is reached, nothing fits."""
+
 _MANY, _LEAST_FACTOR = 200, 0.25  # degrees of freedom that tell a variance factor, and its least
 
 
@@ -429,9 +431,9 @@ def _excess(
     ratio = squares(0.0) / freedom
     if ratio <= 1.0:
         return 0.0, max(ratio, _LEAST_FACTOR) if freedom >= _MANY else 1.0
-    if squares(_MOST_EXTRA_PX) > freedom:
-        return _MOST_EXTRA_PX, 1.0
-    sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, _MOST_EXTRA_PX, xtol=1e-12)
+    if squares(MOST_EXTRA_PX) > freedom:
+        return MOST_EXTRA_PX, 1.0
+    sd = optimize.brentq(lambda sd: squares(sd) - freedom, 0.0, MOST_EXTRA_PX, xtol=1e-12)
     return float(sd), 1.0
 
 

@@ -140,14 +140,17 @@ def orient_flight(
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    poses = orient_frames(
-        frames,
-        sightings,
-        positions.static,
-        flight.camera,
-        min_points=options.min_points,
-        has_free_focal=options.has_free_focal,
-    )
+    if not frames:
+        raise KgcpError(f"{table}: has no readable frame; run 'kgcp detect' on this flight again")
+    with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
+        poses = orient_frames(
+            frames,
+            sightings,
+            positions.static,
+            flight.camera,
+            min_points=options.min_points,
+            has_free_focal=options.has_free_focal,
+        )
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
         reason, count = reasons.most_common(1)[0]

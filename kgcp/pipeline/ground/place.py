@@ -31,6 +31,7 @@ from kgcp.io.tables.places import (
 )
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.target_places import PlacedTarget, Placement, place_targets
+from kgcp.network.ground.target_plane import MOST_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -165,19 +166,27 @@ def place_flight(
     poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
     local_frame = _local_frame(flight, poses)
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    placement = place_targets(
-        sightings,
-        targets,
-        poses,
-        local_frame,
-        flight.camera,
-        flight.calibration_covariance,
-        min_frames=options.min_frames,
-        has_exact_poses=options.has_exact_poses,
-    )
+    with np.errstate(all="ignore"):  # circles are tried anywhere: what is not finite is no result
+        placement = place_targets(
+            sightings,
+            targets,
+            poses,
+            local_frame,
+            flight.camera,
+            flight.calibration_covariance,
+            min_frames=options.min_frames,
+            has_exact_poses=options.has_exact_poses,
+        )
     if not placement.targets:
         name, reason = next(iter(placement.skipped.items()))
         raise KgcpError(f"no target can be placed: {name!r} {reason}")
+    if placement.noise.centre_px >= MOST_EXTRA_PX:
+        raise KgcpError(
+            f"{options.poses or flight.folder / 'flight.toml'}: the poses do not fit the images, by"
+            f" {MOST_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
+            " whether each pose has its own frame's name",
+            option=None if options.poses is None else "poses",
+        )
     used = {
         (placed.target, frame)
         for placed in placement.targets
