@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from kgcp.pipeline.ground.orient import FlightPoses
 
 _MIN_POINTS = 4
+_FEW_FRAMES = 3  # that are named
 
 
 @click.command()
@@ -112,10 +113,19 @@ def _report(poses: FlightPoses) -> None:
     reasons = Counter(each.reason for each in poses.poses if each.pose is None)
     for reason, count in reasons.most_common():
         click.echo(f"  {count:6d} {reason}", err=True)
+    left_out: dict[str, list[str]] = {}
     for each in oriented:
-        left_out = [name for name in each.targets if name not in each.used]
-        if left_out and not each.is_by_one_ring:
-            click.echo(f"kgcp: look: {each.frame}: {', '.join(left_out)} left out", err=True)
+        if not each.is_by_one_ring:
+            for name in each.targets:
+                if name not in each.used:
+                    left_out.setdefault(name, []).append(each.frame)
+    for name, frames in left_out.items():
+        where = ", ".join(frames)
+        if len(frames) > _FEW_FRAMES:
+            measured = sum(name in each.targets for each in oriented)
+            where = f"{len(frames)} of {measured} frames, {frames[0]} the first"
+            where += "; look at its position_m" if 2 * len(frames) > measured else ""
+        click.echo(f"kgcp: look: {name} left out in {where}", err=True)
     if poses.focal_px is not None:
         focal, sd = poses.focal_px
         click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)

@@ -72,7 +72,16 @@ def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     result = run("orient", folder, "--frames", "f_00[1-3].png", "--min-points", "3", "--json")
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["rejected_targets"] == {"f_002.png": ["B"]}
-    assert "f_002.png: B left out" in result.stderr
+    assert "B left out in f_002.png" in result.stderr
+
+
+def test_a_target_that_is_elsewhere_is_told_once(tmp_path: Path) -> None:
+    folder = GroundFlight(wrong={(frame, "B"): np.array([0.5, 0.3, 0.0]) for frame in range(5)})
+    result = run("orient", folder.write(tmp_path / "flight"))
+    assert result.exit_code == 0, result.stderr
+    told = "B left out in 5 of 12 frames, f_000.png the first\n"
+    assert told in result.stderr
+    assert result.stderr.count("left out") == 1
 
 
 def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_poses_of_other_frames_are_no_poses(
     others = [*poses[1:], poses[0]] if is_shifted else [poses[0]] * len(poses)
     lines = [f"{frame},{pose}" for frame, pose in zip(frames, others, strict=True)]
     path.write_text("\n".join((head, *lines)), encoding="utf-8")
-    result = run(folder)
+    result = run(folder, "--targets", "A")
     assert result.exit_code == 1
     assert problem in result.stderr
     assert result.stderr.count("\n") == 1
