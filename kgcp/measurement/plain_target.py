@@ -53,6 +53,7 @@ _MOST_TRIES = 24  # edges that are measured per target
 # them), and of the radius (jagged or dirty edges)
 _EDGE_PX, _EDGE = 0.1, 0.01
 _SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
+_ROUGH_PX = 0.075  # what an edge's unevenness may displace the centre by
 _PLACE_PX = 0.1  # of a prediction, at least
 _UNLIKELY = 1e-4  # that a target's own shape has so large a χ²
 # The variances on ground that is not known to be even: its texture displaces edges over longer
@@ -185,6 +186,7 @@ def _try_edge(
     """
     start = _start(camera, target, prediction, edge.ellipse)
     circles = _measured_circles(grey, camera, target, start, edge)
+    _check_edge(circles.discs[0])
     try:
         tolerant = fit_circles(camera, _tolerated(circles.images), start, prediction.normal)
         _check_agreement(camera, target, prediction, tolerant, len(circles.discs))
@@ -357,6 +359,19 @@ def _tolerated(images: CircleMoments) -> CircleMoments:
         to_moments = moments_by_stretch(geometry)
         covs.append(cov + to_moments @ spread @ to_moments.T)
     return CircleMoments(images.radii_m, images.moments, np.array(covs))
+
+
+def _check_edge(disc: Disc) -> None:
+    """Refuse an edge that is displaced here and there by more than noise: of a stone, of a stain.
+
+    Raises
+    ------
+    Rejection
+    """
+    beyond_noise_px = disc.sd_px * math.sqrt(max(0.0, 1.0 - 1.0 / disc.inflation))
+    if beyond_noise_px > math.hypot(_ROUGH_PX, _EDGE * disc.ellipse.mean_radius):
+        detail = f"an uneven edge, which leaves the centre open by {beyond_noise_px:.2f} px"
+        raise Rejection(Reason.POOR_FIT, detail)
 
 
 def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:

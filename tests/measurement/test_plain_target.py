@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -141,6 +142,26 @@ def test_refuses_the_other_polarity_and_another_shape() -> None:
 
 def pose_tilted(pose: Pose) -> Pose:
     return pose_towards(pose.translation_m, np.array([math.sin(0.9), 0.0, math.cos(0.9)]))
+
+
+@pytest.mark.parametrize("uneven_px", [0.0, 0.35])
+def test_refuses_a_stone_of_the_right_size(uneven_px: float) -> None:
+    radius_px = 4.5
+    sight_m = RADIUS_PX / radius_px * pose_at(90.0, 70.0).translation_m
+    pose = pose_towards(sight_m, np.array([0.0, 0.0, 1.0]))
+    rows, columns = np.indices((CAMERA.height, CAMERA.width))
+    around = np.arctan2(rows - 70.0, columns - 90.0)
+    edge_px = radius_px + uneven_px * np.cos(3.0 * around + 0.4)
+    inside = np.clip(edge_px - np.hypot(rows - 70.0, columns - 90.0) + 0.5, 0.0, 1.0)
+    light = cv2.GaussianBlur(0.2 + 0.5 * inside, (0, 0), 0.6)
+    grey = Sensor().expose(np.asarray(light), 1.0, np.random.default_rng(1))
+    normal = NormalPrior(np.array([0.0, 0.0, 1.0]), 3.0)
+    level = replace(prediction_of(pose), normal=normal, radius_px=radius_px)
+    outcome = looked(grey, level, replace(DISC, border_m=None))
+    assert isinstance(outcome, Miss if uneven_px else Measurement)
+    if isinstance(outcome, Miss):
+        assert outcome.reason is Reason.POOR_FIT
+        assert "uneven edge" in outcome.detail
 
 
 def test_two_alike_are_ambiguous() -> None:
