@@ -3,33 +3,71 @@
 The compiled code is kept beside the source, or in the user's cache folder where that cannot be
 written, and found again by later runs. It is found by the source file of the function alone: so
 compiled functions call only compiled functions of their own file.
+
+A function is handed to numba at its first call. A process that compiles nothing does not load
+numba, and one that uses few functions does not ask for each of the others where its compiled code
+may be kept: together half a second of a process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import update_wrapper
 from typing import Any, TypeVar, cast
-
-import numba
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+class _Compilable:
+    """A function that is compiled, or found compiled, when it is first called.
+
+    Parameters
+    ----------
+    options
+        Of `numba.njit`, beyond those of all functions.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:  # noqa: ANN401 - numba's
+        self._function, self._options = function, options
+        self._dispatcher: Callable[..., Any] | None = None
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
+        """Call the function."""
+        dispatcher = self._dispatcher or self.dispatcher()
+        return dispatcher(*args)
+
+    def dispatcher(self) -> Callable[..., Any]:
+        """Return numba's dispatcher of the function, which replaces this one in its module.
+
+        Those that the function calls come first: numba looks for them under their names.
+        """
+        if self._dispatcher is None:
+            import numba
+
+            function = self._function
+            for name in function.__code__.co_names:
+                called = function.__globals__.get(name)
+                if isinstance(called, _Compilable):
+                    called.dispatcher()
+            made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
+            function.__globals__[function.__name__] = self._dispatcher = made
+        return self._dispatcher
+
+
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
-    return cast("_Function", numba.njit(cache=True, error_model="numpy")(function))
+    return cast("_Function", _Compilable(function))
 
 
 def summed(function: _Function) -> _Function:
     """Compile as `compiled`; sums may be reordered so that vector units take several terms."""
-    made = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
-    return cast("_Function", made)
+    return cast("_Function", _Compilable(function, fastmath={"contract", "reassoc"}))
 
 
 def inlined(function: _Function) -> _Function:
     """Compile a function into those that call it, which leave out what they do not use."""
-    made = numba.njit(cache=True, error_model="numpy", forceinline=True)(function)
-    return cast("_Function", made)
+    return cast("_Function", _Compilable(function, forceinline=True))
 
 
 def fused(function: _Function) -> _Function:
@@ -39,5 +77,4 @@ def fused(function: _Function) -> _Function:
     a function that others call there may be two versions, and which one they get depends on what a
     process has compiled itself and what it has found compiled.
     """
-    made = numba.njit(cache=True, error_model="numpy", forceinline=True, fastmath={"contract"})
-    return cast("_Function", made(function))
+    return cast("_Function", _Compilable(function, forceinline=True, fastmath={"contract"}))
