@@ -8,10 +8,9 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
@@ -49,6 +48,9 @@ from kgcp.measurement.records import (
 )
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings, Method
+
+if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
+    import pandas as pd
 
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
@@ -311,6 +313,8 @@ def read_learnt_imaging(path: Path) -> LearntImaging | None:
 
 
 def _attempt(row: _Cells, number: int) -> Attempt:
+    import pandas as pd  # which has read the row
+
     time = row["time"]
     time_s = time.timestamp() if isinstance(time, pd.Timestamp) else None
     measured = row["status"] == _MEASURED

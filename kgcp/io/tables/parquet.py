@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -15,6 +14,9 @@ from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import whole_file
 from kgcp.io.files.safe_read import is_file
 from kgcp.io.tables.columns import Column, ColumnType, Row
+
+if TYPE_CHECKING:  # 0.3 s that writing does not need
+    import pandas as pd
 
 _ARROW_TYPES = {
     ColumnType.TEXT: pa.string(),

@@ -14,15 +14,14 @@ import platform
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, fields
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 import PIL
 import pyarrow as pa
 import pyarrow.parquet as pq
-import scipy
 
 from kgcp import __version__
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
@@ -256,12 +255,15 @@ def _digest_of_file(path: Path) -> str | None:
 
 def versions() -> dict[str, str]:
     """Return the versions of kgcp, of Python, and of the libraries that results depend on."""
-    libraries = {"numpy": np, "scipy": scipy, "opencv": cv2, "numba": numba, "pillow": PIL}
     return {
         "kgcp": __version__,
         "python": platform.python_version(),
-        **{name: str(module.__version__) for name, module in libraries.items()},
-        "pyarrow": str(pa.__version__),
+        "numpy": np.__version__,
+        "scipy": version("scipy"),  # of the package: not every process loads it
+        "opencv": cv2.__version__,
+        "numba": version("numba"),
+        "pillow": PIL.__version__,
+        "pyarrow": pa.__version__,
     }
 
 

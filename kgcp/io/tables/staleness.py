@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 
 from kgcp.errors import KgcpError
@@ -27,6 +27,9 @@ from kgcp.io.tables.provenance import (
 )
 from kgcp.measurement.records import TimeSource
 from kgcp.settings import DetectSettings
+
+if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
+    import pandas as pd
 
 _SAME_TIME_S = 2e-6  # tables hold microseconds
 _SAME_SHIFT_S = 1e-3  # spread of differences that are called one shift
@@ -190,7 +193,12 @@ def _shown_time(time_s: float) -> str:
 
 def _unix_s(times: pd.Series) -> FloatArray:
     """Return timestamps as Unix seconds, NaN for null."""
-    return np.array([np.nan if pd.isna(time) else time.timestamp() for time in times])
+    return np.array(
+        [
+            np.nan if isna else time.timestamp()
+            for time, isna in zip(times, times.isna(), strict=True)
+        ]
+    )
 
 
 def _to_middle_s(frames: pd.DataFrame, flight: Flight) -> FloatArray:
