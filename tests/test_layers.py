@@ -75,7 +75,9 @@ LIBRARIES: dict[str, frozenset[str]] = {
     "report": IMAGES | {"jinja2", "matplotlib"},
     "report.bias": IMAGES | {"jinja2", "markupsafe", "matplotlib"},
     "report.calibration": ARRAYS | {"jinja2", "matplotlib"},
-    "pipeline.execution": frozenset({"cv2", "distributed", "numpy", "scipy", "threadpoolctl"}),
+    "pipeline.execution": frozenset(
+        {"cv2", "distributed", "numba", "numpy", "scipy", "threadpoolctl"}
+    ),
     "pipeline": IMAGES | {"pandas", "PIL", "pyarrow"},
     "cli": frozenset({"click", "tqdm"}),
     "__main__": frozenset(),

@@ -170,7 +170,8 @@ def command(
     if jobs != 0 and scheduler is None:
         from kgcp.pipeline.execution.local_processes import start_server
 
-        start_server("kgcp.pipeline.frame_task")  # meanwhile, this process loads what follows
+        # meanwhile, this process loads what follows
+        start_server("kgcp.pipeline.frame_task", "kgcp.pipeline.execution.ready_worker")
 
     from kgcp.cli.doubts import print_doubts
     from kgcp.io.flight.flight import read_flight

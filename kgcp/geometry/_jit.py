@@ -11,11 +11,16 @@ may be kept: together half a second of a process.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import update_wrapper
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+_SPARED_CALLS = 20_000  # by Python take some 0.1 s, loading numba and its tables 0.5 s
 
 
 class _Compilable:
@@ -37,6 +42,11 @@ class _Compilable:
         dispatcher = self._dispatcher or self.dispatcher()
         return dispatcher(*args)
 
+    def interpreted(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
+        """Call the function as Python runs it, with numpy's division by zero."""
+        with np.errstate(all="ignore"):
+            return self._function(*args)
+
     def dispatcher(self) -> Callable[..., Any]:
         """Return numba's dispatcher of the function, which replaces this one in its module.
 
@@ -49,15 +59,36 @@ class _Compilable:
             for name in function.__code__.co_names:
                 called = function.__globals__.get(name)
                 if isinstance(called, _Compilable):
-                    called.dispatcher()
+                    function.__globals__[name] = called.dispatcher()
             made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
             function.__globals__[function.__name__] = self._dispatcher = made
         return self._dispatcher
 
 
+class _Spared(_Compilable):
+    """A function that Python runs until numba is loaded, or there are many calls."""
+
+    calls_left = _SPARED_CALLS  # of all such functions together
+
+    def __call__(self, *args: Any) -> Any:  # noqa: ANN401 - those of the function
+        """Call the function."""
+        if _Spared.calls_left > 0 and "numba" not in sys.modules:
+            _Spared.calls_left -= 1
+            return self.interpreted(*args)
+        return super().__call__(*args)
+
+
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; division by zero gives inf or NaN as in numpy."""
     return cast("_Function", _Compilable(function))
+
+
+def compiled_if_often(function: _Function) -> _Function:
+    """Compile as `compiled`, unless the whole process calls such functions a few times only.
+
+    Sums, differences, products and quotients alone: of these, Python makes the same bits.
+    """
+    return cast("_Function", _Spared(function))
 
 
 def summed(function: _Function) -> _Function:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled_if_often
 from kgcp.geometry.arrays import FloatArray
 
 _MAX_NEWTON_STEPS = 30
@@ -17,7 +17,7 @@ Scale = tuple[float, float, float, float]
 """fx, fy, cx, cy [px]."""
 
 
-@compiled
+@compiled_if_often
 def _radial(lens: Lens, r2: float) -> tuple[float, float]:
     """Return the radial factor and its derivative with respect to r²."""
     k1, k2, _, _, k3, k4, k5, k6 = lens
@@ -29,7 +29,7 @@ def _radial(lens: Lens, r2: float) -> tuple[float, float]:
     return factor, (slope_above - factor * slope_below) / below
 
 
-@compiled
+@compiled_if_often
 def _distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
     p1, p2 = lens[2], lens[3]
     r2 = x * x + y * y
@@ -41,7 +41,7 @@ def _distorted(lens: Lens, x: float, y: float) -> tuple[float, float]:
     )
 
 
-@compiled
+@compiled_if_often
 def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
     """Return the derivatives of the distorted x by x, of either by the other, and of y by y."""
     p1, p2 = lens[2], lens[3]
@@ -53,7 +53,7 @@ def _slopes(lens: Lens, x: float, y: float) -> tuple[float, float, float]:
     )
 
 
-@compiled
+@compiled_if_often
 def distort_points(lens: Lens, scale: Scale, points: FloatArray, pixels: FloatArray) -> None:
     """Map normalised points (n, 2) to pixels."""
     fx, fy, cx, cy = scale
@@ -62,7 +62,7 @@ def distort_points(lens: Lens, scale: Scale, points: FloatArray, pixels: FloatAr
         pixels[i, 0], pixels[i, 1] = fx * x + cx, fy * y + cy
 
 
-@compiled
+@compiled_if_often
 def distort_circles(
     lens: Lens,
     scale: Scale,
@@ -88,7 +88,7 @@ def distort_circles(
             pixels[m, k, 0], pixels[m, k, 1] = fx * x + cx, fy * y + cy
 
 
-@compiled
+@compiled_if_often
 def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatArray) -> None:
     """Fill in the derivatives (n, 2, 2) of `distort_points`: rows of results, columns of points."""
     fx, fy, _, _ = scale
@@ -98,7 +98,7 @@ def distort_slopes(lens: Lens, scale: Scale, points: FloatArray, slopes: FloatAr
         slopes[i, 1, 0], slopes[i, 1, 1] = fy * xy, fy * yy
 
 
-@compiled
+@compiled_if_often
 def undistort_points(lens: Lens, scale: Scale, pixels: FloatArray, points: FloatArray) -> None:
     """Invert `distort_points` by Newton's method, to 1e-13; NaN where it does not converge."""
     fx, fy, cx, cy = scale

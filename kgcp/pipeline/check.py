@@ -24,6 +24,7 @@ from kgcp.quality.checks.doubt import Doubt, ranked
 from kgcp.quality.checks.lever_arm import lever_arm_text
 from kgcp.quality.checks.place import place_text
 from kgcp.settings import DetectSettings
+from kgcp.simulation.outlook import least_plain_px
 from kgcp.targets.plain import PlainTarget
 
 _TYPICAL_M = 50.0  # a distance to name, where no reference tells any
@@ -242,8 +243,6 @@ def _expected_text(inputs: FlightInputs) -> str:
     if inputs.expected_radii_px is None:
         least = DetectSettings().min_radius_px
         if isinstance(target, PlainTarget):
-            from kgcp.simulation.outlook import least_plain_px  # 0.3 s of libraries
-
             least = least_plain_px(target)
         return (
             f"{target.name} has a radius of {scale / _TYPICAL_M:.0f} px at {_TYPICAL_M:g} m;"

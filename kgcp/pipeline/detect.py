@@ -21,8 +21,10 @@ from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
+from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_code
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
+from kgcp.pipeline.execution.local_processes import Preparation
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
@@ -100,6 +102,7 @@ _NEGATIVE = (
     " or print the ring black on white"
 )
 _MOST_LOOKS = 4  # for plain targets, each by what the last one has found
+_NEEDED_AT_THE_END = ("pandas",)  # which pyarrow loads to write a table
 _STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
 
 
@@ -170,8 +173,10 @@ def detect_flight(
             options.scheduler,
             frames_folder,
             _STAGE_CALLERS if options.is_profiled else (),
+            Preparation(load_compiled_code, compile_code),
         ) as pool:
             run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
+            pool.import_meanwhile(*_NEEDED_AT_THE_END)
             with stopwatch.stage("first look"):
                 run.first_pass()
             with stopwatch.stage("second look"):

@@ -18,7 +18,6 @@ from enum import StrEnum
 
 import numpy as np
 import scipy.fft
-from scipy.ndimage import gaussian_filter
 
 from kgcp.geometry.arrays import ComplexArray, FloatArray, GreyArray
 from kgcp.settings import require_range
@@ -176,6 +175,8 @@ class Sensor:
         """Return the grey values 0…255, not rounded, of an exposure 0…1."""
         grey = self.tone.apply(exposure)
         if self.sharpening > 0.0:
+            from scipy.ndimage import gaussian_filter  # 0.05 s that outlooks do not need
+
             grey = grey + self.sharpening * (grey - gaussian_filter(grey, self.sharpening_px))
             grey = np.clip(grey, 0.0, 1.0)
         return grey * _WHITE_LEVEL

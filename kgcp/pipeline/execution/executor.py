@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
 
 from kgcp.io.images.remote import StoredFolder
 from kgcp.pipeline.execution.dask_client import connected
-from kgcp.pipeline.execution.local_processes import SupervisedProcessPool
+from kgcp.pipeline.execution.local_processes import Preparation, SupervisedProcessPool
 from kgcp.pipeline.execution.profiling import profiled
 from kgcp.pipeline.execution.resilient_map import (
     SerialExecutor,
@@ -21,6 +23,7 @@ from kgcp.pipeline.execution.resilient_map import (
     resilient_map,
     usable_cores,
 )
+from kgcp.pipeline.execution.signals import defer_interrupts
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -35,6 +38,12 @@ class WorkerPool:
     # whose callees are the stages to be timed; empty: nothing is timed
     callers: tuple[Callable[..., object], ...]
     stages_s: Counter[str]  # takes the time of all workers by stage [s]
+
+    def import_meanwhile(self, *modules: str) -> None:
+        """Import what this process needs later, while the workers work on the first frames."""
+        if self.jobs:
+            with defer_interrupts():  # a thread leaves Ctrl-C to this one
+                threading.Thread(target=lambda: [*map(import_module, modules)]).start()
 
     def map(
         self, function: Callable[[_Item], _Result], items: Iterable[_Item]
@@ -61,6 +70,7 @@ def open_pool(
     scheduler: str | None,
     frames: Path | StoredFolder,
     callers: tuple[Callable[..., object], ...] = (),
+    preparation: Preparation | None = None,
 ) -> Iterator[WorkerPool]:
     """Provide workers until the block ends.
 
@@ -76,6 +86,8 @@ def open_pool(
         Where they are; other machines must see a folder under the same, absolute, name.
     callers : tuple of callable
         To time what they call; see `profiled`.
+    preparation : Preparation, optional
+        Of each process of this machine.
 
     Raises
     ------
@@ -84,7 +96,8 @@ def open_pool(
     """
     if scheduler is None:
         jobs = usable_cores() if jobs is None else jobs
-        with SupervisedProcessPool(jobs, limit_s) if jobs else SerialExecutor() as executor:
+        executor = SupervisedProcessPool(jobs, limit_s, preparation) if jobs else SerialExecutor()
+        with executor:
             yield WorkerPool(jobs, executor, callers, Counter())
         return
     folders = (frames,) if isinstance(frames, Path) else ()

@@ -51,6 +51,22 @@ def start_server(*modules: str) -> None:
             forkserver.ensure_running()
 
 
+class Preparation:
+    """What new processes do before their first call.
+
+    Parameters
+    ----------
+    quick : callable
+        Returns whether that was enough.
+    slow : callable
+        What else it takes. One process at a time does it, and leaves what the others need.
+    """
+
+    def __init__(self, quick: Callable[[], bool], slow: Callable[[], bool]) -> None:
+        self.quick, self.slow = quick, slow
+        self.lock = threading.Lock()  # of `slow`
+
+
 class WorkerProcess:
     """A process that makes one call at a time; started when first needed, and again after a loss.
 
@@ -60,8 +76,9 @@ class WorkerProcess:
         Time for one call [s], after which the process is killed: also inside a decoder.
     """
 
-    def __init__(self, limit_s: float) -> None:
+    def __init__(self, limit_s: float, preparation: Preparation | None = None) -> None:
         self._limit_s = min(limit_s, _LONGEST_WAIT_S)
+        self._preparation = preparation
         self._lock = threading.Lock()  # of starting and killing, which two threads may do
         self._is_over = False
         self._process: multiprocessing.process.BaseProcess | None = None
@@ -81,15 +98,26 @@ class WorkerProcess:
             As the function does.
         """
         connection = self._connection or self._start()
-        if function is not self._function:
-            self._answer(connection, None, function)  # may import much: not counted as work
-            self._function = function
+        self._send(connection, function)
         return self._answer(connection, self._limit_s, args)
 
     def end(self) -> None:
         """Kill the process, and start none any more; a call under way is lost."""
         self._is_over = True
         self._kill()
+
+    def _send(self, connection: _Connection, function: Callable[..., Any]) -> None:
+        if function is not self._function:
+            self._answer(connection, None, function)  # may import much: not counted as work
+            self._function = function
+
+    def _prepare(self, connection: _Connection, preparation: Preparation) -> None:
+        """Let a new process get ready, however long it takes: not counted as work."""
+        self._send(connection, preparation.quick)
+        if not self._answer(connection, _LONGEST_WAIT_S, ()):
+            self._send(connection, preparation.slow)
+            with preparation.lock:
+                self._answer(connection, _LONGEST_WAIT_S, ())
 
     def _answer(self, connection: _Connection, limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
         try:
@@ -121,6 +149,8 @@ class WorkerProcess:
             except (EOFError, OSError):
                 self._kill()
             else:
+                if self._preparation is not None:
+                    self._prepare(own, self._preparation)
                 self._connection = own
                 return own
         raise KgcpError(
@@ -187,11 +217,13 @@ class SupervisedProcessPool(ThreadPoolExecutor):
         Processes.
     limit_s : float
         Time for one call [s].
+    preparation : Preparation, optional
+        Of each process.
     """
 
-    def __init__(self, jobs: int, limit_s: float) -> None:
+    def __init__(self, jobs: int, limit_s: float, preparation: Preparation | None = None) -> None:
         super().__init__(jobs)
-        self._workers = [WorkerProcess(limit_s) for _ in range(jobs)]
+        self._workers = [WorkerProcess(limit_s, preparation) for _ in range(jobs)]
         self._idle = list(self._workers)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:  # noqa: ANN401 - the base class's signature

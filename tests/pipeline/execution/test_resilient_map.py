@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError, SettingError
-from kgcp.pipeline.execution.local_processes import SupervisedProcessPool
+from kgcp.pipeline.execution.local_processes import Preparation, SupervisedProcessPool
 from kgcp.pipeline.execution.resilient_map import (
     SerialExecutor,
     TaskFailure,
@@ -61,6 +61,21 @@ def pid_and(*values: object) -> tuple[int, tuple[object, ...]]:
 
 def end_process(_: object) -> None:
     os._exit(1)
+
+
+def is_prepared(path: Path) -> bool:
+    return path.exists() and path.read_text(encoding="utf-8").endswith("ready ")
+
+
+def prepare(path: Path) -> bool:
+    """Write down begin and end of a long preparation, unless another process is through with it."""
+    if not is_prepared(path):
+        with path.open("a", encoding="utf-8") as file:
+            file.write("begin ")
+        time.sleep(0.2)
+        with path.open("a", encoding="utf-8") as file:
+            file.write("ready ")
+    return True
 
 
 def pool(jobs: int, limit_s: float = LIMIT_S) -> Executor:
@@ -113,6 +128,14 @@ def test_one_pool_serves_several_maps(tmp_path: Path) -> None:
         (third,) = resilient_map(pid_and, (2,), executor, 1)
     assert first[1] == (second[1][0], (tmp_path, 1))  # type: ignore[index] # nothing was lost
     assert second == third
+
+
+def test_one_process_prepares_what_all_of_them_need(tmp_path: Path) -> None:
+    path = tmp_path / "steps"
+    preparation = Preparation(partial(is_prepared, path), partial(prepare, path))
+    with SupervisedProcessPool(2, LIMIT_S, preparation) as executor:
+        assert dict(resilient_map(abs, range(6), executor, 2)) == {i: i for i in range(6)}
+    assert path.read_text(encoding="utf-8") == "begin ready "
 
 
 @pytest.mark.usefixtures("sigint_raises")
