@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,9 @@ import click
 from kgcp import __version__
 from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.pipeline.execution.threads import use_one_thread_each
+
+STARTED_S = time.perf_counter()
+"""When the program began to run: after some 20 ms of Python's own."""
 
 # Name → module, in the order of use; a module is imported when its command is called.
 COMMANDS = {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from kgcp.cli import STARTED_S
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
 from kgcp.cli.options import flight_place_argument, json_option, out_place_option
 from kgcp.errors import KgcpError
@@ -216,6 +217,6 @@ def command(
     seconds = time.perf_counter() - start
     report(summary, workspace.named(summary.table), overlay, seconds, log, as_json=as_json)
     if is_profiled:
-        report_stages(summary)
+        report_stages(summary, start - STARTED_S, time.perf_counter() - STARTED_S)
     if summary.problem is not None:
         raise KgcpError(summary.problem)

@@ -179,11 +179,21 @@ def report(
         click.echo(f"wrote {' and '.join(files.values())}", err=True)
 
 
-def report_stages(summary: DetectionSummary) -> None:
-    """Print the time per stage."""
-    for stage, seconds in summary.stages_s.items():
+def report_stages(summary: DetectionSummary, before_s: float, total_s: float) -> None:
+    """Print the time per stage.
+
+    Parameters
+    ----------
+    before_s : float
+        From the start of the program to the begin of the work [s].
+    total_s : float
+        From the start of the program to now [s].
+    """
+    stages_s = {"libraries, flight and its doubts": before_s, **summary.stages_s}
+    for stage, seconds in stages_s.items():
         if seconds >= _SHORTEST_STAGE_S:
             click.echo(f"{seconds:10.3f} s  {stage}", err=True)
+    click.echo(f"{total_s:10.3f} s  in all", err=True)
 
 
 def counted(count: int, noun: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -25,6 +25,7 @@ from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_co
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.local_processes import Preparation
+from kgcp.pipeline.execution.profiling import OTHER
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.frame_priors import priors_of_frames
 from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
@@ -102,7 +103,6 @@ _NEGATIVE = (
     " or print the ring black on white"
 )
 _MOST_LOOKS = 4  # for plain targets, each by what the last one has found
-_NEEDED_AT_THE_END = ("pandas",)  # which pyarrow loads to write a table
 _STAGE_CALLERS = (examine_frame, examine)  # what their modules call are the stages of the work
 
 
@@ -176,7 +176,7 @@ def detect_flight(
             Preparation(load_compiled_code, compile_code),
         ) as pool:
             run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
-            pool.import_meanwhile(*_NEEDED_AT_THE_END)
+            pool.import_meanwhile(*_needed_at_the_end(job))
             with stopwatch.stage("first look"):
                 run.first_pass()
             with stopwatch.stage("second look"):
@@ -237,6 +237,13 @@ def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> li
         FrameInput(frame, times.get(frame), priors, flight.may_use_exif_times, plain)
         for frame, priors, plain in known
     ]
+
+
+def _needed_at_the_end(job: DetectionJob) -> tuple[str, ...]:
+    """Return libraries that learning and the table use: pyarrow loads pandas to write one."""
+    if job.camera.response is Response.UNKNOWN and job.settings.is_learning:
+        return ("pandas", "numba")
+    return ("pandas",)
 
 
 def _look_again(
@@ -327,12 +334,17 @@ def _sheet(flight: Flight, folder: Path) -> ContactSheet:
 def _stages_s(
     stopwatch: Stopwatch, journal: Journal[FrameResult], pool: WorkerPool
 ) -> dict[str, float]:
-    workers = pool.stages_s.most_common()
-    return {
-        **stopwatch.stages_s,
-        "journal, within these": journal.seconds,
-        **{f"workers: {stage}": seconds for stage, seconds in workers},
-    }
+    """Return times by stage: those of this process, then those of all workers together."""
+    stages_s = dict(stopwatch.stages_s)
+    stages_s[OTHER] = stopwatch.seconds - sum(stages_s.values())
+    stages_s["journal, within these"] = journal.seconds
+    if pool.callers:
+        workers = pool.stages_s.most_common()
+        stages_s |= {f"workers: {stage}": seconds for stage, seconds in workers}
+        open_s = stopwatch.seconds - stages_s["preparation"]
+        idle_s = max(1, pool.jobs) * open_s - pool.stages_s.total()
+        stages_s["workers: starting, waiting, ending"] = idle_s
+    return stages_s
 
 
 def _making(job: DetectionJob) -> dict[str, str]:

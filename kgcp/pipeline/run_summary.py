@@ -122,6 +122,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.stages_s: dict[str, float] = defaultdict(float)
+        self._start_s = time.perf_counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -131,6 +132,11 @@ class Stopwatch:
             yield
         finally:
             self.stages_s[name] += time.perf_counter() - start_s
+
+    @property
+    def seconds(self) -> float:
+        """Time since the stopwatch was started [s]."""
+        return time.perf_counter() - self._start_s
 
 
 class SummaryBuilder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cProfile
 import inspect
+import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
@@ -12,6 +13,9 @@ from typing import TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+OTHER = "other steps"
+"""What a call does between its stages."""
 
 _PACKAGE = PurePath(__file__).parents[2]
 
@@ -32,7 +36,7 @@ def profiled(
     result
         As the function's.
     stages_s : mapping of str to float
-        Seconds of each stage, by its name.
+        Seconds of each stage, by its name. Together they are the time of the call.
 
     Raises
     ------
@@ -41,6 +45,7 @@ def profiled(
     """
     files = {inspect.getfile(inspect.unwrap(caller)) for caller in callers}
     profiler = cProfile.Profile()
+    begin_s = time.perf_counter()
     result = profiler.runcall(function, item)
     stages_s: dict[str, float] = defaultdict(float)
     for entry in profiler.getstats():
@@ -51,4 +56,5 @@ def profiled(
                     if path.is_relative_to(_PACKAGE):
                         module = path.relative_to(_PACKAGE).with_suffix("").parts
                         stages_s[".".join((*module, call.code.co_name))] += call.totaltime
+    stages_s[OTHER] = time.perf_counter() - begin_s - sum(stages_s.values())
     return result, dict(stages_s)
