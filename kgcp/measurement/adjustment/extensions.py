@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -56,12 +58,13 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
     Rejection
         As `_fit_in_any_light`, if neither leads anywhere.
     """
+    look = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))  # whatever the tone
     if problem.tone is not Tone.UNKNOWN:
-        return FitsByTone(_fit_in_any_light(problem, pose, blur), None)
+        return FitsByTone(_fit_in_any_light(problem, pose, blur, look), None)
     fits = []
     for tone in (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE):
         try:
-            fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur))
+            fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur, look))
         except Rejection as rejection:
             failure = rejection
     if not fits:
@@ -75,7 +78,9 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
     return FitsByTone(over_srgb, over_line, -advantage)
 
 
-def _fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
+def _fit_in_any_light(
+    problem: FitProblem, pose: Pose, blur: Blur, look: Callable[[], Plateaus | None]
+) -> TwoPoses:
     """Adjust both poses by the plain model, and by what its residuals ask for beyond it.
 
     Raises
@@ -88,13 +93,13 @@ def _fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
-        plateaus = None if is_small else look_at_plateaus(problem, pose, blur.mean_sd_px)
+        plateaus = None if is_small else look()
         if plateaus is None or not plateaus.is_uneven:
             raise
     else:
         if is_small or not asks_for_levels(plain.best):
             return plain
-        plateaus = look_at_plateaus(problem, pose, blur.mean_sd_px)
+        plateaus = look()
         if plateaus is None or not plateaus.is_uneven:
             return _with_levels(problem, plain)
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)

@@ -168,35 +168,52 @@ def _products(
 
     The knots of a pixel ascend, so that only upper triangles are added up.
     """
-    reach, rows, number = knots.shape[1], scaled.shape[0], np.full(count, -1, np.intp)
-    for i in range(len(knots)):
-        for j in range(reach):
-            if weights[i, j] > 0.0:
-                number[knots[i, j]] = 0
-    used = np.flatnonzero(number == 0)
-    number[used] = np.arange(len(used))
+    reach, rows = knots.shape[1], scaled.shape[0]
+    used, number = _used(knots, weights, count)
     q = len(used)
     ink_ink, mixed_both, plate_plate = np.zeros((3, q, q))
-    mixed = np.zeros((2 * q, rows))
+    mixed = np.zeros((q, 2, rows))  # by knot, so that what is added lies side by side
+    at, share = np.empty(reach, np.intp), np.empty(reach)
     by_row = scaled.T.copy()
     for i in range(len(knots)):
         ink, plate = by_level[0, i], by_level[1, i]
         ii, ip, pp = weight[i] * ink * ink, weight[i] * ink * plate, weight[i] * plate * plate
+        near = 0
         for j in range(reach):
-            if weights[i, j] == 0.0:
-                continue
-            a = number[knots[i, j]]
-            for k in range(j, reach):
-                if weights[i, k] > 0.0:
-                    b, both = number[knots[i, k]], weights[i, j] * weights[i, k]
-                    ink_ink[a, b] += both * ii
-                    mixed_both[a, b] += both * ip
-                    plate_plate[a, b] += both * pp
-            of_ink, of_plate = weights[i, j] * weight[i] * ink, weights[i, j] * weight[i] * plate
+            if weights[i, j] != 0.0:
+                at[near], share[near] = number[knots[i, j]], weights[i, j]
+                near += 1
+        for j in range(near):
+            a = at[j]
+            for k in range(j, near):
+                b, both = at[k], share[j] * share[k]
+                ink_ink[a, b] += both * ii
+                mixed_both[a, b] += both * ip
+                plate_plate[a, b] += both * pp
+            of_ink, of_plate = share[j] * weight[i] * ink, share[j] * weight[i] * plate
+            by_ink, by_plate = mixed[a, 0], mixed[a, 1]
             for p in range(rows):
-                mixed[a, p] += of_ink * by_row[i, p]
-                mixed[q + a, p] += of_plate * by_row[i, p]
-    return _whole(ink_ink, mixed_both, plate_plate), mixed.T.copy(), np.append(used, used + count)
+                by_ink[p] += of_ink * by_row[i, p]
+            for p in range(rows):
+                by_plate[p] += of_plate * by_row[i, p]
+    by_level_and_row = np.empty((rows, 2 * q))
+    for p in range(rows):
+        by_level_and_row[p, :q], by_level_and_row[p, q:] = mixed[:, 0, p], mixed[:, 1, p]
+    own = _whole(ink_ink, mixed_both, plate_plate)
+    return own, by_level_and_row, np.append(used, used + count)
+
+
+@compiled
+def _used(knots: IndexArray, weights: FloatArray, count: int) -> tuple[IndexArray, IndexArray]:
+    """Return the knots (q,) that pixels use, and of every knot its number among them."""
+    number = np.full(count, -1, np.intp)
+    for i in range(len(knots)):
+        for j in range(knots.shape[1]):
+            if weights[i, j] > 0.0:
+                number[knots[i, j]] = 0
+    used = np.flatnonzero(number == 0)
+    number[used] = np.arange(len(used))
+    return used, number
 
 
 @compiled
