@@ -57,11 +57,14 @@ PLAIN_SCATTER = (1.7, 1.15)
 
 `python -m benchmarks.ground.plain_targets`: white and black discs of 3 to 20 px, linear response.
 """
-PLAIN_FOUND = (400, 400)
-"""Plain discs found and shown from `PLAIN_LEAST_PX` on, by the same benchmark; rings with as much
-between their circles."""
-PLAIN_LEAST_PX = 3.0
-"""Least radius of a disc, least distance of a ring's circles and radius of its innermost [px]."""
+PLAIN_FOUND = (1498, 1500)
+"""Plain discs and rings found and shown from `PLAIN_LEAST_PX` on, by the same benchmark with
+`--count 100`."""
+PLAIN_LEAST_PX, PLAIN_GAP_PX, PLAIN_HOLE_PX = 3.0, 2.0, 1.0
+"""Least radius, least distance of a ring's circles and least radius of its innermost [px].
+
+Thinner rings are found as well, but their edges say less than edges apart.
+"""
 SURE_PX = 9.0
 """Radius to plan for [px]: below, blur that is not foreseen leaves little of the dots."""
 LARGEST_SHARE = 0.46
@@ -283,9 +286,15 @@ def _plain_outlook(
 
 def least_plain_px(target: PlainTarget) -> float:
     """Return the least radius at which all circles of a plain target are told apart [px]."""
-    radii = (*target.radii_m, 0.0)
+    radii = target.radii_m
+    if len(radii) == 1:
+        return PLAIN_LEAST_PX
     narrowest_m = min(outer - inner for outer, inner in pairwise(radii))
-    return PLAIN_LEAST_PX * target.radii_m[0] / narrowest_m
+    return max(
+        PLAIN_LEAST_PX,
+        PLAIN_GAP_PX * radii[0] / narrowest_m,
+        PLAIN_HOLE_PX * radii[0] / radii[-1],
+    )
 
 
 def _plain_accuracy(

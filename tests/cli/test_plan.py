@@ -156,19 +156,19 @@ position_m = [1.0, 2.0, 3.0]
 def test_plans_for_a_plain_target(flight: Path) -> None:
     text = (flight / "flight.toml").read_text(encoding="utf-8")
     (flight / "flight.toml").write_text(text + PLAIN, encoding="utf-8")
-    heights = [option for height in (20, 95, 96) for option in ("--height", str(height))]
+    heights = [option for height in (20, 142, 143) for option in ("--height", str(height))]
     result = CliRunner().invoke(
         main, ["plan", str(flight), "--target", "ring", "--blur", "0", "--json", *heights]
     )
     assert result.exit_code == 0, result.output
     near, far, beyond = json.loads(result.stdout)["heights"]
-    # circles 3 px apart, which is a radius of 6 px, at 95.1 m
-    assert near["found"] == far["found"] == 1.0
+    # circles 2 px apart, which is a radius of 4 px, at 142.7 m
+    assert 0.99 < near["found"] == far["found"]
     assert beyond["found"] == 0.0
     assert beyond["sd_distance_m"] is None
-    # R = 28.5 and 6.0 px: the centre improves by R^(1/2), the distance by R^(3/2)
+    # R = 28.5 and 4.0 px: the centre improves by R^(1/2), the distance by R^(3/2)
     assert 0.0015 < near["sd_centre_px"] < far["sd_centre_px"] < 0.006
-    ratio = far["sd_distance_m"] / 95.0 / (near["sd_distance_m"] / 20.0)
-    assert math.isclose(ratio, (95.0 / 20.0) ** 1.5, rel_tol=1e-6)
+    ratio = far["sd_distance_m"] / 142.0 / (near["sd_distance_m"] / 20.0)
+    assert math.isclose(ratio, (142.0 / 20.0) ** 1.5, rel_tol=1e-6)
     shown = CliRunner().invoke(main, ["plan", str(flight), "--target", "ring"])
-    assert "a radius of 6 px" in shown.output
+    assert "a radius of 4 px" in shown.output
