@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -45,15 +45,22 @@ class PlainTracks:
             if isinstance(outcome, Measurement) and outcome.target in self._found:
                 self._found[outcome.target][row] = outcome
 
-    def predictions(self, camera: Camera) -> Mapping[int, Predictions]:
-        """Return by row where targets must be that were not found, as far as neighbours tell."""
+    def predictions(
+        self, camera: Camera, wanted: Mapping[int, Collection[str]]
+    ) -> Mapping[int, Predictions]:
+        """Return by row where targets must be, as far as neighbours tell, of those wanted in it."""
         made: dict[int, dict[str, PlainPrediction]] = {}
         for target in self._targets:
             found = self._found[target.name]
-            state = np.full((len(self._time_s), 3), math.nan)
-            for row, each in found.items():
-                state[row] = (*each.centre_px, math.log(each.distance_m))
-            for row, one in enumerate(predict_between(Track(self._time_s, state), _LONGEST_GAP)):
+            if not found:
+                continue
+            rows = sorted(found.keys() | {row for row in wanted if target.name in wanted[row]})
+            state = np.full((len(rows), 3), math.nan)
+            for at, row in enumerate(rows):
+                if row in found:
+                    state[at] = (*found[row].centre_px, math.log(found[row].distance_m))
+            track = Track(self._time_s[rows], state)
+            for row, one in zip(rows, predict_between(track, _LONGEST_GAP), strict=True):
                 if one is not None:
                     prediction = self._prediction(target, row, one, camera)
                     made.setdefault(row, {})[target.name] = prediction

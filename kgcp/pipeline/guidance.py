@@ -173,7 +173,9 @@ def plain_by_results(
                 for one in result.outcomes
                 if isinstance(one, Measurement) and one.target in static
             ]
-    by_neighbours = tracks.predictions(flight.camera)
+    if not lacking:
+        return {}
+    by_neighbours = tracks.predictions(flight.camera, lacking)
     by_targets = _by_own_targets(flight, data.static_positions, [*rows], sightings)
     made: dict[int, Predictions] = {}
     for frame, row in rows.items():
