@@ -8,6 +8,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, Response
+from kgcp.georef.plain_prediction import exchanged_marks
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -151,7 +152,7 @@ def detect_flight(
         data = FlightData(flight, all_frames)
         times = data.frame_times.time_s
         inputs = _frame_inputs(flight, data, frames)
-        marks = _marks(flight, all_frames, options.places)
+        marks = _marks(flight, data, all_frames, options.places)
         sheet = None if options.overlay is None else _sheet(flight, options.overlay)
     job = DetectionJob(
         frames_folder,
@@ -305,7 +306,7 @@ def _without(times: Mapping[str, float], left_out: Collection[str]) -> dict[str,
 
 
 def _marks(
-    flight: Flight, frames: Sequence[str], places: Path | None
+    flight: Flight, data: FlightData, frames: Sequence[str], places: Path | None
 ) -> Mapping[str, Sequence[Mark]]:
     if places is None:
         return {}
@@ -316,7 +317,17 @@ def _marks(
             option="places",
         )
     static = {target.name for target in flight.all_targets if target.position_m is not None}
-    return read_marks(places, set(frames), static, flight.camera)
+    marks = read_marks(places, set(frames), static, flight.camera)
+    for frame, in_frame in marks.items():
+        by_target = {mark.target: mark.place for mark in in_frame}
+        pair = exchanged_marks(by_target, data.static_positions, flight.camera)
+        if pair is not None:
+            raise KgcpError(
+                f"{places}: the marks of {pair[0]!r} and {pair[1]!r} in {frame} seem to be"
+                " exchanged; exchange their names, or look at their position_m",
+                option="places",
+            )
+    return marks
 
 
 def _sheet(flight: Flight, folder: Path) -> ContactSheet:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -158,6 +159,22 @@ def test_marks_by_hand_tell_where_they_are(bare: Path) -> None:
     rows = detections(bare).set_index("target")
     assert set(rows["status"]) == {"measured"}
     assert_at(rows, centres_m, largest_sd_px=0.04)  # how the frame looks is hardly known
+
+
+def test_exchanged_marks_are_refused(bare: Path) -> None:
+    """Two marks alone can be exchanged, three not."""
+    places = CAMERA.project(PlainFlight(frames=1).centres_m(0))
+    names = [target.name for target in TARGETS]
+    path = bare / "exchanged.csv"
+    for first, second in combinations(range(3), 2):
+        exchanged = [*names]
+        exchanged[first], exchanged[second] = names[second], names[first]
+        marks = [f"f_0.png,{name},{x},{y}" for name, (x, y) in zip(exchanged, places, strict=True)]
+        path.write_text("\n".join(("frame,target,x_px,y_px", *marks)), encoding="utf-8")
+        with pytest.raises(KgcpError, match="seem to be exchanged") as caught:
+            detect_flight(read_flight(bare), options=RunOptions(jobs=0, places=path))
+        assert names[first] in str(caught.value)
+        assert names[second] in str(caught.value)
 
 
 @dataclass(frozen=True)
