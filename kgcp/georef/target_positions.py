@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,7 +18,7 @@ from kgcp.georef.gps_counts import gps_count_remedy
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.trajectory import ENU_FROM_NED, Coverage, Motion, States, Trajectory, body_to_ned
 from kgcp.settings import VehicleSettings
-from kgcp.targets.plain import AnyTarget
+from kgcp.targets.plain import AnyTarget, PlainTarget
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,8 +242,21 @@ def _static_positions(
     positions = {}
     for target in targets:
         if target.position_m is not None:
-            position = local_frame.enu_from_map(np.array([target.position_m]))[0]
-            axes = local_frame.grid_rotation(position)
-            cov = covariance_along(axes, np.array(target.sd_position_m))
-            positions[target.name] = TargetPosition(position, cov)
+            positions[target.name] = static_position(target.position_m, target, local_frame)
     return positions
+
+
+def static_position(
+    position_map: tuple[float, float, float], target: AnyTarget, local_frame: LocalFrame
+) -> TargetPosition:
+    """Return the place of the centre of a target's face, from the position that is stated of it."""
+    position = local_frame.enu_from_map(np.array([position_map]))[0]
+    axes = local_frame.grid_rotation(position)
+    cov = covariance_along(axes, np.array(target.sd_position_m))
+    if isinstance(target, PlainTarget) and target.thickness_m:
+        level = local_frame.level_rotations(position[None])[0]
+        normal = level @ np.array(target.normal_enu)
+        aside_m = target.thickness_m * math.radians(target.sd_normal_deg)
+        position = position + target.thickness_m * normal
+        cov = cov + aside_m**2 * (np.eye(3) - np.outer(normal, normal))
+    return TargetPosition(position, cov)

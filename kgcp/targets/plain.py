@@ -58,6 +58,8 @@ class PlainTarget:
         Standard deviation of the normal about either axis square to it [deg].
     border_m : float or None
         Width of the even ground around it [m]; None: as even as it happens to be.
+    thickness_m : float
+        How far its face is from `position_m`, along the normal [m].
 
     Raises
     ------
@@ -76,6 +78,7 @@ class PlainTarget:
     normal_enu: tuple[float, float, float] = (0.0, 0.0, 1.0)
     sd_normal_deg: float = SD_NORMAL_DEG
     border_m: float | None = None
+    thickness_m: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.diameters_m) <= _MOST_CIRCLES:
@@ -97,6 +100,7 @@ class PlainTarget:
         require_range("level_sd_deg", self.sd_normal_deg, 0.0, 90.0, unit="deg", open_low=True)
         if self.border_m is not None:
             require_range("border_m", self.border_m, 0.0, 100.0, unit="m", open_low=True)
+        require_range("thickness_m", self.thickness_m, 0.0, 100.0, unit="m")
         length = math.hypot(*self.normal_enu)
         if length < _SQUARE:
             raise SettingError("normal", "has no direction", 'give [east, north, up] or "level"')

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.attitude import cross_matrix
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.plain_prediction import predict_plain, reference_orientations
+from kgcp.georef.target_positions import static_position
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
-from tests.plain_flight import CAMERA, TARGETS, PlainFlight
+from tests.plain_flight import CAMERA, CRS, ORIGIN_MAP, TARGETS, PlainFlight
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,23 @@ def test_poses_without_both_deviations_are_trusted_less(
     orientation = reference_orientations(bare, positions.local_frame)["f_0.png"]
     named = predict_plain(flight.plain_targets, orientation, positions, CAMERA)
     assert all(4.0 < one.sd_px < 6.0 for one in named.values())
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
+def test_a_face_lies_above_its_position(normal: tuple[float, float, float]) -> None:
+    frame = LocalFrame.at(CRS, ORIGIN_MAP)
+    low = replace(TARGETS[0], normal_enu=normal)
+    thick = replace(low, thickness_m=0.1)
+    ground, face = (static_position(each.position_m, each, frame) for each in (low, thick))
+    np.testing.assert_allclose(
+        face.position_m - ground.position_m, 0.1 * np.array(normal), atol=1e-6
+    )
+    assert ground.cov_m2 is not None
+    assert face.cov_m2 is not None
+    # the face tilts by 3° at 0.1 m: 5.2 mm aside, nothing along the normal
+    more = face.cov_m2 - ground.cov_m2
+    assert np.trace(more) == pytest.approx(2.0 * 0.00524**2, rel=0.01)
+    assert np.array(normal) @ more @ normal == pytest.approx(0.0, abs=1e-9)
 
 
 def test_correlated_errors_of_a_pose_cancel(made: Path) -> None:

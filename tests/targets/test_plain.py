@@ -39,6 +39,7 @@ def test_normal_becomes_a_unit_vector() -> None:
         ({"diameters_m": (0.0,)}, "diameter_m"),
         ({"diameters_m": (math.nan,)}, "diameter_m"),
         ({"border_m": 0.0}, "border_m"),
+        ({"thickness_m": -0.01}, "thickness_m"),
         ({"sd_normal_deg": 0.0}, "level_sd_deg"),
         ({"normal_enu": (0.0, 0.0, 0.0)}, "normal"),
         ({"sd_diameter_m": -0.1}, "sd_diameter_m"),

@@ -19,7 +19,7 @@ PLATE_KEYS = (
 )
 PLAIN_KEYS = (
     *("name", "shape", "polarity", "diameter_m", "inner_diameter_m", "sd_diameter_m"),
-    *("position_m", "sd_position_m", "normal", "level_sd_deg", "border_m"),
+    *("position_m", "sd_position_m", "normal", "level_sd_deg", "border_m", "thickness_m"),
 )
 _LEVEL = "level"
 _MOST_TARGETS = 200  # each is compared with every other
@@ -118,6 +118,7 @@ def _read_plain(table: TomlTable) -> PlainTarget:
             normal_enu=_read_normal(table),
             sd_normal_deg=table.number("level_sd_deg", PlainTarget.SD_NORMAL_DEG),
             border_m=table.number("border_m") if "border_m" in table else None,
+            thickness_m=table.number("thickness_m", 0.0),
         )
 
 

@@ -188,6 +188,7 @@ def _plain_table(target: PlainTarget) -> dict[str, object]:
         "normal": target.normal_enu,
         "level_sd_deg": target.sd_normal_deg,
         "border_m": target.border_m,
+        "thickness_m": target.thickness_m,
     }
 
 

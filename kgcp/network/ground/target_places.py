@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import ReferencePoses, covariance_along
+from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
@@ -23,6 +23,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circles
 from kgcp.targets.plain import AnyTarget
@@ -350,10 +351,11 @@ def _check(
 ) -> PlaceCheck:
     residual, residual_cov = None, None
     if target.position_m is not None:
-        stated = local_frame.enu_from_map(np.array([target.position_m]))[0]
-        residual = enu_from_map.T @ (circle.centre_m - stated)
-        stated_cov = covariance_along(np.eye(3), np.array(target.sd_position_m))
-        residual_cov = cov[:3, :3] + stated_cov
+        stated = static_position(target.position_m, target, local_frame)
+        residual = enu_from_map.T @ (circle.centre_m - stated.position_m)
+        residual_cov = cov[:3, :3]
+        if stated.cov_m2 is not None:
+            residual_cov = residual_cov + enu_from_map.T @ stated.cov_m2 @ enu_from_map
     diameter_m = target.outer_diameter_m
     return PlaceCheck(
         residual,

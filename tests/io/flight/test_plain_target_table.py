@@ -70,6 +70,7 @@ sd_position_m = [0.01, 0.01, 0.02]
 normal = [0, -1, 0]
 level_sd_deg = 5
 border_m = 0.2
+thickness_m = 0.03
 """
     assert read(tmp_path, _HEAD, ring) == (
         PlainTarget(
@@ -82,6 +83,7 @@ border_m = 0.2
             normal_enu=(0.0, -1.0, 0.0),
             sd_normal_deg=5.0,
             border_m=0.2,
+            thickness_m=0.03,
         ),
     )
 
