@@ -84,7 +84,7 @@ def test_deviations_of_poses_count(tmp_path: Path) -> None:
 def test_poses_of_other_frames_are_no_poses(
     tmp_path: Path, problem: str, *, is_shifted: bool
 ) -> None:
-    folder = GroundFlight(frames=4).write(tmp_path / "flight")
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
     path = folder / "reference.csv"
     head, *lines = path.read_text(encoding="utf-8").splitlines()
     frames, poses = zip(*(line.split(",", 1) for line in lines), strict=True)
