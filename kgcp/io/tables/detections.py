@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -385,11 +386,18 @@ def _number(row: _Cells, name: str) -> float | None:
     return float(value) if isinstance(value, float) and abs(value) < _LARGEST else None
 
 
+def _told(value: object) -> str:
+    """Describe what stands in place of a number."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "empty"
+    return f"{value!r}" if isinstance(value, float) else "no number"
+
+
 def _known(row: _Cells, name: str) -> float:
     value = _number(row, name)
     if value is None:
         raise KgcpError(
-            f"detections of {row['frame']!r}: {name} is empty in a measured row;"
+            f"detections of {row['frame']!r}: {name} of a measured row is {_told(row[name])};"
             " run 'kgcp detect' on this flight again"
         )
     return value
