@@ -86,6 +86,7 @@ def _look(
         rho_m[i] = math.sqrt(x * x + y * y)
         stretch[i] = _stretch(x, y, spread)
         share[i], off_edge_m[i], off_measured_m[i] = 1.0, np.inf, np.inf
+    near = np.empty(len(rho_m), np.intp)
     c = 0
     while c < len(beyond):
         radius, sign = circles[2, c], circles[3, c]
@@ -97,16 +98,20 @@ def _look(
                 is_small |= rho_m < radius
             c += 1
             continue
+        count = 0
         for i in range(len(rho_m)):
-            if abs(rho_m[i] - out_m[c]) < radius + reach_m:
-                x, y = _from_nearest(points_m[0, i], points_m[1, i], circles[:2, c : beyond[c]])
-                beyond_m = math.sqrt(x * x + y * y) - radius
-                off_edge_m[i] = min(off_edge_m[i], abs(beyond_m))
-                if c < measured_count and abs(beyond_m) < off_measured_m[i]:
-                    felt_m = abs(beyond_m) * _stretch(x, y, spread)
-                    off_measured_m[i] = min(off_measured_m[i], felt_m)
-                share[i] += sign if beyond_m < 0.0 else 0.0
-                is_small[i] |= beyond_m < 0.0 and radius < small_m
+            near[count] = i
+            count += abs(rho_m[i] - out_m[c]) < radius + reach_m
+        from_x, from_y = _from_nearest(points_m, near[:count], circles[:2, c : beyond[c]])
+        for k in range(count):
+            i, x, y = near[k], from_x[k], from_y[k]
+            beyond_m = math.sqrt(x * x + y * y) - radius
+            off_edge_m[i] = min(off_edge_m[i], abs(beyond_m))
+            if c < measured_count and abs(beyond_m) < off_measured_m[i]:
+                felt_m = abs(beyond_m) * _stretch(x, y, spread)
+                off_measured_m[i] = min(off_measured_m[i], felt_m)
+            share[i] += sign if beyond_m < 0.0 else 0.0
+            is_small[i] |= beyond_m < 0.0 and radius < small_m
         c = beyond[c]
     for i in range(len(rho_m)):
         off_edge_m[i] = 0.0 if is_small[i] else off_edge_m[i]
@@ -138,11 +143,24 @@ def _near_ring(
 
 
 @compiled
-def _from_nearest(x: float, y: float, centres_m: FloatArray) -> tuple[float, float]:
-    """Return where a point is from the nearest of some centres (2, k)."""
-    least, nearest = np.inf, 0
+def _from_nearest(
+    points_m: FloatArray, near: IndexArray, centres_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return where some points, by their index (m,), are from the nearest of some centres (2, k).
+
+    Centre by centre: a loop without a branch.
+    """
+    x, y = np.empty(len(near)), np.empty(len(near))
+    from_x, from_y, least = x.copy(), y.copy(), np.full(len(near), np.inf)
+    for m in range(len(near)):
+        x[m], y[m] = points_m[0, near[m]], points_m[1, near[m]]
     for k in range(centres_m.shape[1]):
-        square = (x - centres_m[0, k]) ** 2 + (y - centres_m[1, k]) ** 2
-        nearest = k if square < least else nearest
-        least = min(least, square)
-    return x - centres_m[0, nearest], y - centres_m[1, nearest]
+        centre_x, centre_y = centres_m[0, k], centres_m[1, k]
+        for m in range(len(near)):
+            off_x, off_y = x[m] - centre_x, y[m] - centre_y
+            square = off_x * off_x + off_y * off_y
+            is_nearer = square < least[m]
+            from_x[m] = off_x if is_nearer else from_x[m]
+            from_y[m] = off_y if is_nearer else from_y[m]
+            least[m] = min(least[m], square)
+    return from_x, from_y
