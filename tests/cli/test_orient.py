@@ -103,7 +103,7 @@ def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> 
         (lambda table: table.iloc[:0], "has no readable frame"),
         (lambda table: pd.concat((table, table)), "has target 'A' of 'f_000.png' twice"),
         (lambda table: table.assign(distance_m=0.0), "distance_m is 0"),
-        (lambda table: table.assign(x_px=1e300), "x_px is empty"),
+        (lambda table: table.assign(x_px=1e300), "x_px of a measured row"),
     ],
 )
 def test_one_line_for_detections_that_cannot_be(
