@@ -18,6 +18,8 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from kgcp.errors import KgcpError
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _SPARED_CALLS = 20_000  # by Python take some 0.1 s, loading numba and its tables 0.5 s
@@ -51,6 +53,11 @@ class _Compilable:
         """Return numba's dispatcher of the function, which replaces this one in its module.
 
         Those that the function calls come first: numba looks for them under their names.
+
+        Raises
+        ------
+        KgcpError
+            If there is no folder in which compiled code could be kept.
         """
         if self._dispatcher is None:
             import numba
@@ -58,9 +65,15 @@ class _Compilable:
             function = self._function
             for name in function.__code__.co_names:
                 called = function.__globals__.get(name)
-                if isinstance(called, _Compilable):
+                if isinstance(called, _Compilable) and called is not self:
                     function.__globals__[name] = called.dispatcher()
-            made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
+            try:
+                made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
+            except RuntimeError as error:  # numba's own, where no folder is left
+                raise KgcpError(
+                    f"compiled code can be kept in no folder ({error}); set the environment"
+                    " variable NUMBA_CACHE_DIR to a folder that can be written"
+                ) from error
             function.__globals__[function.__name__] = self._dispatcher = made
         return self._dispatcher
 

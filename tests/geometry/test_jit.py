@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -12,6 +14,8 @@ from kgcp.geometry.arrays import FloatArray
 
 LENS = (-0.1, 0.05, 1e-4, -2e-4, 0.01, 0.02, 0.0, 0.0)
 SCALE = (3100.0, 3110.0, 2001.0, 1498.0)
+_KGCP = Path(_jit.__file__).parents[1]
+_DECORATORS = {"compiled", "compiled_if_often", "summed", "inlined", "fused"}
 
 
 def fresh_copy(module: ModuleType) -> ModuleType:
@@ -47,3 +51,29 @@ def test_few_points_are_distorted_without_numba_to_the_same_bits(
     for ours, numbas in zip(interpreted, compiled, strict=True):
         np.testing.assert_array_equal(ours, numbas)
     assert np.isnan(interpreted[1]).any()
+
+
+def _compiled_functions(path: Path) -> dict[str, ast.FunctionDef]:
+    """Return the functions of a file that have one of the decorators of `_jit`, by their names."""
+    tree = ast.parse(path.read_text("utf-8"))
+    return {
+        node.name: node
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and any(isinstance(by, ast.Name) and by.id in _DECORATORS for by in node.decorator_list)
+    }
+
+
+def test_compiled_functions_call_compiled_ones_of_their_own_file_only() -> None:
+    """Of another file they would go on calling an old version that they were compiled with."""
+    by_file = {path: _compiled_functions(path) for path in sorted(_KGCP.rglob("*.py"))}
+    names = {name for functions in by_file.values() for name in functions}
+    assert len(names) > 50
+    for path, functions in by_file.items():
+        for name, function in functions.items():
+            called = {
+                node.func.id
+                for node in ast.walk(function)
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+            }
+            assert called & names <= functions.keys(), f"{path}: {name}"

@@ -8,8 +8,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
+from kgcp.measurement.image_model.edge_terms import skew_rows
 from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, SKEW_PARAMS
-from kgcp.measurement.image_model.skew import skew_rows
 
 _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew

@@ -19,8 +19,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.covariance import propagate, unevenness_factor
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
-from kgcp.measurement.adjustment.solver import TargetFit, added_levels
-from kgcp.measurement.image_model.contour_smoothing import smoothing_row
+from kgcp.measurement.adjustment.solver import TargetFit
+from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
@@ -68,7 +68,8 @@ def _by_smoothing(fit: TargetFit) -> FloatArray:
     step = _SMALL_PX2 * smoothing_row(
         parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
     )
-    added = added_levels(sample, parameters)
+    field, pixels = parameters.field, sample.problem.window.pixels(sample.index)
+    added = None if field is None else field.added(pixels)
     more, less = (
         sample.photometry.levels(each, parameters.light, added)
         for each in (share + step, share - step)

@@ -20,11 +20,9 @@ from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, white_share
-from kgcp.measurement.image_model.light_across_edges import spread_share_gradient
-from kgcp.measurement.image_model.light_field import LightField
+from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
 from kgcp.measurement.image_model.photometry import Param
-from kgcp.measurement.image_model.skew import skew_rows
 
 EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
@@ -83,11 +81,7 @@ class TargetFit:
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
     """Model the grey values of a sample."""
     share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
-    if parameters.has_skew:
-        share = _skewed(share, sample, parameters)
-    added = added_levels(sample, parameters)
-    if parameters.field is not None and added is not None:
-        share = _in_light(share, sample, parameters, parameters.field, added)
+    share, added = _with_edge_terms(share, sample, parameters)
     levels = sample.photometry.levels(share.value, parameters.light, added)
     return PredictedImage(share.points_m, share.value, levels)
 
@@ -99,53 +93,34 @@ def linearise(sample: Sample, parameters: Parameters) -> tuple[PredictedImage, F
     where there is none.
     """
     share = white_share(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
-    if parameters.has_skew:
-        share = _skewed(share, sample, parameters)
-    added = added_levels(sample, parameters)
-    if parameters.field is not None and added is not None:
-        share = _in_light(share, sample, parameters, parameters.field, added)
+    share, added = _with_edge_terms(share, sample, parameters)
     levels, jacobian = sample.photometry.linearised(share, parameters.light, added)
     return PredictedImage(share.points_m, share.value, levels), jacobian
 
 
-def _skewed(share: WhiteShare, sample: Sample, parameters: Parameters) -> WhiteShare:
-    """Add what a skew point spread does to the white share and to its derivatives.
+def _with_edge_terms(
+    share: WhiteShare, sample: Sample, parameters: Parameters
+) -> tuple[WhiteShare, FloatArray | None]:
+    """Add what skew point spreads, and light that changes across edges, do to the white share.
 
-    Those by pose and blur stay as they are: the skew changes them by a few per cent.
+    Derivatives by pose, blur and levels stay as they are: these terms change them by a few per
+    cent. Also returned is what the levels of ink and plate (2, n) have more where the light is
+    uneven.
     """
-    rows = skew_rows(
-        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
-    )
-    value = share.value + parameters.vector[Param.SKEW_XXX :] @ rows
-    jacobian = np.vstack((share.jacobian, rows)) if len(share.jacobian) else share.jacobian
-    return WhiteShare(share.points_m, value, jacobian)
-
-
-def _in_light(
-    share: WhiteShare,
-    sample: Sample,
-    parameters: Parameters,
-    field: LightField,
-    added: FloatArray,
-) -> WhiteShare:
-    """Add what light that changes across an edge does to the white share under blur.
-
-    The derivatives stay as they are.
-    """
-    spread = spread_share_gradient(
-        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
-    )
-    gradient = field.contrast_gradient(sample.problem.window.pixels(sample.index))
+    value, jacobian, field = share.value, share.jacobian, parameters.field
+    covariance = parameters.blur.total_covariance
+    if parameters.has_skew:
+        rows = skew_rows(parameters.matrix, sample.rays, covariance, sample.incidence)
+        value = value + parameters.vector[Param.SKEW_XXX :] @ rows
+        jacobian = np.vstack((jacobian, rows)) if len(jacobian) else jacobian
+    if field is None:
+        return WhiteShare(share.points_m, value, jacobian), None
+    pixels = sample.problem.window.pixels(sample.index)
+    added, gradient = field.added(pixels), field.contrast_gradient(pixels)
+    spread = spread_share_gradient(parameters.matrix, sample.rays, covariance, sample.incidence)
     contrast = np.maximum(1.0 + added[1] - added[0], _LEAST_CONTRAST)
-    value = share.value + np.sum(gradient * spread, axis=0) / contrast
-    return WhiteShare(share.points_m, value, share.jacobian)
-
-
-def added_levels(sample: Sample, parameters: Parameters) -> FloatArray | None:
-    """Return what the levels of ink and plate (2, n) have more where the light is uneven."""
-    if parameters.field is None:
-        return None
-    return parameters.field.added(sample.problem.window.pixels(sample.index))
+    value = value + np.sum(gradient * spread, axis=0) / contrast
+    return WhiteShare(share.points_m, value, jacobian), added
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:

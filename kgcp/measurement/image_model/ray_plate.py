@@ -5,9 +5,7 @@ Loops go over all pixels for few numbers at a time: so the vector units take sev
 
 from __future__ import annotations
 
-import math
-
-from kgcp.geometry._jit import compiled, inlined
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
 
 VIEW_ROWS = 15
@@ -87,17 +85,3 @@ def carry_slopes(
     for i in range(count):
         slopes[9, i] = views[2, i] * t[7, i] + views[4, i] * t[8, i]
         slopes[10, i] = views[3, i] * t[7, i] + views[5, i] * t[8, i]
-
-
-@inlined
-def across_edge(views: FloatArray, i: int, x: float, y: float) -> tuple[float, float, float, float]:
-    """Return how a circle's edge lies in the image at pixel i, which is at (x, y) from its centre.
-
-    Distance from the centre [m], metres on the plate per pixel square to the edge, and the unit
-    normal of the edge in the image, outwards.
-    """
-    out_m = max(math.sqrt(x * x + y * y), 1e-9)
-    right = (x * views[2, i] + y * views[4, i]) / out_m
-    down = (x * views[3, i] + y * views[5, i]) / out_m
-    per_px = math.sqrt(right * right + down * down)
-    return out_m, per_px, right / per_px, down / per_px

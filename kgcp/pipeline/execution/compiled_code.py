@@ -15,6 +15,7 @@ import numpy as np
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.measurement.frame import examine
+from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
 
@@ -23,6 +24,8 @@ _FINE = 4  # points per pixel and axis
 _BLACK, _WHITE, _NOISE = 40.0, 200.0, 1.5  # grey values
 _CAMERA = Camera(_SIDE_PX, _SIDE_PX, 1000.0, 1000.0, 49.5, 49.5)
 _RING = Ring("A", 1.0, 0.5, 0.75, 0.15, (0.0, 80.0, 130.0, 250.0))
+
+_RESPONSES = (Response.LINEAR, Response.UNKNOWN)  # with the others nothing more is compiled
 
 _loaded: set[Response] = set()
 
@@ -33,7 +36,7 @@ class _NotCompiled(Exception):  # noqa: N818 - a state and no error
 
 def load_compiled_code() -> bool:
     """Load what most frames need, and tell whether all of it is there; nothing is compiled."""
-    if _loaded:
+    if _loaded.issuperset(_RESPONSES):
         return True
     from numba.core import event
 
@@ -55,10 +58,11 @@ def load_compiled_code() -> bool:
     return True
 
 
+@single_threaded()
 def compile_code() -> bool:
     """Load what most frames need, and compile what is missing: by measuring a drawn plate."""
     grey = _drawn_plate()
-    for response in (Response.LINEAR, Response.UNKNOWN):
+    for response in _RESPONSES:
         if response not in _loaded:
             camera = replace(_CAMERA, response=response)
             examine(grey, camera, (Target(_RING),), DetectSettings())

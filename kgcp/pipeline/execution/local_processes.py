@@ -113,11 +113,16 @@ class WorkerProcess:
 
     def _prepare(self, connection: _Connection, preparation: Preparation) -> None:
         """Let a new process get ready, however long it takes: not counted as work."""
-        self._send(connection, preparation.quick)
-        if not self._answer(connection, _LONGEST_WAIT_S, ()):
-            self._send(connection, preparation.slow)
-            with preparation.lock:
-                self._answer(connection, _LONGEST_WAIT_S, ())
+        if self._is_ready(connection, preparation.quick):
+            return
+        with preparation.lock:  # meanwhile another process may have done what is slow
+            if self._is_ready(connection, preparation.quick):
+                return
+            self._is_ready(connection, preparation.slow)
+
+    def _is_ready(self, connection: _Connection, prepare: Callable[[], bool]) -> bool:
+        self._send(connection, prepare)
+        return bool(self._answer(connection, _LONGEST_WAIT_S, ()))
 
     def _answer(self, connection: _Connection, limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
         try:
@@ -146,11 +151,16 @@ class WorkerProcess:
                     self._process.start()
                 other.close()
                 own.recv()  # it is there: its start is not counted as work
-            except (EOFError, OSError):
-                self._kill()
-            else:
                 if self._preparation is not None:
                     self._prepare(own, self._preparation)
+            except (EOFError, OSError, Lost):
+                self._kill()
+                if self._is_over:
+                    raise Lost(TaskFailure.CRASHED) from None
+            except BaseException:
+                self._kill()
+                raise
+            else:
                 self._connection = own
                 return own
         raise KgcpError(

@@ -14,7 +14,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_incidence
 from kgcp.measurement.image_model.blurred_plate import white_level, white_share
-from kgcp.measurement.image_model.contour_smoothing import smoothing_row
+from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.plate import (
     EVEN,
     Circles,

@@ -7,7 +7,7 @@ from scipy.special import ndtr
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
-from kgcp.measurement.image_model.light_across_edges import spread_share_gradient
+from kgcp.measurement.image_model.edge_terms import spread_share_gradient
 
 _RADIUS = 8.0
 _XX, _YY, _XY = 0.9, 0.6, 0.15  # of the blur [px²]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,7 +18,11 @@ from pathlib import Path
 import pytest
 
 from kgcp.errors import KgcpError, SettingError
-from kgcp.pipeline.execution.local_processes import Preparation, SupervisedProcessPool
+from kgcp.pipeline.execution.local_processes import (
+    Preparation,
+    SupervisedProcessPool,
+    WorkerProcess,
+)
 from kgcp.pipeline.execution.resilient_map import (
     SerialExecutor,
     TaskFailure,
@@ -136,6 +141,29 @@ def test_one_process_prepares_what_all_of_them_need(tmp_path: Path) -> None:
     with SupervisedProcessPool(2, LIMIT_S, preparation) as executor:
         assert dict(resilient_map(abs, range(6), executor, 2)) == {i: i for i in range(6)}
     assert path.read_text(encoding="utf-8") == "begin ready "
+
+
+def refuse() -> bool:
+    raise LookupError("no folder")
+
+
+def end() -> bool:
+    os._exit(3)
+
+
+def test_a_preparation_that_fails_says_why_and_leaves_no_process() -> None:
+    preparation = Preparation(refuse, refuse)
+    worker = WorkerProcess(LIMIT_S, preparation)
+    for _ in range(2):
+        with pytest.raises(LookupError, match="no folder"):
+            worker.call(abs, 1)
+    assert not multiprocessing.active_children()
+
+
+def test_a_process_that_ends_while_it_prepares_is_no_item_s_fault() -> None:
+    preparation = Preparation(end, refuse)
+    with pytest.raises(KgcpError, match="end as soon as they start"):
+        WorkerProcess(LIMIT_S, preparation).call(abs, 1)
 
 
 @pytest.mark.usefixtures("sigint_raises")

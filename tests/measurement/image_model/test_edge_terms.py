@@ -6,7 +6,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
-from kgcp.measurement.image_model.skew import skew_rows
+from kgcp.measurement.image_model.edge_terms import skew_rows
 
 _SHIFT_PX, _SHARE = 1.0, 0.2  # a fifth of the light lands one pixel beside
 _SD_PX = 1.2
