@@ -167,8 +167,7 @@ class LightField:
             _add_gradient(pixels, corner, spacing, counts, contrasts[first:], gradient)
             first += self.knots.counts[g]
         for edge in self.edges:
-            z = beyond(edge, pixels - self.centre_px[:, None])
-            density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+            density = _density(beyond(edge, pixels - self.centre_px[:, None]))
             slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * density
             gradient[0] += math.cos(edge[ANGLE]) * slope
             gradient[1] += math.sin(edge[ANGLE]) * slope
@@ -190,9 +189,8 @@ class LightField:
         rows = np.empty((len(self.edges), 5, pixels.shape[1]))
         for k, edge in enumerate(self.edges):
             z = beyond(edge, offsets)
-            density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
             across = -math.sin(edge[ANGLE]) * offsets[0] + math.cos(edge[ANGLE]) * offsets[1]
-            by_z = (edge[INK] * by_level[0] + edge[PLATE] * by_level[1]) * density
+            by_z = (edge[INK] * by_level[0] + edge[PLATE] * by_level[1]) * _density(z)
             per_px = math.exp(-edge[LOG_WIDTH])
             rows[k, ANGLE] = by_z * across * per_px
             rows[k, OFFSET] = -by_z * per_px
@@ -209,6 +207,11 @@ def beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
     """Return how far places (2, n) [px] are beyond a shadow's edge, in penumbra's σ."""
     along = np.cos(edge[ANGLE]) * offsets[0] + np.sin(edge[ANGLE]) * offsets[1]
     return np.asarray((along - edge[OFFSET]) / np.exp(edge[LOG_WIDTH]))
+
+
+def _density(z: FloatArray) -> FloatArray:
+    """Return the standard normal density."""
+    return np.asarray(np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
 
 
 EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
