@@ -282,15 +282,21 @@ def _look_for_plain(
 ) -> None:
     """Look for plain targets where the frames' results say that they must be, until nothing is new.
 
-    What is found in a frame tells where others are, in this one and in those beside it.
+    What is found in a frame tells where others are, in this one and in those beside it. Where that
+    is not sure enough, the first of these looks says so in the row; a later one may be sure.
     """
     tried: set[tuple[int, str]] = set()
-    for _ in range(looks):
+    for look in range(looks):
         plain = plain_by_results(flight, data, run.results(), run.tracks.time_s, marks, tried)
-        if not plain:
+        sure = {
+            row: {name: each for name, each in predictions.items() if each.is_sure}
+            for row, predictions in plain.items()
+        }
+        sure = {row: predictions for row, predictions in sure.items() if predictions}
+        run.guided_pass({}, sure if look else plain)
+        if not sure:
             return
-        tried |= {(row, name) for row, predictions in plain.items() for name in predictions}
-        run.guided_pass({}, plain)
+        tried |= {(row, name) for row, predictions in sure.items() for name in predictions}
 
 
 def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:

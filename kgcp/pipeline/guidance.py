@@ -153,7 +153,7 @@ def plain_by_results(
     marks : mapping
         Static targets that were marked by hand, by frame.
     tried : collection of tuple
-        Rows and targets that were looked for in such a way before.
+        Rows and targets that were looked for before, by a sure prediction.
     """
     if not flight.plain_targets or flight.crs is None:
         return {}

@@ -161,6 +161,22 @@ def test_marks_by_hand_tell_where_they_are(bare: Path) -> None:
     assert_at(rows, centres_m, largest_sd_px=0.04)  # how the frame looks is hardly known
 
 
+def test_a_poor_mark_does_not_keep_a_target_from_being_found(tmp_path: Path) -> None:
+    """Four good marks orient the frame, and this says where the fifth target is."""
+    fifth = plain_target("fifth", (-1.2, 0.6), 0.8)
+    made = PlainFlight(targets=(*FOUR, fifth), frames=1)
+    made.write(tmp_path)
+    (tmp_path / "reference.csv").unlink()
+    lines = ["frame,target,x_px,y_px,sd_px"]
+    for target, (x, y) in zip(made.targets, CAMERA.project(made.centres_m(0)), strict=True):
+        lines.append(f"f_0.png,{target.name},{x:.0f},{y:.0f},{80 if target is fifth else 2}")
+    (tmp_path / "places.csv").write_text("\n".join(lines), encoding="utf-8")
+    run("detect", tmp_path, "--jobs", "0", "--places", str(tmp_path / "places.csv"))
+    rows = detections(tmp_path).set_index("target")
+    assert set(rows["status"]) == {"measured"}
+    assert_at(rows, made.centres_m(0)[: len(TARGETS)], largest_sd_px=0.04)
+
+
 def test_exchanged_marks_are_refused(bare: Path) -> None:
     """Two marks alone can be exchanged, three not."""
     places = CAMERA.project(PlainFlight(frames=1).centres_m(0))
