@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, cross_matrix
@@ -27,12 +25,7 @@ _UNSTATED_PX, _UNSTATED_LOG = 5.0, 0.01
 
 # Of what is marked: how far a camera that looks down does not, and distances from marks.
 _DOWN_SD_DEG, _MARKED_LOG = 10.0, 0.08
-# Misfits of marks, root mean square of their extent, from which on names may be exchanged, and the
-# share of the squares that is left then.
-_UNLIKE_MAP, _BETTER = 0.05, 0.1
 _LEVEL = 0.95  # upward component of a normal that counts as level
-
-ComplexArray = NDArray[np.complex128]
 
 Predictions = Mapping[str, PlainPrediction]
 """By the target's name."""
@@ -183,40 +176,6 @@ def predict_marked(
             source="a mark",
         )
     return predictions
-
-
-def exchanged_marks(
-    places: Mapping[str, MarkedPlace], positions: TargetPositions, camera: Camera
-) -> tuple[str, str] | None:
-    """Return two targets whose marks are each other's, as those of all targets of a frame say it.
-
-    Seen from above, marks and targets differ by shift, turn and scale: three marks at least tell.
-    """
-    names = [*places]
-    if len(names) < 3:
-        return None
-    plane = camera.undistort(np.array([(places[name].x_px, places[name].y_px) for name in names]))
-    marked = plane[:, 0] - 1j * plane[:, 1]  # image rows run south if the frame's top is north
-    on_ground = np.array([positions.static[name].position_m[:2] for name in names]) @ (1.0, 1.0j)
-    if not np.ptp(np.abs(on_ground - on_ground[0])) > 0.0:
-        return None
-    before = _misfit(on_ground, marked)
-    if before < (_UNLIKE_MAP * float(np.std(marked))) ** 2 * len(names):
-        return None
-    after = {}
-    for pair in combinations(range(len(names)), 2):
-        exchanged = marked.copy()
-        exchanged[list(pair)] = marked[list(pair[::-1])]
-        after[pair] = _misfit(on_ground, exchanged)
-    first, second = min(after, key=lambda pair: after[pair])
-    return (names[first], names[second]) if after[first, second] < _BETTER * before else None
-
-
-def _misfit(ground: ComplexArray, marked: ComplexArray) -> float:
-    """Return the sum of squares that shift, turn and scale leave, of points in complex numbers."""
-    ground, marked = ground - ground.mean(), marked - marked.mean()
-    scale = np.vdot(ground, marked) / np.vdot(ground, ground)
-    return float(np.sum(np.abs(marked - scale * ground) ** 2))
 
 
 def _depth_of_marks(

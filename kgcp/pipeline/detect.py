@@ -8,7 +8,6 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, Response
-from kgcp.georef.plain_prediction import exchanged_marks
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -21,6 +20,7 @@ from kgcp.io.tables.provenance import detections_provenance, versions, write_run
 from kgcp.measurement.frame import examine
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult
+from kgcp.network.ground.exchanged_marks import exchanged_marks
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_code
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
@@ -326,7 +326,7 @@ def _marks(
     marks = read_marks(places, set(frames), static, flight.camera)
     for frame, in_frame in marks.items():
         by_target = {mark.target: mark.place for mark in in_frame}
-        pair = exchanged_marks(by_target, data.static_positions, flight.camera)
+        pair = exchanged_marks(by_target, data.static_positions.static, flight.camera)
         if pair is not None:
             raise KgcpError(
                 f"{places}: the marks of {pair[0]!r} and {pair[1]!r} in {frame} seem to be"

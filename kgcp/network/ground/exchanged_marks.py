@@ -1,0 +1,114 @@
+"""Marks in a frame that carry each other's names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from kgcp.geometry.camera import Camera
+from kgcp.georef.plain_prediction import MarkedPlace
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.network.ground.resection import (
+    CameraPose,
+    PointImages,
+    adjusted_pose,
+    three_point_poses,
+)
+
+_MOST_TRIPLES = 6  # that poses start from: one with right names is enough
+_START_SHARE = 0.1  # of the frame's width, that marks may be off a pose from three of them
+_LIKELY_CHI2 = 25.0  # of a mark, in the mean, at most
+_DOWN_SD_DEG = 10.0  # how far a camera that looks down does not
+_SIGMAS = 4.0  # that one of three marks may be displaced by
+
+
+def exchanged_marks(
+    places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition], camera: Camera
+) -> tuple[str, str] | None:
+    """Return two targets whose marks are each other's, as those of all targets of a frame say it.
+
+    No camera above the targets can see them as they are marked, and one can with two names
+    exchanged. Three marks at least tell: exchanged names turn the sense in which they follow each
+    other. Three that are nearly in a line do not.
+
+    Parameters
+    ----------
+    positions : mapping of str to TargetPosition
+        Of the marked targets at least, in the ENU frame.
+    """
+    names = [*places]
+    if len(names) < 3:
+        return None
+    images = _point_images(places, positions)
+    if any(next(_misfits(camera, each), None) is not None for each in _displaced(images)):
+        return None
+    misfits = {}
+    for pair in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[list(pair)] = pair[::-1]
+        exchanged = replace(images, pixels=images.pixels[order], pixel_cov=images.pixel_cov[order])
+        misfits[pair] = min(_misfits(camera, exchanged), default=math.inf)
+    first, second = min(misfits, key=lambda pair: misfits[pair])
+    return (names[first], names[second]) if math.isfinite(misfits[first, second]) else None
+
+
+def _point_images(
+    places: Mapping[str, MarkedPlace], positions: Mapping[str, TargetPosition]
+) -> PointImages:
+    covs = [positions[name].cov_m2 for name in places]
+    unknown = np.full(len(places), np.nan)
+    return PointImages(
+        np.array([positions[name].position_m for name in places]),
+        np.array([np.zeros((3, 3)) if cov is None else cov for cov in covs]),
+        np.array([(place.x_px, place.y_px) for place in places.values()]),
+        np.array([place.sd_px**2 * np.eye(2) for place in places.values()]),
+        unknown,
+        unknown,
+    )
+
+
+def _displaced(images: PointImages) -> Iterator[PointImages]:
+    """Yield the marks; of three, which no adjustment smooths, also with one of them displaced."""
+    yield images
+    if len(images) > 3:
+        return
+    for mark, axis in np.ndindex(3, 2):
+        for sigmas in (-_SIGMAS, _SIGMAS):
+            pixels = images.pixels.copy()
+            pixels[mark, axis] += sigmas * math.sqrt(float(images.pixel_cov[mark, axis, axis]))
+            yield replace(images, pixels=pixels)
+
+
+def _misfits(camera: Camera, images: PointImages) -> Iterator[float]:
+    """Yield how ill poses fit that see the marks as they are from above, their tilt included."""
+    for start in _starts(camera, images):
+        pose, chi2 = start, 0.0
+        if len(images) > 3:
+            adjusted = adjusted_pose(camera, images, start, 0.0)
+            if adjusted is None:
+                continue
+            pose, off_px = adjusted[0], adjusted[2][:, :2]
+            chi2 = float(np.sum(off_px**2 / images.pixel_cov[:, :1, 0]))
+        is_above = bool(np.all(pose.centre_m[2] > images.positions_m[:, 2]))
+        down = -float(pose.world_from_camera[2, 2])
+        if is_above and down > 0.0 and chi2 <= _LIKELY_CHI2 * len(images):
+            tilt_deg = math.degrees(math.acos(min(1.0, down)))
+            yield chi2 + (tilt_deg / _DOWN_SD_DEG) ** 2
+
+
+def _starts(camera: Camera, images: PointImages) -> Iterator[CameraPose]:
+    """Yield poses of three marks that the others roughly agree with."""
+    rays, count = camera.undistort(images.pixels), len(images)
+    for first in range(1 if count == 3 else min(count, _MOST_TRIPLES)):
+        triple = [(first + each) % count for each in range(3)]
+        for pose in three_point_poses(images.positions_m[triple], rays[triple]):
+            points_m = pose.in_camera(images.positions_m)
+            if np.any(points_m[:, 2] <= 0.0):
+                continue
+            off_px = camera.project(points_m) - images.pixels
+            if np.max(np.abs(off_px)) < _START_SHARE * camera.width:
+                yield pose

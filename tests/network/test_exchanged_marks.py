@@ -1,0 +1,61 @@
+"""Marks with each other's names are told from right ones on ground that is anything but flat."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import rotation_about
+from kgcp.georef.plain_prediction import MarkedPlace
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.network.ground.exchanged_marks import exchanged_marks
+
+CAMERA = Camera(4000, 3000, 3000.0, 3000.0, 2000.0, 1500.0)
+HEIGHT_M, RELIEF_M, NOISE_PX = 30.0, 5.0, 1.0
+
+
+def marked_frame(
+    rng: np.random.Generator, count: int, tilt_deg: float
+) -> tuple[dict[str, MarkedPlace], dict[str, TargetPosition]]:
+    """Marks, good to a pixel, of targets of any height in a tilted frame."""
+    tilt = rotation_about(np.array([math.radians(tilt_deg), 0.0, 0.0]))
+    enu_from_camera = np.diag((1.0, -1.0, -1.0)) @ tilt
+    pixels = rng.uniform((50.0, 50.0), (CAMERA.width - 50.0, CAMERA.height - 50.0), (count, 2))
+    rays = np.column_stack((CAMERA.undistort(pixels), np.ones(count))) @ enu_from_camera.T
+    depths = (rng.uniform(-RELIEF_M, RELIEF_M, count) - HEIGHT_M) / rays[:, 2]
+    positions = rays * depths[:, None] + (0.0, 0.0, HEIGHT_M)
+    marks = pixels + NOISE_PX * rng.standard_normal((count, 2))
+    names = [f"T{number}" for number in range(count)]
+    return (
+        {name: MarkedPlace(x, y, 2.0) for name, (x, y) in zip(names, marks, strict=True)},
+        {name: TargetPosition(place, None) for name, place in zip(names, positions, strict=True)},
+    )
+
+
+@pytest.mark.parametrize(("count", "least", "trials"), [(3, 0.7, 60), (4, 0.95, 20)])
+@pytest.mark.parametrize("tilt_deg", [5.0, 30.0])
+def test_exchanged_marks_are_told_from_right_ones(
+    count: int, least: float, trials: int, tilt_deg: float
+) -> None:
+    rng = np.random.default_rng(5)
+    named = 0
+    for _ in range(trials):
+        marks, positions = marked_frame(rng, count, tilt_deg)
+        assert exchanged_marks(marks, positions, CAMERA) is None
+        exchanged = {**marks, "T0": marks["T2"], "T2": marks["T0"]}
+        named += exchanged_marks(exchanged, positions, CAMERA) == ("T0", "T2")
+    assert least * trials <= named <= trials
+
+
+def test_two_marks_do_not_tell() -> None:
+    marks, positions = marked_frame(np.random.default_rng(5), 2, 5.0)
+    assert exchanged_marks(marks, positions, CAMERA) is None
+
+
+def test_three_in_a_line_do_not_tell() -> None:
+    places = {f"T{at}": TargetPosition(np.array([4.0 * at, 0.0, 0.0]), None) for at in range(3)}
+    marks = {f"T{at}": MarkedPlace(1000.0 + 500.0 * at, 1500.0, 2.0) for at in (1, 0, 2)}
+    assert exchanged_marks(marks, places, CAMERA) is None
