@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import Predictions
-from kgcp.georef.prediction import Track, predict_between
-from kgcp.measurement.guided import Prediction
+from kgcp.georef.prediction import NEIGHBOURS, Interpolation, Track, interpolate
 from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult, Measurement
@@ -21,6 +22,23 @@ from kgcp.targets.plain import PlainTarget
 # longer: the camera may turn round meanwhile.
 _LONGEST_GAP = 4.0
 _FLOOR_PX, _FLOOR_DEG = 1.0, 2.0  # least standard deviations, whatever neighbours agree on
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Where a target is in a frame, and how it lies: what other frames need of a measurement."""
+
+    state: FloatArray  # (3,): centre x, y [px] and logarithm of the distance [m]
+    normal: FloatArray  # (3,): in the camera frame
+    sd_normal_deg: float
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Self:
+        """Take it from a measurement."""
+        state = np.append(measurement.centre_px, math.log(measurement.distance_m))
+        # copies: views would keep what they are views of
+        normal = measurement.pose.normal.copy()
+        return cls(state, normal, _sd_normal_deg(measurement))
 
 
 class PlainTracks:
@@ -34,7 +52,7 @@ class PlainTracks:
 
     def __init__(self, targets: Sequence[PlainTarget], time_s: FloatArray) -> None:
         self._targets = targets
-        self._found: dict[str, dict[int, Measurement]] = {target.name: {} for target in targets}
+        self._found: dict[str, dict[int, _Place]] = {target.name: {} for target in targets}
         # frames without any times are at least in order, and how evenly, the targets tell
         in_order = np.arange(len(time_s), dtype=np.float64)
         self._time_s = time_s if np.isfinite(time_s).any() else in_order
@@ -43,7 +61,7 @@ class PlainTracks:
         """Take what was measured in a frame."""
         for outcome in result.outcomes:
             if isinstance(outcome, Measurement) and outcome.target in self._found:
-                self._found[outcome.target][row] = outcome
+                self._found[outcome.target][row] = _Place.of(outcome)
 
     def predictions(
         self, camera: Camera, wanted: Mapping[int, Collection[str]]
@@ -58,29 +76,29 @@ class PlainTracks:
             state = np.full((len(rows), 3), math.nan)
             for at, row in enumerate(rows):
                 if row in found:
-                    state[at] = (*found[row].centre_px, math.log(found[row].distance_m))
+                    state[at] = found[row].state
             track = Track(self._time_s[rows], state)
-            for row, one in zip(rows, predict_between(track, _LONGEST_GAP), strict=True):
-                if one is not None:
-                    prediction = self._prediction(target, row, one, camera)
+            for row, between in zip(rows, interpolate(track, _LONGEST_GAP), strict=True):
+                if between is not None:
+                    prediction = self._prediction(target, row, between, camera)
                     made.setdefault(row, {})[target.name] = prediction
         return made
 
     def _prediction(
-        self, target: PlainTarget, row: int, between: Prediction, camera: Camera
+        self, target: PlainTarget, row: int, between: Interpolation, camera: Camera
     ) -> PlainPrediction:
-        """Return the prediction for a place between; its radius is a distance here."""
-        distance_m = between.radius_px
+        """Return the prediction for a place between, whose size is the distance."""
+        distance_m = between.size
         sight = np.append(camera.undistort(between.centre_px[None])[0], 1.0)
         position_m = distance_m / float(np.linalg.norm(sight)) * sight
         return PlainPrediction(
             centre_px=between.centre_px,
             cov_px2=(between.sd_px**2 + _FLOOR_PX**2) * np.eye(2),
             position_m=position_m,
-            sd_log_distance=between.sd_log_radius,
+            sd_log_distance=between.sd_log_size,
             normal=self._normal(target, row),
             radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
-            source=between.source,
+            source=NEIGHBOURS,
         )
 
     def _normal(self, target: PlainTarget, row: int) -> NormalPrior:
@@ -89,10 +107,10 @@ class PlainTracks:
         before = max((each for each in found if self._time_s[each] < now), key=self._when)
         after = min((each for each in found if self._time_s[each] > now), key=self._when)
         both = found[before], found[after]
-        first, second = (each.pose.normal for each in both)
+        first, second = (place.normal for place in both)
         mean = (first + second) / np.linalg.norm(first + second)
         apart_deg = math.degrees(math.acos(min(1.0, float(first @ second))))
-        sd_deg = max(map(_sd_normal_deg, both))
+        sd_deg = max(place.sd_normal_deg for place in both)
         return NormalPrior(mean, math.hypot(sd_deg, apart_deg, _FLOOR_DEG))
 
     def _when(self, row: int) -> float:

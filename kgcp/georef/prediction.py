@@ -26,6 +26,8 @@ _MEDIAN_OF_1D = 0.6745  # of the absolute value
 _FLOOR_PX, _FLOOR_LOG = 0.5, 0.02  # least standard deviations of a prediction
 _TRIPLES = 8  # of neighbours, nearest in time, that tell how the target moves
 _MIN_TRIPLES = 3
+NEIGHBOURS = "its neighbours"
+"""What a prediction by interpolation was made from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +35,9 @@ class Track:
     """One target through the frames of a flight, n of them in their order."""
 
     time_s: FloatArray  # (n,): mid-exposures [s]; NaN: not known
-    state: FloatArray  # (n, 3): centre x, y [px] and logarithm of the radius [px]; NaN: not found
+    # (n, 3): centre x, y [px] and logarithm of the radius [px], or of the distance [m] where only
+    # `interpolate` sees it; NaN: not found
+    state: FloatArray
 
     @property
     def is_found(self) -> BoolArray:
@@ -88,7 +92,29 @@ def predict_by_reference(track: Track, predicted: FloatArray) -> list[Prediction
     ]
 
 
-def predict_between(track: Track, longest_gap: float = np.inf) -> list[Prediction | None]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Interpolation:
+    """A state between two frames, with standard deviations."""
+
+    centre_px: FloatArray  # (2,): [px]
+    sd_px: float  # of either coordinate [px]
+    size: float  # radius or distance, whose logarithm the track has
+    sd_log_size: float
+
+
+def predict_between(track: Track) -> list[Prediction | None]:
+    """Return the states of `interpolate` as predictions of a target's image."""
+    return [
+        None
+        if between is None
+        else Prediction(
+            between.centre_px, between.sd_px, between.size, between.sd_log_size, NEIGHBOURS
+        )
+        for between in interpolate(track)
+    ]
+
+
+def interpolate(track: Track, longest_gap: float = np.inf) -> list[Interpolation | None]:
     """Interpolate between the found frames before and after.
 
     These are at most `longest_gap` times as far apart as found frames nearby usually are.
@@ -97,12 +123,12 @@ def predict_between(track: Track, longest_gap: float = np.inf) -> list[Predictio
     a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
     triples of found frames, of which each predicts its middle one.
     """
-    predictions: list[Prediction | None] = [None] * len(track.time_s)
+    states: list[Interpolation | None] = [None] * len(track.time_s)
     found = np.flatnonzero(track.is_found & np.isfinite(track.time_s))
     found = found[np.unique(track.time_s[found], return_index=True)[1]]
     time, state = track.time_s[found], track.state[found]
     if len(time) < _MIN_TRIPLES + 2:
-        return predictions
+        return states
     middle, lever = _between(time[1:-1], time[:-2], time[2:], state[:-2], state[2:])
     acceleration2 = ((state[1:-1] - middle) / lever[:, None]) ** 2
     for index in np.flatnonzero(~track.is_found & np.isfinite(track.time_s)):
@@ -119,14 +145,13 @@ def predict_between(track: Track, longest_gap: float = np.inf) -> list[Predictio
         if time[after] - time[after - 1] > longest_gap * usual_s:
             continue
         sd = arm[0] * np.sqrt(acceleration2[near].mean(axis=0))
-        predictions[index] = Prediction(
+        states[index] = Interpolation(
             state_now[0, :2],
             float(np.hypot(np.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)), _FLOOR_PX)),
             float(np.exp(state_now[0, 2])),
             float(np.hypot(sd[2], _FLOOR_LOG)),
-            "its neighbours",
         )
-    return predictions
+    return states
 
 
 def _between(

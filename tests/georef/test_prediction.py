@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.georef.prediction import Track, predict_between, predict_by_reference, predict_position
+from kgcp.georef.prediction import (
+    Track,
+    interpolate,
+    predict_between,
+    predict_by_reference,
+    predict_position,
+)
 
 FRAMES = 200
 
@@ -63,7 +69,7 @@ def test_gaps_are_bridged_that_are_not_much_longer_than_what_tells_the_motion() 
     time_s = np.arange(30.0)
     state = np.column_stack((30.0 * time_s, 7.0 * time_s, np.full(30, 3.0)))
     track = Track(time_s, without(state, np.array([4, 5, 6, *range(12, 20)])))
-    rows = [row for row, one in enumerate(predict_between(track, 4.0)) if one is not None]
+    rows = [row for row, one in enumerate(interpolate(track, 4.0)) if one is not None]
     assert rows == [4, 5, 6]
     assert sum(one is not None for one in predict_between(track)) == 11
 
