@@ -102,7 +102,11 @@ def test_two_names_exchanged_in_a_frame_orient_it_by_no_ring(tmp_path: Path) -> 
     [
         (lambda table: table.iloc[:0], "has no readable frame"),
         (lambda table: pd.concat((table, table)), "has target 'A' of 'f_000.png' twice"),
-        (lambda table: table.assign(distance_m=0.0), "distance_m is 0"),
+        (lambda table: table.assign(distance_m=0.0), "distance_m of a measured row is 0.0"),
+        (lambda table: table.assign(distance_m=1e-300), "distance_m of a measured row is 1e-300"),
+        (lambda table: table.assign(x_px=1e11), "x_px of a measured row is 100000000000.0"),
+        (lambda table: table.assign(sd_y_px=0.0), "sd_y_px of a measured row is 0.0"),
+        (lambda table: table.assign(sd_distance_m=-1.0), "sd_distance_m of a measured row is -1"),
         (lambda table: table.assign(x_px=1e300), "x_px of a measured row"),
     ],
 )

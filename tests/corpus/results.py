@@ -182,6 +182,8 @@ CASES = (
     Case("a rotation of zeros", _table(qw=0.0), "; ", command=_EXPORT),
     Case("a measurement that is none", _table(x_px=float("nan")), "is empty;", command=_EXPORT),
     Case("a point out of all frames", _table(x_px=1e300), "x_px of a m", command=_EXPORT),
+    Case("a point at no distance", _table(distance_m=1e-300), "distance_m of", command=_EXPORT),
+    Case("a sure error of none", _table(sd_x_px=0.0), "sd_x_px of a meas", command=_EXPORT),
     Case("a status of its own", _table(status="splendid"), "no target was meas", command=_EXPORT),
     Case("settings in depth", _table(settings="[" * 100_000), "its settings", command=_REPORT),
     Case("settings of words", _table(settings='{"min_score": "x"}'), "its set", command=_REPORT),

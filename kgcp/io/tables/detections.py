@@ -56,6 +56,8 @@ if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
 _Cells = Mapping[Hashable, object]
 _MEASURED = Status.MEASURED.value
 _LARGEST = 1e12  # of any number in a table, in its unit: beyond, as if it were infinite
+_MOST_PX = 1e6  # of the place of a target
+_LEAST_M, _MOST_M = 1e-3, 1e6  # of a distance
 _Part = TypeVar("_Part")
 _Record = tuple[FrameResult, Outcome]
 _Get = Callable[[_Record], object]
@@ -329,27 +331,22 @@ def _attempt(row: _Cells, number: int) -> Attempt:
 
 
 def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
-    sd_x, sd_y, cov_xy = (_number(row, name) for name in ("sd_x_px", "sd_y_px", "cov_xy_px2"))
+    sd_x, sd_y = (_deviation(row, name) for name in ("sd_x_px", "sd_y_px"))
+    cov_xy = _number(row, "cov_xy_px2")
     cov = None
     if sd_x is not None and sd_y is not None:
         cov_xy = cov_xy or 0.0
         cov = np.array([[sd_x**2, cov_xy], [cov_xy, sd_y**2]])
-    distance_m = _known(row, "distance_m")
-    if distance_m <= 0.0:
-        raise KgcpError(
-            f"detections of {row['frame']!r}: distance_m is {distance_m:g};"
-            " run 'kgcp detect' on this flight again"
-        )
     return Sighting(
         frame=str(row["frame"]),
         number=number,
         target=str(row["target"]),
         instance=int(str(row["instance"])),
         time_s=time_s,
-        centre_px=np.array([_known(row, "x_px"), _known(row, "y_px")]),
+        centre_px=np.array([_known(row, name, -_MOST_PX, _MOST_PX) for name in ("x_px", "y_px")]),
         centre_cov_px2=cov,
-        distance_m=distance_m,
-        sd_distance_m=_number(row, "sd_distance_m"),
+        distance_m=_known(row, "distance_m", _LEAST_M, _MOST_M),
+        sd_distance_m=_deviation(row, "sd_distance_m"),
         sd_common_distance_m=_number(row, "sd_common_distance_m"),
         pose=_pose(row),
         pose_cov=_square(row, "pose_cov", 6),
@@ -393,11 +390,23 @@ def _told(value: object) -> str:
     return f"{value!r}" if isinstance(value, float) else "no number"
 
 
-def _known(row: _Cells, name: str) -> float:
+def _known(row: _Cells, name: str, least: float, most: float) -> float:
     value = _number(row, name)
-    if value is None:
-        raise KgcpError(
-            f"detections of {row['frame']!r}: {name} of a measured row is {_told(row[name])};"
-            " run 'kgcp detect' on this flight again"
-        )
+    if value is None or not least <= value <= most:
+        raise _impossible(row, name)
     return value
+
+
+def _deviation(row: _Cells, name: str) -> float | None:
+    """Return a standard deviation; None: the method does not estimate it."""
+    value = _number(row, name)
+    if value is not None and not value > 0.0:
+        raise _impossible(row, name)
+    return value
+
+
+def _impossible(row: _Cells, name: str) -> KgcpError:
+    return KgcpError(
+        f"detections of {row['frame']!r}: {name} of a measured row is {_told(row[name])};"
+        " run 'kgcp detect' on this flight again"
+    )
