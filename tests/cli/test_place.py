@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner, Result
 
@@ -112,4 +114,17 @@ def test_what_cannot_be_placed_is_one_line(
     result = run(folder, *arguments)
     assert result.exit_code == 1
     assert problem in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_without_a_readable_frame_that_is_said(tmp_path: Path) -> None:
+    folder = GroundFlight(frames=3).write(tmp_path / "flight")
+    path = folder / "kgcp" / "detections.parquet"
+    table = pq.read_table(path)
+    status = table.column_names.index("status")
+    unreadable = pa.array(["unreadable"] * table.num_rows)
+    pq.write_table(table.set_column(status, "status", unreadable), path)
+    result = run(folder)
+    assert result.exit_code == 1
+    assert "has no readable frame" in result.stderr
     assert result.stderr.count("\n") == 1
