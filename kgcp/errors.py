@@ -128,7 +128,7 @@ class Reason(StrEnum):
         "no_prediction",
         Status.NOT_FOUND,
         "where a plain target must be is not known of this frame, or not well enough",
-        "give [reference] poses of the frames, for example those of kgcp orient",
+        "give [reference] poses of the frames (see kgcp orient), marks or more static targets",
     )
     UNLIKE_PREDICTION = (
         "unlike_prediction",
