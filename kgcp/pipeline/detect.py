@@ -181,7 +181,9 @@ def detect_flight(
             with stopwatch.stage("first look"):
                 run.first_pass()
             with stopwatch.stage("second look"):
-                predictions, guide_problem = _look_again(run, flight, data, settings, marks)
+                predictions, guide_problem = _measure_missing_targets(
+                    run, flight, data, settings, marks
+                )
             with stopwatch.stage("learning"):
                 run.learn()
             likely_cause = _likely_cause(run, stopwatch)
@@ -247,7 +249,7 @@ def _needed_at_the_end(job: DetectionJob) -> tuple[str, ...]:
     return ("pandas",)
 
 
-def _look_again(
+def _measure_missing_targets(
     run: DetectionRun,
     flight: Flight,
     data: FlightData,

@@ -64,10 +64,10 @@ class FrameTracks:
         """Take what is needed from the result of a frame."""
         self.time_s[row] = math.nan if result.time_s is None else result.time_s
         self.is_readable[row] = not any(map(is_unreadable, result.outcomes))
-        seen = [one for one in result.outcomes if isinstance(one, Measurement)]
-        self.found += bool(seen) - int(self._is_found[row])
-        self._is_found[row] = bool(seen)
-        for observation in seen:
+        measured = [each for each in result.outcomes if isinstance(each, Measurement)]
+        self.found += bool(measured) - int(self._is_found[row])
+        self._is_found[row] = bool(measured)
+        for observation in measured:
             if observation.instance == 0:
                 self.states[observation.target][row] = state_of(observation)
 
@@ -103,9 +103,9 @@ def predict_missing(
                 )
         except KgcpError as error:
             problem = str(error)
-        for row, one in enumerate(predict_position(track, states)):
-            if one is not None and one.is_sure:
-                predictions.setdefault(row, {})[target.name] = one
+        for row, prediction in enumerate(predict_position(track, states)):
+            if prediction is not None and prediction.is_sure:
+                predictions.setdefault(row, {})[target.name] = prediction
     return predictions, problem
 
 
@@ -164,14 +164,14 @@ def plain_by_results(
     sightings: list[Sighting] = []
     for row, result in enumerate(results):
         tracks.add(row, result)
-        names = {one.target for one in result.outcomes if _lacks_prediction(one)}
+        names = {outcome.target for outcome in result.outcomes if _lacks_prediction(outcome)}
         names = {name for name in names if (row, name) not in tried}
         if names:
             rows[result.frame], lacking[row] = row, names
             sightings += [
-                sighting_of(result.frame, row + 1, result.time_s, one)
-                for one in result.outcomes
-                if isinstance(one, Measurement) and one.target in static
+                sighting_of(result.frame, row + 1, result.time_s, outcome)
+                for outcome in result.outcomes
+                if isinstance(outcome, Measurement) and outcome.target in static
             ]
     if not lacking:
         return {}
@@ -202,12 +202,15 @@ def _by_own_targets(
 ) -> dict[str, Predictions]:
     """Return by frame where plain targets must be, as other static targets orient it."""
     made: dict[str, Predictions] = {}
-    for one in orient_frames(frames, sightings, positions.static, flight.camera):
-        if one.pose is not None:
+    for oriented in orient_frames(frames, sightings, positions.static, flight.camera):
+        if oriented.pose is not None:
             orientation = FrameOrientation(
-                one.pose.centre_m, one.pose.world_from_camera, one.cov, "the frame's other targets"
+                oriented.pose.centre_m,
+                oriented.pose.world_from_camera,
+                oriented.cov,
+                "the frame's other targets",
             )
-            made[one.frame] = predict_plain(
+            made[oriented.frame] = predict_plain(
                 flight.plain_targets, orientation, positions, flight.camera
             )
     return made
@@ -226,10 +229,12 @@ def with_predictions(
     contradicts the prediction, and keeps its reason.
     """
     outcomes = tuple(
-        _with_prediction(one, predictions[one.target], camera)
-        if isinstance(one, Miss) and one.target in predictions and not is_unreadable(one)
-        else one
-        for one in result.outcomes
+        _with_prediction(outcome, predictions[outcome.target], camera)
+        if isinstance(outcome, Miss)
+        and outcome.target in predictions
+        and not is_unreadable(outcome)
+        else outcome
+        for outcome in result.outcomes
     )
     return replace(result, outcomes=outcomes)
 
