@@ -32,7 +32,8 @@ from kgcp.simulation.presets import preset
 
 _RENDERED = 100  # frames; further ones are links to them, later by a multiple of a break
 _BREAK_S = 1000.0
-_EARLY_S = 4.0  # in which a run starts
+_EARLY_S = 2.0  # in which a run starts
+_PAUSE_S = 0.3  # at most, between a frame and a kill
 _EARLY, _WORKER = 0.2, 0.5  # share of lives that end while they start, that lose a worker
 _ORPHAN_S = 20.0  # after which no worker may be left of a parent that was killed
 
@@ -159,7 +160,7 @@ def live_and_die(life: Life, kills_left: int, rng: random.Random, toll: Toll) ->
     else:
         life.wait_for(1, 0.0)
         share = rng.uniform(0.0, 2.0) / max(kills_left, 1)
-        life.wait_for(life.done + share * (life.total - life.done), rng.uniform(0.0, 1.0))
+        life.wait_for(life.done + share * (life.total - life.done), rng.uniform(0.0, _PAUSE_S))
         workers = life.workers()
         if workers and rng.random() < _WORKER:
             kill(rng.choice(workers))

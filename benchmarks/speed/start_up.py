@@ -78,7 +78,6 @@ def detecting(flight: Path, *options: str) -> list[str]:
 
 def make_flight(folder: Path, name: str) -> None:
     """Simulate a flight of a preset whose camera has more pixels."""
-    from kgcp.pipeline.execution.resilient_map import usable_cores
     from kgcp.pipeline.simulate import write_simulated_flight
     from kgcp.simulation.flight import plan_flight
     from kgcp.simulation.presets import preset
@@ -93,7 +92,8 @@ def make_flight(folder: Path, name: str) -> None:
         **{key: scale * getattr(camera, key) for key in ("fx", "fy", "cx", "cy")},
     )
     plan = plan_flight(replace(settings, camera=larger, frames=_FRAMES), 1)
-    write_simulated_flight(plan, folder, jobs=usable_cores(), on_frame=lambda: None)
+    # in this process: a server of others would never end, which `run` waits for
+    write_simulated_flight(plan, folder, jobs=0, on_frame=lambda: None)
 
 
 def print_runs(flight: Path, repeats: int) -> None:
