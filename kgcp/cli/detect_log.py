@@ -189,7 +189,7 @@ def report_stages(summary: DetectionSummary, before_s: float, total_s: float) ->
     total_s : float
         From the start of the program to now [s].
     """
-    stages_s = {"libraries, flight and its doubts": before_s, **summary.stages_s}
+    stages_s = {"loading libraries, checking the flight": before_s, **summary.stages_s}
     for stage, seconds in stages_s.items():
         if seconds >= _SHORTEST_STAGE_S:
             click.echo(f"{seconds:10.3f} s  {stage}", err=True)

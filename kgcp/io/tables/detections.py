@@ -216,8 +216,8 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
     Raises
     ------
     KgcpError
-        If the table is missing or unreadable, was made from another flight.toml or times file, or
-        names a target that flight.toml does not have.
+        If the table is missing or unreadable, was made from another flight.toml or times file,
+        names a target that flight.toml does not have, or has no readable frame.
     """
     table = read_detections(path)
     require_current(path, table, flight)
@@ -236,6 +236,8 @@ def read_attempts(path: Path, flight: Flight) -> list[Attempt]:
         )
     numbers = {frame: number for number, frame in enumerate(sorted(set(table["frame"])), start=1)}
     readable = table[table["status"] != Status.UNREADABLE.value]
+    if readable.empty:
+        raise KgcpError(f"{path}: has no readable frame; run 'kgcp detect' on this flight again")
     ordered = readable.sort_values(["frame", "target", "instance"])
     return [_attempt(row, numbers[row["frame"]]) for row in ordered.to_dict("records")]
 

@@ -58,13 +58,14 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
     Rejection
         As `_fit_in_any_light`, if neither leads anywhere.
     """
-    look = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))  # whatever the tone
+    # the same whatever the tone
+    find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
     if problem.tone is not Tone.UNKNOWN:
-        return FitsByTone(_fit_in_any_light(problem, pose, blur, look), None)
+        return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
     fits = []
     for tone in (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE):
         try:
-            fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur, look))
+            fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur, find_plateaus))
         except Rejection as rejection:
             failure = rejection
     if not fits:
@@ -79,7 +80,7 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
 
 
 def _fit_in_any_light(
-    problem: FitProblem, pose: Pose, blur: Blur, look: Callable[[], Plateaus | None]
+    problem: FitProblem, pose: Pose, blur: Blur, find_plateaus: Callable[[], Plateaus | None]
 ) -> TwoPoses:
     """Adjust both poses by the plain model, and by what its residuals ask for beyond it.
 
@@ -93,13 +94,13 @@ def _fit_in_any_light(
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
-        plateaus = None if is_small else look()
+        plateaus = None if is_small else find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
             raise
     else:
         if is_small or not asks_for_levels(plain.best):
             return plain
-        plateaus = look()
+        plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
             return _with_levels(problem, plain)
     poses = fit_both_poses(evened_window(problem, plateaus), pose, blur)

@@ -25,6 +25,7 @@ one direction.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,8 +33,6 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.ray_plate import VIEW_ROWS, meet_plate
-
-_SKEW_ROWS = 4
 
 
 def skew_rows(
@@ -55,10 +54,7 @@ def skew_rows(
     covariance : (3,) tuple
         Of the blur: xx, yy, xy [px²].
     """
-    views, rows = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((_SKEW_ROWS, rays.shape[1]))
-    meet_plate(pose, rays, views)
-    _add_skew(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
-    return rows
+    return _summed_over_edges(_add_skew, 4, pose, rays, covariance, incidence)
 
 
 @compiled
@@ -102,19 +98,10 @@ def smoothing_row(
 ) -> FloatArray:
     """Return the derivative (n,) of the white share by smoothing along contours [1/px²].
 
-    Parameters
-    ----------
-    pose : (3, 4) array
-        `Pose.matrix`.
-    rays : (6, n) array
-        As of a window.
-    covariance : (3,) tuple
-        Of the blur: xx, yy, xy [px²].
+    Parameters are those of `skew_rows`.
     """
-    views, row = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros(rays.shape[1])
-    meet_plate(pose, rays, views)
-    _add_smoothing(views, *covariance, incidence.circles, incidence.starts, incidence.members, row)
-    return row
+    (row,) = _summed_over_edges(_add_smoothing, 1, pose, rays, covariance, incidence)
+    return np.asarray(row)
 
 
 @compiled
@@ -126,7 +113,7 @@ def _add_smoothing(
     circles: FloatArray,
     starts: IndexArray,
     members: IndexArray,
-    row: FloatArray,
+    rows: FloatArray,
 ) -> None:
     """Add the circles' shares.
 
@@ -145,7 +132,7 @@ def _add_smoothing(
             step_x = views[3, i] * nx - views[2, i] * ny
             step_y = views[5, i] * nx - views[4, i] * ny
             along_m = (x * step_y - y * step_x) / out_m
-            row[i] -= sign * density * along_m * along_m / (2.0 * radius_m)
+            rows[0, i] -= sign * density * along_m * along_m / (2.0 * radius_m)
 
 
 def spread_share_gradient(
@@ -156,19 +143,9 @@ def spread_share_gradient(
 ) -> FloatArray:
     """Return Σ ∇S (2, n) [px]: the white share's gradient in the image, times the blur.
 
-    Parameters
-    ----------
-    pose : (3, 4) array
-        `Pose.matrix`.
-    rays : (6, n) array
-        As of a window.
-    covariance : (3,) tuple
-        Σ, of the blur: xx, yy, xy [px²].
+    Parameters are those of `skew_rows`; Σ is the covariance.
     """
-    views, rows = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((2, rays.shape[1]))
-    meet_plate(pose, rays, views)
-    _add_gradient(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
-    return rows
+    return _summed_over_edges(_add_gradient, 2, pose, rays, covariance, incidence)
 
 
 @compiled
@@ -193,6 +170,21 @@ def _add_gradient(
             per_px_out = -sign * math.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * sd)
             rows[0, i] += per_px_out * (xx * nx + xy * ny)
             rows[1, i] += per_px_out * (xy * nx + yy * ny)
+
+
+def _summed_over_edges(
+    add: Callable[..., None],
+    count: int,
+    pose: FloatArray,
+    rays: FloatArray,
+    covariance: tuple[float, float, float],
+    incidence: EdgeIncidence,
+) -> FloatArray:
+    """Return what a kernel adds to rows (count, n) for the edges near every pixel."""
+    views, rows = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((count, rays.shape[1]))
+    meet_plate(pose, rays, views)
+    add(views, *covariance, incidence.circles, incidence.starts, incidence.members, rows)
+    return rows
 
 
 @inlined

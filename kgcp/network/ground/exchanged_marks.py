@@ -22,7 +22,7 @@ from kgcp.network.ground.resection import (
 _MOST_TRIPLES = 6  # that poses start from: one with right names is enough
 _START_SHARE = 0.1  # of the frame's width, that marks may be off a pose from three of them
 _LIKELY_CHI2 = 25.0  # of a mark, in the mean, at most
-_DOWN_SD_DEG = 10.0  # how far a camera that looks down does not
+_DOWN_SD_DEG = 10.0  # how far the axis of a camera that looks down is off the vertical
 _SIGMAS = 4.0  # that one of three marks may be displaced by
 
 
@@ -84,7 +84,7 @@ def _displaced(images: PointImages) -> Iterator[PointImages]:
 
 
 def _misfits(camera: Camera, images: PointImages) -> Iterator[float]:
-    """Yield how ill poses fit that see the marks as they are from above, their tilt included."""
+    """Yield the misfits of poses that see the marks as they are, from above; tilt counts, too."""
     for start in _starts(camera, images):
         pose, chi2 = start, 0.0
         if len(images) > 3:

@@ -25,7 +25,7 @@ _BLACK, _WHITE, _NOISE = 40.0, 200.0, 1.5  # grey values
 _CAMERA = Camera(_SIDE_PX, _SIDE_PX, 1000.0, 1000.0, 49.5, 49.5)
 _RING = Ring("A", 1.0, 0.5, 0.75, 0.15, (0.0, 80.0, 130.0, 250.0))
 
-_RESPONSES = (Response.LINEAR, Response.UNKNOWN)  # with the others nothing more is compiled
+_RESPONSES = (Response.LINEAR, Response.UNKNOWN)  # between them, they use most compiled functions
 
 _loaded: set[Response] = set()
 

@@ -113,14 +113,15 @@ class WorkerProcess:
 
     def _prepare(self, connection: _Connection, preparation: Preparation) -> None:
         """Let a new process get ready, however long it takes: not counted as work."""
-        if self._is_ready(connection, preparation.quick):
+        if self._prepared_by(connection, preparation.quick):
             return
         with preparation.lock:  # meanwhile another process may have done what is slow
-            if self._is_ready(connection, preparation.quick):
+            if self._prepared_by(connection, preparation.quick):
                 return
-            self._is_ready(connection, preparation.slow)
+            self._prepared_by(connection, preparation.slow)
 
-    def _is_ready(self, connection: _Connection, prepare: Callable[[], bool]) -> bool:
+    def _prepared_by(self, connection: _Connection, prepare: Callable[[], bool]) -> bool:
+        """Call a function in the process, which returns whether nothing is left to prepare."""
         self._send(connection, prepare)
         return bool(self._answer(connection, _LONGEST_WAIT_S, ()))
 

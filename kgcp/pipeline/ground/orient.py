@@ -140,8 +140,6 @@ def orient_flight(
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    if not frames:
-        raise KgcpError(f"{table}: has no readable frame; run 'kgcp detect' on this flight again")
     with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
         poses = orient_frames(
             frames,

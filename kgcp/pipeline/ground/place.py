@@ -162,8 +162,6 @@ def place_flight(
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     targets = _targets(flight, options.targets)
     attempts = read_attempts(table, flight)
-    if not attempts:
-        raise KgcpError(f"{table}: has no readable frame; run 'kgcp detect' on this flight again")
     data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
     poses = _poses(flight, data, options.poses, [attempt.frame for attempt in attempts])
     local_frame = _local_frame(flight, poses)

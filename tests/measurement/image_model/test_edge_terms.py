@@ -1,53 +1,98 @@
-"""Point spreads with a third moment, against discs that are blurred by one."""
+"""Skew point spreads, and light across edges, against sums over the tenths of a disc's pixels."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.special import ndtr
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
-from kgcp.measurement.image_model.edge_terms import skew_rows
+from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 
-_SHIFT_PX, _SHARE = 1.0, 0.2  # a fifth of the light lands one pixel beside
-_SD_PX = 1.2
+Light = Callable[[FloatArray, FloatArray], FloatArray]
+_RADIUS_PX = 8.0
+_POSE = np.hstack((np.eye(3), [[0.0], [0.0], [1.0]]))  # a metre is a pixel
 
 
-def _disc(x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
-    """Blur a disc by a Gaussian, by sums over its pixels' tenths."""
+def _around_the_edge(out_px: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return np.outer(out_px, np.cos(angles)).ravel(), np.outer(out_px, np.sin(angles)).ravel()
+
+
+def _rays(x: FloatArray, y: FloatArray) -> FloatArray:
+    rays = np.zeros((6, len(x)))
+    rays[0], rays[1], rays[2], rays[5] = x, y, 1.0, 1.0
+    return rays
+
+
+def _incidence(count: int) -> EdgeIncidence:
+    circle = np.array([[0.0, 0.0, _RADIUS_PX, 1.0, 0.0]])
+    return EdgeIncidence(circle, np.array([0, count]), np.arange(count), np.zeros(count))
+
+
+def _even(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.ones_like(x * y)
+
+
+def _blurred_disc(
+    x: FloatArray, y: FloatArray, covariance: FloatArray, light: Light = _even
+) -> FloatArray:
+    """Blur what a disc sends back of the light, by a Gaussian."""
     step = 0.1
-    line = np.arange(-radius, radius, step) + 0.5 * step
+    line = np.arange(-_RADIUS_PX, _RADIUS_PX, step) + 0.5 * step
     u, v = np.meshgrid(line, line)
-    inside = u * u + v * v < radius * radius
+    inside = u * u + v * v < _RADIUS_PX * _RADIUS_PX
     u, v = u[inside], v[inside]
-    square = (x[:, None] - u) ** 2 + (y[:, None] - v) ** 2
-    weights = np.exp(-0.5 * square / _SD_PX**2) / (2.0 * np.pi * _SD_PX**2)
+    (xx, xy), (_, yy) = np.linalg.inv(covariance)
+    dx, dy = x[:, None] - u, y[:, None] - v
+    weights = np.exp(-0.5 * (xx * dx * dx + 2.0 * xy * dx * dy + yy * dy * dy))
+    weights *= light(u, v) / (2.0 * np.pi * np.sqrt(np.linalg.det(covariance)))
     return np.asarray(weights.sum(axis=1) * step * step)
 
 
 def test_third_moments_displace_edges_as_two_gaussians_do() -> None:
     """Two Gaussians beside each other have κ_xxx = p (1 − p)(1 − 2p) d³ about their centroid."""
-    radius = 8.0
-    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    out = np.array([6.5, 7.5, 8.0, 8.5, 9.5])
-    x, y = (np.outer(out, f(angles)).ravel() for f in (np.cos, np.sin))
-    near, far = -_SHARE * _SHIFT_PX, (1.0 - _SHARE) * _SHIFT_PX
-    truth = (1.0 - _SHARE) * _disc(x - near, y, radius) + _SHARE * _disc(x - far, y, radius)
-    variance = _SHARE * (1.0 - _SHARE) * _SHIFT_PX**2
-    cumulant = variance * (1.0 - 2.0 * _SHARE) * _SHIFT_PX
-    rays = np.zeros((6, len(x)))
-    rays[0], rays[1], rays[2], rays[5] = x, y, 1.0, 1.0
-    pose = np.hstack((np.eye(3), [[0.0], [0.0], [1.0]]))  # a metre is a pixel
-    members = np.arange(len(x))
-    incidence = EdgeIncidence(
-        np.array([[0.0, 0.0, radius, 1.0, 0.0]]),
-        np.array([0, len(x)]),
-        members,
-        np.zeros(len(x)),
+    share, shift_px = 0.2, 1.0  # a fifth of the light lands one pixel beside
+    each = 1.2**2 * np.eye(2)
+    x, y = _around_the_edge(np.array([6.5, 7.5, 8.0, 8.5, 9.5]), 16)
+    near, far = -share * shift_px, (1.0 - share) * shift_px
+    truth = (1.0 - share) * _blurred_disc(x - near, y, each) + share * _blurred_disc(
+        x - far, y, each
     )
-    rows = skew_rows(pose, rays, (_SD_PX**2 + variance, _SD_PX**2, 0.0), incidence)
+    variance = share * (1.0 - share) * shift_px**2
+    cumulant = variance * (1.0 - 2.0 * share) * shift_px
+    spread = (each[0, 0] + variance, each[1, 1], 0.0)
+    rows = skew_rows(_POSE, _rays(x, y), spread, _incidence(len(x)))
     # what is odd in x is the skew's; all else is the spread's variance
     opposite = np.array([np.argmin((x + a) ** 2 + (y - b) ** 2) for a, b in zip(x, y, strict=True)])
     odd = 0.5 * (truth - truth[opposite])
     modelled = cumulant * rows[0]
     assert np.abs(odd).max() > 0.003
     assert np.abs(modelled - odd).max() < 0.2 * np.abs(odd).max()
+
+
+def test_light_across_an_edge_is_blurred_with_it() -> None:
+    light_left, width_px, offset_px = 0.45, 2.0, 6.5  # of a shadow across the disc
+    normal = np.array((np.cos(0.6), np.sin(0.6)))
+    covariance = np.array([[0.9, 0.15], [0.15, 0.6]])
+    blurred_px = np.sqrt(width_px**2 + normal @ covariance @ normal)
+
+    def across_px(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(normal[0] * x + normal[1] * y - offset_px)
+
+    def light(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(1.0 - (1.0 - light_left) * ndtr(across_px(x, y) / width_px))
+
+    x, y = _around_the_edge(np.array([7.0, 7.5, 8.0, 8.5, 9.0]), 24)
+    z = across_px(x, y) / blurred_px
+    blurred_light = 1.0 - (1.0 - light_left) * ndtr(z)
+    density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / blurred_px
+    gradient = np.outer(normal, -(1.0 - light_left) * density)
+    spread = spread_share_gradient(_POSE, _rays(x, y), (0.9, 0.6, 0.15), _incidence(len(x)))
+    truth = _blurred_disc(x, y, covariance, light)
+    product = blurred_light * _blurred_disc(x, y, covariance)
+    missed = truth - (product + np.sum(gradient * spread, axis=0))
+    assert 0.03 < np.abs(truth - product).max() < 0.06
+    assert np.abs(missed).max() < 0.2 * np.abs(truth - product).max()
