@@ -84,18 +84,23 @@ def rendered(
 
 
 def lines(table: pd.DataFrame) -> Iterator[str]:
-    """Yield the means of every band: as measured, of the renderings, and of the difference."""
-    yield "      R px  frames   measured %         rendering %        what is left %"
+    """Yield means and RMS of every band: as measured, of the renderings, and of the difference."""
+    yield "      R px  frames   measured: mean, RMS %      rendering: mean, RMS %     left: mean, RMS %"
     for low, high in RADIUS_BANDS_PX:
         band = table[(table["radius_px_true"] >= low) & (table["radius_px_true"] < high)]
         if len(band) < 2:
             continue
         left = band["error_percent"] - band["rendering_percent"]
         parts = (band["error_percent"], band["rendering_percent"], left)
-        means = "  ".join(
-            f"{part.mean():+.4f} ± {2.0 * part.std() / np.sqrt(len(part)):.4f}" for part in parts
+        figures = "  ".join(
+            f"{part.mean():+.4f} ± {2.0 * part.std() / np.sqrt(len(part)):.4f} {_rms(part):.4f}"
+            for part in parts
         )
-        yield f"{low:6.0f}–{high:<4.0f}{len(band):6d}   {means}"
+        yield f"{low:6.0f}–{high:<4.0f}{len(band):6d}   {figures}"
+
+
+def _rms(errors: pd.Series) -> float:
+    return float(np.sqrt((errors**2).mean()))
 
 
 @click.command()
