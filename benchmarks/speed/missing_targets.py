@@ -72,6 +72,7 @@ def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
     from kgcp.io.flight.data import FlightData
     from kgcp.io.images.frames import read_grey
     from kgcp.measurement.records import Measurement
+    from kgcp.pipeline.execution.kept_frames import KeptFrames
     from kgcp.pipeline.frame_task import (
         DetectionJob,
         FrameInput,
@@ -86,7 +87,9 @@ def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
     shutil.copytree(source.flight.frames_folder, folder)
     flight = replace(source.flight, frames_folder=folder)
     data = FlightData(flight, source.frames)
-    job = DetectionJob(folder, flight.camera, None, flight.targets, DetectSettings())
+    kept = KeptFrames(work, 1 << 31)
+    settings = DetectSettings()
+    job = DetectionJob(folder, flight.camera, None, flight.targets, settings, kept_frames=kept)
     times = data.frame_times.time_s
     inputs = [FrameInput(frame, times.get(frame), {}) for frame in source.frames]
     tracks = FrameTracks(flight.targets, source.frames)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_code
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
+from kgcp.pipeline.execution.kept_frames import KeptFrames, kept_frames
 from kgcp.pipeline.execution.local_processes import Preparation
 from kgcp.pipeline.execution.profiling import OTHER
 from kgcp.pipeline.execution.threads import single_threaded
@@ -168,14 +170,18 @@ def detect_flight(
     not_drawn = 0
     path, is_new = out / ".detections.journal", options.is_restart
     with Journal(path, _making(job), (FrameResult,), is_new=is_new) as journal:
-        with open_pool(
-            options.jobs,
-            options.frame_timeout_s,
-            options.scheduler,
-            frames_folder,
-            _STAGE_CALLERS if options.is_profiled else (),
-            Preparation(load_compiled_code, compile_code),
-        ) as pool:
+        with (
+            _kept_frames(out, settings, options) as kept,
+            open_pool(
+                options.jobs,
+                options.frame_timeout_s,
+                options.scheduler,
+                frames_folder,
+                _STAGE_CALLERS if options.is_profiled else (),
+                Preparation(load_compiled_code, compile_code),
+            ) as pool,
+        ):
+            job = replace(job, kept_frames=kept)
             run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
             pool.import_meanwhile(*_needed_at_the_end(job))
             with stopwatch.stage("first look"):
@@ -225,6 +231,16 @@ def detect_flight(
         write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
+
+
+def _kept_frames(
+    out: Path, settings: DetectSettings, options: RunOptions
+) -> AbstractContextManager[KeptFrames | None]:
+    """Return where frames are kept between looks: nowhere for other machines, or a single look."""
+    is_one_look = not settings.is_guided and options.places is None
+    if is_one_look or options.scheduler is not None:
+        return nullcontext()
+    return kept_frames(out / ".detections.frames")
 
 
 def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:

@@ -34,6 +34,7 @@ from kgcp.measurement.records import (
 )
 from kgcp.measurement.search.template_match import CODE_LIKE
 from kgcp.measurement.systematic_errors import common_uncertainty
+from kgcp.pipeline.execution.kept_frames import KeptFrames
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
@@ -54,6 +55,8 @@ class DetectionJob:
     # whether the results name the rings that were compared with a target's and dropped
     keeps_dropped: bool = False
     plain_targets: tuple[PlainTarget, ...] = ()
+    # of frames that may be looked at again; None: they are decoded again
+    kept_frames: KeptFrames | None = None
 
     @property
     def all_targets(self) -> tuple[AnyTarget, ...]:
@@ -100,6 +103,8 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
         plain = _look_for_plain(grey, job, frame_input, examination.outcomes)
         outcomes = tuple(completed(job, one) for one in (*examination.outcomes, *plain))
+        if job.kept_frames is not None and any(isinstance(one, Miss) for one in outcomes):
+            job.kept_frames.keep(frame_input.frame, grey)
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
     except Rejection as rejection:
@@ -137,14 +142,7 @@ def _look_for_plain(
 @single_threaded()
 def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
-    try:
-        with at_hand(job.frames_folder, guided_input.input.frame) as path:
-            grey = read_grey(path, job.camera)
-    except Rejection as rejection:
-        raise KgcpError(
-            f"{job.frames_folder / guided_input.input.frame}: could be read, and cannot any more"
-            f" ({rejection.detail}); put it back, and the same command goes on"
-        ) from rejection
+    grey = _read_again(job, guided_input.input.frame)
     found = {
         outcome.target: outcome
         for outcome in guided_input.first.outcomes
@@ -170,6 +168,20 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
     if job.keeps_dropped:
         dropped = _best_dropped((*dropped, *considered))
     return replace(guided_input.first, outcomes=outcomes, dropped=dropped)
+
+
+def _read_again(job: DetectionJob, frame: str) -> GreyArray:
+    kept = None if job.kept_frames is None else job.kept_frames.find(frame)
+    if kept is not None:
+        return kept
+    try:
+        with at_hand(job.frames_folder, frame) as path:
+            return read_grey(path, job.camera)
+    except Rejection as rejection:
+        raise KgcpError(
+            f"{job.frames_folder / frame}: could be read, and cannot any more"
+            f" ({rejection.detail}); put it back, and the same command goes on"
+        ) from rejection
 
 
 @single_threaded()

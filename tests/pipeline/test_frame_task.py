@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss
+from kgcp.pipeline.execution.journal import to_text
+from kgcp.pipeline.execution.kept_frames import KeptFrames
 from kgcp.pipeline.frame_task import (
     DetectionJob,
     FrameInput,
@@ -84,6 +87,21 @@ def test_where_nothing_is_the_first_reason_stays(folder: Path) -> None:
     away = replace(PREDICTION, centre_px=np.array([400.0, 60.0]))
     first, second = look_twice(folder, {"A": away, "B": away})
     assert second.outcomes == first.outcomes
+
+
+def test_a_kept_frame_gives_the_same_result_and_is_not_decoded(
+    folder: Path, tmp_path: Path
+) -> None:
+    _, decoded = look_twice(folder, {"A": PREDICTION})
+    copy = tmp_path / "a.png"
+    shutil.copy(folder / "a.png", copy)
+    (tmp_path / "kept").mkdir()
+    kept = KeptFrames(tmp_path / "kept", 1 << 20)
+    job = DetectionJob(tmp_path, CAMERA, None, (A, B), STRICT, kept_frames=kept)
+    first = examine_frame(job, FRAME_INPUT)
+    copy.unlink()
+    second = examine_frame_again(job, GuidedInput(FRAME_INPUT, first, {"A": PREDICTION}))
+    assert to_text(second) == to_text(decoded)
 
 
 def test_a_measured_target_is_left_as_it_is(folder: Path) -> None:

@@ -1,0 +1,75 @@
+"""Decoded frames kept on the disk between two looks at them, as far as there is room.
+
+Decoding is most of what a second look costs. To read grey values back takes a tenth of it or less,
+and whatever process looks again finds them, while the memory of the workers stays as it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kgcp.geometry.arrays import GreyArray
+
+_MOST_BYTES = 1 << 31  # a thousand frames of 2 Mpx: their number is asked for with each of them
+_SHARE_OF_DISK = 0.25  # of what is free
+
+
+@dataclass(frozen=True, slots=True)
+class KeptFrames:
+    """A folder of decoded frames."""
+
+    folder: Path
+    most_bytes: int  # all frames of a flight are of one size
+
+    def keep(self, frame: str, grey: GreyArray) -> None:
+        """Keep the grey values of a frame if there is room; a disk that refuses does no harm."""
+        path = self._path(frame)
+        unfinished = path.with_suffix(f".{os.getpid()}")  # whatever ends this process: not the name
+        try:
+            # a thousand paths would take as long as all else
+            number = len(os.listdir(self.folder))  # noqa: PTH208
+            if (number + 1) * grey.nbytes <= self.most_bytes:
+                with unfinished.open("wb") as stream:
+                    np.lib.format.write_array(stream, grey, allow_pickle=False)
+                unfinished.replace(path)
+        except OSError:
+            with suppress(OSError):
+                unfinished.unlink()
+
+    def find(self, frame: str) -> GreyArray | None:
+        """Return the grey values of a frame; None if they were not kept."""
+        try:
+            with self._path(frame).open("rb") as stream:
+                return np.lib.format.read_array(stream, allow_pickle=False)
+        except (OSError, ValueError):
+            return None
+
+    def _path(self, frame: str) -> Path:
+        return self.folder / hashlib.sha256(frame.encode()).hexdigest()[:32]
+
+
+@contextmanager
+def kept_frames(folder: Path) -> Iterator[KeptFrames | None]:
+    """Have a folder for decoded frames until the block ends; None if it cannot be made.
+
+    What a run that was killed has left there goes first: its frames may have changed since.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        folder.mkdir()
+        room = int(_SHARE_OF_DISK * shutil.disk_usage(folder).free)
+        kept = KeptFrames(folder.absolute(), min(_MOST_BYTES, room))
+    except OSError:
+        kept = None
+    try:
+        yield kept
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
