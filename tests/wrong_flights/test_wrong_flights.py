@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,7 +15,7 @@ from kgcp.pipeline.check import check_flight
 from kgcp.pipeline.export import make_gcps
 from kgcp.quality.checks.doubt import Cause, Doubt
 from tests.wrong_flights.flights import Flight, drone_pictures, flight, without_reference
-from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE
+from tests.wrong_flights.slips import ANYWAY, PAIRS, WITH_REFERENCE, WITHOUT_REFERENCE, Slip
 
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "flights"
 
@@ -55,31 +55,40 @@ def verdict(one: Flight, folder: Path) -> Verdict:
     return Verdict(checked or made.doubts)
 
 
-@cache
-def wrong() -> dict[str, tuple[Flight, tuple[Cause, ...]]]:
-    """All flights with one slip, and the causes of which one must be named first."""
+def wrong() -> dict[str, tuple[Callable[[], Flight], tuple[Cause, ...]]]:
+    """How all flights with one slip are made, and the causes of which one must be named first."""
 
-    def all_of_them() -> Iterator[tuple[str, Flight, tuple[Cause, ...]]]:
+    def all_of_them() -> Iterator[tuple[str, Slip, Callable[[], Flight]]]:
         for name, slip in ANYWAY.items():
-            yield name, slip.make(flight()), slip.causes
-            yield f"{name}, no reference", slip.make(without_reference(flight())), slip.causes
+            yield name, slip, flight
+            yield f"{name}, no reference", slip, flight_without_reference
         for name, slip in WITH_REFERENCE.items():
-            yield name, slip.make(flight()), slip.causes
+            yield name, slip, flight
         for name, slip in WITHOUT_REFERENCE.items():
-            yield name, slip.make(without_reference(flight())), slip.causes
+            yield name, slip, flight_without_reference
 
-    return {name: (one, causes) for name, one, causes in all_of_them()}
+    return {
+        name: (lambda slip=slip, right=right: slip.make(right()), slip.causes)
+        for name, slip, right in all_of_them()
+    }
+
+
+def flight_without_reference() -> Flight:
+    return without_reference(flight())
+
+
+WRONG = wrong()
 
 
 def test_there_are_many_slips() -> None:
-    assert len(wrong()) >= 100
-    assert len({cause for _, causes in wrong().values() for cause in causes}) >= 20
+    assert len(WRONG) >= 100
+    assert len({cause for _, causes in WRONG.values() for cause in causes}) >= 20
 
 
-@pytest.mark.parametrize("name", [*wrong()])
+@pytest.mark.parametrize("name", WRONG)
 def test_the_cause_is_named_first(name: str, tmp_path: Path) -> None:
-    one, causes = wrong()[name]
-    told = verdict(one, tmp_path / "flight")
+    make, causes = WRONG[name]
+    told = verdict(make(), tmp_path / "flight")
     assert told.first in causes, told
     assert told.doubts[0].remedy
 
@@ -92,28 +101,29 @@ def test_of_two_slips_at_least_one_is_named_first(first: str, second: str, tmp_p
     assert told.first in (*both[first].causes, *both[second].causes), told
 
 
-CORRECT = {
-    "Munich": flight(),
-    "Munich, drone": replace(flight(), pictures=drone_pictures()),
-    "Munich, degrees": flight("EPSG:4258", (11.5491, 48.1509, 545.5)),
-    "Munich, neighbouring zone": flight("EPSG:25833", (242000.0, 5338000.0, 545.5)),
-    "Bern": flight("EPSG:2056", (2600000.0, 1200000.0, 600.0)),
-    "London": flight("EPSG:27700", (530000.0, 180000.0, 60.0)),
-    "Melbourne": flight("EPSG:28355", (320000.0, 5812000.0, 30.0)),
-    "Santiago": flight("EPSG:32719", (350000.0, 6300000.0, 560.0)),
-    "Nairobi": flight("EPSG:4326", (36.8, -1.3, 1650.0)),
-    "Fiji": flight("EPSG:32760", (650000.0, 7990000.0, 80.0)),
-    "Raleigh, feet": flight("EPSG:2264", (2100000.0, 740000.0, 90.0)),
-    "Tokyo": flight("EPSG:6677", (-7000.0, -35000.0, 70.0)),
-    "Svalbard": flight("EPSG:25833", (515000.0, 8680000.0, 50.0)),
-    "Kiruna, web": flight("EPSG:3857", (2250000.0, 10450000.0, 430.0)),
+CORRECT: dict[str, Callable[[], Flight]] = {
+    "Munich": flight,
+    "Munich, drone": lambda: replace(flight(), pictures=drone_pictures()),
+    "Munich, degrees": partial(flight, "EPSG:4258", (11.5491, 48.1509, 545.5)),
+    "Munich, neighbouring zone": partial(flight, "EPSG:25833", (242000.0, 5338000.0, 545.5)),
+    "Bern": partial(flight, "EPSG:2056", (2600000.0, 1200000.0, 600.0)),
+    "London": partial(flight, "EPSG:27700", (530000.0, 180000.0, 60.0)),
+    "Melbourne": partial(flight, "EPSG:28355", (320000.0, 5812000.0, 30.0)),
+    "Santiago": partial(flight, "EPSG:32719", (350000.0, 6300000.0, 560.0)),
+    "Nairobi": partial(flight, "EPSG:4326", (36.8, -1.3, 1650.0)),
+    "Fiji": partial(flight, "EPSG:32760", (650000.0, 7990000.0, 80.0)),
+    "Raleigh, feet": partial(flight, "EPSG:2264", (2100000.0, 740000.0, 90.0)),
+    "Tokyo": partial(flight, "EPSG:6677", (-7000.0, -35000.0, 70.0)),
+    "Svalbard": partial(flight, "EPSG:25833", (515000.0, 8680000.0, 50.0)),
+    "Kiruna, web": partial(flight, "EPSG:3857", (2250000.0, 10450000.0, 430.0)),
 }
 
 
 @pytest.mark.parametrize("place", CORRECT)
 @pytest.mark.parametrize("has_reference", [True, False])
 def test_correct_flights_raise_no_doubt(place: str, tmp_path: Path, *, has_reference: bool) -> None:
-    one = CORRECT[place] if has_reference else without_reference(CORRECT[place])
+    one = CORRECT[place]()
+    one = one if has_reference else without_reference(one)
     assert verdict(one, tmp_path / "flight") == Verdict(())
 
 

@@ -170,7 +170,7 @@ def test_every_rule_is_its_plain_version(
         np.testing.assert_allclose(disc.level(x, y), plain, rtol=0.0, atol=1e-6)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(radius=st.floats(0.3, 40.0), blur=ROUND_BLURS, streak=STREAKS)
 def test_every_rule_is_the_integral_that_it_stands_for(
     radius: float, blur: tuple[float, float, float], streak: tuple[float, float]
