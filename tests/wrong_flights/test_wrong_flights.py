@@ -68,9 +68,13 @@ def wrong() -> dict[str, tuple[Callable[[], Flight], tuple[Cause, ...]]]:
             yield name, slip, flight_without_reference
 
     return {
-        name: (lambda slip=slip, right=right: slip.make(right()), slip.causes)
+        name: (partial(_slipped, slip, right), slip.causes)
         for name, slip, right in all_of_them()
     }
+
+
+def _slipped(slip: Slip, right: Callable[[], Flight]) -> Flight:
+    return slip.make(right())
 
 
 def flight_without_reference() -> Flight:
