@@ -25,18 +25,32 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.noise import median_at_edges
-from kgcp.measurement.image_model.photometry import Tone, plateau_levels, share_at
+from kgcp.measurement.image_model.photometry import (
+    SKEW_PARAMS,
+    Tone,
+    plateau_levels,
+    share_at,
+)
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.records import Uncertainty
 
 _ARC_PX = 6.0
 _UNEVEN_ARC_PX = 12.0  # where levels vary: stains leave residuals that go together over their knots
 _ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so many arcs
+_ARCS_OF_NOISE = 20.0  # that residuals scatter less than noise counts against so many that do not
 _LEAST_LEFT = 0.25  # of the scatter, after the fit
 _VECTOR = 4  # numbers that the processor takes at once
-# Of a circle's edge as a whole: no print and no pixel is known better, …
-_EDGE_FLOOR_PX = 0.0005
-_TONED_EDGE_FLOOR_PX = 0.004  # of the frame, where a tone curve displaces edges within bins
+# Of a circle's edge as a whole: no print and no pixel is known better, nor what cameras of unknown
+# tone make of it: on 20 plates of a simulated phone (R 26-110 px) noise reduction under local tone
+# mapping displaced the outer edge by 0.003 px in the mean. That of bins is of the frame's pixels:
+# within bins, a tone curve displaces edges.
+_EDGE_FLOOR_PX = {
+    Tone.LINEAR: 0.0005,
+    Tone.SRGB: 0.0005,
+    Tone.UNKNOWN: 0.002,
+    Tone.UNKNOWN_FROM_LINE: 0.002,
+    Tone.OF_BINS: 0.004,
+}
 # The variance where levels vary without a shadow's edge, by what residuals show of it: dirt and
 # highlights on 100 simulated plates (R 13-110 px). With an edge residuals show it all.
 _UNDER_UNEVEN_LIGHT = 1.4
@@ -59,8 +73,8 @@ class PoseCovariance:
 def pose_covariance(fit: TargetFit) -> PoseCovariance:
     """Return the covariance of the pose of a fit.
 
-    From the scatter of its scores over arcs, nowhere below that of independent pixels, plus what a
-    small common displacement of each circle's edge would do.
+    From the scatter of its scores over arcs, plus what a small common displacement of each circle's
+    edge would do.
     """
     misfit = fit.misfit
     if fit.varied is None:
@@ -83,14 +97,17 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         left -= fit.varied.taken_over(of_pose, misfit.weight, arc)
     ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
     mean = float(ratios.mean())
+    if mean < 1.0:  # few arcs can agree by chance
+        mean = (arcs * mean + _ARCS_OF_NOISE) / (arcs + _ARCS_OF_NOISE)
     ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
-    half = root @ (directions * np.sqrt(np.maximum(ratios, 1.0)))
+    half = root @ (directions * np.sqrt(ratios))
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
     pose_cov = half @ half.T + shifts @ shifts.T
     pose_cov *= unevenness_factor(fit)
     if fit.parameters.has_skew:
         depth_m = fit.parameters.matrix[2, 3]
-        across_m = _skew_displacement_px(fit) * depth_m / fit.sample.problem.focal_px
+        across_px = _skew_displacement_px(fit, mean * np.diag(inverse))
+        across_m = across_px * depth_m / fit.sample.problem.focal_px
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     shutter = fit.sample.problem.shutter
     if shutter is not None:
@@ -117,14 +134,17 @@ def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
     return np.asarray((turned + by_turn) * shutter.delay_s[fit.sample.index])
 
 
-def _skew_displacement_px(fit: TargetFit) -> float:
+def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
     """Return the standard deviation of the centre by what skew spreads displace it [px].
 
     A third cumulant κ displaces all edges across it by κ / 6σ². Higher moments of the spread are
-    not known, so that holds but for about a quarter of it, or half in uneven light.
+    not known, so that holds but for about a quarter of it, or half in uneven light. What of a κ may
+    be noise, by the `variances` of the free parameters, is in the covariance already.
     """
     blur = fit.parameters.blur
-    largest = max(abs(value) for value in blur.skew)
+    skew = np.array(blur.skew)
+    of_skew = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
+    largest = math.sqrt(max(0.0, float(np.max(skew * skew - of_skew))))
     share = _SKEW_SHARE if fit.varied is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
     return share * largest / (6.0 * blur.mean_sd_px**2)
 
@@ -137,8 +157,9 @@ def _common_displacement_px(fit: TargetFit) -> float:
     of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
     """
     problem = fit.sample.problem
-    is_plain = problem.window.binning == 1 or problem.tone is Tone.LINEAR
-    floor_px = _EDGE_FLOOR_PX if is_plain else _TONED_EDGE_FLOOR_PX / problem.window.binning
+    floor_px = _EDGE_FLOOR_PX[problem.tone]
+    if problem.tone is Tone.OF_BINS:
+        floor_px /= problem.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction, is_even=fit.varied is None)
     excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
