@@ -26,6 +26,7 @@ from kgcp.measurement.discs.fit_disc import (
     Unknowns,
 )
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
+from kgcp.measurement.discs.tone_curve import WAVES
 from kgcp.measurement.image_model.photometry import Tone
 
 _MOST_DISCS = 9
@@ -38,6 +39,12 @@ _LEAST_SD = 0.01  # of each parameter, however many discs agree
 # Masks are tried from 1 px on by steps of this factor, if the camera sharpens at all.
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
+_BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_FROM_LINE}
+# Least gain of twice the log-likelihood by three bends. Film's curve gains 70 to 800 on nine discs
+# (`benchmarks.calibrate.operator`); burnt, sharpened photographs up to 35, and what the bends
+# pretend displaces their discs.
+_WORTHY_BENDS = 40.0
+_LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
 _MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
 
@@ -54,21 +61,27 @@ class CameraTone:
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
     """Return the tone to use for discs of one photograph, or of all by one camera.
 
-    An unknown curve is shaped from sRGB's, and from a straight line; the one that makes the same
-    pixels of all discs together likelier is kept. Then the width of the mask is adjusted, where the
-    camera sharpens.
+    An unknown curve is sRGB's or a straight line, whichever makes the same pixels of all discs
+    together likelier. It is bent only if that makes them significantly likelier still: where white
+    is burnt and black sunk, little of the curve is seen, and its bends explain what the model of
+    the image lacks. Then the width of the mask is adjusted, where the camera sharpens.
     """
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
     fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
-    bases = (tone,) if tone is Tone.SRGB else (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE)
-    joints = [joint for joint in (_from_first_fits(fits, base) for base in bases) if joint]
-    if not joints:
+    best = _likeliest(fits, (tone,) if tone is Tone.SRGB else (Tone.SRGB, Tone.LINEAR))
+    if tone is Tone.UNKNOWN:
+        best = _with_worthy_bends(best, _likeliest(fits, tuple(_BENT.values())))
+    if best is None:
         return CameraTone(tone, SHARPENING_PX)
-    best = _with_best_mask(min(joints, key=lambda joint: joint.loss))
+    best = _with_best_mask(best)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
-    return CameraTone(best.tone, best.sharpening_px, _known_by(best), blur_px)
+    known = _known_by(best)
+    if tone is Tone.UNKNOWN and not best.tone.is_shaped:
+        # what an unknown curve may be off stays in the covariances
+        return CameraTone(_BENT[best.tone], best.sharpening_px, _without_bends(known), blur_px)
+    return CameraTone(best.tone, best.sharpening_px, known, blur_px)
 
 
 def unknowns_of(task: DiscTask, camera: CameraTone) -> Unknowns:
@@ -111,6 +124,32 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
             fits.append(fit)
     clean = [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED]
     return clean if len(clean) >= min(_MOST_DISCS, len(fits) // 2) else fits
+
+
+def _likeliest(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> JointFit | None:
+    """Return discs adjusted together by the likeliest of some curves; None if by none."""
+    joints = [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
+    return min(joints, key=lambda joint: joint.loss, default=None)
+
+
+def _with_worthy_bends(plain: JointFit | None, bent: JointFit | None) -> JointFit | None:
+    """Return discs by the bent curve if it is significantly likelier than the plain one.
+
+    Discs that contradict each other more than their noise lets them speak so much less. Whatever
+    makes them do so is not in the model, and the bends may stand for it: it counts once more.
+    """
+    if plain is None or bent is None:
+        return bent or plain
+    gain = 2.0 * (plain.loss - bent.loss) / _excess(bent) ** 2
+    return bent if gain > _WORTHY_BENDS else plain
+
+
+def _without_bends(known: CameraPrior) -> CameraPrior:
+    """Return what is known of the camera with bends that are hardly there."""
+    precision = known.precision.copy()
+    waves = np.arange(WAVES)
+    precision[waves, waves] = _LITTLE_BENT**-2
+    return CameraPrior(known.mean, precision)
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
@@ -185,11 +224,16 @@ def _known_by(joint: JointFit) -> CameraPrior:
 
     Where they contradict each other more than their noise lets them, it is known so much worse.
     """
+    cov = np.linalg.inv(joint.precision) * _excess(joint)
+    cov += _LEAST_SD**2 * np.eye(len(cov))
+    return CameraPrior(joint.shared, np.asarray(np.linalg.inv(cov)))
+
+
+def _excess(joint: JointFit) -> float:
+    """Return the square of how much more than by their noise discs contradict each other."""
     own = joint.informations[0].any(axis=0)
     squares = [
         float(score[own] @ np.linalg.lstsq(information[np.ix_(own, own)], score[own])[0])
         for score, information in zip(joint.scores, joint.informations, strict=True)
     ]
-    excess = max(float(np.median(squares)) / _MEDIAN_SQUARE[int(own.sum())], 1.0)
-    cov = np.linalg.inv(joint.precision) * excess + _LEAST_SD**2 * np.eye(len(own))
-    return CameraPrior(joint.shared, np.asarray(np.linalg.inv(cov)))
+    return max(float(np.median(squares)) / _MEDIAN_SQUARE[int(own.sum())], 1.0)

@@ -13,7 +13,7 @@ from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_p
 from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, limited
 from kgcp.measurement.discs.disc_levels import COUNT, GEOMETRY_COUNT, LevelModel, Row
 from kgcp.measurement.discs.pixel_choice import DiscWindow
-from kgcp.measurement.discs.tone_curve import DiscTone, steep_enough
+from kgcp.measurement.discs.tone_curve import DiscTone, plausible
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.noise import (
     Censoring,
@@ -47,6 +47,9 @@ _PRIOR_SD = {
     Row.INK_SLOPE_X: 0.05,
     Row.INK_SLOPE_Y: 0.05,
 }
+# Strengths of a camera's unsharp mask; below 0 stand the skirts of a point spread. Burnt discs, of
+# whose edges little is seen, would go to 3 and take their blur along.
+_SHARPENINGS = (-0.5, 1.5)
 _FALL = 0.7  # of the light, from the middle of a photograph to its end
 _WHITE, _WHITE_SD = 1.0, 0.4  # burnt levels of unknown tone: lest level and tone drift together
 _ALWAYS = (*range(GEOMETRY_COUNT), Row.BLUR_MEAN, Row.BLUR_DIFFERENCE, Row.BLUR_XY)
@@ -203,7 +206,9 @@ class DiscState:
         if step[Row.BLUR_MEAN] < 0.0:  # what steps promise of narrower blur is too much
             moved[Row.BLUR_MEAN] = before**2 / (before - step[Row.BLUR_MEAN])
         moved[Row.BLUR_MEAN] = max(moved[Row.BLUR_MEAN], _MIN_VARIANCE_PX2)
-        moved[Row.WAVE_1 : Row.SHARPENING] = steep_enough(moved[Row.WAVE_1 : Row.SHARPENING])
+        moved[Row.WAVE_1 : Row.SHARPENING] = plausible(moved[Row.WAVE_1 : Row.SHARPENING], tone)
+        low, high = _SHARPENINGS
+        moved[Row.SHARPENING] = min(max(moved[Row.SHARPENING], low), high)
         if tone.is_shaped:
             levels = [Row.BLACK, Row.WHITE]
             grey = self.tone(tone).levels(self.vector[levels])

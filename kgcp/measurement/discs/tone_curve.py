@@ -24,6 +24,9 @@ from kgcp.measurement.image_model.photometry import Tone, srgb_decoded, srgb_enc
 WAVES = 3
 _LEAST_SLOPE = 0.35  # of the bent curve relative to the known one, …
 _DARKEST, _BRIGHTEST = 0.05, 0.95  # … between these grey values
+# No camera makes its darks darker than they are, but for errors of the black level: least first
+# wave of sRGB's curve, which is a straight line at about -0.68, and of a straight line.
+_LEAST_GAMMA = (-0.8, -0.15)
 _NEWTON_STEPS = 20
 
 
@@ -56,6 +59,17 @@ class DiscTone:
         """Return the light (n,) of grey values (n,)."""
         known = _straightened(levels, np.array(self.waves))
         return srgb_decoded(known) if self.tone.is_srgb else known
+
+
+def plausible(waves: FloatArray, tone: Tone) -> FloatArray:
+    """Return amplitudes (3,) of a curve that a camera can have.
+
+    The skirts of a point spread look like a curve that darkens the dark: light that is scattered
+    from the ground onto a disc is as much brighter near its edge.
+    """
+    waves = waves.copy()
+    waves[0] = max(waves[0], _LEAST_GAMMA[0 if tone.is_srgb else 1])
+    return steep_enough(waves)
 
 
 def steep_enough(waves: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.discs.disc_levels import COUNT, LevelModel, Row
-from kgcp.measurement.discs.tone_curve import DiscTone, steep_enough
+from kgcp.measurement.discs.tone_curve import DiscTone, plausible, steep_enough
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
 from kgcp.measurement.image_model.photometry import Tone, srgb_encoded
 from kgcp.measurement.image_model.sharpening import unsharp_mask
@@ -70,3 +70,9 @@ def test_curves_rise_everywhere() -> None:
     assert 0.3 < slopes.min() < 0.36
     few = np.array((0.1, -0.2, 0.0))
     assert np.all(steep_enough(few) == few)
+
+
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+def test_curves_darken_no_darks(tone: Tone) -> None:
+    curve = DiscTone(tone).bent(plausible(np.array((-2.0, 0.0, 0.0)), tone))
+    assert 0.16 < float(curve.levels(np.array([0.2]))[0]) < 0.2 + 0.1 * tone.is_srgb
