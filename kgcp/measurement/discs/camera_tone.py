@@ -40,10 +40,11 @@ _LEAST_SD = 0.01  # of each parameter, however many discs agree
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
 _BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_FROM_LINE}
-# Least gain of twice the log-likelihood by three bends. Film's curve gains 70 to 800 on nine discs
-# (`benchmarks.calibrate.operator`); burnt, sharpened photographs up to 35, and what the bends
-# pretend displaces their discs.
-_WORTHY_BENDS = 40.0
+_WORTHY_BENDS = 6.0  # least gain of twice the log-likelihood by three parameters (Akaike), …
+# … times this power of the excess. Burnt, sharpened photographs have an excess of 4 to 6, their
+# bends gain up to 1200, and what these pretend displaces the discs. Film's curve, with an excess of
+# 1 to 1.5, gains 70 to 800 on nine discs (`benchmarks.calibrate.operator`).
+_BY_EXCESS = 3
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
 _MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
@@ -135,13 +136,13 @@ def _likeliest(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> JointFit | Non
 def _with_worthy_bends(plain: JointFit | None, bent: JointFit | None) -> JointFit | None:
     """Return discs by the bent curve if it is significantly likelier than the plain one.
 
-    Discs that contradict each other more than their noise lets them speak so much less. Whatever
-    makes them do so is not in the model, and the bends may stand for it: it counts once more.
+    Where discs contradict each other more than their noise lets them, the model lacks something
+    that the bends may stand for.
     """
     if plain is None or bent is None:
         return bent or plain
-    gain = 2.0 * (plain.loss - bent.loss) / _excess(bent) ** 2
-    return bent if gain > _WORTHY_BENDS else plain
+    gain = 2.0 * (plain.loss - bent.loss)
+    return bent if gain > _WORTHY_BENDS * _excess(bent) ** _BY_EXCESS else plain
 
 
 def _without_bends(known: CameraPrior) -> CameraPrior:
