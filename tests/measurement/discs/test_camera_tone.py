@@ -44,5 +44,5 @@ def test_curve_and_sharpening_are_those_of_the_camera(
     assert 0.65 < camera.sharpening_px < 0.97
     assert camera.known.mean[3] == pytest.approx(0.5, abs=0.25)
     assert camera.tone is tone
-    tolerance = 0.25 if any(waves) else 0.0  # a curve that is not bent is not bent at all
+    tolerance = 0.25 if any(waves) else 0.1
     assert camera.known.mean[:3] == pytest.approx(waves, abs=tolerance)
