@@ -45,6 +45,8 @@ _MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it b
 # Residuals at the edge, of the contrast, and share of outliers. Small discs that are burnt and
 # sharpened leave up to 0.19; what is not a disc, mostly more than 0.3.
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.2, 0.3
+_LEAST_CURVED_PX = 6.0  # radius from which on discs tell a curved light from their blur
+_CURVED = 60.0  # least χ² of three terms: noise alone makes 16 at most, of one in a thousand discs
 _FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
 
 
@@ -124,7 +126,20 @@ def adjust_disc(
         geometry, blur = state.geometry, state.blur
         if moved_px < _SETTLED_PX and widened < _SETTLED_BLUR:
             break
+    if _is_in_curved_light(fit, task):
+        return adjust_disc(task, free.with_curved_light(), state)
     return fit
+
+
+def _is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
+    """Return whether the edge of a shadow or of a spot crosses the disc.
+
+    Only where it is seen: a second order that is always free would cost accuracy.
+    """
+    if fit.free.is_light_curved or len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
+        return False
+    is_seen = fit.sample.censoring.share <= _MUCH_CLIPPED
+    return is_seen and fit.curvature_gain > _CURVED
 
 
 def _adjust_on(

@@ -35,15 +35,19 @@ class Row(IntEnum):
     SHARPENING = 15  # strength of the unsharp mask
     INK_SLOPE_X = 16  # of the darker level alone, of the contrast per radius
     INK_SLOPE_Y = 17
+    CURVE_XX = 18  # second order of the light, per square of the radius
+    CURVE_XY = 19
+    CURVE_YY = 20
 
 
-COUNT = 18
+COUNT = 21
 GEOMETRY_COUNT = 5
 _OF_SHARE = np.array([0, 1, 2, 3, 4, 6, 7, 8])  # rows of a white share's Jacobian
 _FILTERED = np.array([Row.BLACK, Row.WHITE, *range(Row.BLACK), Row.SLOPE_X, Row.SLOPE_Y])
 _BESIDE = 10  # levels about a pixel, their derivatives by light, and by the waves
 _MOST_LIGHT, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
 _WAVES = np.array([Row.WAVE_1, Row.WAVE_2, Row.WAVE_3])
+_CURVES = np.array([Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,11 +59,11 @@ class LevelModel:
     mask: Mask | None  # of the camera's sharpening; None: it does not sharpen
 
     def linearised(self, share: WhiteShare, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the grey values (n,) before clipping and their Jacobian (18, n).
+        """Return the grey values (n,) before clipping and their Jacobian (21, n).
 
         Parameters
         ----------
-        vector : (18,) array
+        vector : (21,) array
             In the order of `Row`.
         """
         count = len(share.value)
@@ -94,13 +98,18 @@ class LevelModel:
         Pixels that are not modelled are ink or plate, and change with all that those depend on.
         """
         strength, (ink, plate, by_ink, by_plate) = vector[Row.SHARPENING], beside[:4]
-        lit = 1.0 + vector[Row.SLOPE_X : Row.WAVE_1] @ self.offsets
+        x, y = self.offsets
+        curves = np.stack((x * x, x * y, y * y))
+        lit = 1.0 + vector[Row.SLOPE_X : Row.WAVE_1] @ self.offsets + vector[_CURVES] @ curves
         rows = np.concatenate((_FILTERED, _WAVES)) if self.tone.is_shaped else _FILTERED
         mask.sharpen(jacobian, rows, (by_ink * lit, by_plate * lit), strength)
         others_ink, others_plate = strength * mask.ink, strength * mask.plate
         black, white = vector[Row.BLACK], vector[Row.WHITE]
         falling = others_ink * by_ink * black + others_plate * by_plate * white
         jacobian[Row.SLOPE_X : Row.WAVE_1] -= falling * self.offsets
+        if vector[_CURVES].any():
+            for row, curve in zip(_CURVES, curves, strict=True):
+                jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0) - falling * curve
         if self.tone.is_shaped:
             jacobian[_WAVES] -= others_ink * beside[4:7] + others_plate * beside[7:10]
         detail = mask.detail(value, ink, plate)
@@ -161,7 +170,7 @@ def _expose(
     jacobian: FloatArray,
     beside: FloatArray,
 ) -> None:
-    """Fill in grey values (n,), Jacobian (18, n), and the levels about every pixel.
+    """Fill in grey values (n,), Jacobian (21, n), and the levels about every pixel.
 
     These are, where there is room for them (10, n): of ink and plate; their derivatives by the
     light of each, and by the waves.
@@ -173,6 +182,7 @@ def _expose(
     for i in range(len(share)):
         x, y, s = offsets[0, i], offsets[1, i], share[i]
         lit = 1.0 + slope_x * x + slope_y * y
+        lit += vector[18] * x * x + vector[19] * x * y + vector[20] * y * y
         more = vector[16] * x + vector[17] * y
         ink, plate = black * lit + contrast * more, white * lit
         light = ink + (plate - ink) * s
@@ -188,6 +198,8 @@ def _expose(
         jacobian[9, i] = slope * (s * lit + (1.0 - s) * more)
         falling = slope * (black * (1.0 - s) + white * s)
         jacobian[10, i], jacobian[11, i] = falling * x, falling * y
+        jacobian[18, i], jacobian[19, i] = falling * x * x, falling * x * y
+        jacobian[20, i] = falling * y * y
         of_ink = slope * (1.0 - s) * contrast
         jacobian[16, i], jacobian[17, i] = of_ink * x, of_ink * y
         if needs_levels:

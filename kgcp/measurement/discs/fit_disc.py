@@ -46,7 +46,11 @@ _PRIOR_SD = {
     Row.SHARPENING: 0.7,
     Row.INK_SLOPE_X: 0.05,
     Row.INK_SLOPE_Y: 0.05,
+    Row.CURVE_XX: 0.2,
+    Row.CURVE_XY: 0.2,
+    Row.CURVE_YY: 0.2,
 }
+_SHADOW_SLOPE_SD = 0.3  # of the light per radius, where the edge of a shadow crosses the disc
 # Strengths of a camera's unsharp mask; below 0 stand the skirts of a point spread. Burnt discs, of
 # whose edges little is seen, would go to 3 and take their blur along.
 _SHARPENINGS = (-0.5, 1.5)
@@ -57,6 +61,7 @@ _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 _WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
 _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
+_CURVES = np.array((Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY))
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
 """What all discs share: the camera's tone curve and sharpening."""
 
@@ -86,8 +91,8 @@ class Unknowns:
     tone: Tone
     sharpening_px: float  # σ of the camera's unsharp mask; 0: it does not sharpen
     rows: IndexArray  # (p,): the free parameters
-    mean: FloatArray  # (18,)
-    precision: FloatArray  # (18, 18); zeros: nothing is known
+    mean: FloatArray  # (21,)
+    precision: FloatArray  # (21, 21); zeros: nothing is known
 
     @classmethod
     def of(
@@ -128,7 +133,19 @@ class Unknowns:
 
     def without_ink_slope(self) -> Unknowns:
         """Return the unknowns without a gradient of the darker level's own."""
-        return replace(self, rows=self.rows[self.rows < Row.INK_SLOPE_X])
+        return replace(self, rows=np.setdiff1d(self.rows, np.array(_INK_SLOPES)))
+
+    @property
+    def is_light_curved(self) -> bool:
+        """Whether the light is of second order."""
+        return bool(self.rows[-1] == Row.CURVE_YY)
+
+    def with_curved_light(self) -> Unknowns:
+        """Return the unknowns of a disc at the edge of a shadow: light of second order."""
+        precision = self.precision.copy()
+        precision[_CURVES, _CURVES] = [_PRIOR_SD[Row(row)] ** -2 for row in _CURVES.tolist()]
+        rows = np.concatenate((self.rows, _CURVES))
+        return replace(self, rows=rows, precision=precision)
 
     def in_light(self, radius_px: float, frame_px: int) -> Unknowns:
         """Return the unknowns of a disc of some size in a photograph of some size.
@@ -137,12 +154,14 @@ class Unknowns:
         burnt, nothing else keeps its gradient from explaining whatever makes opposite edges differ.
         """
         sd = min(_FALL * radius_px / (0.5 * frame_px), _PRIOR_SD[Row.SLOPE_X])
+        if self.is_light_curved:
+            sd = _SHADOW_SLOPE_SD
         precision = self.precision.copy()
         precision[_SLOPES, _SLOPES] = sd**-2
         return replace(self, precision=precision)
 
     def penalty(self, vector: FloatArray) -> float:
-        """Return the priors' part of the negative log-likelihood of a vector (18,)."""
+        """Return the priors' part of the negative log-likelihood of a vector (21,)."""
         off = vector - self.mean
         return 0.5 * float(off @ self.precision @ off)
 
@@ -151,7 +170,7 @@ class Unknowns:
 class DiscState:
     """Numbers that the adjustment works with."""
 
-    vector: FloatArray  # (18,): in the order of `Row`
+    vector: FloatArray  # (21,): in the order of `Row`
 
     @classmethod
     def of(cls, geometry: Geometry, blur: Blur, levels: tuple[float, float]) -> DiscState:
@@ -196,7 +215,7 @@ class DiscState:
         return float(min(max(share, 0.0), 1.0))
 
     def moved(self, step: FloatArray, tone: Tone) -> DiscState:
-        """Return the state after a step (18,), such that ellipse, blur and tone can be.
+        """Return the state after a step (21,), such that ellipse, blur and tone can be.
 
         Where the tone curve changes, the levels follow such that their grey values change by as
         much as the step promises: steps of both would go wrong together.
@@ -300,7 +319,7 @@ class DiscFit:
     state: DiscState
     share: FloatArray  # (n,): white share
     levels: FloatArray  # (n,): modelled, before clipping
-    jacobian: FloatArray  # (18, n)
+    jacobian: FloatArray  # (21, n)
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit
     scaled: FloatArray  # (p, n): Jacobian of the free parameters, in units of the noise
@@ -312,6 +331,17 @@ class DiscFit:
         free = self.free
         of_prior = (free.precision @ (free.mean - self.state.vector))[free.rows]
         return np.asarray(self.scaled @ self.misfit.score + of_prior)
+
+    @property
+    def curvature_gain(self) -> float:
+        """What light of second order would explain: χ² with three degrees of freedom."""
+        curves = scaled_rows(self.jacobian, _CURVES, self.sd)
+        weighted = curves * self.misfit.weight
+        shared = weighted @ self.scaled.T
+        information = weighted @ curves.T - shared @ np.linalg.solve(self.normal, shared.T)
+        information[np.diag_indices(len(_CURVES))] += _PRIOR_SD[Row.CURVE_XX] ** -2
+        score = curves @ self.misfit.score
+        return float(score @ np.linalg.solve(information, score))
 
     @property
     def noise(self) -> GreyNoise:
@@ -355,7 +385,7 @@ def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
 
 
 def _linearised(sample: DiscSample, state: DiscState) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return white share, grey values (n,) and Jacobian (18, n)."""
+    """Return white share, grey values (n,) and Jacobian (21, n)."""
     share = sample.pixels.white_share(state.geometry, state.blur)
     levels, jacobian = sample.level_model.linearised(share, state.vector)
     return share.value, levels, jacobian
@@ -388,7 +418,7 @@ def _minimise(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArr
 
 
 def _step(fit: DiscFit, damping: float) -> tuple[FloatArray, float]:
-    """Return a step (18,) and the gain that it promises."""
+    """Return a step (21,) and the gain that it promises."""
     free = fit.free
     gradient = fit.gradient
     damped = fit.normal.copy()

@@ -144,7 +144,7 @@ def _total(fits: Sequence[DiscFit], usual: CameraPrior) -> float:
 
 
 def _own_step(fit: DiscFit) -> FloatArray:
-    """Return a step (18,) of what is a disc's own."""
+    """Return a step (21,) of what is a disc's own."""
     own = np.flatnonzero(~np.isin(fit.free.rows, _SHARED))
     step = np.zeros(COUNT)
     step[fit.free.rows[own]] = np.linalg.solve(fit.normal[np.ix_(own, own)], fit.gradient[own])
@@ -170,7 +170,7 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
 def _steps(
     fits: Sequence[DiscFit], usual: CameraPrior, damping: float
 ) -> tuple[list[FloatArray], float]:
-    """Return a step (18,) of every disc, and the gain that they promise together."""
+    """Return a step (21,) of every disc, and the gain that they promise together."""
     free = fits[0].free
     own = np.isin(_SHARED, free.rows)
     precision = usual.precision[np.ix_(own, own)]

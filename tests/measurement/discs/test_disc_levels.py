@@ -20,12 +20,13 @@ NEAR = np.flatnonzero((np.abs(FAR_PX) < 4.0) & ((ROWS + COLUMNS) % 2 == 0))  # a
 LEVEL_ROWS = [
     *(Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y),
     *(Row.WAVE_1, Row.WAVE_2, Row.WAVE_3, Row.SHARPENING),
+    *(Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY),
 ]
 
 
 def vector() -> FloatArray:
     values = np.zeros(COUNT)
-    values[LEVEL_ROWS] = 0.12, 0.66, 0.03, -0.05, 0.1, -0.5, 0.05, 0.4
+    values[LEVEL_ROWS] = 0.12, 0.66, 0.03, -0.05, 0.1, -0.5, 0.05, 0.4, 0.02, 0.01, -0.03
     return values
 
 

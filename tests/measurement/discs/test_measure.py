@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.measurement.discs import fit_disc
+from kgcp.measurement.discs import adjust_disc, fit_disc
 from kgcp.measurement.discs.measure import measure_disc, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
@@ -197,3 +197,31 @@ def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPat
     own = rms_px()
     monkeypatch.setattr(fit_disc, "_FALL", 100.0)
     assert 0.005 < own < 0.8 * rms_px()
+
+
+def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The photographer's shadow: light of first order leaves residuals, which count as errors."""
+    pose, camera = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), Camera(480, 110, 1e3, 1e3, 240, 55)
+    discs = tuple(FieldDisc((0.09 * (k - 2), 0.0, 0.0), 0.03) for k in range(5))
+    scene, rng = FieldScene(discs, 0.8, 0.1), np.random.default_rng(3)
+    photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    edges_px = columns + 0.5 * (rows - 55) - 70.0  # beside the discs' middles
+    shadows = sum((-1) ** k / (1.0 + np.exp((90.0 * k - edges_px) / 4.0)) for k in range(5))
+    photo = np.round(photo * (1.0 - 0.3 * np.asarray(shadows))).astype(np.uint8)
+    truth = circle_images(camera, field_circles(pose, scene.discs)).moments
+    outlines = find_outlines(photo)
+
+    def rms_and_sd_px() -> tuple[float, float]:
+        measured = measure_discs(photo, outlines, response=Response.LINEAR)
+        own = [each for each in measured if isinstance(each, Disc)]
+        assert len(own) == len(discs)
+        centres = np.array([each.centre_px for each in own])
+        off = centres - truth[nearest(centres, truth), :2]
+        variances = [each.cov[0, 0] + each.cov[1, 1] for each in own]
+        return float(np.sqrt(np.mean(off**2))), float(np.sqrt(0.5 * np.mean(variances)))
+
+    rms_px, sd_px = rms_and_sd_px()
+    assert 0.5 * sd_px < rms_px < 1.8 * sd_px
+    monkeypatch.setattr(adjust_disc, "_CURVED", np.inf)
+    assert sd_px < 0.5 * rms_and_sd_px()[1]
