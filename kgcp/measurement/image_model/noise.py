@@ -171,10 +171,32 @@ def _estimate(
     excess = 0.0 if math.isnan(standardised) else max(0.0, standardised - 1.0)
     if in_bands:
         of_band = _band_variances(residuals, share, usable, (ink, white, excess, floor))
-        sd[:] = np.exp(0.5 * np.interp(share, _MIDDLES, np.log(of_band)))
+        _interpolate(share, 0.5 * np.log(of_band), sd)
         return
     for i in range(len(share)):
         sd[i] = math.sqrt(_variance_at(share[i], ink, white, excess, floor))
+
+
+@compiled
+def _interpolate(share: FloatArray, log_sd: FloatArray, sd: FloatArray) -> None:
+    """Fill in the deviations between those of the bands' middles, linear in the logarithm.
+
+    Without a branch and without a library's exponential, so that vector units take several: its
+    argument is halved ten times, and the power of it squared as often.
+    """
+    for i in range(len(share)):
+        value = log_sd[0]
+        for k in range(len(_MIDDLES) - 1):
+            width = _MIDDLES[k + 1] - _MIDDLES[k]
+            within = min(max(share[i] - _MIDDLES[k], 0.0), width)
+            value += within * ((log_sd[k + 1] - log_sd[k]) / width)
+        sd[i] = value
+    for i in range(len(sd)):
+        x = sd[i] * (1.0 / 1024.0)
+        power = 1.0 + x * (1.0 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120)))))
+        for _ in range(10):
+            power *= power
+        sd[i] = power
 
 
 @inlined
@@ -193,13 +215,14 @@ def _band_variances(
 ) -> FloatArray:
     """Return the variances that the bands show, drawn to `_variance_at` where pixels are few."""
     ink, white, excess, floor = of_line
-    squares, number = _by_band(residuals, share, usable)
+    squares, starts = _by_band(residuals, share, usable)
     variances = np.empty(len(_MIDDLES))
     for band in range(len(_MIDDLES)):
         variances[band] = _variance_at(_MIDDLES[band], ink, white, excess, floor)
-        shown = _trimmed_variance(squares[band, : number[band]])
+        number = starts[band + 1] - starts[band]
+        shown = _trimmed_variance(squares[starts[band] : starts[band + 1]])
         if not math.isnan(shown):
-            weight = number[band] / (number[band] + _WORTH_PIXELS)
+            weight = number / (number + _WORTH_PIXELS)
             variances[band] = max(weight * shown + (1.0 - weight) * variances[band], floor)
     return variances
 
@@ -208,15 +231,22 @@ def _band_variances(
 def _by_band(
     residuals: FloatArray, share: FloatArray, usable: BoolArray
 ) -> tuple[FloatArray, IndexArray]:
-    """Return the squares of usable residuals (bands, n) by band, and how many each band has."""
-    squares = np.empty((len(_MIDDLES), len(share)))
-    number = np.zeros(len(_MIDDLES), np.intp)
+    """Return the squares of usable residuals, band after band, and where each band starts."""
+    bands, count = np.zeros(len(share), np.uint8), len(_MIDDLES)
+    for limit in _LIMITS:
+        for i in range(len(share)):
+            bands[i] += share[i] >= limit
+    starts = np.zeros(count + 1, np.intp)
+    for i in range(len(share)):
+        starts[bands[i] + 1] += usable[i]
+    for band in range(count):
+        starts[band + 1] += starts[band]
+    squares, places = np.empty(starts[count]), starts.copy()
     for i in range(len(share)):
         if usable[i]:
-            band = np.searchsorted(_LIMITS, share[i], side="right")
-            squares[band, number[band]] = residuals[i] * residuals[i]
-            number[band] += 1
-    return squares, number
+            squares[places[bands[i]]] = residuals[i] * residuals[i]
+            places[bands[i]] += 1
+    return squares, starts
 
 
 @compiled
