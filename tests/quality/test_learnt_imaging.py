@@ -10,7 +10,7 @@ import pytest
 from kgcp.errors import Reason
 from kgcp.geometry.pose import Pose
 from kgcp.io.tables.learnt_imaging import learnt_from_text, learnt_text
-from kgcp.measurement.image_model.photometry import srgb_decoded
+from kgcp.measurement.image_model.srgb import srgb_decoded
 from kgcp.measurement.records import (
     Appearance,
     ExposureSettings,

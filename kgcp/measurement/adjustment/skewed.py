@@ -7,9 +7,8 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
-from kgcp.measurement.image_model.blurred_plate import WhiteShare
 from kgcp.measurement.image_model.edge_terms import skew_rows
-from kgcp.measurement.image_model.photometry import GEOMETRY_ROWS, SKEW_PARAMS
+from kgcp.measurement.image_model.photometry import SKEW_PARAMS
 
 _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
@@ -41,11 +40,7 @@ def _by_skew(fit: TargetFit) -> FloatArray:
     rows = skew_rows(
         parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
     )
-    if sample.photometry.mask is None:
-        return sample.photometry.slopes(fit.prediction.share, parameters.light) * rows
-    by_geometry = np.vstack((np.zeros((GEOMETRY_ROWS, rows.shape[1])), rows))
-    share = WhiteShare(fit.prediction.points_m, fit.prediction.share, by_geometry)
-    return sample.photometry.linearised(share, parameters.light)[1][SKEW_PARAMS]
+    return sample.photometry.carried(fit.prediction.share, parameters.light, rows)
 
 
 def with_skew(unknowns: Unknowns) -> Unknowns:

@@ -24,7 +24,6 @@ from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
-_SMALL_PX2 = 1e-4  # for a derivative by differences
 # Of eight flights by other programs, smoothing had means of −0.07 to 0.09 px² with scatters of 0 to
 # 0.08 px² about them (docs/method.md, "What a flight shares").
 _SD_OF_CAMERAS_PX2, _SCATTER_PX2 = 0.1, 0.05
@@ -65,16 +64,13 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
 def _by_smoothing(fit: TargetFit) -> FloatArray:
     """Return the derivative (n,) of the grey values by smoothing along contours."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
-    step = _SMALL_PX2 * smoothing_row(
+    row = smoothing_row(
         parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
     )
     field, pixels = parameters.field, sample.problem.window.pixels(sample.index)
     added = None if field is None else field.added(pixels)
-    more, less = (
-        sample.photometry.levels(each, parameters.light, added)
-        for each in (share + step, share - step)
-    )
-    return np.asarray((more - less) / (2.0 * _SMALL_PX2))
+    carried = sample.photometry.carried(share, parameters.light, row[None], added)
+    return np.asarray(carried[0])
 
 
 @dataclass(frozen=True, slots=True)

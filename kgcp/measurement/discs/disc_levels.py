@@ -15,8 +15,9 @@ import numpy as np
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.photometry import Tone, srgb_encoded, srgb_slope
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import Mask
+from kgcp.measurement.image_model.srgb import srgb_encoded, srgb_slope
 
 
 class Row(IntEnum):

@@ -19,7 +19,8 @@ import numpy as np
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.image_model.photometry import Tone, srgb_decoded, srgb_encoded
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.srgb import srgb_decoded, srgb_encoded
 
 WAVES = 3
 _LEAST_SLOPE = 0.35  # of the bent curve relative to the known one, …

@@ -20,7 +20,13 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.sharpening import Mask
+from kgcp.measurement.image_model.sharpening import Mask, SharpenedRows
+from kgcp.measurement.image_model.srgb import (
+    encode_pixels,
+    srgb_decoded,
+    srgb_encoded,
+    srgb_slope,
+)
 
 
 class Tone(Enum):
@@ -137,29 +143,11 @@ def light_of_levels(black: float, white: float, tone: Tone) -> Light:
     return Light(black, white)
 
 
-def srgb_decoded(level: FloatArray) -> FloatArray:
-    """Return linear light from sRGB grey values, both 0…1 (IEC 61966-2-1)."""
-    bright = ((np.maximum(level, 0.0) + 0.055) / 1.055) ** 2.4
-    return np.where(level <= 0.04045, level / 12.92, bright)
-
-
-def srgb_encoded(light: FloatArray) -> FloatArray:
-    """Return sRGB grey values of linear light, both 0…1 (IEC 61966-2-1)."""
-    safe = np.maximum(light, 0.0031308)
-    return np.where(light > 0.0031308, 1.055 * safe ** (1.0 / 2.4) - 0.055, 12.92 * light)
-
-
-def srgb_slope(light: FloatArray) -> FloatArray:
-    """Return the derivative of `srgb_encoded`."""
-    safe = np.maximum(light, 0.0031308)
-    return np.where(light > 0.0031308, 1.055 / 2.4 * safe ** (1.0 / 2.4 - 1.0), 12.92)
-
-
 # Gradient and curvature of the light are left out: over a whole ring, they are flat over the mask.
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
-_STREAK_ROWS = [Param.STREAK_X, Param.STREAK_Y]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
+_ALSO_FILTERED = {int(Param.STREAK_X), int(Param.STREAK_Y), *SKEW_PARAMS}  # mostly nothing
 _SHARE_STEPS = 400
 GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
@@ -190,20 +178,40 @@ class PhotometricModel:
         if mask is not None and light.linear_sharpening:
             detail = mask.detail(value, light.black, light.white)
             value += light.linear_sharpening * detail
-        value = encoded(value, self.tone)
+        if self.tone.is_srgb:
+            value = encode_pixels(value, np.empty(len(value)))
         if self.mask is None:
             return value
         return value + light.sharpening * self._detail(self.mask, value, light, added)
 
-    def slopes(self, share: FloatArray, light: Light) -> FloatArray:
-        """Return the derivatives (n,) of the levels by the share, in even light, unsharpened."""
-        slopes, values = _tone_slopes(share, light.values), light.values
-        slopes *= _light_at(self.offsets, values)
+    def carried(
+        self, share: FloatArray, light: Light, rows: FloatArray, added: FloatArray | None = None
+    ) -> FloatArray:
+        """Return what changes (k, n) of the share make of the levels, to first order.
+
+        `added` as in `levels`.
+        """
+        value, values = np.empty(len(share)), light.values
+        _expose(share, self.offsets, values, self._added(added), value)
+        if added is None:
+            gains = _tone_slopes(share, values)
+        else:
+            between = 1.0 + added[1] - added[0]
+            gains = between * _tone_slopes(added[0] + between * share, values)
+        carried: FloatArray = gains * _light_at(self.offsets, values) * rows
+        mask = self._mask_in_light(added)
+        if mask is not None and light.linear_sharpening:
+            value += light.linear_sharpening * mask.detail(value, light.black, light.white)
+            for k in range(len(carried)):
+                carried[k] += light.linear_sharpening * mask.detail(carried[k], 0.0, 0.0)
         if self.tone.is_srgb:
-            value = np.empty(len(share))
-            _expose(share, self.offsets, values, _NOTHING, value)
-            slopes *= srgb_slope(value)
-        return slopes
+            slope = np.empty(len(value))
+            encode_pixels(value, slope)
+            carried *= slope
+        if self.mask is not None:
+            for k in range(len(carried)):
+                carried[k] += light.sharpening * self.mask.detail(carried[k], 0.0, 0.0)
+        return carried
 
     def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the levels of ink and of plate at all pixels, where the light is uneven."""
@@ -256,21 +264,20 @@ class PhotometricModel:
             value,
             jacobian,
         )
-        mask = self._mask_in_light(added)
-        if mask is not None:
-            detail = mask.detail(value, light.black, light.white)
-            if light.linear_sharpening:
-                self._sharpen_rows(mask, jacobian, (1.0, 1.0), light.linear_sharpening)
-            jacobian[Param.LINEAR_SHARPENING] = detail
+        in_light, detail, slope = self._mask_in_light(added), None, None
+        if in_light is not None:
+            detail = in_light.detail(value, light.black, light.white)
             value += light.linear_sharpening * detail
         if self.tone.is_srgb:
-            jacobian *= srgb_slope(value)
-            value = encoded(value, self.tone)
+            slope = np.empty(len(value))
+            value = encode_pixels(value, slope)
         if self.mask is None:
+            if slope is not None:
+                jacobian *= slope
             return value, jacobian
+        self._sharpen(self.mask, jacobian, light, detail, slope)
         if added is not None:
             self._sharpen_levels(self.mask, jacobian, light, added)
-        self._sharpen(self.mask, jacobian, light)
         detail = self._detail(self.mask, value, light, added)
         jacobian[Param.SHARPENING] = detail
         return value + light.sharpening * detail, jacobian
@@ -287,24 +294,45 @@ class PhotometricModel:
         ink, plate = self.local_levels(light, added)
         return mask.detail(value, ink, plate)
 
-    def _sharpen(self, mask: Mask, jacobian: FloatArray, light: Light) -> None:
-        """Sharpen the rows of a Jacobian after the tone curve."""
+    def _sharpen(
+        self,
+        mask: Mask,
+        jacobian: FloatArray,
+        light: Light,
+        detail: FloatArray | None,
+        slope: FloatArray | None,
+    ) -> None:
+        """Sharpen the rows of a Jacobian in the light, carry them to grey values, and sharpen them.
+
+        `detail` is what is sharpened in the light at full strength, None: nothing; `slope` that of
+        the curve to grey values, None: there is none.
+        """
+        rows, in_light = [*_FILTERED], light.linear_sharpening if detail is not None else 0.0
+        if self.tone.is_shaped:
+            rows += _TONE_ROWS
+        if detail is not None:
+            rows.append(Param.LINEAR_SHARPENING)
+        sharpened = SharpenedRows(mask, jacobian, np.array(rows))
+        if in_light:
+            sharpened.sharpen((1.0, 1.0), in_light)
+        if detail is not None:
+            sharpened.replace_last(detail)
         others = (1.0, 1.0)
-        if self.tone.is_srgb:
+        if slope is not None:
+            sharpened.multiply(slope)
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
-        self._sharpen_rows(mask, jacobian, others, light.sharpening)
-
-    def _sharpen_rows(
-        self, mask: Mask, jacobian: FloatArray, others: tuple[float, float], strength: float
-    ) -> None:
-        """Sharpen the rows of a Jacobian; `others` are those of ink and plate off the sample."""
-        rows = [*_FILTERED, *(_TONE_ROWS if self.tone.is_shaped else [])]
-        of_skew = SKEW_PARAMS if len(jacobian) > PLAIN_COUNT else []
-        for row in (*_STREAK_ROWS, Param.LINEAR_SHARPENING, *of_skew):
-            if jacobian[row].any():
-                jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0)
-        mask.sharpen(jacobian, np.array(rows), others, strength)
+        sharpened.sharpen(others, light.sharpening)
+        for row in set(range(len(jacobian))).difference(rows):
+            values = jacobian[row]
+            is_fine = row in _ALSO_FILTERED and values.any()
+            if is_fine and in_light:
+                values += in_light * mask.detail(values, 0.0, 0.0)
+            if slope is not None:
+                values *= slope
+            if is_fine:
+                values += light.sharpening * mask.detail(values, 0.0, 0.0)
+        sharpened.write(jacobian)
 
 
 def share_at(level: float, light: Light, tone: Tone) -> float:

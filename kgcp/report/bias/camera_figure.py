@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.axes import Axes
 
-from kgcp.measurement.image_model.photometry import srgb_decoded
+from kgcp.measurement.image_model.srgb import srgb_decoded
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.quality.number_text import minus
 from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet

@@ -9,8 +9,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.discs.disc_levels import COUNT, LevelModel, Row
 from kgcp.measurement.discs.tone_curve import DiscTone, plausible, steep_enough
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.photometry import Tone, srgb_encoded
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import unsharp_mask
+from kgcp.measurement.image_model.srgb import srgb_encoded
 
 SIDE = 24
 ROWS, COLUMNS = (each.ravel().astype(np.float64) for each in np.mgrid[0:SIDE, 0:SIDE])
