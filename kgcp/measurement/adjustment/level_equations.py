@@ -11,14 +11,13 @@ with A of pose, blur, light and shadows' edges, C of the levels with their prior
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.image_model.noise import Misfit
 
@@ -42,7 +41,7 @@ class LevelEquations:
     count: int  # of the knots
     # (q,): the values that some pixel depends on: of ink at all knots, then of plate
     used: IndexArray
-    root: FloatArray  # (q, q): lower Cholesky factor of C
+    root: FloatArray  # (q, q): Cholesky factor of C, the lower triangle
     # (p, q): b, and B C⁻¹
     mixed: FloatArray
     projected: FloatArray
@@ -57,11 +56,13 @@ class LevelEquations:
         """Return L⁻¹ times a gradient (q,), with C = L Lᵀ."""
         return solved(self.root, gradient)
 
-    def step_of_levels(self, gradient: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the levels' step (2, k) that goes with that of all else (p,)."""
-        left = self.half_solved(gradient - self.mixed.T @ step)
+    def step_of_levels(self, half: FloatArray, step: FloatArray) -> FloatArray:
+        """Return the levels' step (2, k) that goes with that of all else (p,).
+
+        `half` is their gradient, `half_solved`.
+        """
         values = np.zeros(2 * self.count)
-        values[self.used] = solved(self.root, left, is_transposed=True)
+        values[self.used] = solved(self.root, half, is_transposed=True) - step @ self.projected
         return values.reshape(2, -1)
 
     def rows(self) -> FloatArray:
@@ -112,8 +113,8 @@ def eliminate_levels(
     count = precision.shape[1]
     own, mixed, used = _products(*at_knots, by_level, current.weight, scaled, count)
     known = precision.ravel()[used]
-    own[np.diag_indices_from(own)] += known
-    root, failure = dpotrf(own, lower=1, clean=1)
+    own.ravel()[:: len(own) + 1] += known
+    root, failure = dpotrf(own.T, lower=1, clean=0, overwrite_a=1)
     if failure:
         raise Rejection(Reason.POOR_FIT, "singular equations of levels")
     projected = solved(root, solved(root, mixed.T), is_transposed=True).T
@@ -133,8 +134,8 @@ def eliminate_levels(
 
 def solved(root: FloatArray, vectors: FloatArray, *, is_transposed: bool = False) -> FloatArray:
     """Return L⁻¹ or L⁻ᵀ times vectors."""
-    trans: Literal["T", "N"] = "T" if is_transposed else "N"
-    return np.asarray(solve_triangular(root, vectors, lower=True, trans=trans, check_finite=False))
+    solution, _ = dtrtrs(root, vectors, lower=1, trans=int(is_transposed))
+    return np.asarray(solution)
 
 
 def gather(at_knots: AtKnots, by_level: FloatArray, values: FloatArray, count: int) -> FloatArray:
@@ -166,41 +167,102 @@ def _products(
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Return the levels' own normal matrix, the mixed one (p, q), and the values that are used.
 
-    The knots of a pixel ascend, so that only upper triangles are added up.
+    Of the former the upper triangle alone. Pixels are taken cell by cell: those of a cell have the
+    same knots, and what they add is summed side by side before it goes to its places.
     """
     reach, rows = knots.shape[1], scaled.shape[0]
     used, number = _used(knots, weights, count)
-    q = len(used)
-    ink_ink, mixed_both, plate_plate = np.zeros((3, q, q))
-    mixed = np.zeros((q, 2, rows))  # by knot, so that what is added lies side by side
-    at, share = np.empty(reach, np.intp), np.empty(reach)
+    q, width = len(used), 3 * reach + 2 * rows
+    own, mixed = np.zeros((2 * q, 2 * q)), np.zeros((q, 2 * rows))
     by_row = scaled.T.copy()
-    for i in range(len(knots)):
-        ink, plate = by_level[0, i], by_level[1, i]
-        ii, ip, pp = weight[i] * ink * ink, weight[i] * ink * plate, weight[i] * plate * plate
-        near = 0
-        for j in range(reach):
-            if weights[i, j] != 0.0:
-                at[near], share[near] = number[knots[i, j]], weights[i, j]
-                near += 1
-        for j in range(near):
-            a = at[j]
-            for k in range(j, near):
-                b, both = at[k], share[j] * share[k]
-                ink_ink[a, b] += both * ii
-                mixed_both[a, b] += both * ip
-                plate_plate[a, b] += both * pp
-            of_ink, of_plate = share[j] * weight[i] * ink, share[j] * weight[i] * plate
-            by_ink, by_plate = mixed[a, 0], mixed[a, 1]
-            for p in range(rows):
-                by_ink[p] += of_ink * by_row[i, p]
-            for p in range(rows):
-                by_plate[p] += of_plate * by_row[i, p]
+    order = _by_cell(knots[:, reach - 1], count)
+    cell, first, second = np.zeros((reach, width)), np.empty(width), np.empty(width)
+    m = 0
+    while m < len(order):
+        i = order[m]
+        _fill_products(weights[i], by_level[:, i], weight[i], by_row[i], first)
+        in_cell = m + 1 < len(order) and _is_same(knots[i], knots[order[m + 1]])
+        if in_cell:  # two at a time: half as much to write
+            i2 = order[m + 1]
+            _fill_products(weights[i2], by_level[:, i2], weight[i2], by_row[i2], second)
+            for j in range(reach):
+                share, share2 = weights[i, j], weights[i2, j]
+                for k in range(width):
+                    cell[j, k] += share * first[k] + share2 * second[k]
+        else:
+            for j in range(reach):
+                share = weights[i, j]
+                for k in range(width):
+                    cell[j, k] += share * first[k]
+        m += 2 if in_cell else 1
+        if m == len(order) or not _is_same(knots[i], knots[order[m]]):
+            _add_cell(cell, knots[i], number, own, mixed)
+            cell[:] = 0.0
     by_level_and_row = np.empty((rows, 2 * q))
     for p in range(rows):
-        by_level_and_row[p, :q], by_level_and_row[p, q:] = mixed[:, 0, p], mixed[:, 1, p]
-    own = _whole(ink_ink, mixed_both, plate_plate)
+        by_level_and_row[p, :q], by_level_and_row[p, q:] = mixed[:, p], mixed[:, rows + p]
     return own, by_level_and_row, np.append(used, used + count)
+
+
+@inlined
+def _is_same(knots: IndexArray, others: IndexArray) -> bool:
+    is_same = True
+    for j in range(len(knots)):
+        is_same &= knots[j] == others[j]
+    return is_same
+
+
+@inlined
+def _fill_products(
+    shares: FloatArray, by_level: FloatArray, weight: float, by_row: FloatArray, out: FloatArray
+) -> None:
+    """Fill in a pixel's weighted products: ink · ink, ink · plate and plate · plate with its knots.
+
+    Then those of ink, and of plate, with all rows.
+    """
+    reach, rows = len(shares), len(by_row)
+    of_ink, of_plate = weight * by_level[0], weight * by_level[1]
+    ii, ip, pp = of_ink * by_level[0], of_ink * by_level[1], of_plate * by_level[1]
+    for k in range(reach):
+        out[k], out[reach + k], out[2 * reach + k] = ii * shares[k], ip * shares[k], pp * shares[k]
+    for p in range(rows):
+        out[3 * reach + p], out[3 * reach + rows + p] = of_ink * by_row[p], of_plate * by_row[p]
+
+
+@compiled
+def _by_cell(last_knots: IndexArray, count: int) -> IndexArray:
+    """Return the pixels in the order of their last knots (n,), which cells of a grid have alone."""
+    places = np.zeros(count + 1, np.intp)
+    for knot in last_knots:
+        places[knot + 1] += 1
+    for k in range(count):
+        places[k + 1] += places[k]
+    order = np.empty(len(last_knots), np.intp)
+    for i in range(len(last_knots)):
+        order[places[last_knots[i]]] = i
+        places[last_knots[i]] += 1
+    return order
+
+
+@compiled
+def _add_cell(
+    cell: FloatArray, knots: IndexArray, number: IndexArray, own: FloatArray, mixed: FloatArray
+) -> None:
+    """Add the sums of a cell, by its knots and as of `_fill_products`, where they belong."""
+    reach, q = len(knots), len(own) // 2
+    for j in range(reach):
+        a = number[knots[j]]
+        if a < 0:  # no pixel has a weight there
+            continue
+        for k in range(reach):
+            b = number[knots[k]]
+            if b >= 0:
+                own[a, q + b] += cell[j, reach + k]
+                if b >= a:
+                    own[a, b] += cell[j, k]
+                    own[q + a, q + b] += cell[j, 2 * reach + k]
+        for p in range(mixed.shape[1]):
+            mixed[a, p] += cell[j, 3 * reach + p]
 
 
 @compiled
@@ -214,18 +276,6 @@ def _used(knots: IndexArray, weights: FloatArray, count: int) -> tuple[IndexArra
     used = np.flatnonzero(number == 0)
     number[used] = np.arange(len(used))
     return used, number
-
-
-@compiled
-def _whole(ink_ink: FloatArray, both: FloatArray, plate_plate: FloatArray) -> FloatArray:
-    q = len(ink_ink)
-    own = np.empty((2 * q, 2 * q))
-    for a in range(q):
-        for b in range(a, q):
-            own[a, b] = own[b, a] = ink_ink[a, b]
-            own[q + a, q + b] = own[q + b, q + a] = plate_plate[a, b]
-            own[a, q + b] = own[b, q + a] = own[q + b, a] = own[q + a, b] = both[a, b]
-    return own
 
 
 @compiled

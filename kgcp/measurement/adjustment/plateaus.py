@@ -20,6 +20,7 @@ from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_pla
 _CLEAR_SIGMAS, _CLEAR_PX, _MOST_CLEAR = 2.0, 1.0, 0.1  # of an edge
 _BORDER = 0.18  # of the plate beyond the ring
 _SMOOTHED = 0.16
+_BINS = 4.0  # to the σ of a smoothing
 _WIDE, _WIDE_SHARE = 3.0, 0.02  # where nothing flat is near, what is farther off counts
 _UNEVEN = 0.12  # smoothed levels vary so much: one pair of them would mislead
 _GLARE, _DARKEST_PLATE, _DARKER_INK = 0.06, 0.35, 0.5
@@ -129,8 +130,20 @@ def _smoothing_px(problem: FitProblem) -> float:
 
 
 def _blurred(problem: FitProblem, values: FloatArray, sigma_px: float) -> FloatArray:
-    image = values.reshape(problem.window.height, problem.window.width)
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float64).ravel()
+    """Blur a window's values; where that is wide, in bins of a quarter of its σ."""
+    image, count = values.reshape(problem.window.height, problem.window.width), 1
+    if sigma_px >= 2.0 * _BINS:
+        count = int(sigma_px / _BINS)
+    if count == 1:
+        blurred = cv2.GaussianBlur(image, (0, 0), sigma_px)
+    else:
+        size = [math.ceil(length / count) for length in image.shape[::-1]]
+        bins = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        # means over bins, and straight lines between them, blur too
+        sigma = math.sqrt((sigma_px / count) ** 2 - 1.0 / 12.0 - 1.0 / 6.0)
+        bins = cv2.GaussianBlur(bins, (0, 0), sigma)
+        blurred = cv2.resize(bins, image.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(blurred, dtype=np.float64).ravel()
 
 
 def evened_window(problem: FitProblem, plateaus: Plateaus) -> FitProblem:

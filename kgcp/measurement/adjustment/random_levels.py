@@ -290,7 +290,7 @@ class _WithLevels:
         alone = reduced.half_solved(of_levels)
         damped = _damped(reduced.normal, parameters, damping)
         solution, promised = solve_damped(damped, gradient, 0.5 * float(alone @ alone))
-        values = reduced.step_of_levels(of_levels, solution)
+        values = reduced.step_of_levels(alone, solution)
         edges = solution[len(free) :].reshape(-1, 5)
         moved = parameters.moved(unknowns.step_of(solution[: len(free)]))
         return replace(moved, field=field.moved(values, edges)), promised

@@ -116,7 +116,7 @@ def _with_edge_terms(
     if field is None:
         return WhiteShare(share.points_m, value, jacobian), None
     pixels = sample.problem.window.pixels(sample.index)
-    added, gradient = field.added(pixels), field.contrast_gradient(pixels)
+    added, gradient = field.added_with_gradient(pixels)
     spread = spread_share_gradient(parameters.matrix, sample.rays, covariance, sample.incidence)
     contrast = np.maximum(1.0 + added[1] - added[0], _LEAST_CONTRAST)
     value = value + np.sum(gradient * spread, axis=0) / contrast

@@ -88,15 +88,18 @@ def _weigh(
 
 
 @compiled
-def _add_gradient(
+def _add_grid(
     pixels: FloatArray,
     corner: tuple[float, float],
     spacing: float,
     counts: tuple[int, int],
     values: FloatArray,
-    gradient: FloatArray,
+    seen: FloatArray,
 ) -> None:
-    """Add the gradient of Σ weights · values over one grid."""
+    """Add what one grid adds to ink and plate, and the gradient of its contrast: seen (4, n).
+
+    Sums along a row of knots come first, so that each of them is multiplied out once.
+    """
     (x0, y0), (columns, rows) = corner, counts
     along_x, along_y = np.empty(3), np.empty(3)
     slopes_x, slopes_y = np.empty(3), np.empty(3)
@@ -108,10 +111,16 @@ def _add_gradient(
         _fill_slopes(across, spacing, slopes_x)
         _fill_slopes(down, spacing, slopes_y)
         for r in range(3):
+            ink, plate, right = 0.0, 0.0, 0.0
             for c in range(3):
-                value = values[(row + r) * columns + column + c]
-                gradient[0, i] += value * along_y[r] * slopes_x[c]
-                gradient[1, i] += value * slopes_y[r] * along_x[c]
+                k = (row + r) * columns + column + c
+                ink += along_x[c] * values[0, k]
+                plate += along_x[c] * values[1, k]
+                right += slopes_x[c] * (values[1, k] - values[0, k])
+            seen[0, i] += along_y[r] * ink
+            seen[1, i] += along_y[r] * plate
+            seen[2, i] += along_y[r] * right
+            seen[3, i] += slopes_y[r] * (plate - ink)
 
 
 @inlined
@@ -155,30 +164,25 @@ class LightField:
 
     def added(self, pixels: FloatArray) -> FloatArray:
         """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
-        return added_by_knots(*self.knots.weights(pixels), self.values) + self.of_edges(pixels)
+        return self.added_with_gradient(pixels)[0]
 
-    def contrast_gradient(self, pixels: FloatArray) -> FloatArray:
-        """Return the gradient (2, n) [1/px] of the contrast between plate and ink."""
-        gradient = np.zeros((2, pixels.shape[1]))
-        first, contrasts = 0, self.values[1] - self.values[0]
+    def added_with_gradient(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what `added` does, and the gradient (2, n) [1/px] of plate's contrast to ink."""
+        seen, first = np.zeros((4, pixels.shape[1])), 0
         for g, spacing in enumerate(self.knots.spacings_px):
             counts = self.knots.columns[g], self.knots.rows[g]
             corner = self.knots.x0, self.knots.y0
-            _add_gradient(pixels, corner, spacing, counts, contrasts[first:], gradient)
+            values = self.values[:, first : first + self.knots.counts[g]].copy()
+            _add_grid(pixels, corner, spacing, counts, values, seen)
             first += self.knots.counts[g]
+        added, gradient = seen[:2], seen[2:]
         for edge in self.edges:
-            density = _density(beyond(edge, pixels - self.centre_px[:, None]))
-            slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * density
+            z = beyond(edge, pixels - self.centre_px[:, None])
+            added += edge[INK:, None] * ndtr(z)
+            slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * _density(z)
             gradient[0] += math.cos(edge[ANGLE]) * slope
             gradient[1] += math.sin(edge[ANGLE]) * slope
-        return gradient
-
-    def of_edges(self, pixels: FloatArray) -> FloatArray:
-        """Return the part of the shadows' edges."""
-        added = np.zeros((2, pixels.shape[1]))
-        for edge in self.edges:
-            added += edge[INK:, None] * ndtr(beyond(edge, pixels - self.centre_px[:, None]))
-        return added
+        return added, gradient
 
     def edge_rows(self, pixels: FloatArray, by_level: FloatArray) -> FloatArray:
         """Return the derivatives (5 s, n) by the shadows' edges.
@@ -221,15 +225,3 @@ EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
 def edge_penalty(edges: FloatArray) -> float:
     """Return the priors' part of shadows' edges."""
     return float(0.5 * np.sum(EDGE_PRECISION * (edges - EDGE_MEAN) ** 2))
-
-
-@compiled
-def added_by_knots(knots: IndexArray, weights: FloatArray, values: FloatArray) -> FloatArray:
-    """Return Σ weights · values, of ink and of plate: (2, n)."""
-    added = np.zeros((2, len(knots)))
-    for i in range(len(knots)):
-        for j in range(knots.shape[1]):
-            k = knots[i, j]
-            added[0, i] += weights[i, j] * values[0, k]
-            added[1, i] += weights[i, j] * values[1, k]
-    return added

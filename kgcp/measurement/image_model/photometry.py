@@ -216,7 +216,10 @@ class PhotometricModel:
     def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the levels of ink and of plate at all pixels, where the light is uneven."""
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
-        return encoded(ink, self.tone), encoded(plate, self.tone)
+        if not self.tone.is_srgb:
+            return ink, plate
+        slope = np.empty(len(ink))
+        return encode_pixels(ink, slope), encode_pixels(plate, slope)
 
     def _mask_in_light(self, added: FloatArray | None) -> Mask | None:
         """Return the mask of what is sharpened before the tone curve; None: nothing is.
@@ -232,8 +235,11 @@ class PhotometricModel:
         """Sharpen the derivatives by what is added to ink and to plate."""
         ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
         if self.tone.is_srgb:
-            ink *= srgb_slope(toned(added[0], light.values))
-            plate *= srgb_slope(toned(1.0 + added[1], light.values))
+            slope = np.empty(len(ink))
+            encode_pixels(toned(added[0], light.values), slope)
+            ink *= slope
+            encode_pixels(toned(1.0 + added[1], light.values), slope)
+            plate *= slope
         by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
         by_ink += light.sharpening * mask.detail(by_ink, ink, 0.0)
         by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate)
