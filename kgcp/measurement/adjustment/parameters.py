@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,9 @@ _NO_POSE = (0.0,) * 6
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
 _MEAN, _DIFFERENCE, _XY = int(Param.BLUR_MEAN), int(Param.BLUR_DIFFERENCE), int(Param.BLUR_XY)
+
+_OF_BLUR, _OF_LIGHT = slice(_MEAN, int(Param.BLACK)), slice(int(Param.BLACK), int(Param.SKEW_XXX))
+_OF_SKEW = slice(int(Param.SKEW_XXX), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +47,20 @@ class Parameters:
     @cached_property
     def blur(self) -> Blur:
         """The blur."""
-        mean, difference, xy, *streak = self.vector[Param.BLUR_MEAN : Param.BLACK].tolist()
-        xxx, xxy, xyy, yyy = self.vector[Param.SKEW_XXX :].tolist()
-        even = Blur(mean + difference, mean - difference, xy, *streak)
-        return replace(even, skew=(xxx, xxy, xyy, yyy))
+        mean, difference, xy, streak_x, streak_y = self.vector[_OF_BLUR].tolist()
+        xxx, xxy, xyy, yyy = self.vector[_OF_SKEW].tolist()
+        skew = (xxx, xxy, xyy, yyy)
+        return Blur(mean + difference, mean - difference, xy, streak_x, streak_y, skew)
 
     @cached_property
     def light(self) -> Light:
         """The light."""
-        return Light(*self.vector[Param.BLACK : Param.SKEW_XXX].tolist())
+        return Light(*self.vector[_OF_LIGHT].tolist())
 
     @property
     def has_skew(self) -> bool:
         """Whether the point spread is skew."""
-        return bool(self.vector[Param.SKEW_XXX :].any())
+        return any(self.vector[_OF_SKEW].tolist())
 
     def at(self, pose: Pose) -> Parameters:
         """Return the same blur and light at another pose."""

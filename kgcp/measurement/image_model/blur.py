@@ -63,13 +63,13 @@ class Blur:
     def largest_sd_px(self) -> float:
         """Standard deviation along the direction of the strongest blur [px]."""
         xx, yy, xy = self.total_covariance
-        return float(np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)))
+        return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
 
     @property
     def mean_sd_px(self) -> float:
         """Standard deviation averaged over directions [px]."""
         xx, yy, _ = self.total_covariance
-        return float(np.sqrt(0.5 * (xx + yy)))
+        return math.sqrt(0.5 * (xx + yy))
 
 
 def variance_in_bins(variance_px2: float, count: int) -> float:

@@ -28,6 +28,13 @@ def srgb_encoded(light: FloatArray) -> FloatArray:
     return np.where(light > _LAST_STRAIGHT, bright, _STRAIGHT * light)
 
 
+def srgb_encoded_number(light: float) -> float:
+    """Return what `srgb_encoded` does of one number, without the time that arrays take."""
+    if light > _LAST_STRAIGHT:
+        return float(_SCALE * light**_POWER - _OFFSET)
+    return _STRAIGHT * light
+
+
 def srgb_slope(light: FloatArray) -> FloatArray:
     """Return the derivative of `srgb_encoded`."""
     safe = np.maximum(light, _LAST_STRAIGHT)
