@@ -47,7 +47,8 @@ def _loss(fit: TargetFit, sample: Sample) -> float:
         problem=replace(sample.problem, tone=tone),
         photometry=replace(sample.photometry, tone=tone),
     )
-    prediction = predict(toned, fit.parameters)
+    is_own = sample is fit.sample
+    prediction = fit.prediction if is_own else predict(toned, fit.parameters)
     sd = noise_of(toned, prediction).sd
     current = misfit(sample.levels, prediction.levels, sd, sample.censoring)
     loss = negative_log_posterior(current, fit.unknowns, fit.parameters)
