@@ -85,7 +85,7 @@ def rendered(
 
 def lines(table: pd.DataFrame) -> Iterator[str]:
     """Yield means and RMS of every band: as measured, of the renderings, and of the difference."""
-    yield "      R px  frames   measured: mean, RMS %      rendering: mean, RMS %     left: mean, RMS %"
+    yield "      R px  frames   measured: mean, RMS %   rendering: mean, RMS %   left: mean, RMS %"
     for low, high in RADIUS_BANDS_PX:
         band = table[(table["radius_px_true"] >= low) & (table["radius_px_true"] < high)]
         if len(band) < 2:
