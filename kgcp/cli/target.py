@@ -205,7 +205,7 @@ def _draw_field(
     import json
     import warnings
 
-    from kgcp.errors import KgcpError, KgcpWarning
+    from kgcp.errors import KgcpError, KgcpWarning, SettingError
     from kgcp.io.files.atomic import write_bytes
     from kgcp.io.flight.field_file import field_toml, read_field
     from kgcp.io.print.write import write_sheets
@@ -214,12 +214,11 @@ def _draw_field(
     from kgcp.targets.sheets import lay_out
 
     field = read_field(text)
-    if not isinstance(field, Field):
-        raise KgcpError(
-            f"{text}: is a field of points, which lie where they are; print one on a grid",
-            option="field",
-        )
-    sheets = lay_out(draw_field(field), "the field", paper, is_tiled=is_tiled)
+    try:
+        drawing = draw_field(field)
+    except SettingError as error:
+        raise KgcpError(f"{text}: {error}", option="field") from error
+    sheets = lay_out(drawing, "the field", paper, is_tiled=is_tiled)
     folder = out or Path("targets")
     files = write_sheets(sheets, "field", folder, formats, dpi)
     files.append(folder / "field.toml")
@@ -227,7 +226,7 @@ def _draw_field(
     if as_json:
         told = {"field": field.name, "discs": len(field.names()), "sheets": len(sheets)}
         click.echo(json.dumps({**told, "files": [str(path) for path in files]}))
-    if field.symmetries():
+    if isinstance(field, Field) and field.symmetries():
         warnings.warn(
             "the field looks the same when it is turned; a [[mark]] in its field.toml, one hollow"
             " disc, gives it one way up",

@@ -163,6 +163,53 @@ def test_a_field_is_drawn_with_its_field_toml(tmp_path: Path) -> None:
     assert steps == pytest.approx(25.0 / 25.4 * 100.0, abs=0.3)
 
 
+_POINTS = """
+name = "panel"
+diameter_m = 0.012
+[code]
+kind = "ring"
+bits = 10
+ring = [1.8, 2.6]
+"""
+_CODES = (5, 11, 13, 37, 63, 85, 343, 127)
+
+
+def _field_of_points(folder: Path, depth_m: float) -> str:
+    """Write a field with codes, one of its discs raised."""
+    places = [(0.06 * (k % 4), 0.07 * (k // 4) + 0.004 * k, 0.0) for k in range(len(_CODES))]
+    places[3] = (*places[3][:2], depth_m)
+    tables = [
+        f'[[point]]\nname = "p{k}"\nposition_m = {list(place)}\ncode = {code}\n'
+        for k, (place, code) in enumerate(zip(places, _CODES, strict=True))
+    ]
+    path = folder / "points.toml"
+    path.write_text(_POINTS + "\n".join(tables), encoding="utf-8")
+    return str(path)
+
+
+def test_a_field_of_points_is_drawn_with_its_codes(tmp_path: Path) -> None:
+    arguments = ["target", "--field", _field_of_points(tmp_path, 0.0), "--sheet", "A4"]
+    options = ["--format", "png", "--dpi", "100", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, [*arguments, *options], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    field = read_field(str(tmp_path / "field.toml"))
+    grey = cv2.imread(str(tmp_path / "target_field.png"), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    naming = measure_field(grey, PhotoTask(field, Response.LINEAR, Operator.CENTROID), "p", "")
+    assert isinstance(naming, PhotoDiscs)
+    assert naming.point.tolist() == list(range(len(_CODES)))
+    off_px = naming.vectors[:, :2] - 100.0 / 0.0254 * field.points_m()[:, :2]
+    assert np.ptp(off_px, axis=0) == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_field_with_depth_is_not_drawn(tmp_path: Path) -> None:
+    arguments = ["target", "--field", _field_of_points(tmp_path, 0.02), "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "points: do not lie in one plane of equal z" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
 def test_a_field_is_drawn_alone(tmp_path: Path) -> None:
     arguments = ["target", "--field", "grid:9x6:25mm:14mm", "--new", "2", "--out", str(tmp_path)]
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)

@@ -68,8 +68,7 @@ def wrong() -> dict[str, tuple[Callable[[], Flight], tuple[Cause, ...]]]:
             yield name, slip, flight_without_reference
 
     return {
-        name: (partial(_slipped, slip, right), slip.causes)
-        for name, slip, right in all_of_them()
+        name: (partial(_slipped, slip, right), slip.causes) for name, slip, right in all_of_them()
     }
 
 

@@ -20,6 +20,7 @@ _MIDDLE = slice(_PER_SECTOR // 4, 3 * _PER_SECTOR // 4)  # of a sector: blur mix
 _ACROSS = (0.35, 0.5, 0.65)  # of the ring's width
 _LEAST_MARGIN = 0.2  # of the contrast, from the middle between 0 and 1
 _LEAST_CONTRAST = 0.02  # of the range of grey values
+_MOST_UNEVEN = 0.35  # of the contrast: the ground beside a letter shows its neighbours
 
 
 def read_codes(
@@ -56,7 +57,8 @@ def _read(values: np.ndarray, outline: DiscOutline, ring: CodeRing) -> int | Non
     within = 0.5 if hole is None else 0.5 + 0.5 * hole.mean_radius / ellipse.mean_radius
     ground, disc = at(0.5 * (1.0 + ring.inner)), float(at(within).mean())
     contrast = disc - float(ground.mean())
-    if abs(contrast) < _LEAST_CONTRAST:
+    is_even = np.abs(ground - np.median(ground)).max() < _MOST_UNEVEN * abs(contrast)
+    if abs(contrast) < _LEAST_CONTRAST or not is_even:
         return None
     width_of_ring = ring.outer - ring.inner
     level = np.mean([at(ring.inner + share * width_of_ring) for share in _ACROSS], axis=0)
