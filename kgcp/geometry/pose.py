@@ -66,7 +66,9 @@ class Pose:
 
     def moved(self, step: FloatArray) -> Pose:
         """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
-        return Pose(rotation_about(step[3:6]) @ self.rotation, self.translation_m + step[:3])
+        # not `rotation_about`: the program itself would load numba for this alone
+        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
+        return Pose(turn @ self.rotation, self.translation_m + step[:3])
 
     def mirrored(self) -> Pose:
         """Return the pose with the plate's normal mirrored about the viewing ray of its centre.

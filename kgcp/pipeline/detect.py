@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -183,7 +183,7 @@ def detect_flight(
         ):
             job = replace(job, kept_frames=kept)
             run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
-            pool.import_meanwhile(*_needed_at_the_end(job))
+            pool.import_meanwhile("pandas")  # pyarrow loads it to write a table
             with stopwatch.stage("first look"):
                 run.first_pass()
             with stopwatch.stage("second look"):
@@ -256,13 +256,6 @@ def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> li
         FrameInput(frame, times.get(frame), priors, flight.may_use_exif_times, plain)
         for frame, priors, plain in known
     ]
-
-
-def _needed_at_the_end(job: DetectionJob) -> tuple[str, ...]:
-    """Return libraries that learning and the table use: pyarrow loads pandas to write one."""
-    if job.camera.response is Response.UNKNOWN and job.settings.is_learning:
-        return ("pandas", "numba")
-    return ("pandas",)
 
 
 def _measure_missing_targets(

@@ -248,22 +248,29 @@ class DetectionRun:
         if self._job.settings.is_learning:
             self.learnt = learn_imaging(map(self._journal.read, self._keys))
         if self._job.settings.is_guided:
-            self._preferences = preferences_of_neighbours(self.results())
+            kept = map(self._journal.read, self._keys)
+            self._preferences = preferences_of_neighbours(
+                result if self.learnt is None else self._as_learnt(result, is_complete=False)
+                for result in kept
+            )
 
     def results(self) -> Iterator[FrameResult]:
         """Yield the last result of every frame, in the frames' order."""
         return map(self._as_learnt, map(self._journal.read, self._keys))
 
-    def _as_learnt(self, result: FrameResult) -> FrameResult:
+    def _as_learnt(self, result: FrameResult, *, is_complete: bool = True) -> FrameResult:
+        """Return a result by what is learnt; where that `is_complete`, what follows from poses."""
         outcomes = tuple(
-            self._measured_as_learnt(result.frame, outcome)
+            self._measured_as_learnt(result.frame, outcome, is_complete=is_complete)
             if isinstance(outcome, Measurement)
             else outcome
             for outcome in result.outcomes
         )
         return replace(result, outcomes=outcomes)
 
-    def _measured_as_learnt(self, frame: str, measurement: Measurement) -> Outcome:
+    def _measured_as_learnt(
+        self, frame: str, measurement: Measurement, *, is_complete: bool
+    ) -> Outcome:
         learnt = measurement
         if self.learnt is not None:
             if self.learnt.base is not None:
@@ -272,8 +279,8 @@ class DetectionRun:
         preference = self._preferences.get((frame, learnt.target, learnt.instance))
         if preference is not None:
             learnt = weighed_anew(self._job.camera, learnt, preference)
-        if learnt is measurement:
-            return measurement
+        if learnt is measurement or not is_complete:
+            return learnt
         return completed(self._job, learnt)
 
     def map_results(

@@ -17,7 +17,13 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
 from kgcp.measurement.adjustment.smoothing import CameraSmoothing, camera_smoothing
-from kgcp.measurement.image_model.photometry import Light, Tone, decoded, encoded, toned
+from kgcp.measurement.image_model.photometry import (
+    Light,
+    Tone,
+    decoded,
+    encoded,
+    toned_between,
+)
 from kgcp.measurement.records import FrameResult, Imaging, Measurement, ToneBase
 
 _MOST_OF_ONE = 30.0  # of log-likelihood: no single frame decides
@@ -163,7 +169,8 @@ def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
     share = np.linspace(0.0, 1.0, 4 * _STEPS + 1)
     tone_1, tone_2, tone_3 = imaging.tone
     light = Light(imaging.black, imaging.white, tone_1=tone_1, tone_2=tone_2, tone_3=tone_3)
-    levels = np.maximum.accumulate(encoded(toned(share, light.values), TONE_OF_BASE[imaging.base]))
+    toned = toned_between(share, light)
+    levels = np.maximum.accumulate(encoded(toned, TONE_OF_BASE[imaging.base]))
     return np.interp(grey, levels, share, left=np.nan, right=np.nan)
 
 

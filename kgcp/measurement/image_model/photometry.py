@@ -390,6 +390,13 @@ def toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
     return level
 
 
+def toned_between(share: FloatArray, light: Light) -> FloatArray:
+    """Return what `toned` does of shares from 0 to 1, without the time that compiled code takes."""
+    arch, lean = share * (1.0 - share), 2.0 * share - 1.0
+    tone = share + arch * (light.tone_1 + lean * (light.tone_2 + lean * light.tone_3))
+    return np.asarray(light.black + (light.white - light.black) * tone)
+
+
 @compiled
 def _tone_slopes(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
     """Return the derivatives of `toned`."""

@@ -25,9 +25,16 @@ from kgcp.measurement.image_model.photometry import (
     decoded,
     encoded,
     plateau_levels,
+    toned,
+    toned_between,
 )
 from kgcp.measurement.image_model.sharpening import unsharp_mask
-from kgcp.measurement.image_model.srgb import encode_pixels, srgb_encoded, srgb_slope
+from kgcp.measurement.image_model.srgb import (
+    encode_pixels,
+    srgb_encoded,
+    srgb_encoded_number,
+    srgb_slope,
+)
 
 WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
 TONE = Tone.UNKNOWN
@@ -154,6 +161,15 @@ def test_srgb_decodes_to_the_light_it_encodes(light: float) -> None:
     grey = float(srgb_encoded(np.array([light]))[0])
     back = grey / 12.92 if grey <= 0.04045 else ((grey + 0.055) / 1.055) ** 2.4
     assert back == pytest.approx(light, abs=2e-7)  # the standard's two branches meet to 1e-7
+
+
+def test_few_numbers_have_the_tone_of_many() -> None:
+    share = np.linspace(0.0, 1.0, 33)
+    np.testing.assert_allclose(
+        toned_between(share, LIGHT), toned(share, LIGHT.values), rtol=1e-14, atol=1e-15
+    )
+    for value in (-0.1, 0.001, 0.7):
+        assert srgb_encoded_number(value) == pytest.approx(float(srgb_encoded(np.array(value))))
 
 
 def test_many_pixels_are_encoded_like_few() -> None:
