@@ -22,7 +22,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.measurement.discs.measure import measure_discs
+from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, Operator, Polarity
 from kgcp.pipeline.execution.threads import use_one_thread_each
@@ -36,6 +36,7 @@ _BRIGHT, _DARK = 0.62, 0.10
 _GRADIENT = 0.05  # of the light over one radius, at most over …
 _LARGEST_FALL = 0.3  # … the photograph's half width
 _PSF_PX = 0.6
+_LEARNED_FROM = 5  # photographs, the tone curve and the sharpening: as `kgcp calibrate`
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 
 
@@ -127,16 +128,26 @@ def measure(setup: Setup) -> Outcome:
     camera = Camera(width, height, _FOCAL_PX, _FOCAL_PX, 0.5 * (width - 1), 0.5 * (height - 1))
     sensor = Sensor(tone=case.tone, sharpening=case.sharpening)
     fall = min(setup.gradient / radius, _LARGEST_FALL / (0.5 * width))
-    errors, covariances, along, seconds = [], [], [], 0.0
+    scenes, photos = [], []
     for _ in range(setup.photographs):
         scene = _scene(setup, pitch, fall, rng)
         photo = photograph(camera, _POSE, scene, Optics(_PSF_PX), sensor, rng, case.gain)
-        photo = _compressed(photo, case.quality)
+        scenes.append(scene)
+        photos.append(_compressed(photo, case.quality))
+    outlines = [
+        [each for each in find_outlines(photo) if each.polarity is setup.polarity]
+        for photo in photos
+    ]
+    start = time.process_time()
+    learned = learn_camera(list(zip(photos, outlines, strict=True))[:_LEARNED_FROM], case.response)
+    measured = [
+        measure_discs(photo, own, response=case.response, operator=setup.operator, camera=learned)
+        for photo, own in zip(photos, outlines, strict=True)
+    ]
+    seconds = time.process_time() - start
+    errors, covariances, along = [], [], []
+    for scene, discs in zip(scenes, measured, strict=True):
         truth = circle_images(camera, field_circles(_POSE, scene.discs)).moments
-        outlines = [each for each in find_outlines(photo) if each.polarity is setup.polarity]
-        start = time.process_time()
-        discs = measure_discs(photo, outlines, response=case.response, operator=setup.operator)
-        seconds += time.process_time() - start
         direction = np.array(scene.gradient) / max(math.hypot(*scene.gradient), 1e-12)
         for expected in truth:
             disc = _nearest(discs, expected, radius)

@@ -127,13 +127,7 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
         made = calibrate_photos(photos, field, Path(out), options, NoProgress())
     seconds = time.perf_counter() - began_s
     stiff = made.calibration
-    free = _again(made, replace(settings, points=PointModel.FREE))
-    # what the peers estimate: all terms, and the field as it is stated
-    peers = CalibrationSettings(PointModel.FIXED, LensModel.BROWN)
-    fixed = min(
-        (_again(made, replace(peers, is_same_aspect=is_same)) for is_same in (True, False)),
-        key=lambda calibration: calibration.rms_px,
-    )
+    fixed, free = (_by_all_terms(made, points) for points in (PointModel.FIXED, PointModel.FREE))
     numbers = calibration_numbers(stiff)
     z = halves_z(stiff, halves) if halves else {}
     camera = stiff.camera
@@ -160,6 +154,15 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
 def _rms(values: Iterable[float]) -> float:
     squares = [value**2 for value in values]
     return math.sqrt(sum(squares) / len(squares)) if squares else math.nan
+
+
+def _by_all_terms(made: PhotoCalibration, points: PointModel) -> CameraCalibration:
+    """Return what the peers estimate of the camera: all terms, whether they are worth it or not."""
+    peers = CalibrationSettings(points, LensModel.BROWN)
+    return min(
+        (_again(made, replace(peers, is_same_aspect=is_same)) for is_same in (True, False)),
+        key=lambda calibration: calibration.rms_px,
+    )
 
 
 def _again(made: PhotoCalibration, settings: CalibrationSettings) -> CameraCalibration:
