@@ -91,6 +91,30 @@ def outline_geometry(outline: DiscOutline) -> Geometry:
     return geometry_of(moments_of_ellipse(outline.ellipse))
 
 
+def adjust_disc_in_any_light(task: DiscTask, free: Unknowns, blur_px: float = 0.0) -> DiscFit:
+    """Adjust a disc, by light of second order where the edge of a shadow or of a spot crosses it.
+
+    Raises
+    ------
+    DiscRejection, NoFit
+    """
+    fit = adjust_disc(task, free, blur_px=blur_px)
+    if _is_in_curved_light(fit, task):
+        return adjust_disc(task, free.with_curved_light(), fit.state)
+    return fit
+
+
+def _is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
+    """Return whether residuals show that the light over a disc is not linear.
+
+    Only where it is seen: a second order that is always free would cost accuracy.
+    """
+    if len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
+        return False
+    is_seen = fit.sample.censoring.share <= _MUCH_CLIPPED
+    return is_seen and fit.curvature_gain > _CURVED
+
+
 def adjust_disc(
     task: DiscTask, free: Unknowns, start: DiscState | None = None, blur_px: float = 0.0
 ) -> DiscFit:
@@ -126,20 +150,7 @@ def adjust_disc(
         geometry, blur = state.geometry, state.blur
         if moved_px < _SETTLED_PX and widened < _SETTLED_BLUR:
             break
-    if _is_in_curved_light(fit, task):
-        return adjust_disc(task, free.with_curved_light(), state)
     return fit
-
-
-def _is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
-    """Return whether the edge of a shadow or of a spot crosses the disc.
-
-    Only where it is seen: a second order that is always free would cost accuracy.
-    """
-    if fit.free.is_light_curved or len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
-        return False
-    is_seen = fit.sample.censoring.share <= _MUCH_CLIPPED
-    return is_seen and fit.curvature_gain > _CURVED
 
 
 def _adjust_on(

@@ -115,7 +115,9 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
 def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
 
-    Of burnt discs the upper end of the curve is not seen: without them, if enough are left.
+    Of burnt discs the upper end of the curve is not seen: without them, if enough are left. The
+    light over a disc is taken to be linear: beside a second order of its own, held fast while all
+    are adjusted together, the curve would be bent to fit it.
     """
     fits = []
     for task in tasks:

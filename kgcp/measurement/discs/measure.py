@@ -14,7 +14,7 @@ from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.adjust_disc import (
     DiscRejection,
     DiscTask,
-    adjust_disc,
+    adjust_disc_in_any_light,
     check_fit,
     geometry_of,
     outline_geometry,
@@ -147,7 +147,7 @@ def _measured(
 
 def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] | DiscMiss:
     try:
-        fit = adjust_disc(task, unknowns_of(task, camera), blur_px=first_blur_px(task, camera))
+        fit = adjust_disc_in_any_light(task, unknowns_of(task, camera), first_blur_px(task, camera))
         check_fit(fit, task.outline)
         return (fit, scatter_of(fit)) if not len(task.inner) else _with_hole(fit)
     except DiscRejection as rejection:

@@ -46,3 +46,26 @@ def test_curve_and_sharpening_are_those_of_the_camera(
     assert camera.tone is tone
     tolerance = 0.25 if any(waves) else 0.1
     assert camera.known.mean[:3] == pytest.approx(waves, abs=tolerance)
+
+
+def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
+    """Light of second order over some discs, held fast while all are adjusted, would (to sRGB)."""
+    scene = FieldScene(DISCS, 0.62, 0.1)
+    grey = photograph(
+        CAMERA,
+        Pose(np.eye(3), np.array([0.0, 0.0, 1.0])),
+        scene,
+        Optics(0.7),
+        Sensor(tone=ToneCurve.LINEAR),
+        np.random.default_rng(3),
+    )
+    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    beyond_px = rows - 127.0 + 0.35 * (columns - 165.0)
+    shade = 1.0 - 0.2 / (1.0 + np.exp(-beyond_px / 5.0))
+    grey = np.round(grey * shade).astype(np.uint8)
+    camera = learn_tone(
+        [[DiscTask(grey, outline, []) for outline in find_outlines(grey)]], Response.UNKNOWN
+    )
+    assert camera.known is not None
+    assert camera.tone is Tone.UNKNOWN_FROM_LINE
+    assert camera.known.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
