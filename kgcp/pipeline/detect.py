@@ -26,7 +26,7 @@ from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
 from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_code
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
-from kgcp.pipeline.execution.kept_frames import KeptFrames, kept_frames
+from kgcp.pipeline.execution.kept_frames import KeptFrames, kept_frames, remove_kept_frames
 from kgcp.pipeline.execution.local_processes import Preparation
 from kgcp.pipeline.execution.profiling import OTHER
 from kgcp.pipeline.execution.threads import single_threaded
@@ -237,10 +237,12 @@ def _kept_frames(
     out: Path, settings: DetectSettings, options: RunOptions
 ) -> AbstractContextManager[KeptFrames | None]:
     """Return where frames are kept between looks: nowhere for other machines, or a single look."""
+    folder = out / ".detections.frames"
     is_one_look = not settings.is_guided and options.places is None
     if is_one_look or options.scheduler is not None:
+        remove_kept_frames(folder)
         return nullcontext()
-    return kept_frames(out / ".detections.frames")
+    return kept_frames(folder)
 
 
 def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> list[FrameInput]:

@@ -10,7 +10,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,7 @@ class KeptFrames:
     most_bytes: int  # all frames of a flight are of one size
 
     def keep(self, frame: str, grey: GreyArray) -> None:
-        """Keep the grey values of a frame if there is room; a disk that refuses does no harm."""
+        """Keep the grey values of a frame if there is room; a full disk gets back what was kept."""
         path = self._path(frame)
         unfinished = path.with_suffix(f".{os.getpid()}")  # whatever ends this process: not the name
         try:
@@ -41,8 +41,7 @@ class KeptFrames:
                     np.lib.format.write_array(stream, grey, allow_pickle=False)
                 unfinished.replace(path)
         except OSError:
-            with suppress(OSError):
-                unfinished.unlink()
+            remove_kept_frames(self.folder)
 
     def find(self, frame: str) -> GreyArray | None:
         """Return the grey values of a frame; None if they were not kept."""
@@ -56,13 +55,18 @@ class KeptFrames:
         return self.folder / hashlib.sha256(frame.encode()).hexdigest()[:32]
 
 
+def remove_kept_frames(folder: Path) -> None:
+    """Remove the folder, of this run or of one that was killed."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 @contextmanager
 def kept_frames(folder: Path) -> Iterator[KeptFrames | None]:
     """Have a folder for decoded frames until the block ends; None if it cannot be made.
 
     What a run that was killed has left there goes first: its frames may have changed since.
     """
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_kept_frames(folder)
     try:
         folder.mkdir()
         room = int(_SHARE_OF_DISK * shutil.disk_usage(folder).free)
@@ -72,4 +76,4 @@ def kept_frames(folder: Path) -> Iterator[KeptFrames | None]:
     try:
         yield kept
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_kept_frames(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -54,3 +55,19 @@ def test_where_no_folder_can_be_nothing_is_kept(tmp_path: Path) -> None:
     (tmp_path / "frames").touch()
     with kept_frames(tmp_path / "frames") as kept:
         assert kept is None
+
+
+def test_a_full_disk_gets_back_what_was_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with kept_frames(tmp_path / "frames") as kept:
+        assert kept is not None
+        kept.keep("a", np.zeros((3, 4), np.uint8))
+
+        def refused(*_: object, **__: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(np.lib.format, "write_array", refused)
+        kept.keep("b", np.zeros((3, 4), np.uint8))
+        assert kept.find("a") is None
+        assert not (tmp_path / "frames").exists()
