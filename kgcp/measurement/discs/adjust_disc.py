@@ -99,12 +99,12 @@ def adjust_disc_in_any_light(task: DiscTask, free: Unknowns, blur_px: float = 0.
     DiscRejection, NoFit
     """
     fit = adjust_disc(task, free, blur_px=blur_px)
-    if _is_in_curved_light(fit, task):
+    if is_in_curved_light(fit, task):
         return adjust_disc(task, free.with_curved_light(), fit.state)
     return fit
 
 
-def _is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
+def is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
     """Return whether residuals show that the light over a disc is not linear.
 
     Only where it is seen: a second order that is always free would cost accuracy.

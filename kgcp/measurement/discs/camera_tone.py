@@ -14,7 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.camera import Response
-from kgcp.measurement.discs.adjust_disc import DiscRejection, DiscTask, adjust_disc, check_fit
+from kgcp.measurement.discs.adjust_disc import (
+    DiscRejection,
+    DiscTask,
+    adjust_disc,
+    check_fit,
+    is_in_curved_light,
+)
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -115,17 +121,20 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
 def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
 
-    Of burnt discs the upper end of the curve is not seen: without them, if enough are left. The
-    light over a disc is taken to be linear: beside a second order of its own, held fast while all
-    are adjusted together, the curve would be bent to fit it.
+    Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
+    of its bends: without them, if enough are left. The light over a disc is taken to be linear:
+    beside a second order of its own, held fast while all are adjusted together, the curve would be
+    bent to fit it.
     """
-    fits = []
+    fits, clean = [], []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
             fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_fit(fit, task.outline)
             fits.append(fit)
-    clean = [fit for fit in fits if fit.sample.censoring.share <= _MOST_CLIPPED]
+            is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
+            if not is_burnt and not is_in_curved_light(fit, task):
+                clean.append(fit)
     return clean if len(clean) >= min(_MOST_DISCS, len(fits) // 2) else fits
 
 
