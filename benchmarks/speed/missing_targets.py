@@ -87,7 +87,8 @@ def costs_of(source: Source, work: Path, paint: str) -> Iterator[MissCost]:
     shutil.copytree(source.flight.frames_folder, folder)
     flight = replace(source.flight, frames_folder=folder)
     data = FlightData(flight, source.frames)
-    kept = KeptFrames(work, 1 << 31)
+    kept = KeptFrames(work / f"{source.name}_{paint}_kept", 1 << 31)
+    kept.folder.mkdir()
     settings = DetectSettings()
     job = DetectionJob(folder, flight.camera, None, flight.targets, settings, kept_frames=kept)
     times = data.frame_times.time_s

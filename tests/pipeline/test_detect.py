@@ -14,11 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
 from kgcp.pipeline.detect import RunOptions, detect_flight
+from kgcp.pipeline.execution.kept_frames import KeptFrames
 from kgcp.pipeline.run_summary import DetectionSummary
 from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.settings import DetectSettings
@@ -83,6 +84,7 @@ class GuidedRuns:
     outs: tuple[Path, ...]
     sheets: tuple[Path, ...]
     summary: DetectionSummary  # of the first
+    were_kept: tuple[bool, ...]  # whether frames that were looked at again had been kept decoded
 
     @property
     def tables(self) -> list[bytes]:
@@ -93,17 +95,26 @@ class GuidedRuns:
 def guided(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> GuidedRuns:
     folder = tmp_path_factory.mktemp("guided")
     outs, sheets = (tuple(folder / f"{name}{k}" for k in range(3)) for name in ("out", "sheet"))
-    summaries = [
-        detect_flight(
-            read_flight(tiny),
-            out=out,
-            options=RunOptions(jobs=jobs, overlay=sheet, all_candidates=all_candidates),
-        )
-        for out, sheet, (jobs, all_candidates) in zip(
-            outs, sheets, ((0, False), (0, True), (2, True)), strict=True
-        )
-    ]
-    return GuidedRuns(outs, sheets, summaries[0])
+    find, were_kept = KeptFrames.find, []
+
+    def noting(kept: KeptFrames, frame: str) -> GreyArray | None:
+        grey = find(kept, frame)
+        were_kept.append(grey is not None)
+        return grey
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(KeptFrames, "find", noting)
+        summaries = [
+            detect_flight(
+                read_flight(tiny),
+                out=out,
+                options=RunOptions(jobs=jobs, overlay=sheet, all_candidates=all_candidates),
+            )
+            for out, sheet, (jobs, all_candidates) in zip(
+                outs, sheets, ((0, False), (0, True), (2, True)), strict=True
+            )
+        ]
+    return GuidedRuns(outs, sheets, summaries[0], tuple(were_kept))
 
 
 def measured(out: Path) -> pd.DataFrame:
@@ -168,6 +179,8 @@ def test_a_second_look_finds_what_the_reference_promises(
     first, second = measured(tmp_path), measured(guided.outs[0])
     assert not first["guided"].any()
     assert guided.summary.guided == second["guided"].sum() == len(second) - len(first) >= 2
+    assert len(guided.were_kept) >= 2
+    assert all(guided.were_kept), "decoded again"
     truth = pd.read_csv(tiny / "truth.csv", index_col="frame")
     assert set(second.index) == set(truth.index[truth["present"] == 1])
     off_px = second[["x_px", "y_px"]].to_numpy() - truth.loc[second.index, ["x", "y"]].to_numpy()

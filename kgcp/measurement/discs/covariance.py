@@ -1,8 +1,8 @@
 """Covariance of a disc's centroid and moments, from the residuals as they are.
 
-As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, their
-scatter is held against what independent residuals of this very fit would leave, and variances are
-nowhere below those of independent pixels.
+As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, and their
+scatter is held against what independent residuals of this very fit would leave. Unlike theirs,
+variances are nowhere below those of independent pixels: a disc has few arcs.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ WAVES = 3
 _LEAST_SLOPE = 0.35  # of the bent curve relative to the known one, …
 _DARKEST, _BRIGHTEST = 0.05, 0.95  # … between these grey values
 # No camera makes its darks darker than they are, but for errors of the black level: least first
-# wave of sRGB's curve, which is a straight line at about -0.68, and of a straight line.
+# wave of sRGB's curve, which at -0.95 is nearly a straight line, and of a straight line. The former
+# acts beside a positive second wave; alone, `_LEAST_SLOPE` stops the first one at -0.66.
 _LEAST_GAMMA = (-0.8, -0.15)
 _NEWTON_STEPS = 20
 
