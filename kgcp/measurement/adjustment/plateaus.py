@@ -20,7 +20,7 @@ from kgcp.measurement.image_model.unblurred import UnblurredPlate, unblurred_pla
 _CLEAR_SIGMAS, _CLEAR_PX, _MOST_CLEAR = 2.0, 1.0, 0.1  # of an edge
 _BORDER = 0.18  # of the plate beyond the ring
 _SMOOTHED = 0.16
-_BINS = 4.0  # to the σ of a smoothing
+_BINS = 4.0  # in the σ of a smoothing
 _WIDE, _WIDE_SHARE = 3.0, 0.02  # where nothing flat is near, what is farther off counts
 _UNEVEN = 0.12  # smoothed levels vary so much: one pair of them would mislead
 _GLARE, _DARKEST_PLATE, _DARKER_INK = 0.06, 0.35, 0.5
@@ -131,9 +131,8 @@ def _smoothing_px(problem: FitProblem) -> float:
 
 def _blurred(problem: FitProblem, values: FloatArray, sigma_px: float) -> FloatArray:
     """Blur a window's values; where that is wide, in bins of a quarter of its σ."""
-    image, count = values.reshape(problem.window.height, problem.window.width), 1
-    if sigma_px >= 2.0 * _BINS:
-        count = int(sigma_px / _BINS)
+    image = values.reshape(problem.window.height, problem.window.width)
+    count = max(1, int(sigma_px / _BINS))  # pixels along a bin's side
     if count == 1:
         blurred = cv2.GaussianBlur(image, (0, 0), sigma_px)
     else:

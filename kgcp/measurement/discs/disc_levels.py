@@ -48,7 +48,8 @@ _FILTERED = np.array([Row.BLACK, Row.WHITE, *range(Row.BLACK), Row.SLOPE_X, Row.
 _BESIDE = 10  # levels about a pixel, their derivatives by light, and by the waves
 _MOST_LIGHT, _STEPS = 4.0, 1 << 16  # of the table of sRGB's curve
 _WAVES = np.array([Row.WAVE_1, Row.WAVE_2, Row.WAVE_3])
-_CURVES = np.array([Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY])
+CURVES = np.array([Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY])
+"""Rows of the light's second order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,15 +102,17 @@ class LevelModel:
         strength, (ink, plate, by_ink, by_plate) = vector[Row.SHARPENING], beside[:4]
         x, y = self.offsets
         curves = np.stack((x * x, x * y, y * y))
-        lit = 1.0 + vector[Row.SLOPE_X : Row.WAVE_1] @ self.offsets + vector[_CURVES] @ curves
+        lit = 1.0 + vector[Row.SLOPE_X : Row.WAVE_1] @ self.offsets + vector[CURVES] @ curves
         rows = np.concatenate((_FILTERED, _WAVES)) if self.tone.is_shaped else _FILTERED
         mask.sharpen(jacobian, rows, (by_ink * lit, by_plate * lit), strength)
         others_ink, others_plate = strength * mask.ink, strength * mask.plate
         black, white = vector[Row.BLACK], vector[Row.WHITE]
         falling = others_ink * by_ink * black + others_plate * by_plate * white
         jacobian[Row.SLOPE_X : Row.WAVE_1] -= falling * self.offsets
-        if vector[_CURVES].any():
-            for row, curve in zip(_CURVES, curves, strict=True):
+        # where there is no second order, its rows only tell whether to ask for it: errors of a few
+        # per cent do no harm
+        if vector[CURVES].any():
+            for row, curve in zip(CURVES, curves, strict=True):
                 jacobian[row] += strength * mask.detail(jacobian[row], 0.0, 0.0) - falling * curve
         if self.tone.is_shaped:
             jacobian[_WAVES] -= others_ink * beside[4:7] + others_plate * beside[7:10]

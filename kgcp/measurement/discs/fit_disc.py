@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dposv
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_products
 from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, limited
-from kgcp.measurement.discs.disc_levels import COUNT, GEOMETRY_COUNT, LevelModel, Row
+from kgcp.measurement.discs.disc_levels import COUNT, CURVES, GEOMETRY_COUNT, LevelModel, Row
 from kgcp.measurement.discs.pixel_choice import DiscWindow
 from kgcp.measurement.discs.tone_curve import DiscTone, plausible
 from kgcp.measurement.image_model.blur import Blur
@@ -61,7 +61,6 @@ _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 _WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
 _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
-_CURVES = np.array((Row.CURVE_XX, Row.CURVE_XY, Row.CURVE_YY))
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
 """What all discs share: the camera's tone curve and sharpening."""
 
@@ -143,8 +142,8 @@ class Unknowns:
     def with_curved_light(self) -> Unknowns:
         """Return the unknowns of a disc at the edge of a shadow: light of second order."""
         precision = self.precision.copy()
-        precision[_CURVES, _CURVES] = [_PRIOR_SD[Row(row)] ** -2 for row in _CURVES.tolist()]
-        rows = np.concatenate((self.rows, _CURVES))
+        precision[CURVES, CURVES] = [_PRIOR_SD[Row(row)] ** -2 for row in CURVES.tolist()]
+        rows = np.concatenate((self.rows, CURVES))
         return replace(self, rows=rows, precision=precision)
 
     def in_light(self, radius_px: float, frame_px: int) -> Unknowns:
@@ -335,11 +334,11 @@ class DiscFit:
     @property
     def curvature_gain(self) -> float:
         """What light of second order would explain: χ² with three degrees of freedom."""
-        curves = scaled_rows(self.jacobian, _CURVES, self.sd)
+        curves = scaled_rows(self.jacobian, CURVES, self.sd)
         weighted = curves * self.misfit.weight
         shared = weighted @ self.scaled.T
         information = weighted @ curves.T - shared @ np.linalg.solve(self.normal, shared.T)
-        information[np.diag_indices(len(_CURVES))] += _PRIOR_SD[Row.CURVE_XX] ** -2
+        information[np.diag_indices(len(CURVES))] += _PRIOR_SD[Row.CURVE_XX] ** -2
         score = curves @ self.misfit.score
         return float(score @ np.linalg.solve(information, score))
 

@@ -131,6 +131,11 @@ def encoded(level: FloatArray, tone: Tone) -> FloatArray:
     return srgb_encoded(level) if tone.is_srgb else level
 
 
+def _encoded_pixels(level: FloatArray, tone: Tone) -> FloatArray:
+    """Return what `encoded` does, of many pixels (n,) in less time."""
+    return encode_pixels(level, np.empty(len(level))) if tone.is_srgb else level
+
+
 def decoded(level: FloatArray, tone: Tone) -> FloatArray:
     """Return the light that gives grey values, by sRGB's curve or a straight line."""
     return srgb_decoded(level) if tone.is_srgb else level
@@ -178,8 +183,7 @@ class PhotometricModel:
         if mask is not None and light.linear_sharpening:
             detail = mask.detail(value, light.black, light.white)
             value += light.linear_sharpening * detail
-        if self.tone.is_srgb:
-            value = encode_pixels(value, np.empty(len(value)))
+        value = _encoded_pixels(value, self.tone)
         if self.mask is None:
             return value
         return value + light.sharpening * self._detail(self.mask, value, light, added)
@@ -216,10 +220,7 @@ class PhotometricModel:
     def local_levels(self, light: Light, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the levels of ink and of plate at all pixels, where the light is uneven."""
         ink, plate = toned(added[0], light.values), toned(1.0 + added[1], light.values)
-        if not self.tone.is_srgb:
-            return ink, plate
-        slope = np.empty(len(ink))
-        return encode_pixels(ink, slope), encode_pixels(plate, slope)
+        return _encoded_pixels(ink, self.tone), _encoded_pixels(plate, self.tone)
 
     def _mask_in_light(self, added: FloatArray | None) -> Mask | None:
         """Return the mask of what is sharpened before the tone curve; None: nothing is.

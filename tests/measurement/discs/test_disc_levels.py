@@ -76,5 +76,12 @@ def test_curves_rise_everywhere() -> None:
 
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
 def test_curves_darken_no_darks(tone: Tone) -> None:
-    curve = DiscTone(tone).bent(plausible(np.array((-2.0, 0.0, 0.0)), tone))
-    assert 0.16 < float(curve.levels(np.array([0.2]))[0]) < 0.2 + 0.1 * tone.is_srgb
+    """Than a straight line, by more than an error of the black level; steep curves can."""
+    waves = np.array((-1.04, 0.63, -0.25) if tone.is_srgb else (-0.6, 0.0, 0.0))
+    light = np.linspace(0.02, 0.4, 39)
+    darker, allowed = (
+        float((light - DiscTone(tone).bent(each).levels(light)).max())
+        for each in (steep_enough(waves), plausible(waves, tone))
+    )
+    assert darker > 0.1
+    assert 0.0 < allowed < 0.05
