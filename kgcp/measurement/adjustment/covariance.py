@@ -57,7 +57,10 @@ _UNDER_UNEVEN_LIGHT = 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.25, 0.5
-_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it, …
+_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it …
+# … if that goes together along arcs, which shows in what they scatter: all of it, where that is
+# this much more than pixels by themselves would make it; …
+_ALL_ALONG_ARCS = 0.5
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
 
@@ -101,7 +104,8 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         mean = (arcs * mean + _ARCS_OF_NOISE) / (arcs + _ARCS_OF_NOISE)
     ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
     half = root @ (directions * np.sqrt(ratios))
-    shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * _common_displacement_px(fit)
+    in_common_px = _common_displacement_px(fit, min(max(mean - 1.0, 0.0) / _ALL_ALONG_ARCS, 1.0))
+    shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * in_common_px
     pose_cov = half @ half.T + shifts @ shifts.T
     pose_cov *= unevenness_factor(fit)
     if fit.parameters.has_skew:
@@ -149,12 +153,13 @@ def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
     return share * largest / (6.0 * blur.mean_sd_px**2)
 
 
-def _common_displacement_px(fit: TargetFit) -> float:
+def _common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     """Return the standard deviation of the displacement that all of a circle's edge shares [px].
 
-    From the residuals: what edges scatter beyond the noise of the plateaus (coarse sampling of a
-    print, compression, tails of what is not modelled) averages out along a circle only in part. And
-    of an edge whose middle is clipped only a tail is seen, whose shape is not known exactly.
+    From the residuals: what edges scatter beyond the noise of the plateaus averages out along a
+    circle only in part where it goes together along arcs (coarse sampling of a print, tails of what
+    is not modelled), and wholly where it does not (compression). And of an edge whose middle is
+    clipped only a tail is seen, whose shape is not known exactly.
     """
     problem = fit.sample.problem
     floor_px = _EDGE_FLOOR_PX[problem.tone]
@@ -166,7 +171,8 @@ def _common_displacement_px(fit: TargetFit) -> float:
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
     black, white = plateau_levels(fit.parameters.light, problem.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
-    return max(floor_px, _COMMON_SHARE * math.sqrt(at_edges) / slope_per_px)
+    scatter_px = math.sqrt(share_along_arcs * at_edges) / slope_per_px
+    return max(floor_px, _COMMON_SHARE * scatter_px)
 
 
 def _clipped_reach_px(fit: TargetFit) -> float:

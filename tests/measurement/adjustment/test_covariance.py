@@ -16,9 +16,10 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.adjustment.solver import TargetFit
+from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.adjustment.two_poses import fit_both_poses
 from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.noise import misfit
 from kgcp.targets.layout import Target
 
 PlacePlate = Callable[..., Pose]
@@ -110,3 +111,31 @@ def test_residuals_that_run_along_the_edges_make_it_worse(fit: TargetFit) -> Non
     score = sign * np.abs(fit.misfit.score)
     striped = replace(fit, misfit=replace(fit.misfit, score=score))
     assert pose_covariance(striped).inflation > 3.0 * pose_covariance(fit).inflation
+
+
+def with_noisy_edges(fit: TargetFit, sign: FloatArray) -> TargetFit:
+    """Return a fit whose residuals at edges, of these signs, are ten times those of plateaus."""
+    light, share = fit.parameters.light, fit.prediction.share
+    size = np.where((share > 0.05) & (share < 0.95), 0.05, 0.005) * (light.white - light.black)
+    levels = fit.prediction.levels + size * sign
+    sample = replace(fit.sample, levels=levels)
+    sd = noise_of(sample, fit.prediction).sd
+    residuals = misfit(levels, fit.prediction.levels, sd, sample.censoring)
+    return replace(fit, sample=sample, sd=sd, misfit=residuals)
+
+
+@pytest.mark.parametrize(("run_px", "least", "most"), [(0.0, 0.4, 1.6), (5.0, 8.0, 60.0)])
+def test_noise_of_edges_is_common_if_it_runs_along_them(
+    fit: TargetFit, run_px: float, least: float, most: float
+) -> None:
+    """Compression's averages out; of a coarse print's, all of an edge may have some in common."""
+    rng, points_m = np.random.default_rng(5), fit.prediction.points_m
+    sign = rng.choice((-1.0, 1.0), len(fit.sd))
+    if run_px:
+        run_rad = run_px / fit.sample.problem.outer_radius_px
+        run = (np.arctan2(points_m[1], points_m[0]) // run_rad).astype(int)
+        sign = rng.choice((-1.0, 1.0), np.ptp(run) + 1)[run - run.min()]
+    noisy = with_noisy_edges(fit, sign)
+    ray = fit.parameters.pose.translation_m / fit.parameters.pose.distance_m
+    of_distance = ray @ pose_covariance(noisy).pose_cov[:3, :3] @ ray
+    assert least < of_distance / (ray @ of_independent_pixels(noisy)[:3, :3] @ ray) < most
