@@ -211,6 +211,7 @@ def _result(
     by_unknown = model.to_calibration()
     share = np.array([_CENTRE_DETERMINED if n in ("cx", "cy") else DETERMINED for n in model.names])
     weak = np.sqrt(cov.diagonal()) > share * state.network.cameras.sd[0]
+    weak |= problem.is_at_border(model.names, state.estimate)
     names = np.array(model.names)
     observed = problem.observations()
     return CameraCalibration(

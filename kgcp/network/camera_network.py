@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import (
     Circles3D,
@@ -39,6 +39,8 @@ _FOCAL_SD = 3.0  # of the focal length to start with
 _RADIAL_SD = 0.3  # of the distance from the middle, at the corner: what a term may displace
 _TANGENTIAL_SD = 0.05
 _SCALINGS = 10  # of the covariances, and new eccentricities, at most
+_HOLDINGS = 6  # of a principal point at the border of the frame, and releases
+_HELD_SD = 1e-3  # px
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
 _SETTLED_VARIANCE = 1.25  # ratio of the discs' variances between two adjustments
 _POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
@@ -129,7 +131,7 @@ class CalibrationProblem:
                 self.camera_prior(model, camera),
             )
             start = replace(estimate, cameras=model.values_of(camera)[None])
-            solution = adjust(network, start, ROBUST)
+            solution = self._adjusted_within_frame(network, start)
             estimate = solution.estimate
             camera = model.camera(estimate.cameras[0])
             next_cov = fitting_covariances(network, solution, observed.cov)
@@ -140,6 +142,39 @@ class CalibrationProblem:
             if is_settled:
                 break
         return AdjustedNetwork(camera, estimate, unknowns, network, solution)
+
+    def _adjusted_within_frame(self, network: Network, start: Estimate) -> Solution:
+        """Return the adjustment in which the principal point stays in the frame.
+
+        Where the photographs would put it outside, they do not determine it: what the field lacks
+        of its shape draws it there. It is held at the border, as long as they draw it outwards.
+        """
+        names = network.model.names
+        index, border = _centre_of(names), np.array(self.size) - 1.0
+        held, at = np.zeros(2, dtype=np.bool_), np.zeros(2)
+        for _ in range(_HOLDINGS):
+            solution = adjust(_held_at(network, index[held], at[held]), start, ROBUST)
+            start = solution.estimate
+            centre = start.cameras[0, index]
+            inside = np.clip(centre, 0.0, border)
+            # one that is held has given way a little to where the photographs draw it
+            is_outward = (centre - at) * (at - 0.5 * border) > 0.0
+            is_drawn_out = np.where(held, is_outward, centre != inside)
+            at = np.where(held, at, inside)
+            if np.array_equal(is_drawn_out, held):
+                break
+            held = is_drawn_out
+        cameras = start.cameras.copy()
+        cameras[0, index] = inside
+        return replace(solution, estimate=replace(start, cameras=cameras))
+
+    def is_at_border(self, names: Sequence[str], estimate: Estimate) -> BoolArray:
+        """Return which unknowns (p,) are a principal point's that is held at the border."""
+        is_held = np.zeros(len(names), dtype=np.bool_)
+        index, border = _centre_of(names), np.array(self.size) - 1.0
+        centre = estimate.cameras[0, index]
+        is_held[index] = (centre <= 0.0) | (centre >= border)
+        return is_held
 
     def eccentricity(
         self, camera: Camera, estimate: Estimate, observed: Observations
@@ -199,6 +234,17 @@ class CalibrationProblem:
         usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
         ratio = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
         return float(np.median(ratio))
+
+
+def _centre_of(names: Sequence[str]) -> IndexArray:
+    return np.array([names.index("cx"), names.index("cy")])
+
+
+def _held_at(network: Network, index: IndexArray, values: FloatArray) -> Network:
+    """Return the network with some of the camera's parameters (k,) held at values."""
+    known, sd = network.cameras.values.copy(), network.cameras.sd.copy()
+    known[0, index], sd[0, index] = values, _HELD_SD
+    return replace(network, cameras=CameraPrior(known, sd))
 
 
 def _determinant(moments: FloatArray) -> FloatArray:

@@ -123,6 +123,14 @@ def test_frontal_photographs_determine_little_and_say_so() -> None:
     assert 0.0 < result.camera.cy < 1200.0
 
 
+def test_a_principal_point_stays_in_the_frame_and_is_not_claimed_at_its_border() -> None:
+    result = calibrated(views(camera=replace(CAMERA, cx=1690.0), distance_m=0.6)[:4])
+    assert result.camera.cx == 1599.0
+    assert 500.0 < result.camera.cy < 700.0
+    assert "cx" in result.undetermined
+    assert judge(result, calibration_numbers(result)).grade is Grade.UNUSABLE
+
+
 def test_a_photograph_with_wrong_names_is_left_out() -> None:
     made = views()
     wrong = np.random.default_rng(1).permutation(made[3].point)
