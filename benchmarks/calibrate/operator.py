@@ -150,7 +150,7 @@ def measure(setup: Setup) -> Outcome:
         truth = circle_images(camera, field_circles(_POSE, scene.discs)).moments
         direction = np.array(scene.gradient) / max(math.hypot(*scene.gradient), 1e-12)
         for expected in truth:
-            disc = _nearest(discs, expected, radius)
+            disc = nearest_disc(discs, expected, radius)
             if disc is not None:
                 errors.append(disc.vector - expected)
                 covariances.append(disc.cov)
@@ -198,7 +198,8 @@ def _compressed(photo: GreyArray, quality: int) -> GreyArray:
     return np.asarray(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE))
 
 
-def _nearest(discs: Sequence[object], expected: FloatArray, radius_px: float) -> Disc | None:
+def nearest_disc(discs: Sequence[object], expected: FloatArray, radius_px: float) -> Disc | None:
+    """Return the one measured disc within half a radius of where it must be."""
     near = [
         disc
         for disc in discs

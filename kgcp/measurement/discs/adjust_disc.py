@@ -46,7 +46,7 @@ _MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it b
 # sharpened leave up to 0.19; what is not a disc, mostly more than 0.3.
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.2, 0.3
 _LEAST_CURVED_PX = 6.0  # radius from which on discs tell a curved light from their blur
-_CURVED = 60.0  # least χ² of three terms: noise alone makes 16 at most, of one in a thousand discs
+_CURVED = 25.0  # least χ² of five terms: noise alone makes more in one of ten thousand discs
 _FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
 
 

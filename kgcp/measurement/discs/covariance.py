@@ -19,6 +19,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit
+from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
 
 _ARC_PX = 6.0
@@ -73,6 +74,8 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     if fit.free.tone.is_shaped:
         aside_px = _TONED_FALL * fit.state.blur.mean_sd_px * fit.state.slope
         common[:2, :2] += np.outer(aside_px, aside_px)
+    bent_px = _bend_px(fit)
+    common[:2, :2] += bent_px @ bent_px
     to_moments = moments_by_stretch(fit.state.geometry)
     return DiscScatter(
         to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T,
@@ -127,6 +130,16 @@ def _common_displacement_px(fit: DiscFit) -> float:
     of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
     of_tone_px = _TONED_SHARE * blur_px if tone.is_shaped else 0.0
     return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, of_tone_px)
+
+
+def _bend_px(fit: DiscFit) -> FloatArray:
+    """Return by how much light beyond second order may displace the centre (2, 2) [px].
+
+    The step of a shadow has all orders. The next ones count as much as the second: a relative
+    change of the light, over the margin that is used, displaces edges by so much of the blur.
+    """
+    blur = fit.state.blur
+    return blur.mean_sd_px * outward_px(blur) ** 2 * fit.light_curvature
 
 
 def _arcs(fit: DiscFit) -> IndexArray:

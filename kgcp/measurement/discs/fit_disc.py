@@ -46,11 +46,9 @@ _PRIOR_SD = {
     Row.SHARPENING: 0.7,
     Row.INK_SLOPE_X: 0.05,
     Row.INK_SLOPE_Y: 0.05,
-    Row.CURVE_XX: 0.2,
-    Row.CURVE_XY: 0.2,
-    Row.CURVE_YY: 0.2,
 }
-_SHADOW_SLOPE_SD = 0.3  # of the light per radius, where the edge of a shadow crosses the disc
+_SHADOW_SLOPE_SD = 0.3  # of the light per radius, where the edge of a shadow crosses the disc, …
+_SHADOW_CURVE_SD = 0.2  # … and of its second order
 # Strengths of a camera's unsharp mask; below 0 stand the skirts of a point spread. Burnt discs, of
 # whose edges little is seen, would go to 3 and take their blur along.
 _SHARPENINGS = (-0.5, 1.5)
@@ -61,6 +59,9 @@ _LIGHT = (Row.BLACK, Row.WHITE, Row.SLOPE_X, Row.SLOPE_Y)
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 _WAVES = (Row.WAVE_1, Row.WAVE_2, Row.WAVE_3)
 _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
+# what is estimated besides at the edge of a shadow
+_UNEVEN = np.array((*_INK_SLOPES, *CURVES.tolist()))
+_UNEVEN_PRECISIONS = np.array([_SHADOW_SLOPE_SD] * 2 + [_SHADOW_CURVE_SD] * 3) ** -2.0
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
 """What all discs share: the camera's tone curve and sharpening."""
 
@@ -140,11 +141,14 @@ class Unknowns:
         return bool(self.rows[-1] == Row.CURVE_YY)
 
     def with_curved_light(self) -> Unknowns:
-        """Return the unknowns of a disc at the edge of a shadow: light of second order."""
+        """Return the unknowns of a disc at the edge of a shadow: light of second order.
+
+        The darker level gets a gradient of its own, whatever the disc's size: a step through the
+        middle has no second order, and an odd one displaces the centre.
+        """
         precision = self.precision.copy()
-        precision[CURVES, CURVES] = [_PRIOR_SD[Row(row)] ** -2 for row in CURVES.tolist()]
-        rows = np.concatenate((self.rows, CURVES))
-        return replace(self, rows=rows, precision=precision)
+        precision[_UNEVEN, _UNEVEN] = _UNEVEN_PRECISIONS
+        return replace(self, rows=np.union1d(self.rows, _UNEVEN), precision=precision)
 
     def in_light(self, radius_px: float, frame_px: int) -> Unknowns:
         """Return the unknowns of a disc of some size in a photograph of some size.
@@ -333,14 +337,21 @@ class DiscFit:
 
     @property
     def curvature_gain(self) -> float:
-        """What light of second order would explain: χ² with three degrees of freedom."""
-        curves = scaled_rows(self.jacobian, CURVES, self.sd)
-        weighted = curves * self.misfit.weight
+        """What uneven light would explain: χ² with three to five degrees of freedom."""
+        is_new = ~np.isin(_UNEVEN, self.free.rows)
+        terms = scaled_rows(self.jacobian, _UNEVEN[is_new], self.sd)
+        weighted = terms * self.misfit.weight
         shared = weighted @ self.scaled.T
-        information = weighted @ curves.T - shared @ np.linalg.solve(self.normal, shared.T)
-        information[np.diag_indices(len(CURVES))] += _PRIOR_SD[Row.CURVE_XX] ** -2
-        score = curves @ self.misfit.score
+        information = weighted @ terms.T - shared @ np.linalg.solve(self.normal, shared.T)
+        information += np.diag(_UNEVEN_PRECISIONS[is_new])
+        score = terms @ self.misfit.score
         return float(score @ np.linalg.solve(information, score))
+
+    @property
+    def light_curvature(self) -> FloatArray:
+        """Second derivatives (2, 2) of the light, relative to it [1/px²]; zeros: it is linear."""
+        xx, xy, yy = (self.state.vector[CURVES] / self.sample.radius_px**2).tolist()
+        return np.array(((2.0 * xx, xy), (xy, 2.0 * yy)))
 
     @property
     def noise(self) -> GreyNoise:

@@ -200,7 +200,10 @@ def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPat
 
 
 def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The photographer's shadow: light of first order leaves residuals, which count as errors."""
+    """The photographer's shadow: light of first order leaves residuals, which count as errors.
+
+    What light beyond the second order may do counts, too; beside the middles it does little.
+    """
     pose, camera = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), Camera(480, 110, 1e3, 1e3, 240, 55)
     discs = tuple(FieldDisc((0.09 * (k - 2), 0.0, 0.0), 0.03) for k in range(5))
     scene, rng = FieldScene(discs, 0.8, 0.1), np.random.default_rng(3)
@@ -222,6 +225,7 @@ def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.Mon
         return float(np.sqrt(np.mean(off**2))), float(np.sqrt(0.5 * np.mean(variances)))
 
     rms_px, sd_px = rms_and_sd_px()
-    assert 0.5 * sd_px < rms_px < 1.8 * sd_px
+    assert 0.25 * sd_px < rms_px < 1.8 * sd_px
+    assert rms_px < 0.005
     monkeypatch.setattr(adjust_disc, "_CURVED", np.inf)
-    assert sd_px < 0.5 * rms_and_sd_px()[1]
+    assert sd_px < 0.7 * rms_and_sd_px()[1]
