@@ -101,6 +101,11 @@ class Outcome:
         return float(np.mean(self.along_light_px))
 
     @property
+    def bias_se_px(self) -> float:
+        """Standard error of the bias, as far as discs differ [px]."""
+        return float(np.std(self.along_light_px) / math.sqrt(len(self.along_light_px)))
+
+    @property
     def radius_bias_px(self) -> float:
         """Mean error of the radius [px]."""
         return float(np.mean(self.errors[:, 2] + self.errors[:, 4]) / self.setup.radius_px)
@@ -249,7 +254,7 @@ def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
 
 HEAD = (
     f"{'case':15}{'':8}{'R px':>6}{'ratio':>6}{'found':>9}{'bound px':>10}{'/ bound':>9}"
-    f"{'limit':>7}{'bias px':>9}{'R bias':>9}{'z':>6}{'Mahal.²':>9}{'ms':>7}"
+    f"{'limit':>7}{'bias px':>9} ± {'se':6}{'R bias':>9}{'z':>6}{'Mahal.²':>9}{'ms':>7}"
 )
 
 
@@ -265,8 +270,8 @@ def line(outcome: Outcome) -> str:
     bound = math.sqrt(0.5 * float(np.trace(outcome.bound_px2)))
     return (
         f"{head}{bound:10.5f}{outcome.over_bound:9.2f}{CASES[setup.case].limit:7.2f}"
-        f"{outcome.bias_px:9.4f}{outcome.radius_bias_px:9.4f}{outcome.z:6.2f}"
-        f"{outcome.mahalanobis2:9.2f}{outcome.ms_per_disc:7.1f}"
+        f"{outcome.bias_px:9.4f} ± {outcome.bias_se_px:.4f}{outcome.radius_bias_px:9.4f}"
+        f"{outcome.z:6.2f}{outcome.mahalanobis2:9.2f}{outcome.ms_per_disc:7.1f}"
     )
 
 
