@@ -44,6 +44,7 @@ from kgcp.io.formats.orientations.records import OrientationFileOptions
 from kgcp.io.formats.trajectories import FORMATS as TRAJECTORY_FORMATS
 from kgcp.io.formats.trajectories import read_trajectory
 from kgcp.io.formats.trajectories.records import TrajectoryFileOptions, Wander
+from kgcp.io.formats.visiona_target import read_visiona_ring
 from kgcp.io.images.exif import read_exif
 from kgcp.io.images.frames import read_grey
 from kgcp.measurement.discs.measure import measure_discs
@@ -177,6 +178,13 @@ def calibrations(data: bytes, folder: Path) -> None:
     read_calibration(path, (1600, 1200), _chosen(data, tuple(CALIBRATION_FORMATS.names)))
 
 
+def visiona(data: bytes, folder: Path) -> None:
+    """Read a target of visiona's configuration files."""
+    read_visiona_ring(
+        ForeignFile(_written(folder, data), "the target"), "A", _chosen(data, (None, 7))
+    )
+
+
 def fields(data: bytes, folder: Path) -> None:
     """Read a field of targets: a field.toml, or another program's board."""
     path = _written(folder, data)
@@ -253,7 +261,7 @@ TARGETS: Mapping[str, Callable[[bytes, Path], None]] = {
     target.__name__: target
     for target in (
         *(flight_toml, bare_folder, times, trajectories, exclusions, poses, calibrations),
-        *(fields, devices, frames, discs, plain_targets, marks, journal),
+        *(visiona, fields, devices, frames, discs, plain_targets, marks, journal),
     )
 }
 

@@ -128,7 +128,7 @@ class JsonObject:
     def of(cls, file: ForeignFile, where: str, value: object) -> Self:
         """Return the object, or raise `KgcpError` if the value is not one."""
         if not isinstance(value, dict):
-            raise file.error_at(where, "is not a JSON object")
+            raise file.error_at(where, "is not an object of named values")
         return cls(file, where, value)
 
     def error(self, problem: str, remedy: str = "export it again") -> KgcpError:

@@ -111,7 +111,7 @@ def read_flight(folder: Path | str) -> Flight:
     )
     camera = table.table("camera", CAMERA_KEYS)
     vehicle = read_vehicle(table, folder)
-    targets = read_targets(table)
+    targets = read_targets(table, folder)
     plain_targets = read_plain_targets(table, _names_of(targets))
     plumb_sd_deg = read_plumb_sd_deg(camera)
     if plumb_sd_deg is not None and (vehicle is None or vehicle.settings.level_sd_deg is None):
@@ -145,7 +145,7 @@ def read_printed_targets(folder: Path) -> tuple[Target, ...]:
         As `read_flight`, for what is wrong with the targets.
     """
     table, _ = _read_flight_toml(folder)
-    targets = read_targets(table)
+    targets = read_targets(table, folder)
     if not targets:
         raise table.error("target", "has no code in any table", "describe the target to be drawn")
     return targets
@@ -159,7 +159,7 @@ def read_target_tables(path: Path) -> tuple[Target, ...]:
     KgcpError
         As `read_flight`, for what is wrong with the targets.
     """
-    return read_targets(read_toml(path, FLIGHT_KEYS, "the targets")[0])
+    return read_targets(read_toml(path, FLIGHT_KEYS, "the targets")[0], path.parent)
 
 
 def read_camera_and_targets(
@@ -174,7 +174,7 @@ def read_camera_and_targets(
     """
     table, _ = _read_flight_toml(folder)
     camera = table.table("camera", CAMERA_KEYS)
-    targets = read_targets(table)
+    targets = read_targets(table, folder)
     return (
         read_camera(camera, folder),
         read_calibration_covariance(camera, folder),

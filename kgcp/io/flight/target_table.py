@@ -7,7 +7,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.flight.toml_table import TomlTable
+from kgcp.io.formats.visiona_target import read_visiona_ring
+from kgcp.settings import require_range
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import PlainPolarity, PlainTarget, Shape
 from kgcp.targets.validation import check_targets
@@ -15,7 +18,7 @@ from kgcp.targets.validation import check_targets
 _DIAMETERS = ("outer_diameter_m", "inner_diameter_m", "code_diameter_m", "dot_diameter_m")
 PLATE_KEYS = (
     *("name", "shape", *_DIAMETERS, "code_deg", "sd_outer_diameter_m"),
-    *("position_m", "sd_position_m"),
+    *("position_m", "sd_position_m", "file", "id"),
 )
 PLAIN_KEYS = (
     *("name", "shape", "polarity", "diameter_m", "inner_diameter_m", "sd_diameter_m"),
@@ -26,8 +29,13 @@ _MOST_TARGETS = 200  # each is compared with every other
 REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
 
 
-def read_targets(flight: TomlTable) -> tuple[Target, ...]:
+def read_targets(flight: TomlTable, folder: Path) -> tuple[Target, ...]:
     """Return the coded plates of a flight in the order of the file, each with its replicas.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the files that targets name.
 
     Raises
     ------
@@ -51,7 +59,7 @@ def read_targets(flight: TomlTable) -> tuple[Target, ...]:
             problem = f"{table.text('replica_of')!r} is not the name of a plate"
             remedy = f"name one of {', '.join(names)}" if names else "describe the plate as well"
             raise table.error("replica_of", problem, remedy)
-    targets = tuple(_read_target(table, replicas) for table in plates)
+    targets = tuple(_read_target(table, replicas, folder) for table in plates)
     with flight.located():
         check_targets(targets)
     return targets
@@ -145,14 +153,8 @@ def _read_sd_position_m(table: TomlTable) -> tuple[float, float, float]:
     return sd_position_m
 
 
-def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
-    with table.located():
-        ring = Ring(
-            name=table.name("name"),
-            code_deg=table.numbers("code_deg"),
-            sd_outer_diameter_m=table.number("sd_outer_diameter_m", 0.0),
-            **{key: table.number(key) for key in _DIAMETERS},
-        )
+def _read_target(table: TomlTable, replicas: Sequence[TomlTable], folder: Path) -> Target:
+    ring = _file_ring(table, folder) if "file" in table else _inline_ring(table)
     if "sd_position_m" in table and "position_m" not in table:
         raise table.error("sd_position_m", "needs position_m", "give both or none")
     return Target(
@@ -161,6 +163,30 @@ def _read_target(table: TomlTable, replicas: Sequence[TomlTable]) -> Target:
         position_m=table.optional("position_m", table.vector),
         sd_position_m=_read_sd_position_m(table),
     )
+
+
+def _inline_ring(table: TomlTable) -> Ring:
+    if "id" in table:
+        raise table.error("id", "needs a file", "give file as well, or delete it")
+    with table.located():
+        return Ring(
+            name=table.name("name"),
+            code_deg=table.numbers("code_deg"),
+            sd_outer_diameter_m=table.number("sd_outer_diameter_m", 0.0),
+            **{key: table.number(key) for key in _DIAMETERS},
+        )
+
+
+def _file_ring(table: TomlTable, folder: Path) -> Ring:
+    for key in (*_DIAMETERS, "code_deg"):
+        if key in table:
+            raise table.error(key, "is given beside a file", "delete one of the two")
+    path = table.existing_file("file", folder)
+    sd_m = table.number("sd_outer_diameter_m", 0.0)
+    with table.located():
+        require_range("sd_outer_diameter_m", sd_m, 0.0, 1.0, unit="m")
+    file, model = ForeignFile(path, "[[target]] file"), table.optional("id", table.integer)
+    return read_visiona_ring(file, table.name("name"), model, sd_m)
 
 
 def _read_replicas(plate: Ring, tables: Sequence[TomlTable]) -> Iterator[Ring]:

@@ -23,6 +23,7 @@ from kgcp.io.formats.calibrations import (
     opf,
     pix4d,
     ros,
+    visiona,
 )
 from kgcp.io.formats.calibrations.entry import Entry
 from kgcp.io.formats.registry import Registry
@@ -37,6 +38,7 @@ FORMATS: Registry[Callable[[ForeignFile], Sequence[Entry]]] = Registry(
         "metashape": (metashape.matches, metashape.entries),
         "dji": (dji.matches, dji.entries),
         "pix4d": (pix4d.matches, pix4d.entries),
+        "visiona": (visiona.matches, visiona.entries),
         "colmap": (colmap.matches, colmap.entries),
         "opencv": (opencv.matches, opencv.entries),
         "ros": (ros.matches, ros.entries),

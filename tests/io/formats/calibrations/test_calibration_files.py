@@ -53,6 +53,9 @@ SAMPLES: dict[str, object] = {
         "F 17\nPx 8\nPy 5.5\nK1 0\nK2 0\nK3 0\nT1 0\nT2 0\n"
     ),
     "dji": "2024-03-08;1710.5,1702.25,12.25,-8.5,-0.06,0.04,0,0,0",
+    "visiona": (
+        "camera = { f = 1700.0; pp = [800.0, 550.0]; TD = [0.0, 0.0]; RD = [-0.06, 0.04, 0.0]; };\n"
+    ),
     "opencv": (
         "%YAML:1.0\n---\nimage_width: 1600\nimage_height: 1100\ncamera_matrix: !!opencv-matrix\n"
         "   rows: 3\n   cols: 3\n   dt: d\n   data: [1700, 0, 800, 0, 1700, 550, 0, 0, 1]\n"
