@@ -13,7 +13,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -37,7 +37,7 @@ from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.simulation.disc_field import FieldDisc, FieldScene
 from kgcp.simulation.flight import grow_ground
-from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.plain import PlainPolarity, PlainTarget
@@ -110,8 +110,17 @@ def target_of(kind: str, radius_px: float) -> PlainTarget:
     return PlainTarget("X", diameters, polarity, (0.0, 0.0, 0.0), border_m=border_m)
 
 
-def look(kind: str, radius_px: float, count: int, grounds: Sequence[FloatArray]) -> Looks:
-    """Render so many targets of one kind and look for them."""
+def look(
+    kind: str,
+    radius_px: float,
+    count: int,
+    grounds: Sequence[FloatArray],
+    tone: ToneCurve | None = None,
+) -> Looks:
+    """Render so many targets of one kind and look for them; a tone curve is not known."""
+    camera, sensor = _CAMERA, _SENSOR
+    if tone is not None:
+        camera, sensor = replace(camera, response=Response.UNKNOWN), replace(sensor, tone=tone)
     rng = np.random.default_rng([int(10 * radius_px), *kind.encode()])
     target, edges = target_of(kind, radius_px), _edge_covs(kind, radius_px)
     reasons: Counter[str] = Counter()
@@ -120,14 +129,13 @@ def look(kind: str, radius_px: float, count: int, grounds: Sequence[FloatArray])
     while shown < count:
         index += 1
         tilt_deg = _TILTS_DEG[index % len(_TILTS_DEG)]
-        camera = _CAMERA
         pose, uphill_px, stated = _placed(camera, target, radius_px, tilt_deg, rng)
         light = grounds[int(rng.integers(len(grounds)))].copy()
         if target.border_m is None and not _is_even(light, camera, pose, radius_px):
             continue
         shown += 1
         image_plate(camera, PlainPlate(target, _BRIGHT, _DARK), pose, _OPTICS).paste(light)
-        grey = _SENSOR.expose(light, 1.0, rng)
+        grey = sensor.expose(light, 1.0, rng)
         truth_px = camera.project(pose.translation_m[None])[0]
         prediction = _prediction(camera, pose, stated, radius_px, rng)
         began = time.perf_counter()
@@ -405,6 +413,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--real", type=Path, help="folder of photographs of ground")
     parser.add_argument("--count", type=int, default=40, help="targets per line")
     parser.add_argument("--windows", type=int, default=2000)
+    parser.add_argument(
+        "--tone", choices=[*ToneCurve], type=ToneCurve, help="a tone curve that is not known"
+    )
     parser.add_argument("--kind", choices=[*_KINDS], action="append")
     chosen = parser.parse_args(arguments)
     use_one_thread_each()
@@ -416,7 +427,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("kind              R px  found wrong   RMS px /bound     z  z(d)  trend 1e-3 px/°   ms")
     for kind in (chosen.kind or _KINDS) if chosen.count else ():
         for radius_px in _RADII_PX:
-            print_looks(look(kind, radius_px, chosen.count, grounds))
+            print_looks(look(kind, radius_px, chosen.count, grounds, chosen.tone))
     if photographs and chosen.windows:
         for windows in (
             random_windows(photographs, chosen.windows),

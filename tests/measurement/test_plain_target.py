@@ -15,6 +15,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.covariance import propagate
+from kgcp.measurement.image_model.srgb import srgb_encoded
 from kgcp.measurement.plain_pose import (
     CircleMoments,
     circles_about,
@@ -113,6 +114,22 @@ def test_a_far_ring_is_measured_as_a_whole() -> None:
     assert outcome.uncertainty is not None
     off_m = outcome.distance_m - pose.distance_m
     assert abs(off_m) < 2.0 * outcome.uncertainty.sd_distance_m < 0.01 * pose.distance_m
+
+
+def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring() -> None:
+    """Its two edges tell how far ink spreads: of a disc, it is counted as 0.1 px, 2.5 % here."""
+    target = replace(RING, border_m=0.9)
+    pose = pose_towards(2.5 * pose_at(90.4, 71.7, RING).translation_m, NORMAL)
+    light = frame_with((target, pose)).astype(np.float64) / 255.0
+    grey = np.rint(255.0 * srgb_encoded(light.ravel()).reshape(light.shape)).astype(np.uint8)
+    expected = replace(prediction_of(pose, (5.0, -4.0)), radius_px=4.0)
+    camera = replace(CAMERA, response=Response.UNKNOWN)
+    outcome = look_for_plain(grey, camera, target, expected)
+    assert isinstance(outcome, Measurement)
+    assert outcome.uncertainty is not None
+    sd = outcome.uncertainty.sd_distance_m / pose.distance_m
+    assert 0.001 < sd < 0.006
+    assert abs(outcome.distance_m / pose.distance_m - 1.0) < 3.0 * sd
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,9 @@ _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what i
 # Of the blur: an unknown tone curve that three parameters do not hold displaces all edges alike, by
 # 0.05 to 0.13 px where σ is 0.67 px (`benchmarks.calibrate.operator`, case `unknown_film`).
 _TONED_SHARE = 0.15
+# Of a ring that is measured as a whole, whose edges tell that displacement, this much is left:
+# 0.012 px by a film's curve, 0.001 px by sRGB's.
+_TONED_RING_SHARE = 0.01
 # … and where the light falls off, it displaces opposite edges differently: of the blur, for light
 # that falls off by all of itself over one radius.
 _TONED_FALL = 0.1
@@ -67,7 +70,10 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
     ratio = float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
-    common_px = _common_displacement_px(fit)
+    common_px = common_displacement_px(fit)
+    if len(fit.sample.pixels.inner):  # `hole_level` knows what that does to a ring
+        left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
+        common_px = max(_FLOOR_PX, left_px)
     # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
@@ -112,7 +118,7 @@ def moments_by_stretch(geometry: Geometry) -> FloatArray:
     return slopes
 
 
-def _common_displacement_px(fit: DiscFit) -> float:
+def common_displacement_px(fit: DiscFit) -> float:
     """Return the standard deviation of the displacement that all of the edge shares [px].
 
     As of coded targets: from what edges scatter beyond the noise of the plateaus, and from how far

@@ -170,7 +170,7 @@ def _with_hole(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
         raise DiscRejection(DiscReason.POOR_FIT, detail)
     to_moments = moments_by_stretch(fit.state.geometry)
     common = scatter.common + to_moments @ hole.cov @ to_moments.T
-    return replace(fit, state=hole.moved(fit.state)), replace(scatter, common=common)
+    return replace(fit, state=hole.corrected(fit.state)), replace(scatter, common=common)
 
 
 def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:
