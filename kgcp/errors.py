@@ -169,7 +169,7 @@ class Reason(StrEnum):
     TOO_BLURRED = (
         "too_blurred",
         Status.REJECTED,
-        "a ring like this target's, but blur has left too little of its dots",
+        "a ring like this target's, but blur has left too little of its dots or edges",
         "expose for a shorter time, fly slower, focus",
     )
     CLIPPED = (

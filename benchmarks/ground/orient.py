@@ -145,6 +145,21 @@ def line(outcome: Outcome) -> str:
     )
 
 
+def total_line(outcomes: Sequence[Outcome]) -> str:
+    """Return the share of right poses in all frames together."""
+    right = sum(len(outcome.z) for outcome in outcomes)
+    wrong = sum(outcome.wrong for outcome in outcomes)
+    refused = sum(outcome.refused for outcome in outcomes)
+    share = right / max(right + wrong, 1)
+    z = np.vstack([outcome.z for outcome in outcomes])
+    is_reached = share >= _LEAST_RIGHT
+    return (
+        f"all: right {100 * share:.2f} % of {right + wrong} poses, {wrong} wrong, {refused} frames"
+        f" refused, z {' '.join(f'{each:.2f}' for each in np.sqrt(np.mean(z**2, axis=0)))}"
+        f"{'' if is_reached else '  MISSED'}"
+    )
+
+
 def measure_devices(count: int, seed: int = 0) -> str:
     """Orient cameras whose focal length is known to 20 % by a device of five points, in a line."""
     rng = np.random.default_rng([seed, 5])
@@ -195,10 +210,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Setup(points, has_distance, options.frames, 0)
         for has_distance, points in itertools.product((True, False), options.points)
     ]
+    outcomes = []
     for outcome in ordered_map(
         measure, setups, jobs=options.jobs, start=use_one_thread_each, start_arguments=()
     ):
         print(line(outcome), flush=True)
+        outcomes.append(outcome)
+    print(total_line(outcomes), flush=True)
     if options.devices:
         print(measure_devices(options.devices), flush=True)
 

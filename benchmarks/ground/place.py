@@ -240,9 +240,10 @@ def coded_ring(seed: int, frames: int = _RING_FRAMES) -> Placings:
 def _job(experiment: str) -> str:
     name, _, number = experiment.partition(" ")
     if name == "table":
-        return _table_line(float(number))
+        size, _, seed = number.partition(" ")
+        return _table_line(float(size), int(seed))
     if name == "sine":
-        return _sine_line()
+        return _sine_line(int(number))
     placings = coded_ring(int(number))
     radius_m = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
     off, sd = placings.errors[0, 5] / radius_m, placings.sds[0, 5] / radius_m
@@ -256,8 +257,8 @@ def _job(experiment: str) -> str:
     )
 
 
-def _table_line(diameter_px: float) -> str:
-    placings = level_table(diameter_px)
+def _table_line(diameter_px: float, seed: int) -> str:
+    placings = level_table(diameter_px, seed)
     mean, limit = float(placings.angle_deg.mean()), _SHARE * TABLE_1[diameter_px]
     z_normal, z_radius = placings.rms_z(slice(3, 5)), placings.rms_z(slice(5, 6))
     is_reached = mean <= limit and all(0.8 <= z <= 1.3 for z in (z_normal, z_radius))
@@ -269,8 +270,8 @@ def _table_line(diameter_px: float) -> str:
     )
 
 
-def _sine_line() -> str:
-    placings, naive_m = sine_surface()
+def _sine_line(seed: int) -> str:
+    placings, naive_m = sine_surface(seed)
     rms = 1e3 * float(np.sqrt(np.mean(placings.errors[:, :3] ** 2)))
     largest = 1e3 * float(np.linalg.norm(placings.errors[:, :3], axis=1).max())
     stated = 1e3 * float(np.sqrt(np.mean(placings.sds[:, :3] ** 2)))
@@ -288,8 +289,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", choices=["table", "sine", "ring"])
     parser.add_argument("--rings", type=int, default=2, help="simulated flights of the ring")
+    parser.add_argument("--seed", type=int, default=0, help="of the tables")
     options = parser.parse_args(arguments)
-    experiments = [f"table {size}" for size in TABLE_1] + ["sine"]
+    experiments = [f"table {size} {options.seed}" for size in TABLE_1] + [f"sine {options.seed}"]
     experiments += [f"ring {seed}" for seed in range(options.rings)]
     chosen = [each for each in experiments if options.only in {None, each.partition(" ")[0]}]
     for line in ordered_map(

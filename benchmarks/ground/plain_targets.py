@@ -30,7 +30,7 @@ from kgcp.measurement.discs.adjust_disc import geometry_of
 from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.plain_pose import CircleMoments, circles_about, fit_circles, pose_towards
-from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
 from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
@@ -48,7 +48,8 @@ _CAMERA = Camera(320, 320, 1500.0, 1500.0, 159.5, 159.5, k1=-0.3, response=Respo
 _MARGIN_PX = 70.0  # of targets against the frame's border
 _OPTICS, _SENSOR = Optics(0.6), Sensor()
 _BORDER_PX = 9.0
-_RADII_PX = (3.0, 4.0, 6.0, 10.0, 20.0)
+_RADII_PX = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0)
+_LEAST_BARE_PX = 3.0
 _TILTS_DEG = (0.0, 12.5, 25.0, 37.5, 50.0)
 _DIAMETER_M = 0.5
 _APART_PX = AROUND_PX  # edges of a ring: farther apart, each has pixels of its own
@@ -285,13 +286,10 @@ def pieces_of_ground(photographs: Sequence[GreyArray], count: int) -> list[Float
         wide = ground.radiance(PlaneRaster.of(camera, down, window))
     pieces = []
     for index in range(count):
-        if photographs:
-            photograph = photographs[index % len(photographs)]
-            light = _linear(photograph)
-        else:
-            light = wide
-        row, column = (int(rng.integers(extent - size)) for extent in light.shape)
-        pieces.append(light[row : row + size, column : column + size])
+        whole = photographs[index % len(photographs)] if photographs else wide
+        row, column = (int(rng.integers(extent - size)) for extent in whole.shape)
+        piece = whole[row : row + size, column : column + size]
+        pieces.append(_linear(piece) if photographs else piece)
     return pieces
 
 
@@ -310,10 +308,14 @@ class Windows:
     reasons: Counter[str]
 
 
-def random_windows(photographs: Sequence[GreyArray], count: int) -> Windows:
+def random_windows(
+    photographs: Sequence[GreyArray], count: int, sizes_px: tuple[float, float], seed: int
+) -> Windows:
     """Look for targets of all kinds and sizes where there is none."""
-    rng = np.random.default_rng(11)
-    return _looked_at("random places", photographs, _random_places(photographs, count, rng))
+    rng = np.random.default_rng(seed)
+    return _looked_at(
+        "random places", photographs, _random_places(photographs, count, sizes_px, rng)
+    )
 
 
 def round_things(photographs: Sequence[GreyArray], most: int) -> Windows:
@@ -321,17 +323,49 @@ def round_things(photographs: Sequence[GreyArray], most: int) -> Windows:
     return _looked_at("round things", photographs, _round_places(photographs, most))
 
 
+def edges_alike(photographs: Sequence[GreyArray]) -> FloatArray:
+    """Return how many edges of a level disc's size and shape a window has by chance.
+
+    Before they are measured: their density in the whole photograph, times the area in which a
+    target is looked for. A test against chance would have to refuse targets where this is large.
+
+    Returns
+    -------
+    (photographs, radii) array
+        Of the polarity that has more of them, for `_RADII_PX`.
+    """
+    window_px2 = math.pi * (SIGMAS * SD_PX) ** 2
+    shares = []
+    for photograph in photographs:
+        outlines = find_outlines(photograph)
+        for radius_px in _RADII_PX:
+            size = SIGMAS * math.hypot(_SD_LOG, 0.015, 0.12 / radius_px)
+            shape_px = math.hypot(1.0, 0.2 * radius_px)
+            alike = Counter(
+                each.polarity
+                for each in outlines
+                if abs(math.log(each.ellipse.mean_radius / radius_px)) < size
+                and each.ellipse.a < radius_px + shape_px
+                and each.ellipse.b > radius_px - shape_px
+            )
+            shares.append(max(alike.values(), default=0) * window_px2 / photograph.size)
+    return np.reshape(shares, (len(photographs), len(_RADII_PX)))
+
+
 _Place = tuple[int, FloatArray, float, str]  # photograph, place, radius [px], kind
 
 
 def _random_places(
-    photographs: Sequence[GreyArray], count: int, rng: np.random.Generator
+    photographs: Sequence[GreyArray],
+    count: int,
+    sizes_px: tuple[float, float],
+    rng: np.random.Generator,
 ) -> Iterator[_Place]:
     for index in range(count):
         photograph = index % len(photographs)
         height, width = photographs[photograph].shape
         place = rng.uniform((60.0, 60.0), (width - 60.0, height - 60.0))
-        log_radius = rng.uniform(math.log(_SMALLEST_PX), math.log(_LARGEST_PX))
+        log_radius = rng.uniform(math.log(sizes_px[0]), math.log(sizes_px[1]))
         yield photograph, place, math.exp(log_radius), [*_KINDS][index // 7 % len(_KINDS)]
 
 
@@ -413,6 +447,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--real", type=Path, help="folder of photographs of ground")
     parser.add_argument("--count", type=int, default=40, help="targets per line")
     parser.add_argument("--windows", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=11, help="of the windows")
+    parser.add_argument(
+        "--sizes", type=float, nargs=2, default=(_SMALLEST_PX, _LARGEST_PX), help="in windows [px]"
+    )
     parser.add_argument(
         "--tone", choices=[*ToneCurve], type=ToneCurve, help="a tone curve that is not known"
     )
@@ -427,10 +465,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("kind              R px  found wrong   RMS px /bound     z  z(d)  trend 1e-3 px/°   ms")
     for kind in (chosen.kind or _KINDS) if chosen.count else ():
         for radius_px in _RADII_PX:
+            if radius_px < _LEAST_BARE_PX and not _KINDS[kind][2]:
+                continue  # it is not looked for
             print_looks(look(kind, radius_px, chosen.count, grounds, chosen.tone))
     if photographs and chosen.windows:
+        for radius_px, shares in zip(_RADII_PX, edges_alike(photographs).T, strict=True):
+            print(
+                f"edges of a disc's size and shape, R {radius_px:g} px: {shares.min():.1e} to"
+                f" {shares.max():.1e} in a window"
+            )
         for windows in (
-            random_windows(photographs, chosen.windows),
+            random_windows(photographs, chosen.windows, tuple(chosen.sizes), chosen.seed),
             round_things(photographs, chosen.windows),
         ):
             print(

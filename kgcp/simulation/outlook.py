@@ -60,8 +60,9 @@ PLAIN_SCATTER = (1.7, 1.15)
 PLAIN_FOUND = (1498, 1500)
 """Plain discs and rings found and shown from `PLAIN_LEAST_PX` on, by the same benchmark with
 `--count 100`."""
-PLAIN_LEAST_PX, PLAIN_GAP_PX, PLAIN_HOLE_PX = 3.0, 2.0, 1.0
-"""Least radius, least distance of a ring's circles and least radius of its innermost [px].
+PLAIN_LEAST_PX, PLAIN_LEAST_BARE_PX, PLAIN_GAP_PX, PLAIN_HOLE_PX = 2.5, 3.0, 2.0, 1.0
+"""Least radius, with even ground of its own and without, least distance of a ring's circles and
+least radius of its innermost [px].
 
 Thinner rings are found as well, but their edges say less than edges apart.
 """
@@ -287,11 +288,12 @@ def _plain_outlook(
 def least_plain_px(target: PlainTarget) -> float:
     """Return the least radius at which all circles of a plain target are told apart [px]."""
     radii = target.radii_m
+    least_px = PLAIN_LEAST_BARE_PX if target.border_m is None else PLAIN_LEAST_PX
     if len(radii) == 1:
-        return PLAIN_LEAST_PX
+        return least_px
     narrowest_m = min(outer - inner for outer, inner in pairwise(radii))
     return max(
-        PLAIN_LEAST_PX,
+        least_px,
         PLAIN_GAP_PX * radii[0] / narrowest_m,
         PLAIN_HOLE_PX * radii[0] / radii[-1],
     )

@@ -208,6 +208,35 @@ def test_looks_only_where_it_is_told() -> None:
         assert outcome.reason is reason
 
 
+@pytest.mark.parametrize(("border_m", "least_px"), [(0.4, 2.5), (None, 3.0)])
+def test_the_smallest_disc_needs_even_ground(border_m: float | None, least_px: float) -> None:
+    pose, target = pose_at(90.4, 71.7), replace(DISC, border_m=border_m)
+    grey = frame_with((target, pose))
+    for radius_px, is_too_small in ((least_px - 0.01, True), (least_px + 0.01, False)):
+        outcome = looked(grey, replace(prediction_of(pose), radius_px=radius_px), target)
+        is_miss = isinstance(outcome, Miss) and outcome.reason is Reason.TOO_SMALL
+        assert is_miss is is_too_small
+        if isinstance(outcome, Miss):
+            assert f"below {least_px:g} px" in outcome.detail
+
+
+@pytest.mark.parametrize("blur_px", [0.8, 2.0])
+def test_refuses_a_smooth_blob(blur_px: float) -> None:
+    along = pose_at(90.0, 70.0).translation_m
+    radius_px = 3.5
+    pose = Pose(np.eye(3), along * RADIUS_PX / radius_px)
+    rows, columns = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
+    inside = np.clip(radius_px - np.hypot(rows - 70.0, columns - 90.0) + 0.5, 0.0, 1.0)
+    light = cv2.GaussianBlur(0.2 + 0.5 * inside, (0, 0), blur_px)
+    grey = Sensor().expose(np.asarray(light), 1.0, np.random.default_rng(1))
+    level = NormalPrior(np.array([0.0, 0.0, 1.0]), 3.0)
+    prediction = replace(prediction_of(pose), normal=level, radius_px=radius_px)
+    outcome = looked(grey, prediction, replace(DISC, border_m=0.8))
+    assert isinstance(outcome, Measurement) is (blur_px < 1.0)
+    if isinstance(outcome, Miss):
+        assert outcome.reason is Reason.TOO_BLURRED
+
+
 def test_fit_returns_what_was_projected() -> None:
     pose = pose_at(150.0, 30.0, RING)
     radii = np.array(RING.radii_m)
