@@ -62,6 +62,18 @@ def test_moved_points_are_left_out_with_their_residuals() -> None:
     assert 10.0 < float(np.linalg.norm(found.residuals[2, :2])) < 40.0
 
 
+def test_four_points_alone_must_fit_well() -> None:
+    points = np.array(
+        [[-5.0, -4.0, 0.0], [5.0, -4.0, 0.8], [5.0, 4.0, 0.0], [-5.0, 4.0, 3.0], [1.0, 0.5, 0.4]]
+    )
+    seen = points.copy()
+    seen[2] += [0.0, 0.0015, 0.0]  # 0.12 px: within the limit of a point
+    assert orient(CAMERA, images_of(points, seen)).is_used.all()
+    assert orient(CAMERA, images_of(points[:4])).is_used.all()
+    with pytest.raises(NoPoseError, match=r"agrees only roughly \(χ² \d+ of 2\)"):
+        orient(CAMERA, images_of(points[:4], seen[:4]))
+
+
 @pytest.mark.parametrize(
     ("points", "problem"),
     [

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.special import chdtri
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix, rotation_onto
@@ -36,6 +37,9 @@ _CONVERGED = 1e-5  # decrease of χ² that means nothing
 _ROUNDS = 10
 _SAME_RAD, _SAME_SHARE = 2e-3, 2e-3  # of two poses that are one: turn, and shift over distance
 _START_PX, _START_SHARE = 2.0, 0.01  # what a hypothesis of three points with noise is off by
+# Four points without distances leave two numbers to check a name by. In one of 1800 frames a wrong
+# one passed the limit of single points; this one is for all together.
+_FEW_CHECKS, _FEW_CHECKS_CHANCE = 2, 0.01
 _MOST_TURN_SD = 0.02  # [rad]: beyond it covariances of first order do not hold
 _NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
 
@@ -200,7 +204,18 @@ def orient(
     turn_sd = math.sqrt(float(np.linalg.eigvalsh(cov[3:6, 3:6])[-1]))
     if turn_sd > _MOST_TURN_SD:
         raise NoPoseError(f"the points hardly determine the pose (± {math.degrees(turn_sd):.1f}°)")
-    return Resection(pose, cov, residuals, chi2, used, margin, other)
+    oriented = Resection(pose, cov, residuals, chi2, used, margin, other)
+    _require_fit(oriented)
+    return oriented
+
+
+def _require_fit(oriented: Resection) -> None:
+    """Refuse a pose that hardly anything checks, if that does not fit well."""
+    freedom = oriented.observations - len(oriented.cov)
+    total = float(np.sum(oriented.chi2[oriented.is_used]))
+    if 0 < freedom <= _FEW_CHECKS and total > chdtri(freedom, _FEW_CHECKS_CHANCE):
+        problem = f"the least number of points agrees only roughly (χ² {total:.0f} of {freedom})"
+        raise NoPoseError(problem)
 
 
 def _require_agreement(images: PointImages, used: BoolArray, min_points: int) -> None:
