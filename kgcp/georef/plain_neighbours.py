@@ -1,8 +1,4 @@
-"""Where plain targets must be in a frame, as the frames before and after it show them.
-
-A frame with a pose shows where a target is even if it is not measured there, hidden or beyond the
-frame's border: between frames with poses, to interpolate places is to interpolate poses.
-"""
+"""Where plain targets must be in a frame, as the frames before and after it show them."""
 
 from __future__ import annotations
 
@@ -30,24 +26,11 @@ _FLOOR_PX, _FLOOR_DEG = 1.0, 2.0  # least standard deviations, whatever neighbou
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Where a target is in a frame, and how it lies: what other frames need to know."""
+    """Where a target is in a frame, and how it lies: what other frames need of a measurement."""
 
     state: FloatArray  # (3,): centre x, y [px] and logarithm of the distance [m]
     normal: FloatArray  # (3,): in the camera frame
     sd_normal_deg: float
-    sd_px: float = 0.0  # of the centre, if it is not measured but predicted
-
-    @classmethod
-    def predicted(cls, prediction: PlainPrediction) -> Self:
-        """Take it from a prediction by the frame's pose."""
-        distance_m = float(np.linalg.norm(prediction.position_m))
-        normal = prediction.normal
-        return cls(
-            np.append(prediction.centre_px, math.log(distance_m)),
-            normal.direction_camera,
-            normal.sd_deg,
-            prediction.sd_px,
-        )
 
     @classmethod
     def of(cls, measurement: Measurement) -> Self:
@@ -74,11 +57,8 @@ class PlainTracks:
         in_order = np.arange(len(time_s), dtype=np.float64)
         self._time_s = time_s if np.isfinite(time_s).any() else in_order
 
-    def add(self, row: int, result: FrameResult, predicted: Predictions) -> None:
-        """Take what was measured in a frame, and else what its own pose predicts."""
-        for name, prediction in predicted.items():
-            if prediction.is_sure:
-                self._found[name][row] = _Place.predicted(prediction)
+    def add(self, row: int, result: FrameResult) -> None:
+        """Take what was measured in a frame."""
         for outcome in result.outcomes:
             if isinstance(outcome, Measurement) and outcome.target in self._found:
                 self._found[outcome.target][row] = _Place.of(outcome)
@@ -108,37 +88,33 @@ class PlainTracks:
         self, target: PlainTarget, row: int, between: Interpolation, camera: Camera
     ) -> PlainPrediction:
         """Return the prediction for a place between, whose size is the distance."""
-        distance_m, both = between.size, self._beside(target, row)
+        distance_m = between.size
         sight = np.append(camera.undistort(between.centre_px[None])[0], 1.0)
         position_m = distance_m / float(np.linalg.norm(sight)) * sight
         return PlainPrediction(
             centre_px=between.centre_px,
-            cov_px2=(between.sd_px**2 + _FLOOR_PX**2 + max(each.sd_px for each in both) ** 2)
-            * np.eye(2),
+            cov_px2=(between.sd_px**2 + _FLOOR_PX**2) * np.eye(2),
             position_m=position_m,
             sd_log_distance=between.sd_log_size,
-            normal=_mean_normal(*both),
+            normal=self._normal(target, row),
             radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
             source=NEIGHBOURS,
         )
 
-    def _beside(self, target: PlainTarget, row: int) -> tuple[_Place, _Place]:
-        """Return the places before and after."""
+    def _normal(self, target: PlainTarget, row: int) -> NormalPrior:
+        """Return the mean of the normals before and after, as uncertain as they are and differ."""
         now, found = self._time_s[row], self._found[target.name]
         before = max((each for each in found if self._time_s[each] < now), key=self._when)
         after = min((each for each in found if self._time_s[each] > now), key=self._when)
-        return found[before], found[after]
+        both = found[before], found[after]
+        first, second = (place.normal for place in both)
+        mean = (first + second) / np.linalg.norm(first + second)
+        apart_deg = math.degrees(math.acos(min(1.0, float(first @ second))))
+        sd_deg = max(place.sd_normal_deg for place in both)
+        return NormalPrior(mean, math.hypot(sd_deg, apart_deg, _FLOOR_DEG))
 
     def _when(self, row: int) -> float:
         return float(self._time_s[row])
-
-
-def _mean_normal(before: _Place, after: _Place) -> NormalPrior:
-    """Return the mean of two normals, as uncertain as they are and differ."""
-    total = before.normal + after.normal
-    apart_deg = math.degrees(math.acos(min(1.0, float(before.normal @ after.normal))))
-    sd_deg = max(before.sd_normal_deg, after.sd_normal_deg)
-    return NormalPrior(total / np.linalg.norm(total), math.hypot(sd_deg, apart_deg, _FLOOR_DEG))
 
 
 def _sd_normal_deg(measurement: Measurement) -> float:

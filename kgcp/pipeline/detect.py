@@ -299,11 +299,8 @@ def _look_for_plain(
     is not sure enough, the first of these looks says so in the row; a later one may be sure.
     """
     tried: set[tuple[int, str]] = set()
-    by_reference = plain_by_reference(flight, data, run.tracks.frames)
     for look in range(looks):
-        plain = plain_by_results(
-            flight, data, run.results(), run.tracks.time_s, marks, by_reference, tried
-        )
+        plain = plain_by_results(flight, data, run.results(), run.tracks.time_s, marks, tried)
         sure = {
             row: {name: each for name, each in predictions.items() if each.is_sure}
             for row, predictions in plain.items()

@@ -137,7 +137,6 @@ def plain_by_results(
     results: Iterable[FrameResult],
     time_s: FloatArray,
     marks: Mapping[str, Sequence[Mark]],
-    by_reference: Sequence[Predictions],
     tried: Collection[tuple[int, str]] = (),
 ) -> dict[int, Predictions]:
     """Return by row where plain targets must be of which nothing else has said it so far.
@@ -153,8 +152,6 @@ def plain_by_results(
         Mid-exposures [s]; NaN: not known.
     marks : mapping
         Static targets that were marked by hand, by frame.
-    by_reference : sequence of mapping
-        For each frame what `plain_by_reference` says.
     tried : collection of tuple
         Rows and targets that were looked for before, by a sure prediction.
     """
@@ -166,7 +163,7 @@ def plain_by_results(
     lacking: dict[int, set[str]] = {}
     sightings: list[Sighting] = []
     for row, result in enumerate(results):
-        tracks.add(row, result, by_reference[row])
+        tracks.add(row, result)
         names = {outcome.target for outcome in result.outcomes if _lacks_prediction(outcome)}
         names = {name for name in names if (row, name) not in tried}
         if names:

@@ -239,28 +239,6 @@ def test_frames_before_and_after_tell_where_they_are(tmp_path: Path) -> None:
         assert np.abs(off_px / rows[["sd_x_px", "sd_y_px"]].to_numpy()).max() < 4.0
 
 
-def test_poses_before_and_after_tell_where_a_target_is_that_they_do_not_show(
-    tmp_path: Path,
-) -> None:
-    made = Passage(targets=(plain_target("white", (-2.0, -1.5), 0.8),), frames=6)
-    made.write(tmp_path)
-    lacking, hidden = "f_2.png", ("f_0.png", "f_1.png", "f_4.png")
-    for name in hidden:
-        empty = np.full((CAMERA.height, CAMERA.width), 80, np.uint8)
-        cv2.imwrite(str(tmp_path / "frames" / name), empty)
-    poses = (tmp_path / "reference.csv").read_text("utf-8").splitlines()
-    kept = [line for line in poses if not line.startswith(lacking)]
-    (tmp_path / "reference.csv").write_text("\n".join(kept) + "\n", encoding="utf-8")
-    run("detect", tmp_path, "--jobs", "0")
-    table = detections(tmp_path).set_index("frame")
-    assert table["guided"].loc[lacking]
-    off_px = (
-        table.loc[lacking, ["x_px", "y_px"]].astype(float) - CAMERA.project(made.centres_m(2))[0]
-    )
-    assert np.abs(off_px).max() < 0.05
-    assert set(table["status"].loc[list(hidden)]) == {"not_found"}
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
