@@ -70,7 +70,7 @@ def test_four_points_alone_must_fit_well() -> None:
     seen[2] += [0.0, 0.0015, 0.0]  # 0.12 px: within the limit of a point
     assert orient(CAMERA, images_of(points, seen)).is_used.all()
     assert orient(CAMERA, images_of(points[:4])).is_used.all()
-    with pytest.raises(NoPoseError, match=r"agrees only roughly \(χ² \d+ of 2\)"):
+    with pytest.raises(NoPoseError, match=r"must agree better \(χ² \d+ of 2\)"):
         orient(CAMERA, images_of(points[:4], seen[:4]))
 
 

@@ -214,8 +214,7 @@ def _require_fit(oriented: Resection) -> None:
     freedom = oriented.observations - len(oriented.cov)
     total = float(np.sum(oriented.chi2[oriented.is_used]))
     if 0 < freedom <= _FEW_CHECKS and total > chdtri(freedom, _FEW_CHECKS_CHANCE):
-        problem = f"the least number of points agrees only roughly (χ² {total:.0f} of {freedom})"
-        raise NoPoseError(problem)
+        raise NoPoseError(f"so few points must agree better (χ² {total:.0f} of {freedom})")
 
 
 def _require_agreement(images: PointImages, used: BoolArray, min_points: int) -> None:
