@@ -18,7 +18,12 @@ from kgcp.network.calibration_records import (
     PointModel,
     rms_px,
 )
-from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
+from kgcp.network.camera_network import (
+    CENTRE_DETERMINED,
+    AdjustedNetwork,
+    CalibrationProblem,
+    Unknowns,
+)
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
 from kgcp.network.parameter_choice import DETERMINED, with_chosen_parameters
@@ -27,7 +32,6 @@ from kgcp.network.start import better_poses, homography_misfits, start_camera_an
 from kgcp.targets.fields.points import AnyField
 
 LEAST_VIEWS = 3
-_CENTRE_DETERMINED = 0.1  # as `DETERMINED`, of a principal point: within 1 % of the frame
 _INFLATION = 100.0  # of a variance by other parameters: a deviation ten times larger
 _LEAST_SHARE = 0.6  # of a photograph's discs that must fit
 _MARGIN_PX = 2.0  # within the frame, where a disc is to be found
@@ -209,7 +213,7 @@ def _result(
     known = precision(state.network, state.solution)
     cov = known.camera_cov
     by_unknown = model.to_calibration()
-    share = np.array([_CENTRE_DETERMINED if n in ("cx", "cy") else DETERMINED for n in model.names])
+    share = np.array([CENTRE_DETERMINED if n in ("cx", "cy") else DETERMINED for n in model.names])
     weak = np.sqrt(cov.diagonal()) > share * state.network.cameras.sd[0]
     weak |= problem.is_at_border(model.names, state.estimate)
     names = np.array(model.names)

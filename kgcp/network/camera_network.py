@@ -21,7 +21,7 @@ from kgcp.geometry.circle_image import (
 from kgcp.geometry.pose import Pose
 from kgcp.network.adjust import ROBUST, adjust
 from kgcp.network.calibration_records import CalibrationSettings, NamedView, PointModel
-from kgcp.network.covariance import fitting_covariances
+from kgcp.network.covariance import fitting_covariances, precision
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import (
     CameraPrior,
@@ -39,6 +39,10 @@ _FOCAL_SD = 3.0  # of the focal length to start with
 _RADIAL_SD = 0.3  # of the distance from the middle, at the corner: what a term may displace
 _TANGENTIAL_SD = 0.05
 _SCALINGS = 10  # of the covariances, and new eccentricities, at most
+CENTRE_DETERMINED = 0.1  # of that: better than to 1 % of the frame
+_FARTHEST = (
+    0.9  # from the middle of the frame, of its size: near 1, where no `Camera` exists, it sticks
+)
 _HOLDINGS = 6  # of a principal point at the border of the frame, and releases
 _HELD_SD = 1e-3  # px
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
@@ -131,7 +135,7 @@ class CalibrationProblem:
                 self.camera_prior(model, camera),
             )
             start = replace(estimate, cameras=model.values_of(camera)[None])
-            solution = self._adjusted_within_frame(network, start)
+            solution = self._with_kept_centre(network, start)
             estimate = solution.estimate
             camera = model.camera(estimate.cameras[0])
             next_cov = fitting_covariances(network, solution, observed.cov)
@@ -143,11 +147,12 @@ class CalibrationProblem:
                 break
         return AdjustedNetwork(camera, estimate, unknowns, network, solution)
 
-    def _adjusted_within_frame(self, network: Network, start: Estimate) -> Solution:
-        """Return the adjustment in which the principal point stays in the frame.
+    def _with_kept_centre(self, network: Network, start: Estimate) -> Solution:
+        """Return the adjustment in which the principal point is outside the frame only for sure.
 
-        Where the photographs would put it outside, they do not determine it: what the field lacks
-        of its shape draws it there. It is held at the border, as long as they draw it outwards.
+        That of photographs that were cropped may be there. But where it is hardly determined, what
+        the field lacks of its shape may draw it out, to where no camera exists. Then it is held at
+        the border, as long as the photographs draw it outwards.
         """
         names = network.model.names
         index, border = _centre_of(names), np.array(self.size) - 1.0
@@ -159,21 +164,32 @@ class CalibrationProblem:
             inside = np.clip(centre, 0.0, border)
             # one that is held has given way a little to where the photographs draw it
             is_outward = (centre - at) * (at - 0.5 * border) > 0.0
-            is_drawn_out = np.where(held, is_outward, centre != inside)
+            is_lost = (centre != inside) & self._is_lost(network, solution, index)
+            is_drawn_out = np.where(held, is_outward, is_lost)
             at = np.where(held, at, inside)
-            if np.array_equal(is_drawn_out, held):
+            before, held = held, is_drawn_out
+            if np.array_equal(before, held):
                 break
-            held = is_drawn_out
         cameras = start.cameras.copy()
-        cameras[0, index] = inside
+        cameras[0, index[before]] = at[before]
         return replace(solution, estimate=replace(start, cameras=cameras))
+
+    def _is_lost(self, network: Network, solution: Solution, index: IndexArray) -> BoolArray:
+        """Return which coordinates of the principal point are hardly determined.
+
+        So are those at the end of what a `Camera` may have: the minimum is beyond.
+        """
+        sd = np.sqrt(precision(network, solution).camera_cov.diagonal()[index])
+        from_middle = np.abs(solution.estimate.cameras[0, index] / self.size - 0.5)
+        is_loose = sd > CENTRE_DETERMINED * network.cameras.sd[0, index]
+        return np.asarray(is_loose | (from_middle > _FARTHEST))
 
     def is_at_border(self, names: Sequence[str], estimate: Estimate) -> BoolArray:
         """Return which unknowns (p,) are a principal point's that is held at the border."""
         is_held = np.zeros(len(names), dtype=np.bool_)
         index, border = _centre_of(names), np.array(self.size) - 1.0
         centre = estimate.cameras[0, index]
-        is_held[index] = (centre <= 0.0) | (centre >= border)
+        is_held[index] = (centre == 0.0) | (centre == border)
         return is_held
 
     def eccentricity(

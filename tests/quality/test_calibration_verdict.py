@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from kgcp.network.calibration_records import (
     NamedView,
     PointModel,
 )
+from kgcp.network.camera_network import CalibrationProblem
+from kgcp.network.records import CameraPrior
 from kgcp.quality.calibration_verdict import (
     Grade,
     calibration_numbers,
@@ -123,12 +126,36 @@ def test_frontal_photographs_determine_little_and_say_so() -> None:
     assert 0.0 < result.camera.cy < 1200.0
 
 
-def test_a_principal_point_stays_in_the_frame_and_is_not_claimed_at_its_border() -> None:
-    result = calibrated(views(camera=replace(CAMERA, cx=1690.0), distance_m=0.6)[:4])
-    assert result.camera.cx == 1599.0
-    assert 500.0 < result.camera.cy < 700.0
+@pytest.mark.parametrize("cx", [-90.0, 1690.0])
+def test_the_principal_point_of_cropped_photographs_is_found_outside_them(cx: float) -> None:
+    result = calibrated(views(camera=replace(CAMERA, cx=cx)))
+    assert abs(result.camera.cx - cx) < 5.0 * calibration_numbers(result).sd[2] < 1.0
+    assert result.undetermined == ()
+    assert result.camera.fx == pytest.approx(1500.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("cx", "border"), [(2399.9, 1599.0), (-799.9, 0.0)])
+def test_a_principal_point_that_runs_away_is_held_at_the_border_and_not_claimed(
+    cx: float, border: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = views(camera=replace(CAMERA, cx=cx))
+    result = calibrated(made)
+    assert result.camera.cx == border
     assert "cx" in result.undetermined
     assert judge(result, calibration_numbers(result)).grade is Grade.UNUSABLE
+    known_prior = CalibrationProblem.camera_prior
+
+    def prior_at_border(*args: Any) -> CameraPrior:
+        prior = known_prior(*args)
+        at = args[1].names.index("cx")
+        values, sd = prior.values.copy(), prior.sd.copy()
+        values[0, at], sd[0, at] = border, 1e-3
+        return CameraPrior(values, sd)
+
+    monkeypatch.setattr(CalibrationProblem, "camera_prior", prior_at_border)
+    fixed = calibrated(made).camera
+    assert result.camera.fx == pytest.approx(fixed.fx, rel=1e-4)
+    assert result.camera.k1 == pytest.approx(fixed.k1, rel=1e-2)
 
 
 def test_a_photograph_with_wrong_names_is_left_out() -> None:
