@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from kgcp.network.calibration_records import (
     PointModel,
 )
 from kgcp.network.camera_network import CalibrationProblem
+from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import CameraPrior
 from kgcp.quality.calibration_verdict import (
     Grade,
@@ -145,9 +145,11 @@ def test_a_principal_point_that_runs_away_is_held_at_the_border_and_not_claimed(
     assert judge(result, calibration_numbers(result)).grade is Grade.UNUSABLE
     known_prior = CalibrationProblem.camera_prior
 
-    def prior_at_border(*args: Any) -> CameraPrior:
-        prior = known_prior(*args)
-        at = args[1].names.index("cx")
+    def prior_at_border(
+        problem: CalibrationProblem, model: FrameCameraModel, camera: Camera
+    ) -> CameraPrior:
+        prior = known_prior(problem, model, camera)
+        at = model.names.index("cx")
         values, sd = prior.values.copy(), prior.sd.copy()
         values[0, at], sd[0, at] = border, 1e-3
         return CameraPrior(values, sd)

@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.measurement.discs import adjust_disc, fit_disc
+from kgcp.measurement.discs import adjust_disc, covariance, fit_disc
 from kgcp.measurement.discs.measure import measure_disc, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
@@ -199,33 +199,69 @@ def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPat
     assert 0.005 < own < 0.8 * rms_px()
 
 
-def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The photographer's shadow: light of first order leaves residuals, which count as errors.
+def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyArray, FloatArray]:
+    """Render five discs, each under a shadow's edge that passes its middle at some distance.
 
-    What light beyond the second order may do counts, too; beside the middles it does little.
+    `width_px` is that of a logistic step, from a twentieth to nineteen of it.
     """
     pose, camera = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), Camera(480, 110, 1e3, 1e3, 240, 55)
     discs = tuple(FieldDisc((0.09 * (k - 2), 0.0, 0.0), 0.03) for k in range(5))
     scene, rng = FieldScene(discs, 0.8, 0.1), np.random.default_rng(3)
     photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
     rows, columns = np.mgrid[: camera.height, : camera.width]
-    edges_px = columns + 0.5 * (rows - 55) - 70.0  # beside the discs' middles
-    shadows = sum((-1) ** k / (1.0 + np.exp((90.0 * k - edges_px) / 4.0)) for k in range(5))
-    photo = np.round(photo * (1.0 - 0.3 * np.asarray(shadows))).astype(np.uint8)
-    truth = circle_images(camera, field_circles(pose, scene.discs)).moments
-    outlines = find_outlines(photo)
+    edges_px = columns + 0.5 * (rows - 55) - 60.0 - aside_px
+    steps = np.subtract.outer(edges_px, 90.0 * np.arange(5)) * (2.0 * np.log(19.0) / width_px)
+    shadows = 0.5 * (1.0 + np.tanh(0.5 * steps)) @ (-1.0) ** np.arange(5)
+    photo = np.round(photo * (1.0 - depth * shadows)).astype(np.uint8)
+    return photo, circle_images(camera, field_circles(pose, scene.discs)).moments
 
-    def rms_and_sd_px() -> tuple[float, float]:
-        measured = measure_discs(photo, outlines, response=Response.LINEAR)
-        own = [each for each in measured if isinstance(each, Disc)]
-        assert len(own) == len(discs)
-        centres = np.array([each.centre_px for each in own])
-        off = centres - truth[nearest(centres, truth), :2]
-        variances = [each.cov[0, 0] + each.cov[1, 1] for each in own]
-        return float(np.sqrt(np.mean(off**2))), float(np.sqrt(0.5 * np.mean(variances)))
 
-    rms_px, sd_px = rms_and_sd_px()
+def rms_and_sd_px(photo: GreyArray, truth: FloatArray) -> tuple[float, float]:
+    """Measure all discs; return their centres' errors and what is stated of them."""
+    measured = measure_discs(photo, find_outlines(photo), response=Response.LINEAR)
+    own = [each for each in measured if isinstance(each, Disc)]
+    assert len(own) == len(truth)
+    centres = np.array([each.centre_px for each in own])
+    off = centres - truth[nearest(centres, truth), :2]
+    variances = [each.cov[0, 0] + each.cov[1, 1] for each in own]
+    return float(np.sqrt(np.mean(off**2))), float(np.sqrt(0.5 * np.mean(variances)))
+
+
+def test_discs_under_the_edge_of_a_shadow_are_known_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The photographer's shadow: light of first order leaves residuals, which count as errors."""
+    photo, truth = under_shadows(0.3, 24.0, 10.0)
+    rms_px, sd_px = rms_and_sd_px(photo, truth)
     assert 0.25 * sd_px < rms_px < 1.8 * sd_px
     assert rms_px < 0.005
     monkeypatch.setattr(adjust_disc, "_CURVED", np.inf)
-    assert sd_px < 0.7 * rms_and_sd_px()[1]
+    assert sd_px < 0.7 * rms_and_sd_px(photo, truth)[1]
+
+
+def test_ink_has_a_gradient_of_its_own_under_an_edge_through_the_middle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    photo, truth = under_shadows(0.45, 12.0, 0.0)
+    rms_px, sd_px = rms_and_sd_px(photo, truth)
+    assert 0.5 * sd_px < rms_px < 1.6 * sd_px
+    curves_only = slice(2, None)
+    monkeypatch.setattr(fit_disc, "_UNEVEN", fit_disc._UNEVEN[curves_only])
+    monkeypatch.setattr(fit_disc, "_UNEVEN_PRECISIONS", fit_disc._UNEVEN_PRECISIONS[curves_only])
+    assert rms_px < 0.7 * rms_and_sd_px(photo, truth)[0]
+
+
+def test_light_beyond_the_second_order_counts_as_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    photo, truth = under_shadows(0.45, 20.0, 3.0)
+    rms_px, sd_px = rms_and_sd_px(photo, truth)
+    assert 0.5 * sd_px < rms_px < 1.6 * sd_px
+    monkeypatch.setattr(covariance, "_bend_px", lambda _: np.zeros((2, 2)))
+    assert 1.1 < sd_px / rms_and_sd_px(photo, truth)[1] < 1.5
+
+
+def test_little_of_an_uneven_light_is_enough_to_be_estimated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    photo, truth = under_shadows(0.3, 12.0, 0.0)
+    rms_px, sd_px = rms_and_sd_px(photo, truth)
+    assert 0.5 * sd_px < rms_px < 1.6 * sd_px
+    monkeypatch.setattr(adjust_disc, "_CURVED", 60.0)
+    assert rms_px < 0.9 * rms_and_sd_px(photo, truth)[0]
