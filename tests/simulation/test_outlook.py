@@ -25,11 +25,13 @@ from kgcp.simulation.outlook import (
     Conditions,
     Outlook,
     chance_to_find,
+    least_plain_px,
     look_ahead,
     usual_heights,
 )
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 CAMERA = Camera(130, 120, 1000.0, 1002.0, 66.3, 58.2, k1=-0.05, response=Response.LINEAR)
 TARGET = TARGET_PLATE.target
@@ -157,3 +159,20 @@ def test_impossible_conditions_are_refused(values: dict[str, float], word: str) 
 def test_impossible_heights_are_refused(heights_m: tuple[float, ...]) -> None:
     with pytest.raises(SettingError, match="height"):
         look_ahead(CAMERA, None, TARGET, heights_m, CONDITIONS)
+
+
+@pytest.mark.parametrize(
+    ("border_m", "diameters_m", "least_px"),
+    [
+        (0.1, (0.4,), 2.5),
+        (None, (0.4,), 3.0),
+        (0.1, (0.4, 0.3), 8.0),  # circles 2 px apart
+        (0.1, (0.4, 0.02), 20.0),  # a hole of 1 px
+    ],
+)
+def test_circles_of_the_smallest_plain_target_are_told_apart(
+    border_m: float | None, diameters_m: tuple[float, ...], least_px: float
+) -> None:
+    position_m = (0.0, 0.0, 0.0)
+    target = PlainTarget("T", diameters_m, PlainPolarity.DARK, position_m, border_m=border_m)
+    assert least_plain_px(target) == pytest.approx(least_px)

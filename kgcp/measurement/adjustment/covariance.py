@@ -104,7 +104,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         mean = (arcs * mean + _ARCS_OF_NOISE) / (arcs + _ARCS_OF_NOISE)
     ratios = (arcs * ratios + _ARCS_IN_COMMON * mean) / (arcs + _ARCS_IN_COMMON)
     half = root @ (directions * np.sqrt(ratios))
-    in_common_px = _common_displacement_px(fit, min(max(mean - 1.0, 0.0) / _ALL_ALONG_ARCS, 1.0))
+    in_common_px = common_displacement_px(fit, min(max(mean - 1.0, 0.0) / _ALL_ALONG_ARCS, 1.0))
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * in_common_px
     pose_cov = half @ half.T + shifts @ shifts.T
     pose_cov *= unevenness_factor(fit)
@@ -153,7 +153,7 @@ def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
     return share * largest / (6.0 * blur.mean_sd_px**2)
 
 
-def _common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
+def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     """Return the standard deviation of the displacement that all of a circle's edge shares [px].
 
     From the residuals: what edges scatter beyond the noise of the plateaus averages out along a

@@ -14,7 +14,7 @@ from kgcp.targets.layout import Ring
 from kgcp.targets.validation import codes_coincide
 
 PAPER = """\
-camera = { f = 2909.0; pp = [1020.3, 1027.8]; TD = [0.0003, -0.0002]; RD = [-0.085, 0.11, 0.0]; };
+camera = { f = 2909.0; pp = [1020.3, 1027.8]; TD = [0.0003, -0.0002]; RD = [-0.085, 0.11, 0.02]; };
 target = {
     d = 0.9;                             // outer diameter
     id = 0.45;
@@ -88,6 +88,8 @@ def test_files_may_have_several_targets(read: Read) -> None:
     assert first.dot_diameter_m == pytest.approx(0.9 * math.sin(math.radians(0.5 * 10.8)))
     one = TWO.replace("},\n", "}\n").replace(TWO.splitlines()[4] + "\n", "")
     assert read(one, "").code_deg == first.code_deg
+    own_circle = one.replace("id = 1;", "id = 1; signalRadiusPercentage = 0.7;")
+    assert read(own_circle, "id = 1").code_diameter_m == pytest.approx(0.42)
 
 
 @pytest.mark.parametrize(
@@ -105,6 +107,12 @@ def test_files_may_have_several_targets(read: Read) -> None:
         ),
         (PAPER.replace("0.151329", "0.0853"), "", "target: 'signal' does not ascend from 0 to 1"),
         (PAPER.replace("0.968116", "1.968116"), "", "'signal' does not ascend from 0 to 1"),
+        (PAPER.replace("[0.031884", "[-0.031884"), "", "'signal' does not ascend from 0 to 1"),
+        (PAPER.replace("0.968116", "1.0"), "", "'signal' does not ascend from 0 to 1"),
+        (PAPER.replace("[0.031884", "[0.042"), "", "white pieces of 23.0 to 26.6 deg; kgcp"),
+        (PAPER.replace("[0.031884", "[0.02"), "", "white pieces of 18.7 to 23.0 deg; kgcp"),
+        (PAPER.replace("signal = [", "signal = []; rest = ["), "", "has 0 places where the colour"),
+        (PAPER, "outer_diameter_m = 0.9", "outer_diameter_m: is given beside a file"),
         (PAPER.replace("With = 1.0", "With = 0.5"), "", "'signalStartsWith' is 0.5; give 1.0 for"),
         (PAPER.replace("With = 1.0", "With = -1.0"), "", "white pieces of 12.0 to 157.0 deg; kgcp"),
         (
@@ -145,5 +153,5 @@ def test_its_camera_is_opencvs_with_one_focal_length(read: Read, tmp_path: Path)
     assert (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3) == (
         *(-0.085, 0.11),
         *(0.0003, -0.0002),
-        0.0,
+        0.02,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,7 +14,11 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, image_heading_deg
-from kgcp.measurement.adjustment.covariance import pose_covariance, propagate
+from kgcp.measurement.adjustment.covariance import (
+    common_displacement_px,
+    pose_covariance,
+    propagate,
+)
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import TargetFit, noise_of
@@ -139,3 +144,17 @@ def test_noise_of_edges_is_common_if_it_runs_along_them(
     ray = fit.parameters.pose.translation_m / fit.parameters.pose.distance_m
     of_distance = ray @ pose_covariance(noisy).pose_cov[:3, :3] @ ray
     assert least < of_distance / (ray @ of_independent_pixels(noisy)[:3, :3] @ ray) < most
+
+
+@pytest.mark.parametrize(("share", "part"), [(0.25, 0.5), (1.0, 1.0)])
+def test_a_quarter_of_what_runs_along_an_edge_is_common(
+    fit: TargetFit, share: float, part: float
+) -> None:
+    sign = np.random.default_rng(5).choice((-1.0, 1.0), len(fit.sd))
+    noisy = with_noisy_edges(fit, sign)
+    slope_per_px = 1.0 / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
+    of_edges_px = math.sqrt(0.05**2 - 0.005**2) / slope_per_px
+    assert common_displacement_px(noisy, share) == pytest.approx(
+        0.25 * part * of_edges_px, rel=0.15
+    )
+    assert common_displacement_px(noisy, 0.0) == 0.002
