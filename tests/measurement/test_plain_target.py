@@ -119,19 +119,23 @@ def test_a_far_ring_is_measured_as_a_whole() -> None:
     assert abs(off_m) < 2.0 * outcome.uncertainty.sd_distance_m < 0.01 * pose.distance_m
 
 
-def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring() -> None:
-    """Its two edges tell how far ink spreads: of a disc, it is counted as 0.1 px, 2.5 % here."""
+@pytest.mark.parametrize(("radius_px", "least", "most"), [(5.0, 0.0005, 0.006), (3.0, 0.015, 0.06)])
+def test_an_unknown_tone_curve_leaves_the_size_of_a_far_ring(
+    radius_px: float, least: float, most: float
+) -> None:
+    """Its two edges tell how far ink spreads; 1.5 px apart they do not, and it counts in full."""
     target = replace(RING, border_m=0.9)
-    pose = pose_towards(2.5 * pose_at(90.4, 71.7, RING).translation_m, NORMAL)
+    near = pose_at(90.4, 71.7, RING).translation_m
+    pose = pose_towards(RADIUS_PX / radius_px * near, NORMAL)
     light = frame_with((target, pose)).astype(np.float64) / 255.0
     grey = np.rint(255.0 * srgb_encoded(light.ravel()).reshape(light.shape)).astype(np.uint8)
-    expected = replace(prediction_of(pose, (5.0, -4.0)), radius_px=4.0)
+    expected = replace(prediction_of(pose, (5.0, -4.0)), radius_px=radius_px)
     camera = replace(CAMERA, response=Response.UNKNOWN)
     outcome = look_for_plain(grey, camera, target, expected)
     assert isinstance(outcome, Measurement)
     assert outcome.uncertainty is not None
     sd = outcome.uncertainty.sd_distance_m / pose.distance_m
-    assert 0.001 < sd < 0.006
+    assert least < sd < most
     assert abs(outcome.distance_m / pose.distance_m - 1.0) < 3.0 * sd
 
 

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.discs.affine_model import Geometry, semi_axes
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
@@ -33,8 +33,10 @@ _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what i
 # 0.05 to 0.13 px where σ is 0.67 px (`benchmarks.calibrate.operator`, case `unknown_film`).
 _TONED_SHARE = 0.15
 # Of a ring that is measured as a whole, whose edges tell that displacement, this much is left:
-# 0.012 px by a film's curve, 0.001 px by sRGB's.
-_TONED_RING_SHARE = 0.01
+# 0.012 px by a film's curve, 0.001 px by sRGB's. Edges nearer to each other than so many px, or
+# standard deviations of the blur, tell it wrongly: by a film's curve distances were off by 3 % at R
+# 2.5 px and by 1.1 % at 3 px.
+_TONED_RING_SHARE, _LEAST_GAP_PX, _LEAST_GAP = 0.01, 1.9, 3.0
 # … and where the light falls off, it displaces opposite edges differently: of the blur, for light
 # that falls off by all of itself over one radius.
 _TONED_FALL = 0.1
@@ -70,10 +72,11 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
     ratio = float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
-    common_px = common_displacement_px(fit)
-    if len(fit.sample.pixels.inner):  # `hole_level` knows what that does to a ring
+    if _edges_tell_displacement(fit):  # then `hole_level` knows what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
+    else:
+        common_px = common_displacement_px(fit)
     # an edge that is displaced everywhere grows both semi-axes alike: M by the identity
     grown = np.array((0.0, 0.0, 1.0, 0.0, 1.0)) * common_px
     common = np.outer(grown, grown) + np.diag([_FLOOR_PX**2] * GEOMETRY_COUNT)
@@ -136,6 +139,16 @@ def common_displacement_px(fit: DiscFit) -> float:
     of_edges_px = _COMMON_SHARE * math.sqrt(max(at_edges, 0.0)) / slope_per_px
     of_tone_px = _TONED_SHARE * blur_px if tone.is_shaped else 0.0
     return max(_FLOOR_PX, _EXTRAPOLATED_SHARE * reach_px, of_edges_px, of_tone_px)
+
+
+def _edges_tell_displacement(fit: DiscFit) -> bool:
+    """Tell whether a ring's edges are far enough apart to show how far ink spreads over them."""
+    pixels, state = fit.sample.pixels, fit.state
+    if not len(pixels.inner):
+        return False
+    mean_radius_px = math.sqrt(math.prod(semi_axes(state.geometry)))
+    gap_px = -float(np.diff(pixels.circles[:, 2]).max()) * mean_radius_px
+    return gap_px > max(_LEAST_GAP_PX, _LEAST_GAP * state.blur.mean_sd_px)
 
 
 def _bend_px(fit: DiscFit) -> FloatArray:
