@@ -148,11 +148,11 @@ class CalibrationProblem:
         return AdjustedNetwork(camera, estimate, unknowns, network, solution)
 
     def _with_kept_centre(self, network: Network, start: Estimate) -> Solution:
-        """Return the adjustment in which the principal point is outside the frame only for sure.
+        """Return the adjustment, with a principal point that is lost held at the frame's border.
 
-        That of photographs that were cropped may be there. But where it is hardly determined, what
-        the field lacks of its shape may draw it out, to where no camera exists. Then it is held at
-        the border, as long as the photographs draw it outwards.
+        That of cropped photographs may well be outside. But if it is hardly determined, a field
+        that is not as described can draw it out to where no camera exists. Then it is held, as
+        long as the photographs draw it outwards.
         """
         names = network.model.names
         index, border = _centre_of(names), np.array(self.size) - 1.0

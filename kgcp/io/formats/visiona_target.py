@@ -92,6 +92,8 @@ def read_visiona_ring(
 def _chosen(file: ForeignFile, model: int | None) -> tuple[JsonObject, JsonObject]:
     """Return the groups that have the diameters and the code of a target: often the same."""
     settings = visiona_settings(file)
+    if "target" in settings and "targets" in settings:
+        raise file.error("has both a group target and a group targets", "delete one of the two")
     if "targets" not in settings:
         if "target" not in settings:
             raise file.error("has no group target or targets", "name a file of visiona")
@@ -121,7 +123,7 @@ def _white_pieces(code: JsonObject) -> tuple[np.ndarray, np.ndarray]:
         problem = f"'signal' has {count} places where the colour changes"
         raise code.error(problem, f"give an even number of them, at most {_MOST_FLIPS}")
     places = np.array(code.vector("signal", count))
-    if places[0] < 0.0 or places[-1] >= 1.0 or np.any(np.diff(places) <= 0.0):
+    if places[0] < 0.0 or places[-1] > 1.0 or np.any(np.diff(places) <= 0.0):
         raise code.error("'signal' does not ascend from 0 to 1", "give places in turns, in order")
     first = code.number("signalStartsWith")
     if first not in _COLOURS:

@@ -57,10 +57,10 @@ _UNDER_UNEVEN_LIGHT = 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.25, 0.5
-_COMMON_SHARE = 0.25  # … and where edges scatter more than noise makes them, so much of it …
-# … if that goes together along arcs, which shows in what they scatter: all of it, where that is
-# this much more than pixels by themselves would make it; …
-_ALL_ALONG_ARCS = 0.5
+# … and where edges scatter more than noise makes them, so much of that scatter. It counts only as
+# far as neighbouring residuals agree: in full where arcs scatter 1 + this times as much as
+# independent pixels would make them; …
+_COMMON_SHARE, _ALL_ALONG_ARCS = 0.25, 0.5
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
 

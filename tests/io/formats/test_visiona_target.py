@@ -88,6 +88,8 @@ def test_files_may_have_several_targets(read: Read) -> None:
     assert first.dot_diameter_m == pytest.approx(0.9 * math.sin(math.radians(0.5 * 10.8)))
     one = TWO.replace("},\n", "}\n").replace(TWO.splitlines()[4] + "\n", "")
     assert read(one, "").code_deg == first.code_deg
+    at_the_seam = TWO.replace("0.52, 0.58]", "0.94, 1.0]")
+    assert read(at_the_seam, "id = 1").code_deg == pytest.approx([28.8, 118.8, 349.2])
     own_circle = one.replace("id = 1;", "id = 1; signalRadiusPercentage = 0.7;")
     assert read(own_circle, "id = 1").code_diameter_m == pytest.approx(0.42)
 
@@ -108,7 +110,7 @@ def test_files_may_have_several_targets(read: Read) -> None:
         (PAPER.replace("0.151329", "0.0853"), "", "target: 'signal' does not ascend from 0 to 1"),
         (PAPER.replace("0.968116", "1.968116"), "", "'signal' does not ascend from 0 to 1"),
         (PAPER.replace("[0.031884", "[-0.031884"), "", "'signal' does not ascend from 0 to 1"),
-        (PAPER.replace("0.968116", "1.0"), "", "'signal' does not ascend from 0 to 1"),
+        (PAPER + TWO, "id = 1", "has both a group target and a group targets; delete one of"),
         (PAPER.replace("[0.031884", "[0.042"), "", "white pieces of 23.0 to 26.6 deg; kgcp"),
         (PAPER.replace("[0.031884", "[0.02"), "", "white pieces of 18.7 to 23.0 deg; kgcp"),
         (PAPER.replace("signal = [", "signal = []; rest = ["), "", "has 0 places where the colour"),
@@ -146,6 +148,8 @@ def test_an_id_needs_a_file(read: Read, tmp_path: Path) -> None:
 
 def test_its_camera_is_opencvs_with_one_focal_length(read: Read, tmp_path: Path) -> None:
     read(PAPER, "")
+    listed = PAPER.replace("[1020.3, 1027.8]", "(1020.3, 1027.8)")
+    (tmp_path / "sample.cfg").write_text(listed, encoding="utf-8")
     toml = FLIGHT.format(camera='file = "sample.cfg"', target='file = "sample.cfg"')
     (tmp_path / "flight.toml").write_text(toml, encoding="utf-8")
     camera = read_flight(tmp_path).camera

@@ -12,7 +12,7 @@ from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.calibrations.entry import Entry
 from kgcp.io.formats.visiona_target import visiona_settings
 
-_GROUP = re.compile(r"\bcamera\s*[=:]\s*\{[^{}]{0,2000}\bpp\s*[=:]\s*\[")
+_GROUP = re.compile(r"\bcamera\s*[=:]\s*\{[^}]{0,2000}\bpp\s*[=:]\s*[\[(]")
 
 
 def matches(file: ForeignFile) -> bool:
