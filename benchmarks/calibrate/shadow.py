@@ -33,7 +33,7 @@ _COLUMNS, _ROWS = 6, 4
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 _WIDTHS_PX = (60.0, 30.0, 12.0, 3.0)
 _NINE_TENTHS = 2.0 * math.log(19.0)  # of a logistic step, in units of its scale
-_LEAST_Z, _MOST_Z = 0.4, 2.3  # as it was measured: steps in the light are not known to be honest
+_LEAST_Z, _MOST_Z = 0.4, 2.3  # as measured: under soft edges, deviations may be stated too small
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from kgcp.measurement.discs.adjust_disc import geometry_of
 from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.plain_pose import CircleMoments, circles_about, fit_circles, pose_towards
-from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
+from kgcp.measurement.plain_prediction import SIGMAS, SMALLEST_BARE_PX, PlainPrediction
 from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
@@ -49,7 +49,6 @@ _MARGIN_PX = 70.0  # of targets against the frame's border
 _OPTICS, _SENSOR = Optics(0.6), Sensor()
 _BORDER_PX = 9.0
 _RADII_PX = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0)
-_LEAST_BARE_PX = 3.0
 _TILTS_DEG = (0.0, 12.5, 25.0, 37.5, 50.0)
 _DIAMETER_M = 0.5
 _APART_PX = AROUND_PX  # edges of a ring: farther apart, each has pixels of its own
@@ -465,7 +464,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("kind              R px  found wrong   RMS px /bound     z  z(d)  trend 1e-3 px/°   ms")
     for kind in (chosen.kind or _KINDS) if chosen.count else ():
         for radius_px in _RADII_PX:
-            if radius_px < _LEAST_BARE_PX and not _KINDS[kind][2]:
+            if radius_px < SMALLEST_BARE_PX and not _KINDS[kind][2]:
                 continue  # it is not looked for
             print_looks(look(kind, radius_px, chosen.count, grounds, chosen.tone))
     if photographs and chosen.windows:

@@ -41,15 +41,12 @@ from kgcp.measurement.plain_pose import (
     fit_circles,
     pose_towards,
 )
-from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction
+from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_radius_px
 from kgcp.measurement.plain_search import edges_like
 from kgcp.measurement.records import Alternative, Appearance, Measurement, Miss, Outcome
 from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
-# Radius: below, pebbles and clods are as round. On ground that is not known to be even, one of
-# sixty was measured at a wrong place at 2.5 px.
-_SMALLEST_PX, _SMALLEST_BARE_PX = 2.5, 3.0
 _MOST_TRIES = 24  # edges that are measured per target
 # How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
 # them), and of the radius (jagged or dirty edges)
@@ -135,7 +132,7 @@ def _check_prediction(camera: Camera, target: PlainTarget, prediction: PlainPred
         raise Rejection(Reason.OUT_OF_VIEW, f"{prediction}, seen from behind")
     if not prediction.is_sure:
         raise Rejection(Reason.NO_PREDICTION, f"{prediction}: not sure enough to look there")
-    smallest_px = _SMALLEST_BARE_PX if target.border_m is None else _SMALLEST_PX
+    smallest_px = smallest_radius_px(target)
     if prediction.radius_px < smallest_px:
         raise Rejection(Reason.TOO_SMALL, f"{prediction}, below {smallest_px:g} px")
 
@@ -379,10 +376,8 @@ def _check_edge(disc: Disc) -> None:
         detail = f"an uneven edge, which leaves the centre open by {beyond_noise_px:.2f} px"
         raise Rejection(Reason.POOR_FIT, detail)
     if disc.blur_px > _MOST_BLUR * disc.ellipse.b:
-        detail = (
-            f"an edge spread by {disc.blur_px:.1f} px, at semi-axes of {disc.ellipse.a:.1f} and"
-        )
-        raise Rejection(Reason.TOO_BLURRED, f"{detail} {disc.ellipse.b:.1f} px")
+        size = f"semi-axes of {disc.ellipse.a:.1f} and {disc.ellipse.b:.1f} px"
+        raise Rejection(Reason.TOO_BLURRED, f"an edge spread by {disc.blur_px:.1f} px, at {size}")
 
 
 def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:

@@ -35,14 +35,16 @@ from kgcp.network.records import (
 from kgcp.targets.fields.points import AnyField
 
 _CENTRE_SD = 0.1  # of the frame's longer side: how far a principal point may be from the middle
+CENTRE_DETERMINED = 0.1
+"""Largest standard deviation of a principal point that counts as determined, of the prior's: 1 % of
+the frame."""
+# How far from the middle a principal point may be found, of the frame's size. At 1 `Camera` ends,
+# and adjustments stick shortly before.
+_FARTHEST_CENTRE = 0.9
 _FOCAL_SD = 3.0  # of the focal length to start with
 _RADIAL_SD = 0.3  # of the distance from the middle, at the corner: what a term may displace
 _TANGENTIAL_SD = 0.05
 _SCALINGS = 10  # of the covariances, and new eccentricities, at most
-CENTRE_DETERMINED = 0.1  # of that: better than to 1 % of the frame
-_FARTHEST = (
-    0.9  # from the middle of the frame, of its size: near 1, where no `Camera` exists, it sticks
-)
 _HOLDINGS = 6  # of a principal point at the border of the frame, and releases
 _HELD_SD = 1e-3  # px
 _SETTLED_PX = 0.002  # change of the eccentricities between two adjustments
@@ -155,23 +157,24 @@ class CalibrationProblem:
         long as the photographs draw it outwards.
         """
         names = network.model.names
-        index, border = _centre_of(names), np.array(self.size) - 1.0
-        held, at = np.zeros(2, dtype=np.bool_), np.zeros(2)
+        index, last_px = _centre_of(names), np.array(self.size) - 1.0
+        is_held, held_px = np.zeros(2, dtype=np.bool_), np.zeros(2)
         for _ in range(_HOLDINGS):
-            solution = adjust(_held_at(network, index[held], at[held]), start, ROBUST)
+            solution = adjust(_held_at(network, index[is_held], held_px[is_held]), start, ROBUST)
             start = solution.estimate
-            centre = start.cameras[0, index]
-            inside = np.clip(centre, 0.0, border)
-            # one that is held has given way a little to where the photographs draw it
-            is_outward = (centre - at) * (at - 0.5 * border) > 0.0
-            is_lost = (centre != inside) & self._is_lost(network, solution, index)
-            is_drawn_out = np.where(held, is_outward, is_lost)
-            at = np.where(held, at, inside)
-            before, held = held, is_drawn_out
-            if np.array_equal(before, held):
+            centre_px = start.cameras[0, index]
+            nearest_px = np.clip(centre_px, 0.0, last_px)
+            # a coordinate that is held has given way a little to where the photographs draw it
+            is_outward = (centre_px - held_px) * (held_px - 0.5 * last_px) > 0.0
+            is_lost = centre_px != nearest_px
+            if np.any(is_lost & ~is_held):
+                is_lost &= self._is_lost(network, solution, index)
+            held_px = np.where(is_held, held_px, nearest_px)
+            was_held, is_held = is_held, np.where(is_held, is_outward, is_lost)
+            if np.array_equal(was_held, is_held):
                 break
         cameras = start.cameras.copy()
-        cameras[0, index[before]] = at[before]
+        cameras[0, index[was_held]] = held_px[was_held]
         return replace(solution, estimate=replace(start, cameras=cameras))
 
     def _is_lost(self, network: Network, solution: Solution, index: IndexArray) -> BoolArray:
@@ -182,7 +185,7 @@ class CalibrationProblem:
         sd = np.sqrt(precision(network, solution).camera_cov.diagonal()[index])
         from_middle = np.abs(solution.estimate.cameras[0, index] / self.size - 0.5)
         is_loose = sd > CENTRE_DETERMINED * network.cameras.sd[0, index]
-        return np.asarray(is_loose | (from_middle > _FARTHEST))
+        return np.asarray(is_loose | (from_middle > _FARTHEST_CENTRE))
 
     def is_at_border(self, names: Sequence[str], estimate: Estimate) -> BoolArray:
         """Return which unknowns (p,) are a principal point's that is held at the border."""

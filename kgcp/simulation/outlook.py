@@ -23,6 +23,7 @@ from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import Circles3D, eccentricity
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.plain_prediction import smallest_radius_px
 from kgcp.measurement.systematic_errors import common_uncertainty
 from kgcp.settings import require_range
 from kgcp.simulation.crlb import Shot, bound_of
@@ -58,11 +59,10 @@ PLAIN_SCATTER = (1.7, 1.15)
 `python -m benchmarks.ground.plain_targets`: white and black discs of 3 to 20 px, linear response.
 """
 PLAIN_FOUND = (2035, 2040)
-"""Plain discs and rings found and shown from `PLAIN_LEAST_PX` on, by
+"""Plain discs and rings found and shown from the smallest radius on, by
 `benchmarks.ground.plain_targets`: 537 of 540 of 2.5 to 3.5 px, 1498 of 1500 of 3 to 20 px."""
-PLAIN_LEAST_PX, PLAIN_LEAST_BARE_PX, PLAIN_GAP_PX, PLAIN_HOLE_PX = 2.5, 3.0, 2.0, 1.0
-"""Least radius, with even ground of its own and without, least distance of a ring's circles and
-least radius of its innermost [px].
+PLAIN_GAP_PX, PLAIN_HOLE_PX = 2.0, 1.0
+"""Least distance of a ring's circles, and least radius of its innermost [px].
 
 Thinner rings are found as well, but their edges say less than edges apart.
 """
@@ -288,7 +288,7 @@ def _plain_outlook(
 def least_plain_px(target: PlainTarget) -> float:
     """Return the least radius at which all circles of a plain target are told apart [px]."""
     radii = target.radii_m
-    least_px = PLAIN_LEAST_BARE_PX if target.border_m is None else PLAIN_LEAST_PX
+    least_px = smallest_radius_px(target)
     if len(radii) == 1:
         return least_px
     narrowest_m = min(outer - inner for outer, inner in pairwise(radii))

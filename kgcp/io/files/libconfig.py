@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 _MOST_CHARACTERS = 1 << 20
-_MOST_NESTED = 40  # a group in a list in a group: files of people have three or four
+_MOST_NESTED = 40  # a group in a list in a group: real files have three or four
 _SPACE = r"[ \t\r\n\f]+|(?:\#|//)[^\n]*|/\*.*?\*/"
 _REAL = r"[-+]?(?:\d+\.\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+)"
 _TOKEN = re.compile(
@@ -82,13 +82,14 @@ def _tokens(text: str) -> Iterator[_Token]:
 
 
 class _Parser:
-    """Recursive descent with one token of foresight."""
+    """Recursive descent with one token of lookahead."""
 
     def __init__(self, text: str) -> None:
         self._tokens = _tokens(text)
         self._next = next(self._tokens)
 
     def expect(self, kind: str, text: str) -> _Token:
+        """Return the next token, of this kind and one of these characters if any are given."""
         token = self._next
         if token.kind != kind or (text and token.text not in text):
             end = "the end of the file"

@@ -30,6 +30,7 @@ class ForeignFile:
 
     path: Path
     toml_key: str  # where flight.toml names it, for messages
+    remedy: str = "export it again"  # what to do if its content is wrong
 
     @cached_property
     def head(self) -> bytes:
@@ -93,13 +94,14 @@ class ForeignFile:
         stripped = ((number, line.strip()) for number, line in lines)
         return tuple((number, line) for number, line in stripped if line and line[0] != "#")
 
-    def error(self, problem: str, remedy: str = "export it again") -> KgcpError:
+    def error(self, problem: str, remedy: str | None = None) -> KgcpError:
         """Return the error for the file as a whole, to be raised."""
         return self.error_at("", problem, remedy)
 
-    def error_at(self, where: str, problem: str, remedy: str = "export it again") -> KgcpError:
+    def error_at(self, where: str, problem: str, remedy: str | None = None) -> KgcpError:
         """Return the error for one place in the file, to be raised; "" is the whole file."""
-        return KgcpError(f"{self.path}{f', {where}' if where else ''}: {problem}; {remedy}")
+        place = f"{self.path}, {where}" if where else str(self.path)
+        return KgcpError(f"{place}: {problem}; {remedy or self.remedy}")
 
     def numbers(self, text: str | None, count: int, where: str) -> tuple[float, ...]:
         """Return the `count` numbers of a text, which white space separates."""
@@ -117,8 +119,8 @@ class ForeignFile:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JsonObject:
-    """An object of a JSON file that knows its place."""
+class NamedValues:
+    """Named values of a file that know their place: a JSON object, or a group of libconfig."""
 
     file: ForeignFile
     where: str  # its place in the file, for messages
@@ -128,11 +130,11 @@ class JsonObject:
     def of(cls, file: ForeignFile, where: str, value: object) -> Self:
         """Return the object, or raise `KgcpError` if the value is not one."""
         if not isinstance(value, dict):
-            raise file.error_at(where, "is not an object of named values")
+            raise file.error_at(where, "is no group of named values")
         return cls(file, where, value)
 
-    def error(self, problem: str, remedy: str = "export it again") -> KgcpError:
-        """Return the error for this object, to be raised."""
+    def error(self, problem: str, remedy: str | None = None) -> KgcpError:
+        """Return the error for this group, to be raised."""
         return self.file.error_at(self.where, problem, remedy)
 
     def __contains__(self, key: str) -> bool:
@@ -163,17 +165,17 @@ class JsonObject:
             raise self.error(f"{key!r} is not a text")
         return str(value)
 
-    def child(self, key: str) -> JsonObject:
+    def child(self, key: str) -> NamedValues:
         """Return an object."""
-        return JsonObject.of(self.file, f"{self.where} {key}".strip(), self[key])
+        return NamedValues.of(self.file, f"{self.where} {key}".strip(), self[key])
 
-    def children(self, key: str) -> tuple[JsonObject, ...]:
+    def children(self, key: str) -> tuple[NamedValues, ...]:
         """Return a list of objects."""
         value = self[key]
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise self.error(f"{key!r} is not a list")
         return tuple(
-            JsonObject.of(self.file, f"{self.where} {key}[{index}]".strip(), element)
+            NamedValues.of(self.file, f"{self.where} {key}[{index}]".strip(), element)
             for index, element in enumerate(value)
         )
 
@@ -183,6 +185,6 @@ class JsonObject:
         return float(value)
 
 
-def vectors(objects: Sequence[JsonObject], key: str) -> FloatArray:
+def vectors(objects: Sequence[NamedValues], key: str) -> FloatArray:
     """Return the lists of three numbers (n, 3) that n objects have under a key."""
     return np.array([each.vector(key, 3) for each in objects]).reshape(-1, 3)

@@ -185,7 +185,8 @@ def _file_ring(table: TomlTable, folder: Path) -> Ring:
     sd_m = table.number("sd_outer_diameter_m", 0.0)
     with table.located():
         require_range("sd_outer_diameter_m", sd_m, 0.0, 1.0, unit="m")
-    file, model = ForeignFile(path, "[[target]] file"), table.optional("id", table.integer)
+    file = ForeignFile(path, "[[target]] file", remedy="correct the file")
+    model = table.optional("id", table.integer)
     return read_visiona_ring(file, table.name("name"), model, sd_m)
 
 

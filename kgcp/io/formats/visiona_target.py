@@ -19,7 +19,7 @@ import numpy as np
 
 from kgcp.errors import SettingError
 from kgcp.io.files.libconfig import load_libconfig
-from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.files.sniff import ForeignFile, NamedValues
 from kgcp.targets.layout import Ring
 
 _SAME_SIZE = 0.1  # relative: of dots whose places are rounded to degrees
@@ -27,8 +27,8 @@ _MOST_FLIPS = 400
 _COLOURS = {1.0: True, -1.0: False}  # signalStartsWith → whether white
 
 
-def visiona_settings(file: ForeignFile) -> JsonObject:
-    """Return the groups of a file of visiona, whose access to values is that of JSON's objects.
+def visiona_settings(file: ForeignFile) -> NamedValues:
+    """Return the groups of a file of visiona.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def visiona_settings(file: ForeignFile) -> JsonObject:
         Naming the line: if it is not libconfig.
     """
     try:
-        return JsonObject.of(file, "", load_libconfig(file.text))
+        return NamedValues.of(file, "", load_libconfig(file.text))
     except ValueError as error:
         raise file.error(f"{error}, which is not libconfig", "repair the line") from None
 
@@ -86,10 +86,10 @@ def read_visiona_ring(
             sd_outer_diameter_m=sd_outer_diameter_m,
         )
     except SettingError as error:
-        raise code.error(f"is no ring with dots ({error})", "correct the file") from None
+        raise code.error(f"is no ring with dots ({error})") from None
 
 
-def _chosen(file: ForeignFile, model: int | None) -> tuple[JsonObject, JsonObject]:
+def _chosen(file: ForeignFile, model: int | None) -> tuple[NamedValues, NamedValues]:
     """Return the groups that have the diameters and the code of a target: often the same."""
     settings = visiona_settings(file)
     if "target" in settings and "targets" in settings:
@@ -105,7 +105,7 @@ def _chosen(file: ForeignFile, model: int | None) -> tuple[JsonObject, JsonObjec
     listed = targets.children("targetModels")
     models = {each.number("id"): each for each in listed}
     if not models or len(models) < len(listed):
-        raise targets.error("does not have targetModels of different ids", "correct the file")
+        raise targets.error("does not have targetModels of different ids")
     if model is None and len(models) == 1:
         return targets, next(iter(models.values()))
     if model not in models:
@@ -115,7 +115,7 @@ def _chosen(file: ForeignFile, model: int | None) -> tuple[JsonObject, JsonObjec
     return targets, models[model]
 
 
-def _white_pieces(code: JsonObject) -> tuple[np.ndarray, np.ndarray]:
+def _white_pieces(code: NamedValues) -> tuple[np.ndarray, np.ndarray]:
     """Return middles and half lengths of the white pieces of the circle [turns]."""
     flips = code["signal"]
     count = len(flips) if isinstance(flips, list) else 0

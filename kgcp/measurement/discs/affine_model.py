@@ -113,6 +113,11 @@ def semi_axes(geometry: Geometry) -> tuple[float, float]:
     return mean - half, mean + half
 
 
+def mean_radius_px(geometry: Geometry) -> float:
+    """Return the radius of the circle of the same area [px]."""
+    return math.sqrt(math.prod(semi_axes(geometry)))
+
+
 def sharpest_px(blur: Blur) -> float:
     """Return the standard deviation along the direction of the weakest blur [px]."""
     xx, yy, xy = blur.total_covariance

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.measurement.discs.affine_model import Geometry, semi_axes
+from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
@@ -72,7 +72,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
     ratio = float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
-    if _edges_tell_displacement(fit):  # then `hole_level` knows what that does
+    if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
     else:
@@ -146,8 +146,7 @@ def _edges_tell_displacement(fit: DiscFit) -> bool:
     pixels, state = fit.sample.pixels, fit.state
     if not len(pixels.inner):
         return False
-    mean_radius_px = math.sqrt(math.prod(semi_axes(state.geometry)))
-    gap_px = -float(np.diff(pixels.circles[:, 2]).max()) * mean_radius_px
+    gap_px = -float(np.diff(pixels.circles[:, 2]).max()) * mean_radius_px(state.geometry)
     return gap_px > max(_LEAST_GAP_PX, _LEAST_GAP * state.blur.mean_sd_px)
 
 

@@ -29,7 +29,6 @@ from kgcp.measurement.discs.covariance import (
     scatter_of,
 )
 from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
-from kgcp.measurement.discs.hole_level import HoleLevel
 from kgcp.measurement.discs.records import (
     Disc,
     DiscMiss,
@@ -39,6 +38,7 @@ from kgcp.measurement.discs.records import (
     Polarity,
     moments_of_ellipse,
 )
+from kgcp.measurement.discs.ring_unknowns import RingUnknowns
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments over the radius
 _NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
@@ -149,28 +149,28 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
     try:
         fit = adjust_disc_in_any_light(task, unknowns_of(task, camera), first_blur_px(task, camera))
         check_fit(fit, task.outline)
-        return (fit, scatter_of(fit)) if not len(task.inner) else _with_hole(fit)
+        return (fit, scatter_of(fit)) if not len(task.inner) else _with_ring_unknowns(fit)
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):
         return DiscMiss(task.outline, DiscReason.POOR_FIT, "singular equations")
 
 
-def _with_hole(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
-    """Return a ring whose areas within are as bright as they are, and not as the ground is.
+def _with_ring_unknowns(fit: DiscFit) -> tuple[DiscFit, DiscScatter]:
+    """Return a ring measured with its own level within, and its own width of the ink.
 
     Raises
     ------
     DiscRejection
         `POOR_FIT`.
     """
-    hole, scatter = HoleLevel.of(fit), scatter_of(fit)
-    if not hole.is_seen:
-        detail = f"an inner circle is not there, or steps by {hole.ratio:.0%} of the outer one"
+    unknowns, scatter = RingUnknowns.of(fit), scatter_of(fit)
+    if not unknowns.is_seen:
+        detail = f"an inner circle is not there, or steps by {unknowns.ratio:.0%} of the outer one"
         raise DiscRejection(DiscReason.POOR_FIT, detail)
     to_moments = moments_by_stretch(fit.state.geometry)
-    common = scatter.common + to_moments @ hole.cov @ to_moments.T
-    return replace(fit, state=hole.corrected(fit.state)), replace(scatter, common=common)
+    common = scatter.common + to_moments @ unknowns.cov @ to_moments.T
+    return replace(fit, state=unknowns.corrected(fit.state)), replace(scatter, common=common)
 
 
 def _certain(outcome: Disc | DiscMiss) -> Disc | DiscMiss:

@@ -101,7 +101,7 @@ def test_files_may_have_several_targets(read: Read) -> None:
         (PAPER, "code_deg = [0, 90]", "code_deg: is given beside a file; delete one of the two"),
         (PAPER, "sd_outer_diameter_m = -1", "sd_outer_diameter_m: -1 m is out of range"),
         (PAPER.replace("0.9;", "0.4;"), "", "target: is no ring with dots (inner_diameter_m: 0.45"),
-        (PAPER.replace("id = 0.45;", ""), "", "target: has no 'id'; export it again"),
+        (PAPER.replace("id = 0.45;", ""), "", "target: has no 'id'; correct the file"),
         (
             PAPER.replace("0.031884, ", ""),
             "",
@@ -126,7 +126,7 @@ def test_files_may_have_several_targets(read: Read) -> None:
         (TWO, "", "targets: has several targets: 1, 7; choose one of them with id"),
         (TWO, "id = 3", "targets: has no target 3: 1, 7; choose one of them with id"),
         (TWO.replace("id = 7", "id = 1"), "id = 1", "does not have targetModels of different ids"),
-        (TWO.replace("d = 0.6;", ""), "id = 1", "targets: has no 'd'; export it again"),
+        (TWO.replace("d = 0.6;", ""), "id = 1", "targets: has no 'd'; correct the file"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.files.sniff import ForeignFile, NamedValues
 from kgcp.io.formats.calibrations.entry import Entry, unsupported
 
 # Models → the distortion terms that they have.
@@ -37,10 +37,10 @@ def matches(file: ForeignFile) -> bool:
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
     """Return the cameras, named by their keys."""
     if isinstance(file.document, list):
-        parts = [JsonObject.of(file, f"[{i}]", v) for i, v in enumerate(file.document)]
+        parts = [NamedValues.of(file, f"[{i}]", v) for i, v in enumerate(file.document)]
         groups = [part.child("cameras") for part in parts]
     else:
-        groups = [JsonObject.of(file, "", file.document)]
+        groups = [NamedValues.of(file, "", file.document)]
     found = {key: group.child(key) for group in groups for key in group.values}
     return tuple(
         Entry(name, _size(camera), partial(_camera, camera), is_relative=True)
@@ -52,12 +52,12 @@ def _has_cameras(item: object) -> bool:
     return isinstance(item, dict) and "cameras" in item and "shots" in item
 
 
-def _size(camera: JsonObject) -> tuple[int, int] | None:
+def _size(camera: NamedValues) -> tuple[int, int] | None:
     width, height = camera.number("width", 0.0), camera.number("height", 0.0)
     return (int(width), int(height)) if width and height else None
 
 
-def _camera(camera: JsonObject, width: int, height: int) -> Camera:
+def _camera(camera: NamedValues, width: int, height: int) -> Camera:
     """Return the camera for a frame, of whose longer side its lengths are shares."""
     model = camera.text("projection_type")
     if model not in _TERMS:
@@ -69,7 +69,7 @@ def _camera(camera: JsonObject, width: int, height: int) -> Camera:
     return Camera(width, height, fx, fy, x, y, **terms)
 
 
-def _matrix(camera: JsonObject, model: str) -> tuple[float, float, float, float]:
+def _matrix(camera: NamedValues, model: str) -> tuple[float, float, float, float]:
     if model == "perspective":
         return camera.number("focal"), camera.number("focal"), 0.0, 0.0
     focal_x = camera.number("focal_x")

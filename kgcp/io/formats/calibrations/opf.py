@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import partial
 
 from kgcp.geometry.camera import Camera
-from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.files.sniff import ForeignFile, NamedValues
 from kgcp.io.formats.calibrations.entry import CORNER_TO_CENTRE_PX, Entry, unsupported
 
 FILE_FORMATS = ("application/opf-calibrated-cameras+json", "application/opf-input-cameras+json")
@@ -22,20 +22,20 @@ def matches(file: ForeignFile) -> bool:
 
 def entries(file: ForeignFile) -> tuple[Entry, ...]:
     """Return the sensors, named by their ids; only input cameras know the size of their images."""
-    sensors = JsonObject.of(file, "", file.document).children("sensors")
+    sensors = NamedValues.of(file, "", file.document).children("sensors")
     return tuple(
         Entry(sensor.text("id"), _size(sensor), partial(_camera, sensor)) for sensor in sensors
     )
 
 
-def _size(sensor: JsonObject) -> tuple[int, int] | None:
+def _size(sensor: NamedValues) -> tuple[int, int] | None:
     if "image_size_px" not in sensor:
         return None
     width, height = sensor.vector("image_size_px", 2)
     return int(width), int(height)
 
 
-def _camera(sensor: JsonObject, width: int, height: int) -> Camera:
+def _camera(sensor: NamedValues, width: int, height: int) -> Camera:
     internals = sensor.child("internals")
     model = internals.text("type")
     if model != "perspective":

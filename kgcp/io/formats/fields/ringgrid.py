@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from kgcp.io.files.sniff import ForeignFile, JsonObject
+from kgcp.io.files.sniff import ForeignFile, NamedValues
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 
 _SCHEMAS = ("ringgrid.target.v4", "ringgrid.target.v5")
@@ -27,7 +27,7 @@ def matches(file: ForeignFile) -> bool:
 
 def field(file: ForeignFile, unit_m: float | None) -> Field:  # noqa: ARG001 - as all readers
     """Return the board."""
-    board = JsonObject.of(file, "", file.document)
+    board = NamedValues.of(file, "", file.document)
     schema = board.text("schema")
     if schema not in _SCHEMAS:
         raise file.error(f"has schema {schema[:40]!r}", f"export it as {_SCHEMAS[-1]}")
@@ -85,7 +85,7 @@ def _hexagonal(rows: int, longest: int, diameter_m: float) -> tuple[int, tuple[M
     return 2 * longest + 1, tuple(missing)
 
 
-def _count(lattice: JsonObject, key: str) -> int:
+def _count(lattice: NamedValues, key: str) -> int:
     count = lattice.number(key)
     if count != int(count) or not 2 <= count <= _MOST:
         raise lattice.error(f"{key!r} is {count:g}", f"print a board with 2 to {_MOST}")

@@ -13,7 +13,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.files.sniff import ForeignFile, NamedValues, vectors
 from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
 _ZONE_TOLERANCE_M = 0.05
@@ -31,7 +31,7 @@ def matches(file: ForeignFile) -> bool:
 
 def poses(file: ForeignFile) -> SourcePoses:
     """Return the poses, in the UTM zone that the file is in."""
-    features = JsonObject.of(file, "", file.document).children("features")
+    features = NamedValues.of(file, "", file.document).children("features")
     properties = [feature.child("properties") for feature in features]
     centre = vectors(properties, "translation")
     points = vectors([feature.child("geometry") for feature in features], "coordinates")

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from kgcp.georef.crs import WGS84_3D
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.files.sniff import ForeignFile, NamedValues, vectors
 from kgcp.io.formats.orientations.records import SourcePoses, photo_rotations
 
 _TOPOCENTRIC = "reconstruction.topocentric.json"
@@ -38,7 +38,7 @@ def matches(file: ForeignFile) -> bool:
 def poses(file: ForeignFile) -> SourcePoses:
     """Return the poses of all reconstructions."""
     document = file.document if isinstance(file.document, list) else [file.document]
-    parts = [JsonObject.of(file, f"[{index}]", part) for index, part in enumerate(document)]
+    parts = [NamedValues.of(file, f"[{index}]", part) for index, part in enumerate(document)]
     groups = [part.child("shots") for part in parts]
     shots = [group.child(name) for group in groups for name in group.values]
     rotation = Rotation.from_rotvec(vectors(shots, "rotation")).as_matrix()
@@ -59,13 +59,13 @@ def _unreferenced(file: ForeignFile, level: LocalFrame | None) -> str | None:
     return f"has no reference_lla, nor has {_REFERENCE} beside it" if level is None else None
 
 
-def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> LocalFrame | None:
+def _level(file: ForeignFile, parts: Sequence[NamedValues]) -> LocalFrame | None:
     """Return the frame over the reference; None without one."""
     references = [part.child("reference_lla") for part in parts if part.values.get("reference_lla")]
     beside = file.path.parent / _REFERENCE
     if not references and beside.is_file():
         other = ForeignFile(beside, "[reference] poses")
-        references = [JsonObject.of(other, "", other.document)]
+        references = [NamedValues.of(other, "", other.document)]
     origins = {_lla(reference) for reference in references}
     if len(origins) > 1:
         raise file.error(
@@ -74,7 +74,7 @@ def _level(file: ForeignFile, parts: Sequence[JsonObject]) -> LocalFrame | None:
     return LocalFrame.at(WGS84_3D, np.array(origins.pop())) if origins else None
 
 
-def _lla(reference: JsonObject) -> tuple[float, float, float]:
+def _lla(reference: NamedValues) -> tuple[float, float, float]:
     """Return longitude, latitude, height: x first."""
     keys = ("longitude", "latitude", "altitude")
     longitude, latitude, altitude = (reference.number(key) for key in keys)

@@ -20,7 +20,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import rotation_from_opk
 from kgcp.georef.crs import crs_of
 from kgcp.io.files.safe_read import is_file
-from kgcp.io.files.sniff import ForeignFile, JsonObject, vectors
+from kgcp.io.files.sniff import ForeignFile, NamedValues, vectors
 from kgcp.io.formats.orientations.records import SourcePoses
 
 _CAMERAS = "calibrated-cameras"
@@ -37,13 +37,13 @@ def matches(file: ForeignFile) -> bool:
 
 def poses(file: ForeignFile) -> SourcePoses:
     """Return the poses, in the base CRS of the scene."""
-    calibrated = JsonObject.of(*_part(file, _CAMERAS))
+    calibrated = NamedValues.of(*_part(file, _CAMERAS))
     cameras = calibrated.children("cameras")
-    names = _names(JsonObject.of(*_part(file, _LIST)))
+    names = _names(NamedValues.of(*_part(file, _LIST)))
     for camera in cameras:
         if camera.text("id") not in names:
             raise camera.error("has an id that the camera list lacks", "export the project again")
-    scene = _Scene.of(JsonObject.of(*_part(file, _SCENE)))
+    scene = _Scene.of(NamedValues.of(*_part(file, _SCENE)))
     return SourcePoses(
         tuple(names[camera.text("id")] for camera in cameras),
         scene.map_from_canonical(vectors(cameras, "position")),
@@ -78,14 +78,14 @@ def _part(file: ForeignFile, kind: str) -> tuple[ForeignFile, str, object]:
 
 
 def _resource(project: ForeignFile, kind: str) -> Path:
-    for item in JsonObject.of(project, "", project.document).children("items"):
+    for item in NamedValues.of(project, "", project.document).children("items"):
         for resource in item.children("resources"):
             if resource.text("format") == f"application/opf-{kind}+json":
                 return project.path.parent / unquote(urlsplit(resource.text("uri")).path)
     raise project.error(f"names no {kind}", "export the calibrated project again")
 
 
-def _names(cameras: JsonObject) -> dict[str, str]:
+def _names(cameras: NamedValues) -> dict[str, str]:
     """Return image names by camera id; URIs without their scheme and page."""
     return {
         camera.text("id"): unquote(urlsplit(camera.text("uri")).path)
@@ -108,7 +108,7 @@ class _Scene:
     geoid_height: float
 
     @classmethod
-    def of(cls, scene: JsonObject) -> _Scene:
+    def of(cls, scene: NamedValues) -> _Scene:
         """Read a scene reference frame.
 
         Raises
@@ -144,7 +144,7 @@ class _Scene:
         return base
 
 
-def _parsed(said: JsonObject) -> CRS | None:
+def _parsed(said: NamedValues) -> CRS | None:
     """Return the CRS; None where it is not on the Earth."""
     text = said.text("definition")
     try:
@@ -158,7 +158,7 @@ def _parsed(said: JsonObject) -> CRS | None:
     return crs
 
 
-def _check_axes(said: JsonObject, crs: CRS, *, swaps: bool) -> None:
+def _check_axes(said: NamedValues, crs: CRS, *, swaps: bool) -> None:
     """Refuse axes that swapping would not bring into the order x, y."""
     directions = [axis.direction for axis in crs.axis_info[:2]]
     swapped = {"north east": True, "east north": False, "west south": False}

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.measurement.discs.affine_model import Geometry
+from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.covariance import common_displacement_px
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
 from kgcp.measurement.discs.fit_disc import DiscFit, DiscState
@@ -29,13 +29,13 @@ _MOST_OFF, _LEAST_SIGMAS = 0.2, 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HoleLevel:
-    """The contrast within a ring over that outside it, and what it does to the outer edge.
+class RingUnknowns:
+    """The contrast within a ring over that outside it, its ink's width, and what both displace.
 
     Attributes
     ----------
     ratio, sd : float
-        By the pixels alone.
+        Of the contrasts, by the pixels alone.
     correction : (5,) array
         Of the geometry: what the likeliest ratio and width of the ink make of it.
     cov : (5, 5) array
@@ -48,15 +48,16 @@ class HoleLevel:
     cov: FloatArray
 
     @classmethod
-    def of(cls, fit: DiscFit) -> HoleLevel:
+    def of(cls, fit: DiscFit) -> RingUnknowns:
         """Linearise at an adjusted ring."""
-        slopes = np.array([_by_level_within(fit), _by_width(fit)]) / fit.sd
+        changes = np.array([_STEP * _within(fit), _wider_ink(fit)])
+        slopes = _levels_changed(fit, changes) / (_STEP * fit.sd)
         shared = fit.scaled @ (fit.misfit.weight * slopes).T
         by_both = np.linalg.solve(fit.normal, shared)
         information = (fit.misfit.weight * slopes) @ slopes.T - shared.T @ by_both
         score = slopes @ fit.misfit.score
         sd = 1.0 / math.sqrt(max(float(information[0, 0]), 1e-12))
-        sd_width = common_displacement_px(fit) / _mean_radius_px(fit)
+        sd_width = common_displacement_px(fit) / mean_radius_px(fit.state.geometry)
         cov = np.linalg.inv(information + np.diag((_PRIOR_SD**-2, sd_width**-2)))
         moves: FloatArray = -by_both[:GEOMETRY_COUNT].astype(np.float64)
         return cls(
@@ -76,31 +77,29 @@ class HoleLevel:
         return DiscState(vector)
 
 
-def _by_level_within(fit: DiscFit) -> FloatArray:
-    """Return the derivatives (n,) of the grey values by the contrast within."""
+def _within(fit: DiscFit) -> FloatArray:
+    """Return the change (n,) of the white share by the contrast within."""
     pixels, state = fit.sample.pixels, fit.state
-    within = pixels.circles[1:, 3] @ pixels.shares_within(state.geometry, state.blur)[1:]
-    return _by_share(fit, _STEP * within)
+    return np.asarray(pixels.circles[1:, 3] @ pixels.shares_within(state.geometry, state.blur)[1:])
 
 
-def _by_width(fit: DiscFit) -> FloatArray:
-    """Return the same by how far ink goes beyond each circle, in outer radii."""
+def _wider_ink(fit: DiscFit) -> FloatArray:
+    """Return the change (n,) of the white share if ink goes farther beyond each circle by a step.
+
+    The step is `_STEP` outer radii.
+    """
     pixels, state = fit.sample.pixels, fit.state
     circles = pixels.circles.copy()
     circles[::2, 2] += _STEP
     circles[1::2, 2] -= _STEP
-    wider = replace(pixels, circles=circles).white_share(state.geometry, state.blur).value
-    return _by_share(fit, wider - fit.share)
+    wider = replace(pixels, circles=circles).white_share(state.geometry, state.blur)
+    return wider.value - fit.share
 
 
-def _by_share(fit: DiscFit, change: FloatArray) -> FloatArray:
+def _levels_changed(fit: DiscFit, changes: FloatArray) -> FloatArray:
+    """Return the changes (k, n) of the grey values that go with those of the white share (k, n)."""
     pixels, state = fit.sample.pixels, fit.state
     share = pixels.white_share(state.geometry, state.blur)
-    changed = replace(share, value=share.value + change)
-    levels, _ = fit.sample.level_model.linearised(changed, state.vector)
-    return np.asarray((levels - fit.levels) / _STEP)
-
-
-def _mean_radius_px(fit: DiscFit) -> float:
-    _, _, xx, xy, yy = fit.state.geometry.tolist()
-    return math.sqrt(abs(xx * yy - xy * xy))
+    changed = [replace(share, value=share.value + change) for change in changes]
+    levels = [fit.sample.level_model.linearised(each, state.vector)[0] for each in changed]
+    return np.array(levels) - fit.levels
