@@ -1,4 +1,4 @@
-"""What is known of a plate before the image is looked at: how it lies, and how fast it goes by.
+"""What is known of a plate before it is measured: how it lies, how fast it goes by, its tone curve.
 
 The two poses of a circle have nearly the same image, and quite different normals. A plate that
 lies level, or on a vehicle of known attitude, in a camera whose attitude is known, makes one of
@@ -17,6 +17,7 @@ from scipy.linalg import null_space
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.records import ToneBase
 
 _BELIEVED_CHI2 = 25.0  # 5 σ: beyond, what is known of the attitudes is wrong, and the image decides
 
@@ -83,3 +84,5 @@ class PlatePrior:
     normal: NormalPrior | None = None
     # None: nothing more than what `SceneRotation.unknown` says
     rotation: SceneRotation | None = None
+    # what an unknown tone curve departs from, if other frames have told it
+    tone_base: ToneBase | None = None

@@ -20,13 +20,21 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason
+from kgcp.geometry.camera import Response
 from kgcp.georef.neighbouring_normals import Place, preferences_of_neighbours
 from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.adjustment.smoothing import with_smoothing
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.other_pose import weighed_anew
 from kgcp.measurement.plain_prediction import PlainPrediction
-from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
+from kgcp.measurement.records import (
+    FrameResult,
+    Measurement,
+    Miss,
+    Outcome,
+    ToneBase,
+    is_unreadable,
+)
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.journal import Journal, fingerprint
 from kgcp.pipeline.execution.resilient_map import TaskFailure
@@ -42,10 +50,11 @@ from kgcp.pipeline.frame_task import (
     shows_negative,
 )
 from kgcp.pipeline.guidance import FrameTracks
-from kgcp.quality.learnt_imaging import LearntImaging, by_base, learn_imaging
+from kgcp.quality.learnt_imaging import LearntImaging, base_of_some, by_base, learn_imaging
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
+_FIRST_BATCH = 8  # frames that are measured over both bases of an unknown tone curve
 _NEGATIVES = 12  # frames that are tried with black and white swapped
 
 _Result = TypeVar("_Result")
@@ -132,9 +141,7 @@ class DetectionRun:
             frame_input.frame: None if stamp is None else stamp[0]
             for frame_input, stamp in zip(inputs, stamps, strict=True)
         }
-        self._keys = [
-            _key(frame_input, stamp) for frame_input, stamp in zip(inputs, stamps, strict=True)
-        ]
+        self._stamps, self._keys = stamps, [""] * len(inputs)  # no key: not looked at yet
         self._stage, self._done, self._total = "", 0, 0
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
@@ -149,18 +156,46 @@ class DetectionRun:
         KgcpError
             If the first frames all have one size, which is not the camera's, or frames vanish.
         """
-        todo = []
-        sizes = FirstSizes(len(self._keys))
-        for row, key in enumerate(self._keys):
-            kept = self._journal.get(key)
-            if kept is None:
-                todo.append(row)
-            else:
-                self.tracks.add(row, kept)
-                sizes.add(kept)
-        self.kept = len(self._keys) - len(todo)
-        self._tell_what_is_kept(todo)
-        self._begin("first look", self.kept, len(self._keys))
+        sizes = FirstSizes(len(self._inputs))
+        self._tell_what_is_kept()
+        self._begin("first look", 0, len(self._inputs))
+        batches = self._batches()
+        for rows in batches:
+            todo = [row for row in rows if not self._is_kept(row, sizes)]
+            self._look_at(todo, sizes)
+            if rows is not batches[-1]:
+                self._ask_for_tone_base()
+
+    def _batches(self) -> list[list[int]]:
+        """Return the rows in the batches after which is asked what they say of the tone curve.
+
+        Each batch lies evenly among all frames and is as large as all before it: what decides
+        depends neither on the number of workers nor on interruptions.
+        """
+        count, camera = len(self._inputs), self._job.camera
+        if not self._job.settings.is_learning or camera.response is not Response.UNKNOWN:
+            return [[*range(count)]]
+        spread = sorted(range(count), key=_bits_reversed)
+        batches, first, last = [], 0, _FIRST_BATCH
+        while first < count:
+            batches.append(sorted(spread[first:last]))
+            first, last = last, 2 * last
+        return batches
+
+    def _is_kept(self, row: int, sizes: FirstSizes) -> bool:
+        """Take the result of a frame from the journal, if it is there."""
+        key = _key(self._inputs[row], self._stamps[row], self._job.tone_base)
+        self._keys[row] = key
+        kept = self._journal.get(key)
+        if kept is None:
+            return False
+        self.tracks.add(row, kept)
+        sizes.add(kept)
+        self.kept += 1
+        self._advance()
+        return True
+
+    def _look_at(self, todo: Sequence[int], sizes: FirstSizes) -> None:
         inputs = (self._inputs[row] for row in todo)
         with closing(self._pool.map(partial(examine_frame, self._job), inputs)) as results:
             for frame_input, result in results:
@@ -174,9 +209,15 @@ class DetectionRun:
                     sizes.add(result)
                     if sizes.wrong is not None:
                         raise KgcpError(
-                            f"{self._job.frames_folder}: the first {FirstSizes.FRAMES} frames are"
-                            f" all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"
+                            f"{self._job.frames_folder}: the first {FirstSizes.FRAMES} frames"
+                            f" looked at are all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"
                         )
+
+    def _ask_for_tone_base(self) -> None:
+        """Measure the other frames over one base alone, if those so far say clearly which."""
+        if self._job.tone_base is None:
+            so_far = (self._journal.read(key) for key in self._keys if key)
+            self._job = replace(self._job, tone_base=base_of_some(so_far))
 
     def guided_pass(
         self,
@@ -198,7 +239,9 @@ class DetectionRun:
                 if named:
                     visible[row] = named
         keys = {
-            row: f"again-{fingerprint(self._keys[row], visible.get(row, {}), plain.get(row, {}))}"
+            row: _key_of_second_look(
+                self._keys[row], visible.get(row, {}), plain.get(row, {}), self._job.tone_base
+            )
             for row in sorted({*visible, *plain})
         }
         todo = []
@@ -246,7 +289,8 @@ class DetectionRun:
         which of two normals is the likelier one, as far as the settings ask for either.
         """
         if self._job.settings.is_learning:
-            self.learnt = learn_imaging(map(self._journal.read, self._keys))
+            results = map(self._journal.read, self._keys)
+            self.learnt = learn_imaging(results, self._job.tone_base)
         if self._job.settings.is_guided:
             kept = map(self._journal.read, self._keys)
             self._preferences = preferences_of_neighbours(
@@ -317,30 +361,52 @@ class DetectionRun:
                 f"{path}: has vanished; when the frames are there again, the same command goes on"
             )
 
-    def _tell_what_is_kept(self, todo: Sequence[int]) -> None:
+    def _tell_what_is_kept(self) -> None:
         if self._journal.changes:
             changes = ", ".join(self._journal.changes)
             self._listener.note(
                 f"starting anew, not with the interrupted run's results: {changes} changed since"
             )
-        kept = {_name_of(key) for key in self._journal}
-        changed = sum(_name_of(self._keys[row]) in kept for row in todo)
-        if self.kept or changed:
+        in_journal = set(self._journal)
+        names = {_name_of(key) for key in in_journal}
+        kept = changed = 0
+        for frame_input, stamp in zip(self._inputs, self._stamps, strict=True):
+            keys = {_key(frame_input, stamp, base) for base in (None, *ToneBase)}
+            if not keys.isdisjoint(in_journal):
+                kept += 1
+            elif _name_of(keys.pop()) in names:
+                changed += 1
+        if kept or changed:
             self._listener.note(
-                f"going on with an interrupted run: results of {self.kept} of"
-                f" {len(self._keys)} frames are kept, {changed} have changed since"
+                f"going on with an interrupted run: results of {kept} of {len(self._inputs)}"
+                f" frames are kept, {changed} have changed since"
             )
 
 
-def _key(frame_input: FrameInput, file: tuple[int, int] | None) -> str:
+def _bits_reversed(number: int) -> int:
+    """Return a number's 32 bits in reverse order: multiples of large powers of 2 come first."""
+    return int(f"{number:032b}"[::-1], 2)
+
+
+def _key(frame_input: FrameInput, file: tuple[int, int] | None, tone_base: ToneBase | None) -> str:
     name = fingerprint(frame_input.frame)[:16]
     known = (
         frame_input.time_s,
         frame_input.may_use_exif_time,
         frame_input.priors,
         frame_input.plain,
+        tone_base,
     )
     return f"first-{name}-{fingerprint(file, *known)[:16]}"
+
+
+def _key_of_second_look(
+    first: str,
+    predictions: Mapping[str, Prediction],
+    plain: Mapping[str, PlainPrediction],
+    tone_base: ToneBase | None,
+) -> str:
+    return f"again-{fingerprint(first, predictions, plain, tone_base)}"
 
 
 def _name_of(key: str) -> str:

@@ -30,6 +30,7 @@ from kgcp.measurement.records import (
     Miss,
     Outcome,
     TimeSource,
+    ToneBase,
     is_unreadable,
 )
 from kgcp.measurement.search.template_match import CODE_LIKE
@@ -57,11 +58,23 @@ class DetectionJob:
     plain_targets: tuple[PlainTarget, ...] = ()
     # of frames that may be looked at again; None: they are decoded again
     kept_frames: KeptFrames | None = None
+    # what an unknown tone curve departs from, once enough frames have told it
+    tone_base: ToneBase | None = None
 
     @property
     def all_targets(self) -> tuple[AnyTarget, ...]:
         """Those with a code, then those without: the order of a frame's outcomes."""
         return (*self.targets, *self.plain_targets)
+
+    def priors(self, frame_input: FrameInput) -> Mapping[str, PlatePrior]:
+        """Return what is known of a frame's targets, by their names."""
+        known = frame_input.priors
+        if self.tone_base is None:
+            return known
+        return {
+            target.name: replace(known.get(target.name, PlatePrior()), tone_base=self.tone_base)
+            for target in self.targets
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +113,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         with at_hand(job.frames_folder, frame_input.frame) as path:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
-        examination = examine(grey, job.camera, job.targets, job.settings, frame_input.priors)
+        examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
         plain = _look_for_plain(grey, job, frame_input, examination.outcomes)
         outcomes = tuple(completed(job, one) for one in (*examination.outcomes, *plain))
         if job.kept_frames is not None and any(isinstance(one, Miss) for one in outcomes):
@@ -148,6 +161,7 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
         for outcome in guided_input.first.outcomes
         if isinstance(outcome, Measurement) and outcome.instance == 0
     }
+    priors = job.priors(guided_input.input)
     considered: list[Considered] = []
     for target in job.targets:
         if target.name in guided_input.predictions:
@@ -157,7 +171,7 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
                 target,
                 guided_input.predictions[target.name],
                 job.settings,
-                guided_input.input.priors.get(target.name, PlatePrior()),
+                priors.get(target.name, PlatePrior()),
                 tuple(found.values()),
             )
             considered += more
@@ -193,7 +207,7 @@ def shows_negative(job: DetectionJob, frame_input: FrameInput) -> bool:
     except Rejection:
         return False
     negative = np.iinfo(grey.dtype).max - grey
-    examination = examine(negative, job.camera, job.targets, job.settings, frame_input.priors)
+    examination = examine(negative, job.camera, job.targets, job.settings, job.priors(frame_input))
     return any(isinstance(outcome, Measurement) for outcome in examination.outcomes)
 
 
@@ -257,7 +271,9 @@ def _merged(
     missed = tuple(target for target in job.targets if target.name not in found)
     if first.keys() & found.keys():  # rings on those plates explain no other's miss any more
         others = tuple(found.values())
-        again = examine(grey, job.camera, missed, job.settings, guided_input.input.priors, others)
+        again = examine(
+            grey, job.camera, missed, job.settings, job.priors(guided_input.input), others
+        )
         first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
     instead: dict[str, Outcome] = {}
     for target in missed:

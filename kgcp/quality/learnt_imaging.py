@@ -9,7 +9,7 @@ shares").
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,8 @@ _MOST_OF_ONE = 30.0  # of log-likelihood: no single frame decides
 # curve have less than 0.01, 40 of sRGB's 0.1; 54 of a film-like curve with sharpening and JPEG have
 # 0.5, as flights of sRGB cameras with dirt do against the right one.
 _MOST_AGAINST = 0.2
+# Before all frames are measured, so much of it decides for the others: 5 clear frames or more.
+_ENOUGH = 5.0 * _MOST_OF_ONE
 _STEPS = 64  # of the curve, over the whole range of grey values
 _ROUNDS = 3
 _BAND = (16.0, 50.0, 84.0)  # percentiles: ±1σ
@@ -49,7 +51,7 @@ class LearntImaging:
     advantages : mapping of ToneBase to float
         Sums of the log-likelihoods by which measurements prefer a base, each at most 30.
     measurements, overruled : int
-        Measurements with both bases, and those that by themselves would have taken the other.
+        Measurements by both bases, and those that by themselves would have taken the other.
     grey : (n,) array
         Grey values, 0…1 of their range.
     light : (3, n) array
@@ -74,28 +76,38 @@ class LearntImaging:
     smoothing: CameraSmoothing
 
 
-def learn_imaging(results: Iterable[FrameResult]) -> LearntImaging | None:
+def base_of_some(results: Iterable[FrameResult]) -> ToneBase | None:
+    """Return the base that some frames say so clearly that the others need not be asked.
+
+    None: they do not.
+    """
+    advantages = _advantages([measurement for *_, measurement in _of_unknown_tone(results)])
+    base = _agreed(advantages)
+    return None if base is None or advantages[base] < _ENOUGH else base
+
+
+def learn_imaging(
+    results: Iterable[FrameResult], base: ToneBase | None = None
+) -> LearntImaging | None:
     """Return what all measurements say together; None if no tone is unknown.
 
     Parameters
     ----------
     results : iterable of FrameResult
         Of all frames. Their order does not matter.
+    base : ToneBase, optional
+        Of the tone curve, by `base_of_some`; by default, what all measurements say.
     """
-    doubtful = sorted(
-        (
-            (result.frame, outcome.target, outcome.instance, outcome)
-            for result in results
-            for outcome in result.outcomes
-            if isinstance(outcome, Measurement) and outcome.rival is not None
-        ),
-        key=lambda each: each[:3],
-    )
+    chosen = [
+        measurement
+        for *_, measurement in sorted(_of_unknown_tone(results), key=lambda each: each[:3])
+    ]
+    doubtful = [measurement for measurement in chosen if measurement.rival is not None]
     if not doubtful:
         return None
-    chosen = [measurement for *_, measurement in doubtful]
-    advantages = _advantages(chosen)
-    base = _agreed(advantages)
+    advantages = _advantages(doubtful)
+    if base is None:
+        base = _agreed(advantages)
     learnt = chosen if base is None else [by_base(each, base) for each in chosen]
     images = [each.imaging for each in learnt if each.imaging is not None]
     grey = np.linspace(0.0, 1.0, _STEPS + 1)
@@ -103,7 +115,7 @@ def learn_imaging(results: Iterable[FrameResult]) -> LearntImaging | None:
     return LearntImaging(
         base=base,
         advantages=advantages,
-        measurements=len(chosen),
+        measurements=len(doubtful),
         overruled=sum(after is not before for before, after in zip(chosen, learnt, strict=True)),
         grey=grey,
         light=_common_curve(images, grey),
@@ -124,6 +136,16 @@ def by_base(measurement: Measurement, base: ToneBase) -> Measurement:
         is_guided=measurement.is_guided,
         rival=replace(rival, measurement=replace(measurement, rival=None)),
     )
+
+
+def _of_unknown_tone(
+    results: Iterable[FrameResult],
+) -> Iterator[tuple[str, str, int, Measurement]]:
+    """Yield the measurements over a base of the tone curve: frame, target, instance, and it."""
+    for result in results:
+        for outcome in result.outcomes:
+            if isinstance(outcome, Measurement) and outcome.imaging is not None:
+                yield result.frame, outcome.target, outcome.instance, outcome
 
 
 def _agreed(advantages: Mapping[ToneBase, float]) -> ToneBase | None:

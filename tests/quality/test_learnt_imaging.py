@@ -21,7 +21,7 @@ from kgcp.measurement.records import (
     RivalTone,
     ToneBase,
 )
-from kgcp.quality.learnt_imaging import by_base, learn_imaging
+from kgcp.quality.learnt_imaging import base_of_some, by_base, learn_imaging
 
 SRGB, LINE = ToneBase.SRGB, ToneBase.LINE
 
@@ -88,6 +88,28 @@ def test_where_frames_disagree_each_keeps_its_own() -> None:
     assert learnt is not None
     assert learnt.base is None
     assert learnt.overruled == 0
+
+
+@pytest.mark.parametrize(
+    ("clear", "against", "base"),
+    [(5, 0.0, LINE), (4, 0.0, None), (5, 29.0, LINE), (5, 31.0, None), (9, 60.0, None)],
+)
+def test_some_frames_decide_only_where_they_say_it_clearly(
+    clear: int, against: float, base: ToneBase | None
+) -> None:
+    results = [frame(f"f{k}", LINE, 1e3) for k in range(clear)]
+    results += [frame(f"g{k}", SRGB, 0.5 * against) for k in range(2)]
+    assert base_of_some(results) is base
+
+
+def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:
+    both = [frame(f"f{k}", SRGB, 30.0) for k in range(6)]
+    one = replace(first_of(frame("g", SRGB, 1.0)), rival=None)
+    alone = FrameResult("g", 0.0, ExposureSettings(), (one,))
+    learnt = learn_imaging([*both, alone], SRGB)
+    assert learnt is not None
+    assert (learnt.base, learnt.measurements) == (SRGB, 6)
+    assert learnt.noise.shape == (14, 2)
 
 
 def test_nothing_is_learnt_where_the_tone_is_known() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from kgcp.errors import Rejection
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
 from kgcp.measurement.adjustment.likelihood import advantage_over
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
@@ -33,6 +34,7 @@ from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_pos
 from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
+from kgcp.measurement.records import ToneBase
 from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
@@ -46,6 +48,19 @@ class FitsByTone:
     likelier: TwoPoses
     rival: TwoPoses | None  # over the other base; None: it leads nowhere, or the tone is known
     advantage: float = 0.0  # of the log-likelihood, by which the likelier one is so
+
+
+def fit_over_base(problem: FitProblem, pose: Pose, blur: Blur, base: ToneBase) -> TwoPoses:
+    """Adjust both poses, where it is known what an unknown tone curve departs from.
+
+    Raises
+    ------
+    Rejection
+        As `_fit_in_any_light`.
+    """
+    problem = replace(problem, tone=TONE_OF_BASE[base])
+    find_plateaus = partial(look_at_plateaus, problem, pose, blur.mean_sd_px)
+    return _fit_in_any_light(problem, pose, blur, find_plateaus)
 
 
 def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
@@ -63,7 +78,7 @@ def fit_in_any_light(problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
     if problem.tone is not Tone.UNKNOWN:
         return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
     fits = []
-    for tone in (Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE):
+    for tone in TONE_OF_BASE.values():
         try:
             fits.append(_fit_in_any_light(replace(problem, tone=tone), pose, blur, find_plateaus))
         except Rejection as rejection:

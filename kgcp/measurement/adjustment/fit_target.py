@@ -19,7 +19,7 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
-from kgcp.measurement.adjustment.extensions import fit_in_any_light
+from kgcp.measurement.adjustment.extensions import fit_in_any_light, fit_over_base
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.smoothing import contour_smoothing, with_smoothing
 from kgcp.measurement.adjustment.two_poses import (
@@ -29,6 +29,7 @@ from kgcp.measurement.adjustment.two_poses import (
 )
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.noise import find_censoring
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
@@ -64,7 +65,7 @@ def measure_by_model(
     start : InitialPose
     prior : PlatePrior, optional
         Its normal only helps to choose between the two poses, whose values remain those of the
-        image.
+        image. Its base of the tone curve is the only one that is tried, unless it leads nowhere.
     visible : (m,) array of bool, optional
         Where the target is seen, in equal steps about its normal from its +x axis on.
 
@@ -76,7 +77,12 @@ def measure_by_model(
     pose = _without_edge_shift(start)
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
     problem = replace(problem, visible=visible)
-    fits = fit_in_any_light(problem, pose, _start_blur(start, problem.window.binning))
+    blur = _start_blur(start, problem.window.binning)
+    if prior.tone_base is not None and problem.tone is Tone.UNKNOWN:
+        with contextlib.suppress(Rejection):  # then this frame is like none of those that told it
+            poses = fit_over_base(problem, pose, blur, prior.tone_base)
+            return _checked(camera, target, start, poses, prior.normal)
+    fits = fit_in_any_light(problem, pose, blur)
     measurement = _checked(camera, target, start, fits.likelier, prior.normal)
     if fits.rival is not None:
         with contextlib.suppress(Rejection):  # then the likelier one has no rival

@@ -15,6 +15,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement, ToneBase
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
@@ -141,7 +142,8 @@ def test_the_base_of_an_unknown_tone_is_told_by_the_same_pixels(
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
     pose = random_pose(camera, 40.0, rng)
     grey = photograph(camera, pose, rng, sensor=Sensor(tone=tone), gain=1.0)
-    seen = measure_by_model(grey, camera, TARGET, start_near(camera, pose, rng))
+    start = start_near(camera, pose, rng)
+    seen = measure_by_model(grey, camera, TARGET, start)
     assert seen.imaging is not None
     assert seen.imaging.base is base
     assert seen.rival is not None
@@ -150,6 +152,11 @@ def test_the_base_of_an_unknown_tone_is_told_by_the_same_pixels(
     assert other.imaging is not None
     assert other.imaging.base is not base
     assert abs(other.distance_m / seen.distance_m - 1.0) < 5e-4
+    for by_both, only in ((seen, seen.imaging.base), (other, other.imaging.base)):
+        prior = PlatePrior(tone_base=only)
+        by_one = measure_by_model(grey, camera, TARGET, start, prior)
+        assert by_one.rival is None
+        assert by_one.distance_m == by_both.distance_m, "what it says does not hang on the other"
 
 
 def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(

@@ -1,0 +1,183 @@
+"""The base of an unknown tone curve: some frames tell it, and the others are measured over it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.io.flight.flight import read_flight
+from kgcp.measurement.records import FrameResult, Measurement, ToneBase
+from kgcp.pipeline.detect import RunOptions, detect_flight
+from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
+from kgcp.pipeline.run_summary import DetectionSummary
+from kgcp.settings import DetectSettings
+from kgcp.simulation.flight import TARGET_PLATE
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+from kgcp.simulation.plate import image_plate
+
+CAMERA = Camera(320, 240, 900.0, 904.0, 156.3, 124.2)
+FRAMES, ASKED = 12, 8
+FLIGHT = """\
+[camera]
+width = 320
+height = 240
+fx = 900.0
+fy = 904.0
+cx = 156.3
+cy = 124.2
+response = "unknown"
+[[target]]
+name = "A"
+outer_diameter_m = 0.9
+inner_diameter_m = 0.45
+code_diameter_m = 0.642857143
+dot_diameter_m = 0.128571429
+code_deg = [0, 43, 78, 180]
+"""
+
+
+class StopAfter:
+    """A listener that presses Ctrl-C after some looks, and remembers what was said."""
+
+    def __init__(self, looks: int) -> None:
+        self._looks = looks
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def progress(self, stage: str, done: int, total: int, found: int) -> None:
+        assert stage == "first look"
+        assert found <= total == FRAMES
+        if done >= self._looks:
+            raise KeyboardInterrupt
+
+
+def written_flight(folder: Path, tones: Mapping[int, ToneCurve], rest: ToneCurve) -> Path:
+    (folder / "frames").mkdir(parents=True)
+    rng = np.random.default_rng(4)
+    for number in range(FRAMES):
+        irradiance = np.full((CAMERA.height, CAMERA.width), 0.3)
+        pose = Pose(np.eye(3), np.array([-0.4 + 0.07 * number, -0.2, 9.0 + 0.2 * number]))
+        image_plate(CAMERA, TARGET_PLATE, pose, Optics(0.7)).paste(irradiance)
+        grey = Sensor(tone=tones.get(number, rest)).expose(irradiance, 0.9, rng)
+        assert cv2.imwrite(str(folder / "frames" / f"f_{number:02d}.png"), grey)
+    (folder / "flight.toml").write_text(FLIGHT, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written_flight(tmp_path_factory.mktemp("tone") / "flight", {}, ToneCurve.SRGB)
+
+
+@pytest.fixture
+def bases(monkeypatch: pytest.MonkeyPatch) -> dict[str, ToneBase | None]:
+    """Remember over which base each frame was measured; None: over both."""
+    asked: dict[str, ToneBase | None] = {}
+
+    def told(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
+        asked[frame_input.frame] = job.tone_base
+        result = examine_frame(job, frame_input)
+        (outcome,) = result.outcomes
+        assert isinstance(outcome, Measurement)
+        assert (outcome.rival is None) == (job.tone_base is not None)
+        return result
+
+    monkeypatch.setattr("kgcp.pipeline.detection_run.examine_frame", told)
+    return asked
+
+
+def detect(
+    flight: Path,
+    out: Path,
+    listener: StopAfter | None = None,
+    *,
+    is_learning: bool = True,
+    jobs: int = 0,
+) -> DetectionSummary:
+    settings = DetectSettings(is_learning=is_learning)
+    options = RunOptions(jobs=jobs)
+    return detect_flight(read_flight(flight), settings, out=out, options=options, listener=listener)
+
+
+def table(out: Path) -> bytes:
+    return (out / "detections.parquet").read_bytes()
+
+
+def test_some_frames_tell_it_and_the_others_are_measured_over_it_alone(
+    flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
+) -> None:
+    summary = detect(flight, tmp_path)
+    assert list(bases.values()) == [None] * ASKED + [ToneBase.SRGB] * (FRAMES - ASKED)
+    assert {f"f_{number:02d}.png" for number in (0, 4, 8)} <= set(list(bases)[:ASKED])
+    assert summary.tone_base == "sRGB"
+    assert summary.measured_with_tone == ASKED
+    assert summary.status["measured"] == FRAMES
+
+
+def test_alone_they_are_measured_over_both(
+    flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
+) -> None:
+    summary = detect(flight, tmp_path, is_learning=False)
+    assert set(bases.values()) == {None}
+    assert summary.tone_base is None
+
+
+def test_where_the_first_frames_disagree_all_are_measured_over_both(
+    tmp_path: Path, bases: dict[str, ToneBase | None]
+) -> None:
+    film = dict.fromkeys(range(0, FRAMES, 2), ToneCurve.FILM)
+    folder = written_flight(tmp_path / "flight", film, ToneCurve.SRGB)
+    summary = detect(folder, tmp_path / "out")
+    assert set(bases.values()) == {None}
+    assert summary.tone_base is None
+    assert summary.measured_with_tone == FRAMES
+
+
+@pytest.mark.parametrize("looks", [3, ASKED, ASKED + 2])
+def test_an_interrupted_run_goes_on_over_the_same_base(
+    flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None], looks: int
+) -> None:
+    detect(flight, tmp_path / "undisturbed")
+    with pytest.raises(KeyboardInterrupt):
+        detect(flight, tmp_path / "out", StopAfter(looks))
+    bases.clear()
+    listener = StopAfter(1000)
+    summary = detect(flight, tmp_path / "out", listener)
+    assert len(bases) == FRAMES - looks
+    assert summary.kept == looks
+    (note,) = listener.notes
+    assert f"results of {looks} of {FRAMES} frames are kept, 0 have changed" in note
+    assert table(tmp_path / "out") == table(tmp_path / "undisturbed")
+
+
+def test_what_decides_does_not_depend_on_the_number_of_workers(
+    flight: Path, tmp_path: Path
+) -> None:
+    for jobs in (0, 2):
+        detect(flight, tmp_path / str(jobs), jobs=jobs)
+    assert table(tmp_path / "0") == table(tmp_path / "2")
+
+
+def test_a_frame_that_has_changed_no_longer_decides(
+    flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
+) -> None:
+    copy = shutil.copytree(flight, tmp_path / "flight")
+    with pytest.raises(KeyboardInterrupt):
+        detect(copy, tmp_path / "out", StopAfter(FRAMES - 1))
+    film = dict.fromkeys(range(FRAMES), ToneCurve.FILM)
+    other = written_flight(tmp_path / "other", film, ToneCurve.FILM)
+    for frame in (other / "frames").iterdir():
+        shutil.copyfile(frame, copy / "frames" / frame.name)
+    bases.clear()
+    summary = detect(copy, tmp_path / "out")
+    assert len(bases) == FRAMES
+    assert summary.tone_base == "a straight line"
