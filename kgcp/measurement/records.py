@@ -201,7 +201,8 @@ class Measurement:
     imaging : Imaging or None
         None where the method fits no tone.
     rival : RivalTone or None
-        The same by the other base of an unknown tone; None where only one base leads anywhere.
+        The same by the other base of an unknown tone; None where that was not asked for, or leads
+        nowhere.
     smoothing : ContourSmoothing or None
         None where none is expected: of cameras with a known tone, and in bins.
     eccentricity_px : (2,) array or None

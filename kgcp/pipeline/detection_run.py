@@ -50,7 +50,13 @@ from kgcp.pipeline.frame_task import (
     shows_negative,
 )
 from kgcp.pipeline.guidance import FrameTracks
-from kgcp.quality.learnt_imaging import LearntImaging, base_of_some, by_base, learn_imaging
+from kgcp.quality.learnt_imaging import (
+    LearntImaging,
+    base_of_no_matter,
+    base_of_some,
+    by_base,
+    learn_imaging,
+)
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
@@ -146,6 +152,7 @@ class DetectionRun:
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
         self.learnt: LearntImaging | None = None
+        self._told_base: ToneBase | None = None
         self._preferences: Mapping[Place, float] = {}
 
     def first_pass(self) -> None:
@@ -214,10 +221,12 @@ class DetectionRun:
                         )
 
     def _ask_for_tone_base(self) -> None:
-        """Measure the other frames over one base alone, if those so far say clearly which."""
+        """Measure the other frames over one base alone, if those so far say which."""
         if self._job.tone_base is None:
-            so_far = (self._journal.read(key) for key in self._keys if key)
-            self._job = replace(self._job, tone_base=base_of_some(so_far))
+            so_far = [self._journal.read(key) for key in self._keys if key]
+            self._told_base = base_of_some(so_far)
+            base = self._told_base or base_of_no_matter(so_far)
+            self._job = replace(self._job, tone_base=base)
 
     def guided_pass(
         self,
@@ -290,7 +299,7 @@ class DetectionRun:
         """
         if self._job.settings.is_learning:
             results = map(self._journal.read, self._keys)
-            self.learnt = learn_imaging(results, self._job.tone_base)
+            self.learnt = learn_imaging(results, self._told_base)
         if self._job.settings.is_guided:
             kept = map(self._journal.read, self._keys)
             self._preferences = preferences_of_neighbours(

@@ -33,6 +33,13 @@ _MOST_OF_ONE = 30.0  # of log-likelihood: no single frame decides
 _MOST_AGAINST = 0.2
 # Before all frames are measured, so much of it decides for the others: 5 clear frames or more.
 _ENOUGH = 5.0 * _MOST_OF_ONE
+# The base does not matter where four of five distances differ by less than this share of their
+# standard deviations, of at least so many. Of flights with rolling shutters it is 0.02, with film-
+# like curves 0.2 to 0.3; under highlights, in phones and with dirt 0.5 to 1.3.
+_ALIKE, _ALIKE_QUANTILE, _FEWEST_ALIKE = 0.35, 0.8, 12
+# A frame so much against the base of all others was not explained over it: with dirt, its fit over
+# that base has often come to rest where errors are up to 3 σ, and 0.1 σ over the other.
+_BEYOND_DOUBT = 100.0
 _STEPS = 64  # of the curve, over the whole range of grey values
 _ROUNDS = 3
 _BAND = (16.0, 50.0, 84.0)  # percentiles: ±1σ
@@ -86,6 +93,20 @@ def base_of_some(results: Iterable[FrameResult]) -> ToneBase | None:
     return None if base is None or advantages[base] < _ENOUGH else base
 
 
+def base_of_no_matter(results: Iterable[FrameResult]) -> ToneBase | None:
+    """Return the likelier base if some frames have nearly the same distances over both; or None."""
+    measurements = [measurement for *_, measurement in _of_unknown_tone(results)]
+    differences = [
+        abs(each.distance_m - each.rival.measurement.distance_m) / each.sd_distance_m
+        for each in measurements
+        if each.rival is not None
+    ]
+    if len(differences) < _FEWEST_ALIKE or np.quantile(differences, _ALIKE_QUANTILE) > _ALIKE:
+        return None
+    advantages = _advantages(measurements)
+    return max(advantages, key=lambda each: advantages[each])
+
+
 def learn_imaging(
     results: Iterable[FrameResult], base: ToneBase | None = None
 ) -> LearntImaging | None:
@@ -126,9 +147,11 @@ def learn_imaging(
 
 
 def by_base(measurement: Measurement, base: ToneBase) -> Measurement:
-    """Return a measurement by a base of its tone curve, if it has one by that."""
+    """Return a measurement by a base of its tone curve, if it has one that may be as good."""
     rival, imaging = measurement.rival, measurement.imaging
     if rival is None or imaging is None or imaging.base is base:
+        return measurement
+    if rival.advantage > _BEYOND_DOUBT:
         return measurement
     return replace(
         rival.measurement,

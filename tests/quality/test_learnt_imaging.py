@@ -20,8 +20,9 @@ from kgcp.measurement.records import (
     Miss,
     RivalTone,
     ToneBase,
+    Uncertainty,
 )
-from kgcp.quality.learnt_imaging import base_of_some, by_base, learn_imaging
+from kgcp.quality.learnt_imaging import base_of_no_matter, base_of_some, by_base, learn_imaging
 
 SRGB, LINE = ToneBase.SRGB, ToneBase.LINE
 
@@ -52,6 +53,10 @@ def frame(name: str, base: ToneBase, advantage: float, white: float = 0.8) -> Fr
     )
     plate = replace(plate, rival=RivalTone(other, advantage), is_guided=True)
     return FrameResult(name, 0.0, ExposureSettings(), (plate, Miss("B", Reason.CUT)))
+
+
+def uncertainty(sd_distance_m: float) -> Uncertainty:
+    return Uncertainty(np.eye(6), np.eye(2), sd_distance_m, 1.0, 1.0, 1.0)
 
 
 def first_of(result: FrameResult) -> Measurement:
@@ -100,6 +105,33 @@ def test_some_frames_decide_only_where_they_say_it_clearly(
     results = [frame(f"f{k}", LINE, 1e3) for k in range(clear)]
     results += [frame(f"g{k}", SRGB, 0.5 * against) for k in range(2)]
     assert base_of_some(results) is base
+
+
+def test_a_frame_that_is_far_from_the_base_of_the_others_keeps_its_own() -> None:
+    results = [frame(f"f{k}", SRGB, 30.0) for k in range(11)]
+    results += [frame("near", LINE, 99.0), frame("far", LINE, 101.0)]
+    learnt = learn_imaging(results)
+    assert learnt is not None
+    assert (learnt.base, learnt.overruled) == (SRGB, 1)
+    near, far = (first_of(result) for result in results[-2:])
+    assert by_base(near, SRGB).distance_m == 11.0
+    assert by_base(far, SRGB) is far
+
+
+@pytest.mark.parametrize(
+    ("frames", "alike", "base"), [(12, 10, SRGB), (12, 9, None), (11, 11, None)]
+)
+def test_the_base_does_not_matter_where_nearly_all_distances_are_alike(
+    frames: int, alike: int, base: ToneBase | None
+) -> None:
+    results = [frame(f"f{k}", SRGB if k % 3 else LINE, 2.0) for k in range(frames)]
+    sds_m = [5.0 if k < alike else 1.0 for k in range(frames)]  # both bases are 1 m apart
+    told = [
+        replace(result, outcomes=(replace(first_of(result), uncertainty=uncertainty(sd_m)),))
+        for result, sd_m in zip(results, sds_m, strict=True)
+    ]
+    assert base_of_some(told) is None
+    assert base_of_no_matter(told) is base
 
 
 def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:

@@ -19,7 +19,7 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
-from kgcp.measurement.adjustment.extensions import fit_in_any_light, fit_over_base
+from kgcp.measurement.adjustment.extensions import fit_in_any_light
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.smoothing import contour_smoothing, with_smoothing
 from kgcp.measurement.adjustment.two_poses import (
@@ -29,7 +29,6 @@ from kgcp.measurement.adjustment.two_poses import (
 )
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.noise import find_censoring
-from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import circles_of
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import contour_px, cut_window, semi_major_axis_px
@@ -78,12 +77,14 @@ def measure_by_model(
     problem = fit_problem_of(grey, camera, target, pose, prior.rotation)
     problem = replace(problem, visible=visible)
     blur = _start_blur(start, problem.window.binning)
-    if prior.tone_base is not None and problem.tone is Tone.UNKNOWN:
-        with contextlib.suppress(Rejection):  # then this frame is like none of those that told it
-            poses = fit_over_base(problem, pose, blur, prior.tone_base)
-            return _checked(camera, target, start, poses, prior.normal)
-    fits = fit_in_any_light(problem, pose, blur)
-    measurement = _checked(camera, target, start, fits.likelier, prior.normal)
+    fits = fit_in_any_light(problem, pose, blur, prior.tone_base)
+    try:
+        measurement = _checked(camera, target, start, fits.likelier, prior.normal)
+    except Rejection:
+        if prior.tone_base is None:
+            raise
+        by_both = replace(prior, tone_base=None)  # this frame may be unlike those that told it
+        return measure_by_model(grey, camera, target, start, by_both, visible)
     if fits.rival is not None:
         with contextlib.suppress(Rejection):  # then the likelier one has no rival
             rival = _checked(camera, target, start, fits.rival, prior.normal)

@@ -14,7 +14,11 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment import extensions
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.two_poses import TwoPoses
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement, ToneBase
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
@@ -157,6 +161,33 @@ def test_the_base_of_an_unknown_tone_is_told_by_the_same_pixels(
         by_one = measure_by_model(grey, camera, TARGET, start, prior)
         assert by_one.rival is None
         assert by_one.distance_m == by_both.distance_m, "what it says does not hang on the other"
+
+
+def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Residuals that are alike may mean a fit that came to rest beside the minimum."""
+    camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
+    pose = random_pose(camera, 40.0, rng)
+    grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=1.0)
+    start, known = start_near(camera, pose, rng), PlatePrior(tone_base=ToneBase.LINE)
+    by_both = measure_by_model(grey, camera, TARGET, start)
+    with monkeypatch.context() as patch:
+        patch.setattr("kgcp.measurement.adjustment.extensions._STRAY_INFLATION", 0.0)
+        compared = measure_by_model(grey, camera, TARGET, start, known)
+    assert compared.rival is not None
+    assert compared.imaging == by_both.imaging
+    assert compared.distance_m == by_both.distance_m
+
+    def fit_over_srgb(problem: FitProblem, *others: object) -> TwoPoses:
+        if problem.tone is Tone.UNKNOWN_FROM_LINE:
+            raise Rejection(Reason.POOR_FIT)
+        return fit(problem, *others)  # type: ignore[arg-type]  # whatever they are
+
+    fit = extensions._fit_in_any_light
+    monkeypatch.setattr(extensions, "_fit_in_any_light", fit_over_srgb)
+    rescued = measure_by_model(grey, camera, TARGET, start, known)
+    assert rescued.distance_m == by_both.distance_m
 
 
 def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(
