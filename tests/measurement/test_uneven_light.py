@@ -84,6 +84,23 @@ def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
     assert 0.1 < math.sqrt(np.mean(np.square(sigmas))) < 2.0
 
 
+def test_dirt_on_a_small_ring_is_told_by_its_edges(
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cells of 8 px say too little there, and the light was taken for even: 0.2 % off."""
+    rng = np.random.default_rng(39)
+    pose = some_pose(rng)
+    pose = Pose(pose.rotation, 3.0 * pose.translation_m)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=dirt(rng))
+    start = start_near(LENS, pose, rng)
+    seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    assert abs(seen.distance_m / pose.distance_m - 1.0) < 5e-4
+    assert abs(seen.distance_m - pose.distance_m) < 1.5 * seen.sd_distance_m
+    monkeypatch.setattr("kgcp.measurement.adjustment.random_levels._ASKS_BY_EDGES", math.inf)
+    by_cells = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    assert by_cells.distance_m / pose.distance_m - 1.0 > 1e-3
+
+
 def test_a_comatic_lens_displaces_the_centre_by_little(
     photograph: Photograph, start_near: StartNear
 ) -> None:
