@@ -14,9 +14,13 @@ from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.adjustment import extensions
+from kgcp.measurement.adjustment import extensions, fit_target, random_levels
 from kgcp.measurement.adjustment.fit_target import measure_by_model
+from kgcp.measurement.adjustment.normal_equations import Unknowns
+from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.residual_image import residual_image_of
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.frame import examine
 from kgcp.measurement.records import InitialPose, Measurement, Miss
 from kgcp.settings import DetectSettings
@@ -99,6 +103,42 @@ def test_dirt_on_a_small_ring_is_told_by_its_edges(
     monkeypatch.setattr("kgcp.measurement.adjustment.random_levels._ASKS_BY_EDGES", math.inf)
     by_cells = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert by_cells.distance_m / pose.distance_m - 1.0 > 1e-3
+
+
+def test_light_that_is_not_explained_makes_what_another_start_finds_part_of_the_deviation(
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(12)
+    pose = some_pose(rng)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=highlight(rng))
+    start = start_near(LENS, pose, rng)
+    explained = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    other_pose = Pose(pose.rotation, 1.002 * explained.pose.translation_m)
+    monkeypatch.setattr(fit_target, "_UNEXPLAINED", 0.0)
+    monkeypatch.setattr(fit_target, "fit_levels", resting_at(other_pose))
+    seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
+    assert seen.distance_m == explained.distance_m
+    wider = math.hypot(explained.sd_distance_m, 0.002 * seen.distance_m)
+    assert seen.sd_distance_m == pytest.approx(wider, rel=1e-3)
+    assert seen.uncertainty is not None
+    assert seen.uncertainty.centre_cov_px2 == pytest.approx(
+        explained.uncertainty.centre_cov_px2 if explained.uncertainty else 0.0, rel=0.2
+    )
+
+
+def resting_at(pose: Pose) -> Callable[..., tuple[TargetFit, TargetFit]]:
+    """Return a fit of levels that comes to rest at a pose, whatever its start."""
+
+    def fit(
+        problem: FitProblem, starts: list[Parameters], other: Pose, unknowns: Unknowns
+    ) -> tuple[TargetFit, TargetFit]:
+        (start,) = starts
+        assert start.field is not None
+        assert not start.field.values.any(), "from even light"
+        best, worse = random_levels.fit_levels(problem, starts, other, unknowns)
+        return replace(best, parameters=best.parameters.at(pose)), worse
+
+    return fit
 
 
 def test_a_comatic_lens_displaces_the_centre_by_little(
