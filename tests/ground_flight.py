@@ -156,6 +156,7 @@ class GroundFlight:
             **_NULL_ROW,
             "frame": self.frame_names[frame],
             "target": self.renamed.get((frame, name), name),
+            "shape": "coded",
             "time_source": "none",
             "instance": 0,
             "status": "measured",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.flight.target_table import target_lines
+from kgcp.measurement.plain_pose import pose_towards
 from kgcp.simulation.ground import Ground
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, PrintedPlate
@@ -81,6 +82,7 @@ class PlainFlight:
     height_m: float = 25.0
     sd_position_m: float = 0.02
     sd_angle_deg: float = 0.02
+    true_normals: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # ENU
 
     def cameras(self) -> tuple[FloatArray, FloatArray]:
         """Projection centres (n, 3) and rotations ENU ← camera (n, 3, 3), exact."""
@@ -119,6 +121,15 @@ class PlainFlight:
         outline = regular_polygon(4, 0.9)
         return tuple(PlatePose(PrintedPlate(target, outline), pose) for target, pose in plates)
 
+    def _lying(self, frame: int, target: PlainTarget) -> FloatArray:
+        """Axes (3, 3) of a plain target in a frame's camera: it lies level, or as it truly does."""
+        _, rotations = self.cameras()
+        enu_from_target = _GROUND_FROM_ENU.T
+        if target.name in self.true_normals:
+            normal = -np.array(self.true_normals[target.name])  # into the plate
+            enu_from_target = pose_towards(np.zeros(3), normal / np.linalg.norm(normal)).rotation
+        return np.asarray(rotations[frame].T @ enu_from_target)
+
     def _in_camera(self, frame: int, targets: Sequence[AnyTarget]) -> FloatArray:
         if not targets:
             return np.empty((0, 3))
@@ -150,7 +161,7 @@ class PlainFlight:
                 None,
                 self._plates(frame, lying),
                 tuple(
-                    PlainPose(PlainPlate(target), Pose(lying, centre))
+                    PlainPose(PlainPlate(target), Pose(self._lying(frame, target), centre))
                     for target, centre in zip(self.targets, self.centres_m(frame), strict=True)
                 ),
             )
@@ -209,6 +220,8 @@ class PlainFlight:
                 f"sd_position_m = {list(target.sd_position_m)}",
                 f"border_m = {target.border_m!r}",
             ]
+            if target.normal_enu is None:
+                lines.append('normal = "free"')
             if len(target.diameters_m) > 1:
                 lines.append(f"inner_diameter_m = {list(target.diameters_m[1:])}")
         moving = () if self.moving is None else (self.moving,)

@@ -27,6 +27,7 @@ from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.measure import measure_frame
 from kgcp.report.bias.reexposure import GAINS, reexposed
 from kgcp.settings import DetectSettings, Method
+from kgcp.targets.plain import Shape
 
 
 def measure_flight(
@@ -53,7 +54,8 @@ def _rows_of_frame(task: tuple[Flight, DetectSettings, str, float]) -> list[Row]
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in flight.targets
         )
-    return detection_rows(FrameResult(frame, None, ExposureSettings(), outcomes))
+    shapes = dict.fromkeys((target.name for target in flight.targets), Shape.CODED)
+    return detection_rows(FrameResult(frame, None, ExposureSettings(), outcomes), shapes)
 
 
 def changes(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:

@@ -116,8 +116,13 @@ def look(
     count: int,
     grounds: Sequence[FloatArray],
     tone: ToneCurve | None = None,
+    *,
+    is_free: bool = False,
 ) -> Looks:
-    """Render so many targets of one kind and look for them; a tone curve is not known."""
+    """Render so many targets of one kind and look for them.
+
+    A tone curve is not known; nor is the normal, if it is free.
+    """
     camera, sensor = _CAMERA, _SENSOR
     if tone is not None:
         camera, sensor = replace(camera, response=Response.UNKNOWN), replace(sensor, tone=tone)
@@ -138,6 +143,7 @@ def look(
         grey = sensor.expose(light, 1.0, rng)
         truth_px = camera.project(pose.translation_m[None])[0]
         prediction = _prediction(camera, pose, stated, radius_px, rng)
+        prediction = replace(prediction, normal=None) if is_free else prediction
         began = time.perf_counter()
         outcome = look_for_plain(grey, camera, target, prediction)
         seconds += time.perf_counter() - began
@@ -151,7 +157,7 @@ def look(
         assert outcome.uncertainty is not None
         errors.append(error)
         sds.append(np.sqrt(np.diag(outcome.uncertainty.centre_cov_px2)))
-        limits.append(_bound_px(target, edges, pose, stated))
+        limits.append(_bound_px(target, edges, pose, prediction.prior))
         off_m = outcome.distance_m - pose.distance_m
         z_distance.append(off_m / outcome.uncertainty.sd_distance_m)
         along.append(float(error @ uphill_px))
@@ -252,7 +258,7 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     return np.array(covs)
 
 
-def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, stated: FloatArray) -> float:
+def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, prior: NormalPrior) -> float:
     """Return the bound of the true centre per coordinate [px].
 
     Of the edges, and of the normal: what its prior leaves open, and which of both it is.
@@ -262,7 +268,7 @@ def _bound_px(target: PlainTarget, edges: FloatArray, pose: Pose, stated: FloatA
     slopes = [moments_by_stretch(geometry_of(one)) for one in moments]
     covs = np.array([slope @ cov @ slope.T for slope, cov in zip(slopes, edges, strict=True)])
     images = CircleMoments(radii, moments, covs)
-    prior, mirrored = NormalPrior(stated, _SD_NORMAL_DEG), pose.mirrored()
+    mirrored = pose.mirrored()
     start = pose_towards(mirrored.translation_m, mirrored.normal)
     fit, other = (fit_circles(_CAMERA, images, each, prior) for each in (pose, start))
     cov = propagate(_CAMERA, pose, fit.pose_cov).centre_cov_px2
@@ -308,18 +314,23 @@ class Windows:
 
 
 def random_windows(
-    photographs: Sequence[GreyArray], count: int, sizes_px: tuple[float, float], seed: int
+    photographs: Sequence[GreyArray],
+    count: int,
+    sizes_px: tuple[float, float],
+    seed: int,
+    *,
+    is_free: bool = False,
 ) -> Windows:
     """Look for targets of all kinds and sizes where there is none."""
     rng = np.random.default_rng(seed)
-    return _looked_at(
-        "random places", photographs, _random_places(photographs, count, sizes_px, rng)
-    )
+    places = _random_places(photographs, count, sizes_px, rng)
+    return _looked_at("random places", photographs, places, is_free=is_free)
 
 
-def round_things(photographs: Sequence[GreyArray], most: int) -> Windows:
+def round_things(photographs: Sequence[GreyArray], most: int, *, is_free: bool = False) -> Windows:
     """Look for targets at wheels, manholes, tanks and stones that have another size."""
-    return _looked_at("round things", photographs, _round_places(photographs, most))
+    places = _round_places(photographs, most)
+    return _looked_at("round things", photographs, places, is_free=is_free)
 
 
 def edges_alike(photographs: Sequence[GreyArray]) -> FloatArray:
@@ -387,7 +398,9 @@ def _round_places(photographs: Sequence[GreyArray], most: int) -> Iterator[_Plac
             yield index, outline.ellipse.centre, radius_px, kinds[number % len(kinds)]
 
 
-def _looked_at(name: str, photographs: Sequence[GreyArray], places: Iterator[_Place]) -> Windows:
+def _looked_at(
+    name: str, photographs: Sequence[GreyArray], places: Iterator[_Place], *, is_free: bool
+) -> Windows:
     rng = np.random.default_rng(7)
     reasons: Counter[str] = Counter()
     windows = wrong = 0
@@ -408,7 +421,7 @@ def _looked_at(name: str, photographs: Sequence[GreyArray], places: Iterator[_Pl
             SD_PX**2 * np.eye(2),
             _ray(camera, centre_px) * pose.distance_m,
             _SD_LOG,
-            NormalPrior(normal, _SD_NORMAL_DEG),
+            None if is_free else NormalPrior(normal, _SD_NORMAL_DEG),
             radius_px,
             "a benchmark",
         )
@@ -454,6 +467,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--tone", choices=[*ToneCurve], type=ToneCurve, help="a tone curve that is not known"
     )
     parser.add_argument("--kind", choices=[*_KINDS], action="append")
+    parser.add_argument("--free", action="store_true", help="normals are not known at all")
     chosen = parser.parse_args(arguments)
     use_one_thread_each()
     photographs = []
@@ -466,7 +480,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for radius_px in _RADII_PX:
             if radius_px < SMALLEST_BARE_PX and not _KINDS[kind][2]:
                 continue  # it is not looked for
-            print_looks(look(kind, radius_px, chosen.count, grounds, chosen.tone))
+            print_looks(
+                look(kind, radius_px, chosen.count, grounds, chosen.tone, is_free=chosen.free)
+            )
     if photographs and chosen.windows:
         for radius_px, shares in zip(_RADII_PX, edges_alike(photographs).T, strict=True):
             print(
@@ -474,8 +490,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 f" {shares.max():.1e} in a window"
             )
         for windows in (
-            random_windows(photographs, chosen.windows, tuple(chosen.sizes), chosen.seed),
-            round_things(photographs, chosen.windows),
+            random_windows(
+                photographs,
+                chosen.windows,
+                tuple(chosen.sizes),
+                chosen.seed,
+                is_free=chosen.free,
+            ),
+            round_things(photographs, chosen.windows, is_free=chosen.free),
         ):
             print(
                 f"{windows.name}: {windows.wrong} wrong in {windows.windows} windows;"

@@ -101,8 +101,13 @@ class PlainTracks:
             source=NEIGHBOURS,
         )
 
-    def _normal(self, target: PlainTarget, row: int) -> NormalPrior:
-        """Return the mean of the normals before and after, as uncertain as they are and differ."""
+    def _normal(self, target: PlainTarget, row: int) -> NormalPrior | None:
+        """Return the mean of the normals before and after, as uncertain as they are and differ.
+
+        None: of a target whose normal is free they may be either of two.
+        """
+        if target.normal_enu is None:
+            return None
         now, found = self._time_s[row], self._found[target.name]
         before = max((each for each in found if self._time_s[each] < now), key=self._when)
         after = min((each for each in found if self._time_s[each] > now), key=self._when)

@@ -125,18 +125,30 @@ def _predicted(
     distance_m = float(np.linalg.norm(sight_m))
     along, by_place = sight_m / distance_m, _pixel_slopes(camera, sight_m)
     sd_along = math.sqrt(max(0.0, float(along @ cov_m2 @ along))) / distance_m
-    level = positions.local_frame.level_rotations(place.position_m[None])[0]
     return PlainPrediction(
         centre_px=centre_px,
         cov_px2=by_place @ cov_m2 @ by_place.T + floor_px**2 * np.eye(2),
         position_m=sight_m,
         sd_log_distance=math.hypot(sd_along, floor_log),
-        normal=NormalPrior(
-            -camera_from_enu @ level @ np.array(target.normal_enu),
-            math.hypot(target.sd_normal_deg, orientation.sd_angle_deg),
-        ),
+        normal=_stated_normal(target, place.position_m, orientation, positions.local_frame),
         radius_px=target.radii_m[0] * camera.mean_focal_px / distance_m,
         source=orientation.source,
+    )
+
+
+def _stated_normal(
+    target: PlainTarget,
+    position_m: FloatArray,
+    orientation: FrameOrientation,
+    local_frame: LocalFrame,
+) -> NormalPrior | None:
+    """Return how a target lies in the camera frame, as flight.toml says; None: it does not."""
+    if target.normal_enu is None:
+        return None
+    level = local_frame.level_rotations(position_m[None])[0]
+    return NormalPrior(
+        -orientation.enu_from_camera.T @ level @ np.array(target.normal_enu),
+        math.hypot(target.sd_normal_deg, orientation.sd_angle_deg),
     )
 
 
@@ -146,7 +158,9 @@ def predict_marked(
     positions: TargetPositions,
     camera: Camera,
 ) -> Predictions:
-    """Return where level plain targets must be that are marked in a frame that looks down.
+    """Return where plain targets must be that are marked in a frame that looks down.
+
+    Those that lie level, or whose normal is not known.
 
     How far they are, the distances of all marks tell: two at least. That it looks down is good to
     some degrees, and so are these.
@@ -162,7 +176,8 @@ def predict_marked(
     predictions = {}
     for target in targets:
         place = places.get(target.name)
-        if place is None or target.normal_enu[2] < _LEVEL:
+        is_free = target.normal_enu is None
+        if place is None or (target.normal_enu is not None and target.normal_enu[2] < _LEVEL):
             continue
         centre_px = np.array([place.x_px, place.y_px])
         position_m = depth_m * np.append(camera.undistort(centre_px[None])[0], 1.0)
@@ -171,7 +186,7 @@ def predict_marked(
             cov_px2=place.sd_px**2 * np.eye(2),
             position_m=position_m,
             sd_log_distance=_MARKED_LOG,
-            normal=NormalPrior(np.array([0.0, 0.0, 1.0]), _DOWN_SD_DEG),
+            normal=None if is_free else NormalPrior(np.array([0.0, 0.0, 1.0]), _DOWN_SD_DEG),
             radius_px=target.radii_m[0] * camera.mean_focal_px / float(np.linalg.norm(position_m)),
             source="a mark",
         )

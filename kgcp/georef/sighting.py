@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.records import Measurement
+from kgcp.measurement.records import CircleImage, Measurement
 
 _NO_HEADING_RAD2 = 1.0  # variance from which on an angle is not known
 
@@ -34,6 +34,7 @@ class Sighting:
     ambiguity: float | None = None  # Δχ² by which the circle's other pose is worse
     # (6, 6): share of calibration and diameter, not in `pose_cov`; None: not known
     common_pose_cov: FloatArray | None = None
+    image: CircleImage | None = None  # of a plain target's outer circle, without any prior
 
     @property
     def has_heading(self) -> bool:
@@ -83,6 +84,7 @@ def sighting_of(frame: str, number: int, time_s: float | None, seen: Measurement
         score=seen.score,
         ambiguity=None if seen.alternative is None else seen.alternative.ambiguity,
         common_pose_cov=None if common is None else common.pose_cov,
+        image=seen.image,
     )
 
 

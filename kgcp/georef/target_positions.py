@@ -253,7 +253,7 @@ def static_position(
     position = local_frame.enu_from_map(np.array([position_map]))[0]
     axes = local_frame.grid_rotation(position)
     cov = covariance_along(axes, np.array(target.sd_position_m))
-    if isinstance(target, PlainTarget) and target.thickness_m:
+    if isinstance(target, PlainTarget) and target.thickness_m and target.normal_enu is not None:
         level = local_frame.level_rotations(position[None])[0]
         normal = level @ np.array(target.normal_enu)
         aside_m = target.thickness_m * math.radians(target.sd_normal_deg)

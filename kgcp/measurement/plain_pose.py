@@ -15,13 +15,17 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.circle import circle_planes
 from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
+from kgcp.geometry.conic import Ellipse, fit_ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.plate_prior import NormalPrior
 
 _STEPS = 12
 _SETTLED = 1e-9  # of the distance, and radians
 _LARGEST_TURN_RAD = 0.3  # of a step
+_TURN = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)
+_LEAST_TILT_RAD = 0.05
 _ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an angle of which nothing is known
 
 
@@ -70,6 +74,22 @@ def pose_towards(centre_m: FloatArray, normal: FloatArray) -> Pose:
         x = np.cross(normal, [0.0, 1.0, 0.0])
     x = x / np.linalg.norm(x)
     return Pose(np.column_stack((x, np.cross(normal, x), normal)), np.asarray(centre_m))
+
+
+def pose_of_ellipse(camera: Camera, ellipse: Ellipse, radius_m: float) -> Pose:
+    """Return one of the two poses that a circle has, whose image is an ellipse of raw pixels.
+
+    A circle that is seen from the front is turned a little, so that an adjustment has a slope.
+
+    Raises
+    ------
+    Rejection
+        If no circle before the camera has this image.
+    """
+    outline = camera.undistort(ellipse.points(_TURN))
+    plane = circle_planes(fit_ellipse(outline))[0]
+    pose = pose_towards(radius_m * plane.centre, plane.normal).tilted(_LEAST_TILT_RAD)
+    return pose_towards(pose.translation_m, pose.normal)
 
 
 def circles_about(pose: Pose, radii_m: FloatArray) -> Circles3D:

@@ -21,6 +21,7 @@ Below, pebbles and clods are as round. On ground that is not known to be even, o
 measured at a wrong place at 2.5 px (`benchmarks.ground.plain_targets`).
 """
 _FARTHEST = 16.0  # radii that a target may be off: beyond, too much else would be looked at
+_FREE_SD_DEG = 60.0
 _LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
 
 
@@ -38,8 +39,8 @@ class PlainPrediction:
         Of its centre in the camera frame [m].
     sd_log_distance : float
         Standard deviation of the logarithm of its distance.
-    normal : NormalPrior
-        How its plane lies.
+    normal : NormalPrior or None
+        How its plane lies; None: not known.
     radius_px : float
         Of its outer circle where it is widest [px].
     source : str
@@ -50,7 +51,7 @@ class PlainPrediction:
     cov_px2: FloatArray
     position_m: FloatArray
     sd_log_distance: float
-    normal: NormalPrior
+    normal: NormalPrior | None
     radius_px: float
     source: str
 
@@ -61,6 +62,17 @@ class PlainPrediction:
             f"expected by {self.source} at ({x:.0f}, {y:.0f}) ± {self.sd_px:.1f} px, radius"
             f" {self.radius_px:.1f} px"
         )
+
+    @property
+    def prior(self) -> NormalPrior:
+        """How its plane lies, for an adjustment.
+
+        Of a plane that may lie any way: roughly towards the camera, since it is seen. So weak a
+        prior only keeps equations regular where a circle is seen from the front.
+        """
+        if self.normal is not None:
+            return self.normal
+        return NormalPrior(self.position_m / np.linalg.norm(self.position_m), _FREE_SD_DEG)
 
     @property
     def sd_px(self) -> float:
@@ -79,6 +91,8 @@ class PlainPrediction:
 
     def is_from_behind(self) -> bool:
         """Tell whether its plane turns away from the camera, or is seen edge on."""
+        if self.normal is None:
+            return False
         along = self.position_m / np.linalg.norm(self.position_m)
         return bool(along @ self.normal.direction_camera < _LEAST_COSINE)
 

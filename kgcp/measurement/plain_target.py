@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import chdtri, expit
+from scipy.special import expit
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
@@ -21,8 +21,6 @@ from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.covariance import propagate
-from kgcp.measurement.discs.adjust_disc import geometry_of
-from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.measure import measure_disc
 from kgcp.measurement.discs.outlines import follow_outlines
 from kgcp.measurement.discs.records import (
@@ -34,34 +32,37 @@ from kgcp.measurement.discs.records import (
     ellipse_of_moments,
 )
 from kgcp.measurement.image_model.window import contour_px, semi_major_axis_px
+from kgcp.measurement.plain_checks import check_agreement, check_edge, tolerated
 from kgcp.measurement.plain_pose import (
     CircleMoments,
     CirclesFit,
     circles_about,
     fit_circles,
+    pose_of_ellipse,
     pose_towards,
 )
-from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_radius_px
+from kgcp.measurement.plain_prediction import PlainPrediction, smallest_radius_px
 from kgcp.measurement.plain_search import edges_like
-from kgcp.measurement.records import Alternative, Appearance, Measurement, Miss, Outcome
+from kgcp.measurement.records import (
+    Alternative,
+    Appearance,
+    CircleImage,
+    Measurement,
+    Miss,
+    Outcome,
+)
 from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
 _MOST_TRIES = 24  # edges that are measured per target
-# How well the edges of a print in the field are known: pixels (an unknown tone curve displaces
-# them), and of the radius (jagged or dirty edges)
-_EDGE_PX, _EDGE = 0.1, 0.01
-_SIZE_PX, _SIZE = 0.12, 0.015  # the same of an edge as a whole
-# Edge spread, of the smaller semi-axis: beyond, a disc is no more than a smooth blob, of which
-# ground has many. Sharp discs of 2.5 px at 50° have 0.38.
-_MOST_BLUR = 0.5
-_ROUGH_PX = 0.075  # what an edge's unevenness may displace the centre by
-_PLACE_PX = 0.1  # of a prediction, at least
-_UNLIKELY = 1e-4  # that a target's own shape has so large a χ²
 # The variances on ground that is not known to be even: its texture displaces edges over longer
 # stretches than the arcs that the covariance is made from.
 _BARE = 3.0
 _SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
+_FREE_RATIO, _FREE_SCALE = (
+    0.5,
+    0.8,
+)  # of an edge's axes, at least; and what is sought, of the largest
 _SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
 _INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
 # Edges nearer to each other than this leave each other too few pixels, and are measured as one. On
@@ -115,10 +116,12 @@ def look_for_plain(
         return Miss(target.name, Reason.NO_PREDICTION)
     try:
         _check_prediction(camera, target, prediction)
-        expected = _expected_ellipses(camera, target, prediction)
-        edges = edges_like(grey, expected[0], _polarity(target), prediction.reach_px)
+        expected = _expected_ellipse(camera, target, prediction)
+        # a plane that may lie any way: between the extremes, within reach of both
+        sought = expected if prediction.normal is not None else expected.scaled(_FREE_SCALE)
+        edges = edges_like(grey, sought, _polarity(target), prediction.reach_px)
         free = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
-        edges = _alike(free, expected[0], prediction)
+        edges = _alike(free, expected, prediction)
         candidate = _only_candidate(grey, camera, target, prediction, edges)
     except Rejection as rejection:
         return Miss(target.name, rejection.reason, rejection.detail)
@@ -188,11 +191,11 @@ def _try_edge(
     Rejection
     """
     start = _start(camera, target, prediction, edge.ellipse)
-    circles = _measured_circles(grey, camera, target, start, edge)
-    _check_edge(circles.discs[0])
+    circles = _measured_circles(grey, camera, target, prediction, start, edge)
+    check_edge(circles.discs[0])
     try:
-        tolerant = fit_circles(camera, _tolerated(circles.images), start, prediction.normal)
-        _check_agreement(camera, target, prediction, tolerant, len(circles.discs))
+        tolerant = fit_circles(camera, tolerated(circles.images), start, prediction.prior)
+        check_agreement(camera, target, prediction, tolerant, len(circles.discs))
         fit, other = _best_fits(camera, circles.images, start, prediction)
     except np.linalg.LinAlgError:
         raise Rejection(Reason.POOR_FIT, "singular equations") from None
@@ -210,11 +213,12 @@ def _alike(
         If there are edges, and none is.
     """
     tolerance_px = math.hypot(_SHAPE_PX, _SHAPE * expected.a)
+    least_b = expected.b if prediction.normal is not None else _FREE_RATIO * expected.b
     alike = [
         edge
         for edge in edges
         if abs(edge.ellipse.a - expected.a) < tolerance_px
-        and abs(edge.ellipse.b - expected.b) < tolerance_px
+        and least_b - tolerance_px < edge.ellipse.b < expected.b + tolerance_px
     ]
     if edges and not alike:
         a, b = edges[0].ellipse.a, edges[0].ellipse.b
@@ -236,17 +240,23 @@ def _ellipses_of(camera: Camera, target: PlainTarget, pose: Pose) -> list[Ellips
     return [ellipse_of_moments(each) for each in images.moments]
 
 
-def _expected_ellipses(
-    camera: Camera, target: PlainTarget, prediction: PlainPrediction
-) -> list[Ellipse]:
-    pose = pose_towards(prediction.position_m, prediction.normal.direction_camera)
-    return _ellipses_of(camera, target, pose)
+def _expected_ellipse(camera: Camera, target: PlainTarget, prediction: PlainPrediction) -> Ellipse:
+    """Return the outer circle's image; of a plane that may lie any way, as seen from the front."""
+    pose = pose_towards(prediction.position_m, prediction.prior.direction_camera)
+    return _ellipses_of(camera, target, pose)[0]
 
 
 def _start(
     camera: Camera, target: PlainTarget, prediction: PlainPrediction, ellipse: Ellipse
 ) -> Pose:
-    """Return the pose that an outline of the outer circle has, if its plane is as expected."""
+    """Return the pose that an outline of the outer circle has, if its plane is as expected.
+
+    Raises
+    ------
+    Rejection
+    """
+    if prediction.normal is None:
+        return pose_of_ellipse(camera, ellipse, target.radii_m[0])
     x, y = camera.undistort(ellipse.centre[None])[0].tolist()
     ray = np.array((x, y, 1.0)) / math.sqrt(x * x + y * y + 1.0)
     pose = pose_towards(
@@ -258,7 +268,12 @@ def _start(
 
 
 def _measured_circles(
-    grey: GreyArray, camera: Camera, target: PlainTarget, start: Pose, edge: DiscOutline
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    start: Pose,
+    edge: DiscOutline,
 ) -> _Circles:
     """Measure the outer circle and those within it.
 
@@ -268,7 +283,11 @@ def _measured_circles(
     """
     ellipses = _ellipses_of(camera, target, start)
     if _is_narrow(ellipses):
-        return _measured_whole(grey, camera, target, start, edge, ellipses)
+        whole = _measured_whole(grey, camera, target, start, edge)
+        if prediction.normal is not None:
+            return whole
+        mirrored = start.mirrored()
+        return _between(whole, _measured_whole(grey, camera, target, mirrored, edge))
     outlines = [edge]
     inner = [
         DiscOutline.predicted(ellipse, _polarity(target, circle))
@@ -313,7 +332,6 @@ def _measured_whole(
     target: PlainTarget,
     start: Pose,
     edge: DiscOutline,
-    ellipses: Sequence[Ellipse],
 ) -> _Circles:
     """Measure the outer circle of a ring whose others move and grow with it.
 
@@ -321,6 +339,7 @@ def _measured_whole(
     ------
     Rejection
     """
+    ellipses = _ellipses_of(camera, target, start)
     to_unit = np.linalg.inv(ellipses[0].stretch)
     inner = [
         (
@@ -340,6 +359,21 @@ def _measured_whole(
     return _Circles((outcome,), images)
 
 
+def _between(first: _Circles, second: _Circles) -> _Circles:
+    """Return the mean of two measurements by two normals, of which either may be the right one.
+
+    The inner circles' places follow from the normal, and with them those of the outer one.
+    """
+    apart = second.images.moments - first.images.moments
+    both = CircleMoments(
+        first.images.radii_m,
+        first.images.moments + 0.5 * apart,
+        0.5 * (first.images.covs + second.images.covs)
+        + 0.25 * apart[:, :, None] * apart[:, None, :],
+    )
+    return _Circles(first.discs, both)
+
+
 def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline]:
     """Return where the even ground ends, as an edge that pixels keep clear of."""
     if target.border_m is None:
@@ -351,87 +385,15 @@ def _border(camera: Camera, target: PlainTarget, pose: Pose) -> list[DiscOutline
     return [DiscOutline.predicted(ellipse_of_moments(moments[0]), _polarity(target, 1))]
 
 
-def _tolerated(images: CircleMoments) -> CircleMoments:
-    """Add to the covariances what edges in the field are off, besides noise."""
-    covs = []
-    for moments, cov in zip(images.moments, images.covs, strict=True):
-        geometry = geometry_of(moments)
-        radius_px = math.sqrt(max(float(geometry[2] * geometry[4] - geometry[3] ** 2), 0.0))
-        edge_px = math.hypot(_EDGE_PX, _EDGE * radius_px)
-        spread = edge_px**2 * np.diag((0.5, 0.5, 1.0, 0.5, 1.0))
-        to_moments = moments_by_stretch(geometry)
-        covs.append(cov + to_moments @ spread @ to_moments.T)
-    return CircleMoments(images.radii_m, images.moments, np.array(covs))
-
-
-def _check_edge(disc: Disc) -> None:
-    """Refuse an edge that is uneven, as of a stone, or hardly one, as of a shrub.
-
-    Raises
-    ------
-    Rejection
-    """
-    beyond_noise_px = disc.sd_px * math.sqrt(max(0.0, 1.0 - 1.0 / disc.inflation))
-    if beyond_noise_px > math.hypot(_ROUGH_PX, _EDGE * disc.ellipse.mean_radius):
-        detail = f"an uneven edge, which leaves the centre open by {beyond_noise_px:.2f} px"
-        raise Rejection(Reason.POOR_FIT, detail)
-    if disc.blur_px > _MOST_BLUR * disc.ellipse.b:
-        size = f"semi-axes of {disc.ellipse.a:.1f} and {disc.ellipse.b:.1f} px"
-        raise Rejection(Reason.TOO_BLURRED, f"an edge spread by {disc.blur_px:.1f} px, at {size}")
-
-
-def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:
-    """Refuse a distance that is not the predicted one.
-
-    Raises
-    ------
-    Rejection
-    """
-    expected_m = float(np.linalg.norm(prediction.position_m))
-    off = math.log(pose.distance_m / expected_m)
-    sd = math.hypot(
-        prediction.sd_log_distance,
-        _SIZE,
-        _SIZE_PX / prediction.radius_px,
-        target.sd_diameter_m / target.outer_diameter_m,
-    )
-    if abs(off) > SIGMAS * sd:
-        raise Rejection(Reason.UNLIKE_PREDICTION, f"{math.exp(-off) - 1.0:+.0%} in size")
-
-
-def _check_agreement(
-    camera: Camera,
-    target: PlainTarget,
-    prediction: PlainPrediction,
-    fit: CirclesFit,
-    circles: int,
-) -> None:
-    """Refuse what has another place, size or shape than the prediction.
-
-    Raises
-    ------
-    Rejection
-    """
-    _check_size(target, prediction, fit.pose)
-    off_px = camera.project(fit.pose.translation_m[None])[0] - prediction.centre_px
-    cov_px2 = prediction.cov_px2 + _PLACE_PX**2 * np.eye(2)
-    if float(off_px @ np.linalg.solve(cov_px2, off_px)) > SIGMAS**2:
-        detail = f"{float(np.linalg.norm(off_px)):.1f} px off"
-        raise Rejection(Reason.UNLIKE_PREDICTION, detail)
-    freedom = 5 * circles - 3
-    if fit.chi2 > chdtri(freedom, _UNLIKELY):
-        raise Rejection(Reason.UNLIKE_PREDICTION, f"shape: χ² {fit.chi2:.0f} of {freedom}")
-
-
 def _best_fits(
     camera: Camera, images: CircleMoments, start: Pose, prediction: PlainPrediction
 ) -> tuple[CirclesFit, CirclesFit | None]:
     """Return the better of both normals' fits, and the other one if it is another."""
-    fits = [fit_circles(camera, images, start, prediction.normal)]
+    fits = [fit_circles(camera, images, start, prediction.prior)]
     mirrored = fits[0].pose.mirrored()
     begin = pose_towards(mirrored.translation_m, mirrored.normal)
     try:
-        fits.append(fit_circles(camera, images, begin, prediction.normal))
+        fits.append(fit_circles(camera, images, begin, prediction.prior))
     except np.linalg.LinAlgError:
         return fits[0], None
     best, other = sorted(fits, key=lambda each: each.chi2)
@@ -442,6 +404,7 @@ def _best_fits(
 
 def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Measurement:
     pose, pose_cov, alternative = _over_both(candidate.fit, candidate.other)
+    images = candidate.circles.images
     return Measurement(
         target=target.name,
         ring=target.name,
@@ -453,6 +416,7 @@ def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> 
         appearance=_appearance(camera, target, candidate),
         alternative=alternative,
         uncertainty=propagate(camera, pose, pose_cov),
+        image=CircleImage(images.moments[0], images.covs[0]),
     )
 
 

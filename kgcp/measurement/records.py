@@ -208,6 +208,8 @@ class Measurement:
     eccentricity_px : (2,) array or None
         Centroid of the image of the main ring's outer circle minus `centre_px`: what other
         programs measure is off by this. None where it was not asked for.
+    image : CircleImage or None
+        What was measured of a plain target, before its pose was made from it; None of coded rings.
     """
 
     target: str
@@ -226,6 +228,7 @@ class Measurement:
     rival: RivalTone | None = None
     smoothing: ContourSmoothing | None = None
     eccentricity_px: FloatArray | None = None
+    image: CircleImage | None = None
 
     @property
     def distance_m(self) -> float:
@@ -241,6 +244,23 @@ class Measurement:
         """Tell whether a ring lies on this plate."""
         offset = np.linalg.norm(outline.centre - self.centre_px)
         return bool(offset < self.appearance.radius_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleImage:
+    """The image of one circle: its centroid [px] and second moments [px²].
+
+    Nothing that is known of target or frame beforehand has a part in it.
+
+    Attributes
+    ----------
+    moments : (5,) array
+        As `discs.records.MOMENTS`.
+    cov : (5, 5) array
+    """
+
+    moments: FloatArray
+    cov: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from kgcp.errors import KgcpError
-from kgcp.geometry.camera import Camera
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import Mark, read_marks
@@ -43,6 +42,7 @@ from kgcp.pipeline.run_summary import DetectionSummary, Stopwatch, SummaryBuilde
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.report.contact_sheet import ContactSheet
 from kgcp.settings import DetectSettings
+from kgcp.targets.plain import shape_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +196,7 @@ def detect_flight(
             if sheet is not None:
                 sheet.clear()
             with stopwatch.stage("table"):
-                rows = _rows(run, predictions, flight.camera, builder)
+                rows = _rows(run, predictions, flight, builder)
                 about = detections_provenance(
                     flight,
                     settings,
@@ -391,10 +391,11 @@ def _making(job: DetectionJob) -> dict[str, str]:
 def _rows(
     run: DetectionRun,
     predictions: Mapping[int, Mapping[str, Prediction]],
-    camera: Camera,
+    flight: Flight,
     builder: SummaryBuilder,
 ) -> Iterator[Row]:
+    shapes = {target.name: shape_of(target) for target in flight.all_targets}
     for row, result in enumerate(run.results()):
-        told = with_predictions(result, predictions.get(row, {}), camera)
+        told = with_predictions(result, predictions.get(row, {}), flight.camera)
         builder.add(told)
-        yield from detection_rows(told)
+        yield from detection_rows(told, shapes)

@@ -320,11 +320,14 @@ def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
         return outcome
     target = next(target for target in job.all_targets if target.name == outcome.target)
     common = common_uncertainty(job.camera, job.calibration_covariance, target, outcome.pose)
-    pose = outcome.pose
-    circle = Circles3D(
-        pose.translation_m[None],
-        pose.rotation[None, :, :2],
-        np.array([0.5 * target.outer_diameter_m]),
-    )
-    off = eccentricity(job.camera, circle).total_px[0]
+    if outcome.image is not None:
+        off = outcome.image.moments[:2] - outcome.centre_px
+    else:
+        pose = outcome.pose
+        circle = Circles3D(
+            pose.translation_m[None],
+            pose.rotation[None, :, :2],
+            np.array([0.5 * target.outer_diameter_m]),
+        )
+        off = eccentricity(job.camera, circle).total_px[0]
     return replace(outcome, common=common, eccentricity_px=off)

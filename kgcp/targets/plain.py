@@ -52,8 +52,8 @@ class PlainTarget:
         Position in the flight's CRS, and its standard deviations [m].
     sd_diameter_m : float
         How well the outer diameter is known [m]; the others are wrong by the same factor.
-    normal_enu : (3,) tuple of float
-        Unit normal, out of its front, in local axes east, north, up.
+    normal_enu : (3,) tuple of float, or None
+        Unit normal, out of its front, in local axes east, north, up; None: not known at all.
     sd_normal_deg : float
         Standard deviation of the normal about either axis square to it [deg].
     border_m : float or None
@@ -75,7 +75,7 @@ class PlainTarget:
     position_m: tuple[float, float, float]
     sd_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sd_diameter_m: float = 0.0
-    normal_enu: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    normal_enu: tuple[float, float, float] | None = (0.0, 0.0, 1.0)
     sd_normal_deg: float = SD_NORMAL_DEG
     border_m: float | None = None
     thickness_m: float = 0.0
@@ -101,9 +101,15 @@ class PlainTarget:
         if self.border_m is not None:
             require_range("border_m", self.border_m, 0.0, 100.0, unit="m", open_low=True)
         require_range("thickness_m", self.thickness_m, 0.0, 100.0, unit="m")
+        if self.normal_enu is None:
+            if self.thickness_m:
+                problem, remedy = "needs a normal", "give that, or the position of the face itself"
+                raise SettingError("thickness_m", problem, remedy)
+            return
         length = math.hypot(*self.normal_enu)
         if length < _SQUARE:
-            raise SettingError("normal", "has no direction", 'give [east, north, up] or "level"')
+            remedy = 'give [east, north, up], "level" or "free"'
+            raise SettingError("normal", "has no direction", remedy)
         x, y, z = (component / length for component in self.normal_enu)
         object.__setattr__(self, "normal_enu", (x, y, z))
 
@@ -130,3 +136,8 @@ class PlainTarget:
 
 AnyTarget = Target | PlainTarget
 """With a code or without."""
+
+
+def shape_of(target: AnyTarget) -> Shape:
+    """Return what is on a target."""
+    return target.shape if isinstance(target, PlainTarget) else Shape.CODED

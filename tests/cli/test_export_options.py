@@ -104,6 +104,7 @@ def _detection(index: int, time_s: float, sight: FloatArray) -> dict[str, object
         | {
             "frame": f"f_{index:02d}.jpg",
             "target": "A",
+            "shape": "coded",
             "time": time_cell(_UNIX_S + time_s),
             "instance": 0,
             "status": "measured",

@@ -91,6 +91,7 @@ def _detection(index: int) -> dict[str, object]:
     row = _NULL_ROW | {
         "frame": _FRAMES[index],
         "target": "A",
+        "shape": "coded",
         "time": time_cell(_UNIX_S + index),
         "instance": 0,
         "status": "measured",

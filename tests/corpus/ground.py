@@ -146,6 +146,7 @@ def write_detections(path: Path, settings: str = "{}", **cells: object) -> None:
     words: dict[str, object] = {
         "frame": "sound.png",
         "target": "A",
+        "shape": "coded",
         "scale_used": "A",
         "status": "measured",
     }

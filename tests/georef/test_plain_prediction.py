@@ -10,7 +10,12 @@ import pytest
 
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.georef.plain_prediction import predict_plain, reference_orientations
+from kgcp.georef.plain_prediction import (
+    MarkedPlace,
+    predict_marked,
+    predict_plain,
+    reference_orientations,
+)
 from kgcp.georef.target_positions import static_position
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import read_flight
@@ -36,6 +41,7 @@ def test_deviations_cover_the_errors_of_the_poses(made: Path) -> None:
         assert np.abs(off_px).max() < 4.0 * one.sd_px
         # 2 cm at 25 m and 0.02° make 0.6 px, besides 1 px at least
         assert 1.0 < one.sd_px < 1.5
+        assert one.normal is not None
         assert one.normal.direction_camera @ centre_m > 0.9 * np.linalg.norm(centre_m)
         assert np.linalg.norm(one.position_m - centre_m) < 0.1
         assert "the reference" in str(one)
@@ -93,3 +99,26 @@ def test_correlated_errors_of_a_pose_cancel(made: Path) -> None:
     correlated, not_correlated = (named["white"].sd_px for named in made_of)
     assert correlated == pytest.approx(1.0, abs=0.1)
     assert not_correlated > 5.0
+
+
+def test_a_free_normal_is_that_of_no_plane(made: Path) -> None:
+    flight = read_flight(made)
+    data = FlightData(flight, ["f_0.png"])
+    positions = data.static_positions
+    orientation = reference_orientations(data.reference_poses, positions.local_frame)["f_0.png"]
+    free = [replace(target, normal_enu=None) for target in flight.plain_targets]
+    for target in free:
+        one = predict_plain(free, orientation, positions, CAMERA)[target.name]
+        assert one.normal is None
+        assert not one.is_from_behind()
+        along = one.position_m / np.linalg.norm(one.position_m)
+        assert one.prior.direction_camera == pytest.approx(along)
+        assert one.prior.sd_deg > 45.0
+    pixels = CAMERA.project(PlainFlight(frames=1).centres_m(0)).tolist()
+    marks = {
+        target.name: MarkedPlace(x, y, 2.0) for target, (x, y) in zip(free, pixels, strict=True)
+    }
+    tilted = replace(free[0], normal_enu=(0.6, 0.0, 0.8))
+    marked = predict_marked([tilted, *free[1:]], marks, positions, CAMERA)
+    assert [*marked] == [target.name for target in free[1:]]
+    assert all(one.normal is None for one in marked.values())

@@ -14,7 +14,7 @@ from kgcp.errors import Reason
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
-from kgcp.geometry.pose import Pose
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.adjustment.covariance import propagate
 from kgcp.measurement.image_model.srgb import srgb_encoded
 from kgcp.measurement.plain_pose import (
@@ -29,7 +29,7 @@ from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement, Miss, Outcome
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, image_plate
-from kgcp.targets.plain import PlainPolarity, PlainTarget
+from kgcp.targets.plain import PlainPolarity, PlainTarget, Shape
 
 CAMERA = Camera(200, 160, 900.0, 900.0, 101.3, 78.4, k1=-0.08, response=Response.LINEAR)
 NORMAL = np.array([math.sin(0.4), 0.0, math.cos(0.4)])
@@ -166,6 +166,55 @@ def test_refuses_the_other_polarity_and_another_shape() -> None:
 
 def pose_tilted(pose: Pose) -> Pose:
     return pose_towards(pose.translation_m, np.array([math.sin(0.9), 0.0, math.cos(0.9)]))
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 40.0, 55.0])
+@pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
+def test_a_free_normal_leaves_two_centres(target: PlainTarget, tilt_deg: float) -> None:
+    """The place is their mean: it is off by half of what they differ by, and says so.
+
+    Circles that are each measured by themselves tell which of the two it is.
+    """
+    target = replace(target, normal_enu=None)
+    along = pose_at(90.4, 71.7, target).translation_m
+    axis = np.cross(along, [0.3, 0.8, 0.1])
+    turn = rotation_about(math.radians(tilt_deg) * axis / np.linalg.norm(axis))
+    pose = pose_towards(along, turn @ along / np.linalg.norm(along))
+    prediction = replace(prediction_of(pose, (5.0, -4.0)), normal=None)
+    outcome = looked(frame_with((target, pose)), prediction, target)
+    assert isinstance(outcome, Measurement)
+    assert outcome.uncertainty is not None
+    off_px = outcome.centre_px - CAMERA.project(along[None])[0]
+    cov_px2 = outcome.uncertainty.centre_cov_px2
+    assert off_px @ np.linalg.solve(cov_px2, off_px) < 12.0
+    tilt_rad = math.radians(tilt_deg)
+    half_px = RADIUS_PX**2 / CAMERA.fx * 0.5 * math.sin(2.0 * tilt_rad)
+    is_told = target.shape is Shape.RING and tilt_deg == 20.0
+    least_px, most_px = (0.0, 0.005) if is_told else (half_px, 1.2 * half_px + 0.015)
+    assert least_px**2 < np.trace(cov_px2) < most_px**2
+    assert outcome.image is not None
+    centroid, *_ = circle_images(CAMERA, circles_about(pose, np.array(target.radii_m))).moments
+    error = outcome.image.moments - centroid
+    assert error @ np.linalg.solve(outcome.image.cov, error) < 20.5  # 99.9 % of five
+    off_m = outcome.distance_m - pose.distance_m
+    assert abs(off_m) < 4.0 * outcome.uncertainty.sd_distance_m < 0.02 * pose.distance_m
+    if tilt_deg:
+        assert outcome.alternative is not None
+        assert (outcome.alternative.ambiguity > 20.0) is is_told
+        assert (outcome.alternative.ambiguity < 0.5) is not is_told
+        normals = (outcome.pose.normal, outcome.alternative.pose.normal)
+        assert max(float(each @ pose.normal) for each in normals) > math.cos(math.radians(1.5))
+
+
+def test_a_free_normal_asks_for_a_size_and_some_width() -> None:
+    target = replace(DISC, normal_enu=None)
+    for size, tilt_rad in ((1.2, 0.3), (0.8, 0.3), (1.0, 1.2)):
+        pose = pose_towards(
+            pose_at(90.4, 71.7).translation_m,
+            np.array([math.sin(tilt_rad), 0.0, math.cos(tilt_rad)]),
+        )
+        prediction = replace(prediction_of(pose, size=size), normal=None)
+        assert isinstance(looked(frame_with((target, pose)), prediction, target), Miss)
 
 
 @pytest.mark.parametrize("uneven_px", [0.0, 0.35])

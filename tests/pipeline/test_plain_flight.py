@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from kgcp.cli import main
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import rotation_about
+from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import read_table
@@ -28,7 +29,16 @@ from kgcp.pipeline.ground.place import PlaceOptions, place_flight
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, image_plate
 from kgcp.targets.layout import Target
-from tests.plain_flight import CAMERA, CODED, TARGETS, PlainFlight, coded_ring, plain_target
+from tests.plain_flight import (
+    CAMERA,
+    CODED,
+    CRS,
+    ORIGIN_MAP,
+    TARGETS,
+    PlainFlight,
+    coded_ring,
+    plain_target,
+)
 
 FOUR = (*TARGETS, plain_target("fourth", (0.3, -3.3), 0.8))
 FLIGHT = PlainFlight(targets=FOUR, moving=Target(coded_ring("car", (0, 43, 78, 180))))
@@ -98,6 +108,51 @@ def test_four_discs_orient_frames_check_a_vehicle_and_are_placed(folder: Path) -
         assert len(points) == FLIGHT.frames * (len(FOUR) + 1)
     finally:
         (folder / "flight.toml").write_text(text, encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Around(PlainFlight):
+    """The camera looks at the targets from all sides."""
+
+    def cameras(self) -> tuple[FloatArray, FloatArray]:
+        around = np.linspace(0.0, 2.0 * np.pi, self.frames, endpoint=False) + 0.3
+        centres = np.stack((9.0 * np.cos(around), 9.0 * np.sin(around), 0.0 * around + 18.0), -1)
+        rotations = [pose_towards(c, -c / np.linalg.norm(c)).rotation for c in centres]
+        return centres, np.array(rotations)
+
+
+def test_frames_tell_how_targets_lie_whatever_is_stated(tmp_path: Path) -> None:
+    """One on a roof, one said to be level, which is not: no frame's prior is in the result."""
+    roof, tilted = (0.5, -0.2, 1.0), (-0.1, 0.05, 1.0)
+    free = replace(plain_target("roof", (2.0, 2.0), 0.8), normal_enu=None)
+    targets = (free, plain_target("tilted", (-2.5, -1.0), 0.7, polarity="dark"))
+    made = Around(
+        targets=targets,
+        frames=6,
+        sd_position_m=0.0002,
+        sd_angle_deg=0.0005,
+        true_normals={"roof": roof, "tilted": tilted},
+    )
+    made.write(tmp_path)
+    run("detect", tmp_path, "--jobs", "0")
+    rows = detections(tmp_path)
+    assert set(rows["status"]) == {"measured"}
+    assert set(rows["shape"]) == {"disc"}
+    run("place", tmp_path)
+    table = pd.read_parquet(tmp_path / "kgcp" / "places.parquet").set_index("target")
+    for target, normal in zip(targets, (roof, tilted), strict=True):
+        row = table.loc[target.name]
+        on_map = row[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64)
+        found = LocalFrame.at(CRS, ORIGIN_MAP).grid_rotation(np.zeros(3)) @ on_map
+        off_deg = np.degrees(np.arccos(found @ normal / np.linalg.norm(normal)))
+        assert off_deg < 4.0 * row["sd_normal_deg"] < 0.5
+        off_m = row[["x", "y", "z"]].to_numpy(np.float64) - target.position_m
+        sd_m = row[["sd_x", "sd_y", "sd_z"]].to_numpy(np.float64)
+        assert np.all(np.abs(off_m) < 4.0 * sd_m)
+        assert sd_m.max() < 0.0006
+        assert abs(row["diameter_residual_m"]) < 4.0 * row["sd_diameter_residual_m"] < 0.005
+        assert row["frames_used"] == made.frames
+        assert row["shape"] == "disc"
 
 
 def test_they_are_among_the_targets_of_a_check(folder: Path) -> None:

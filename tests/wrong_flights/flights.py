@@ -202,6 +202,7 @@ class Flight:
         row = _NULL_ROW | {
             "frame": self.frames[index],
             "target": "A",
+            "shape": "coded",
             "time": time_cell(float(self.frame_s[index])),
             "instance": 0,
             "status": "not_found",

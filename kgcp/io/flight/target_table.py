@@ -24,7 +24,7 @@ PLAIN_KEYS = (
     *("name", "shape", "polarity", "diameter_m", "inner_diameter_m", "sd_diameter_m"),
     *("position_m", "sd_position_m", "normal", "level_sd_deg", "border_m", "thickness_m"),
 )
-_LEVEL = "level"
+_LEVEL, _FREE = "level", "free"  # normals
 _MOST_TARGETS = 200  # each is compared with every other
 REPLICA_KEYS = ("name", "replica_of", "scale", "code_deg")
 
@@ -139,11 +139,17 @@ def _inner_diameters_m(table: TomlTable) -> tuple[float, ...]:
     return (table.number("inner_diameter_m"),)
 
 
-def _read_normal(table: TomlTable) -> tuple[float, float, float]:
+def _read_normal(table: TomlTable) -> tuple[float, float, float] | None:
     up = (0.0, 0.0, 1.0)
-    if table.values.get("normal", _LEVEL) == _LEVEL:
+    written = table.values.get("normal", _LEVEL)
+    if written == _LEVEL:
         return up
-    return table.vector("normal", example='[east, north, up] or "level"')
+    if written == _FREE:
+        if "level_sd_deg" in table:
+            problem = "is given of a normal that is free"
+            raise table.error("level_sd_deg", problem, "delete one of the two")
+        return None
+    return table.vector("normal", example='[east, north, up], "level" or "free"')
 
 
 def _read_sd_position_m(table: TomlTable) -> tuple[float, float, float]:

@@ -40,6 +40,7 @@ from kgcp.io.tables.parquet import read_table
 from kgcp.io.tables.staleness import require_current
 from kgcp.measurement.records import (
     Alternative,
+    CircleImage,
     CommonUncertainty,
     FrameResult,
     Measurement,
@@ -49,6 +50,7 @@ from kgcp.measurement.records import (
 )
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.settings import DetectSettings, Method
+from kgcp.targets.plain import Shape
 
 if TYPE_CHECKING:  # 0.3 s that `kgcp detect` does not need
     import pandas as pd
@@ -59,7 +61,7 @@ _LARGEST = 1e12  # of any number in a table, in its unit: beyond, as if it were 
 _MOST_PX = 1e6  # of the place of a target
 _LEAST_M, _MOST_M = 1e-3, 1e6  # of a distance
 _Part = TypeVar("_Part")
-_Record = tuple[FrameResult, Outcome]
+_Record = tuple[FrameResult, Outcome, Shape]
 _Get = Callable[[_Record], object]
 
 
@@ -111,6 +113,10 @@ def _eccentricity(seen: Measurement) -> FloatArray | None:
     return seen.eccentricity_px
 
 
+def _image(seen: Measurement) -> CircleImage | None:
+    return seen.image
+
+
 @lru_cache(maxsize=2)
 def _quaternion(pose: Pose) -> list[float]:
     quaternion: list[float] = pose.quaternion_wxyz.tolist()
@@ -120,6 +126,7 @@ def _quaternion(pose: Pose) -> list[float]:
 DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("frame", TEXT, _frame(lambda result: result.frame)),
     Column("target", TEXT, lambda record: record[1].target),
+    Column("shape", TEXT, lambda record: record[2].value),
     Column("time", TIME, _frame(lambda result: time_cell(result.time_s))),
     Column("time_source", TEXT, _frame(lambda result: result.time_source.value)),
     Column("instance", INTEGER, _outcome(lambda seen: seen.instance, lambda _: 0)),
@@ -160,6 +167,8 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
     Column("ecc_x_px", NUMBER, _part(_eccentricity, lambda off: float(off[0]))),
     Column("ecc_y_px", NUMBER, _part(_eccentricity, lambda off: float(off[1]))),
+    Column("moments", NUMBERS, _part(_image, lambda image: matrix_cell(image.moments))),
+    Column("moments_cov", NUMBERS, _part(_image, lambda image: matrix_cell(image.cov))),
     Column("score", NUMBER, _outcome(lambda seen: _finite(seen.score), lambda miss: miss.score)),
     Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
     Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),
@@ -173,14 +182,22 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
 )
 
 
-def detection_rows(result: FrameResult) -> list[Row]:
-    """Return the rows of one frame, one per target and instance, by target and instance."""
+def detection_rows(result: FrameResult, shapes: Mapping[str, Shape]) -> list[Row]:
+    """Return the rows of one frame, one per target and instance, by target and instance.
+
+    Parameters
+    ----------
+    shapes : mapping of str to Shape
+        Of all targets, by their names.
+    """
 
     def place(outcome: Outcome) -> tuple[str, int]:
         return outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance
 
     outcomes = sorted(result.outcomes, key=place)
-    return [row_of(DETECTION_COLUMNS, (result, outcome)) for outcome in outcomes]
+    return [
+        row_of(DETECTION_COLUMNS, (result, outcome, shapes[outcome.target])) for outcome in outcomes
+    ]
 
 
 def read_detections(path: Path | str, *, status: str | None = None) -> pd.DataFrame:
@@ -355,6 +372,7 @@ def _sighting(row: _Cells, number: int, time_s: float | None) -> Sighting:
         score=_number(row, "score"),
         ambiguity=_number(row, "ambiguity"),
         common_pose_cov=_square(row, "common_pose_cov", 6),
+        image=_circle_image(row),
     )
 
 
@@ -371,6 +389,13 @@ def _pose(row: _Cells) -> Pose | None:
         )
     rotation = Rotation.from_quat(components, scalar_first=True)
     return Pose(rotation.as_matrix(), np.array(translation, float))
+
+
+def _circle_image(row: _Cells) -> CircleImage | None:
+    moments, cov = row["moments"], _square(row, "moments_cov", 5)
+    if cov is None or not isinstance(moments, np.ndarray) or moments.size != 5:
+        return None
+    return CircleImage(moments.astype(np.float64), cov)
 
 
 def _square(row: _Cells, name: str, size: int) -> FloatArray | None:

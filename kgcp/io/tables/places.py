@@ -64,6 +64,7 @@ def _sd_off(axis: int, placed: PlacedTarget) -> float | None:
 
 PLACE_COLUMNS: tuple[Column[PlacedTarget], ...] = (
     Column("target", TEXT, lambda placed: placed.target),
+    Column("shape", TEXT, lambda placed: placed.shape.value),
     *(Column(a, NUMBER, partial(_position, i)) for i, a in enumerate(_AXES)),
     *(Column(f"sd_{a}", NUMBER, partial(_sd_position, i)) for i, a in enumerate(_AXES)),
     *(Column(f"normal_{a}", NUMBER, partial(_normal, i)) for i, a in enumerate(_AXES)),

@@ -185,7 +185,7 @@ def _plain_table(target: PlainTarget) -> dict[str, object]:
         "inner_diameter_m": inner_m,
         "sd_diameter_m": target.sd_diameter_m,
         "position_m": target.position_m,
-        "normal": target.normal_enu,
+        "normal": "free" if target.normal_enu is None else target.normal_enu,
         "level_sd_deg": target.sd_normal_deg,
         "border_m": target.border_m,
         "thickness_m": target.thickness_m,

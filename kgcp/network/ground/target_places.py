@@ -26,7 +26,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circles
-from kgcp.targets.plain import AnyTarget
+from kgcp.targets.plain import AnyTarget, Shape, shape_of
 
 _FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose
 _CODED_EDGE_SD_PX = 0.0  # displaced edges are an unknown of every measurement of a coded ring
@@ -40,6 +40,8 @@ class PlacedTarget:
     ----------
     target : str
         Name in flight.toml.
+    shape : Shape
+        What is on it.
     frames : tuple of str
         All n frames with the target and a known orientation.
     is_used : (n,) array
@@ -69,6 +71,7 @@ class PlacedTarget:
     """
 
     target: str
+    shape: Shape
     frames: tuple[str, ...]
     is_used: BoolArray
     residuals: FloatArray
@@ -194,17 +197,7 @@ def place_targets(
             skipped[target.name] = _too_few(mine, posed, rows, min_frames)
             continue
         at = [rows[each.frame] for each in posed]
-        measured = [
-            (each.pose, each.pose_cov)
-            for each in posed
-            if each.pose is not None and each.pose_cov is not None
-        ]
-        moments, cov = ring_images(
-            camera,
-            [pose for pose, _ in measured],
-            [cov for _, cov in measured],
-            0.5 * target.outer_diameter_m,
-        )
+        moments, cov = _images(camera, posed, 0.5 * target.outer_diameter_m)
         usable.append(target)
         all_frames.append(tuple(each.frame for each in posed))
         all_views.append(
@@ -267,6 +260,23 @@ def _exterior_cov(poses: ReferencePoses, orientations: ExteriorOrientations) -> 
     return cov
 
 
+def _images(
+    camera: Camera, sightings: Sequence[Sighting], radius_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return moments (n, 5) and covariances (n, 5, 5) of a target's outer circle.
+
+    Those of a plain target were measured: its pose has what was assumed of its normal in it, which
+    n frames together would make √n times surer.
+    """
+    plain = [each.image for each in sightings if each.image is not None]
+    if len(plain) == len(sightings):
+        moments = np.array([each.moments for each in plain])
+        return moments, _with_floor(moments, np.array([each.cov for each in plain]))
+    poses = [each.pose for each in sightings if each.pose is not None]
+    covs = [each.pose_cov for each in sightings if each.pose_cov is not None]
+    return ring_images(camera, poses, covs, radius_m)
+
+
 def ring_images(
     camera: Camera, poses: Sequence[Pose], pose_covs: Sequence[FloatArray], radius_m: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -287,10 +297,15 @@ def ring_images(
     slopes = circle_slopes(camera, circles)
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
     cov = by_pose @ np.array(pose_covs) @ np.swapaxes(by_pose, 1, 2)
+    return moments, _with_floor(moments, cov)
+
+
+def _with_floor(moments: FloatArray, cov: FloatArray) -> FloatArray:
+    """Return covariances (n, 5, 5) of which none is smaller than prints allow."""
     size = np.sqrt(np.maximum(moments[:, 2] + moments[:, 4], 0.0))
     floor = np.ones((len(moments), 5))
     floor[:, 2:] = size[:, None]
-    return moments, cov + _FLOOR_PX**2 * floor[:, :, None] ** 2 * np.eye(5)
+    return np.asarray(cov + _FLOOR_PX**2 * floor[:, :, None] ** 2 * np.eye(5))
 
 
 def _circles(poses: Sequence[Pose], radius_m: float) -> Circles3D:
@@ -320,6 +335,7 @@ def _on_the_map(
     other = placed.other
     return PlacedTarget(
         target=target.name,
+        shape=shape_of(target),
         frames=frames,
         is_used=fit.is_used,
         residuals=fit.residuals,

@@ -88,6 +88,14 @@ thickness_m = 0.03
     )
 
 
+@pytest.mark.parametrize(("written", "normal"), [("level", (0.0, 0.0, 1.0)), ("free", None)])
+def test_a_normal_in_words(
+    tmp_path: Path, written: str, normal: tuple[float, float, float] | None
+) -> None:
+    (target,) = read(tmp_path, _HEAD, f'{_DISC}normal = "{written}"\n')
+    assert target.normal_enu == normal
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -100,6 +108,14 @@ thickness_m = 0.03
         (("diameter_m = 0.3", "outer_diameter_m = 0.3"), "outer_diameter_m: is not a known key"),
         (("diameter_m = 0.3", 'diameter_m = 0.3\nnormal = "up"'), "normal: is a text"),
         (("diameter_m = 0.3", "diameter_m = nan"), "not a finite number"),
+        (
+            ("diameter_m = 0.3", 'diameter_m = 0.3\nnormal = "free"\nlevel_sd_deg = 5'),
+            "level_sd_deg: is given of a normal that is free",
+        ),
+        (
+            ("diameter_m = 0.3", 'diameter_m = 0.3\nnormal = "free"\nthickness_m = 0.1'),
+            "thickness_m: needs a normal",
+        ),
     ],
 )
 def test_one_line_for_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str) -> None:

@@ -17,6 +17,7 @@ from kgcp.io.tables.parquet import write_table
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
+    CircleImage,
     CommonUncertainty,
     ExposureSettings,
     FrameResult,
@@ -24,6 +25,7 @@ from kgcp.measurement.records import (
     Miss,
     Uncertainty,
 )
+from kgcp.targets.plain import Shape
 
 POSE = Pose(
     Rotation.from_rotvec(np.radians([8.0, -5.0, 40.0])).as_matrix(), np.array([1.0, -2.0, 14.0])
@@ -42,11 +44,13 @@ FULL = Measurement(
     uncertainty=Uncertainty(COV, np.array([[4e-4, 1e-5], [1e-5, 9e-4]]), 0.03, 0.2, 0.3, 0.1),
     common=CommonUncertainty(2.0 * COV, 0.05, 0.4),
     eccentricity_px=np.array([0.12, -0.03]),
+    image=CircleImage(np.array([511.12, 383.97, 400.0, -3.0, 410.0]), np.diag(np.arange(1.0, 6.0))),
 )
-BARE = replace(FULL, instance=1, alternative=None, uncertainty=None, common=None)
+BARE = replace(FULL, instance=1, alternative=None, uncertainty=None, common=None, image=None)
 NAMES = [column.name for column in DETECTION_COLUMNS]
+SHAPES = {"A": Shape.CODED, "B": Shape.RING, "C": Shape.DISC}
 ABOUT_THE_FRAME = {
-    *("frame", "target", "time", "instance", "status", "reason", "detail", "candidates"),
+    *("frame", "target", "shape", "time", "instance", "status", "reason", "detail", "candidates"),
     *("guided", "scale_used", "time_source"),
 }
 EXPOSURE = {"exposure_time_s", "iso", "f_number"}
@@ -59,15 +63,16 @@ FRAME = FrameResult(
 
 
 def test_every_row_has_every_declared_column() -> None:
-    for row in detection_rows(FRAME):
+    for row in detection_rows(FRAME, SHAPES):
         assert list(row) == NAMES
 
 
 def test_rows_are_sorted_by_target_and_instance() -> None:
-    rows = detection_rows(FRAME)
+    rows = detection_rows(FRAME, SHAPES)
     assert [(row["target"], row["instance"]) for row in rows] == [
         ("A", 0), ("B", 0), ("B", 1), ("C", 0),
     ]  # fmt: skip
+    assert [row["shape"] for row in rows] == ["coded", "ring", "ring", "disc"]
     assert {row["frame"] for row in rows} == {"east/0007.jpg"}
     assert {row["time"] for row in rows} == {datetime(2026, 6, 16, 8, 15, 0, 250_000, UTC)}
     assert {(row["exposure_time_s"], row["iso"], row["f_number"]) for row in rows} == {
@@ -76,7 +81,7 @@ def test_rows_are_sorted_by_target_and_instance() -> None:
 
 
 def test_a_whole_observation_leaves_nothing_empty() -> None:
-    row = detection_rows(FRAME)[1]
+    row = detection_rows(FRAME, SHAPES)[1]
     assert [name for name in NAMES if row[name] is None] == []
     assert (row["status"], row["reason"], row["scale_used"]) == ("measured", "", "B-inner")
     assert row["distance_m"] == pytest.approx(np.sqrt(201.0))
@@ -91,14 +96,17 @@ def test_a_whole_observation_leaves_nothing_empty() -> None:
 
 
 def test_what_a_method_does_not_give_is_null() -> None:
-    row = detection_rows(FRAME)[2]
+    row = detection_rows(FRAME, SHAPES)[2]
     empty = {name for name in NAMES if row[name] is None}
     deviations = {name for name in NAMES if name.startswith(("sd_", "alt_"))}
-    assert empty == deviations | {"cov_xy_px2", "pose_cov", "common_pose_cov", "ambiguity"}
+    of_plain = {"moments", "moments_cov"}
+    assert empty == deviations | of_plain | {
+        *("cov_xy_px2", "pose_cov", "common_pose_cov", "ambiguity"),
+    }
 
 
 def test_a_miss_has_its_reason_and_no_measurement() -> None:
-    first, *_, last = detection_rows(FRAME)
+    first, *_, last = detection_rows(FRAME, SHAPES)
     for row, status, reason, score, detail, candidates in (
         (first, "not_found", "no_candidate", None, "", 0),
         (last, "rejected", "cut", 0.7, "half of it", 3),
@@ -111,7 +119,9 @@ def test_a_miss_has_its_reason_and_no_measurement() -> None:
 
 @pytest.mark.parametrize("reason", Reason)
 def test_every_reason_makes_a_row(reason: Reason) -> None:
-    (row,) = detection_rows(FrameResult("a.png", None, ExposureSettings(), (Miss("A", reason),)))
+    (row,) = detection_rows(
+        FrameResult("a.png", None, ExposureSettings(), (Miss("A", reason),)), SHAPES
+    )
     assert (row["status"], row["reason"]) == (reason.status.value, reason.value)
     assert row["time"] is None
     assert row["status"] != "measured"
@@ -119,7 +129,7 @@ def test_every_reason_makes_a_row(reason: Reason) -> None:
 
 def test_rows_go_into_the_table_as_they_are(tmp_path: Path) -> None:
     path = tmp_path / "detections.parquet"
-    write_table(path, DETECTION_COLUMNS, detection_rows(FRAME), {})
+    write_table(path, DETECTION_COLUMNS, detection_rows(FRAME, SHAPES), {})
     table = read_detections(path)
     assert table.columns.to_list() == NAMES
     assert table["distance_m"].notna().to_list() == [False, True, True, False]
