@@ -30,7 +30,7 @@ from kgcp.measurement.discs.adjust_disc import geometry_of
 from kgcp.measurement.discs.covariance import moments_by_stretch
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.plain_pose import CircleMoments, circles_about, fit_circles, pose_towards
-from kgcp.measurement.plain_prediction import SIGMAS, SMALLEST_BARE_PX, PlainPrediction
+from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_radius_px
 from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
@@ -102,12 +102,18 @@ class Looks:
         return slope, float(np.sqrt(np.mean(residual**2) / square))
 
 
-def target_of(kind: str, radius_px: float) -> PlainTarget:
-    """Return a target; its border is as wide in the image as it takes."""
+def target_of(kind: str, radius_px: float, *, is_free: bool = False) -> PlainTarget:
+    """Return a target; its border is as wide in the image as it takes.
+
+    Its normal is level, or free.
+    """
     shares, polarity, has_border = _KINDS[kind]
     border_m = 0.5 * _DIAMETER_M * _BORDER_PX / radius_px if has_border else None
     diameters = tuple(_DIAMETER_M * share for share in shares)
-    return PlainTarget("X", diameters, polarity, (0.0, 0.0, 0.0), border_m=border_m)
+    normal = None if is_free else (0.0, 0.0, 1.0)
+    return PlainTarget(
+        "X", diameters, polarity, (0.0, 0.0, 0.0), normal_enu=normal, border_m=border_m
+    )
 
 
 def look(
@@ -127,7 +133,7 @@ def look(
     if tone is not None:
         camera, sensor = replace(camera, response=Response.UNKNOWN), replace(sensor, tone=tone)
     rng = np.random.default_rng([int(10 * radius_px), *kind.encode()])
-    target, edges = target_of(kind, radius_px), _edge_covs(kind, radius_px)
+    target, edges = target_of(kind, radius_px, is_free=is_free), _edge_covs(kind, radius_px)
     reasons: Counter[str] = Counter()
     errors, sds, limits, z_distance, along, tilts = [], [], [], [], [], []
     shown, wrong, seconds, index = 0, 0, 0.0, 0
@@ -410,7 +416,7 @@ def _looked_at(
         height, width = photograph.shape
         focal = _FOCAL * width
         camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
-        target = target_of(kind, radius_px)
+        target = target_of(kind, radius_px, is_free=is_free)
         normal = rotation_about(np.append(rng.normal(0.0, 0.1, 2), 0.0)) @ down
         distance_m = focal * target.radii_m[0] / radius_px
         off_px = SD_PX * rng.standard_normal(2)
@@ -478,7 +484,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("kind              R px  found wrong   RMS px /bound     z  z(d)  trend 1e-3 px/°   ms")
     for kind in (chosen.kind or _KINDS) if chosen.count else ():
         for radius_px in _RADII_PX:
-            if radius_px < SMALLEST_BARE_PX and not _KINDS[kind][2]:
+            if radius_px < smallest_radius_px(target_of(kind, radius_px, is_free=chosen.free)):
                 continue  # it is not looked for
             print_looks(
                 look(kind, radius_px, chosen.count, grounds, chosen.tone, is_free=chosen.free)

@@ -10,7 +10,11 @@ import click
 from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from kgcp.io.images.remote import StoredFolder
+    from kgcp.pipeline.ground.device import DeviceFrame
+    from kgcp.pipeline.ground.field import FieldFrame
     from kgcp.pipeline.ground.orient import FlightPoses
 
 _MIN_POINTS = 4
@@ -48,6 +52,18 @@ _FEW_FRAMES = 3  # that are named
     help="Orient frames by an EO device in them instead, in its own frame: device.toml has its"
     " points.",
 )
+@click.option(
+    "--field",
+    "field_text",
+    metavar="FIELD",
+    help="Orient frames by a field of discs in them instead, in its own frame: a field.toml,"
+    " another program's board file, or a shorthand, as for 'kgcp calibrate'.",
+)
+@click.option(
+    "--unit",
+    type=click.Choice(("mm", "cm", "m", "in")),
+    help="Unit of a board file that does not say its unit, as BoofCV's.",
+)
 @detections_option
 @json_option
 def command(
@@ -59,6 +75,8 @@ def command(
     min_points: int | None,
     free_focal: bool,
     device_file: Path | None,
+    field_text: str | None,
+    unit: str | None,
     as_json: bool,
 ) -> None:
     """Orient frames by the static targets in them, without an adjustment.
@@ -69,19 +87,35 @@ def command(
     [reference] poses. Run 'kgcp detect' first.
 
     With --device, frames are oriented by plain discs within a closed boundary, whose arrangement
-    tells which is which. 'kgcp detect' is not needed. Writes device_poses.csv.
+    tells which is which. With --field, by the discs of a field, as 'kgcp calibrate' finds and names
+    them. 'kgcp detect' is not needed. Writes device_poses.csv or field_poses.csv.
 
     \b
     Examples:
       kgcp orient FLIGHT
       kgcp orient FLIGHT --device device.toml --free-focal
+      kgcp orient FLIGHT --field field.toml
     """  # noqa: D301 - \b is click's mark for lines that stay
-    if device_file is not None:
-        if detections is not None or min_points is not None:
-            raise click.UsageError("--device takes no --detections or --min-points; leave them out")
-        _orient_by_device(
-            flight, out, patterns, device_file, free_focal=free_focal, as_json=as_json
+    if unit is not None and field_text is None:
+        raise click.UsageError("--unit is that of a --field; leave it out")
+    if device_file is not None or field_text is not None:
+        _refuse_together(
+            {
+                "--device": device_file is not None,
+                "--field": field_text is not None,
+                "--detections": detections is not None,
+                "--min-points": min_points is not None,
+            }
         )
+        folder, target = _own_frame_folders(flight, out)
+        if device_file is not None:
+            _orient_by_device(
+                folder, target, patterns, device_file, free_focal=free_focal, as_json=as_json
+            )
+        elif field_text is not None:
+            _orient_by_field(
+                folder, target, patterns, (field_text, unit), free_focal=free_focal, as_json=as_json
+            )
         return
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
@@ -131,9 +165,26 @@ def _report(poses: FlightPoses) -> None:
         click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)
 
 
+def _refuse_together(given: Mapping[str, bool]) -> None:
+    """Refuse what goes with neither a device nor a field, and both of them at once."""
+    first, *others = (name for name, is_given in given.items() if is_given)
+    if others:
+        raise click.UsageError(f"{first} takes no {' or '.join(others)}; leave one out")
+
+
+def _own_frame_folders(
+    flight: Path | StoredFolder, out: Path | StoredFolder | None
+) -> tuple[Path, Path | None]:
+    from kgcp.errors import KgcpError
+
+    if isinstance(flight, Path) and (out is None or isinstance(out, Path)):
+        return flight, out
+    raise KgcpError(f"{flight}: frames are read from a disk here; copy them there")
+
+
 def _orient_by_device(
-    flight: Path | StoredFolder,
-    out: Path | StoredFolder | None,
+    flight: Path,
+    out: Path | None,
     patterns: tuple[str, ...],
     device_file: Path,
     *,
@@ -146,26 +197,49 @@ def _orient_by_device(
     from kgcp.pipeline.ground.device import orient_frames_by_device, write_device_poses
     from kgcp.pipeline.workspace import results_folder
 
-    if not isinstance(flight, Path) or (out is not None and not isinstance(out, Path)):
-        raise KgcpError(f"{flight}: frames with a device are read from a disk; copy them there")
     if not device_file.is_file():
         raise KgcpError(f"{device_file}: does not exist; name a device's file", option="device")
     device, the_flight = read_device(device_file), read_flight(flight)
     made = orient_frames_by_device(the_flight, device, patterns, has_free_focal=free_focal)
     path = write_device_poses(made, out or results_folder(flight))
+    _report_frames({"device": device.name}, made, path, as_json=as_json)
+
+
+def _orient_by_field(
+    flight: Path,
+    out: Path | None,
+    patterns: tuple[str, ...],
+    field_and_unit: tuple[str, str | None],
+    *,
+    free_focal: bool,
+    as_json: bool,
+) -> None:
+    from kgcp.io.flight.field_file import read_field
+    from kgcp.io.flight.flight import read_flight
+    from kgcp.pipeline.ground.field import orient_frames_by_field, write_field_poses
+    from kgcp.pipeline.workspace import results_folder
+
+    field, the_flight = read_field(*field_and_unit), read_flight(flight)
+    made = orient_frames_by_field(the_flight, field, patterns, has_free_focal=free_focal)
+    path = write_field_poses(made, out or results_folder(flight))
+    _report_frames({"field": field.name}, made, path, as_json=as_json)
+
+
+def _report_frames(
+    about: Mapping[str, str],
+    frames: Sequence[DeviceFrame] | Sequence[FieldFrame],
+    path: Path,
+    *,
+    as_json: bool,
+) -> None:
     if as_json:
         import json
 
-        oriented = sum(each.pose is not None for each in made)
-        reasons = {each.frame: each.reason for each in made if each.pose is None}
-        counts = {"frames": len(made), "oriented": oriented, "not_oriented": reasons}
-        click.echo(json.dumps({"device": device.name, **counts, "files": [str(path)]}))
-    for each in made:
-        if each.pose is None:
-            click.echo(f"{each.frame}: not oriented: {each.reason}", err=True)
-        else:
-            click.echo(
-                f"{each.frame}: RMS {each.pose.rms_px:.3f} px, margin {each.pose.margin:.0f}",
-                err=True,
-            )
+        oriented = sum(each.pose is not None for each in frames)
+        reasons = {each.frame: each.reason for each in frames if each.pose is None}
+        counts = {"frames": len(frames), "oriented": oriented, "not_oriented": reasons}
+        click.echo(json.dumps({**about, **counts, "files": [str(path)]}))
+    for each in frames:
+        outcome = f"not oriented: {each.reason}" if each.pose is None else each.pose.in_words
+        click.echo(f"{each.frame}: {outcome}", err=True)
     click.echo(f"wrote {path}", err=True)

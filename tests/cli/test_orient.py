@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +17,14 @@ from benchmarks.ground.orient import DEVICE_M
 from kgcp.cli import main
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.io.flight.field_file import field_toml
 from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
 from kgcp.io.tables.parquet import write_table
+from kgcp.pipeline.calibration.simulation import FieldSimulation
 from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
 from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.presets import preset
+from kgcp.targets.fields.layout import Field, GridKind, Mark
 from tests.ground_flight import GroundFlight
 
 
@@ -200,10 +205,80 @@ def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> N
     assert np.abs(table[["x", "y", "z"]].to_numpy()[0] - centre).max() < 0.02
 
 
-def test_options_of_detections_are_not_taken_with_a_device(tmp_path: Path) -> None:
-    result = run("orient", tmp_path, "--device", tmp_path / "device.toml", "--min-points", "5")
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--device", "device.toml", "--min-points", "5"), "--device takes no --min-points;"),
+        (("--field", "grid:5x4:30mm", "--detections", "d"), "--field takes no --detections;"),
+        (("--device", "device.toml", "--field", "grid:5x4:30mm"), "--device takes no --field;"),
+        (("--unit", "mm"), "--unit is that of a --field;"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    tmp_path: Path, options: tuple[str, ...], message: str
+) -> None:
+    result = run("orient", tmp_path, *options)
     assert result.exit_code == 2
-    assert "takes no --detections or --min-points" in result.stderr
+    assert message in result.stderr
+
+
+def field_flight(folder: Path) -> list[Pose]:
+    """A board in two frames, and one without; its file; the poses, field → camera."""
+    camera = Camera(320, 240, 330.0, 330.0, 163.0, 117.5, -0.08, response=Response.LINEAR)
+    board = Field(
+        "board",
+        GridKind.SQUARE,
+        columns=5,
+        rows=4,
+        pitch_m=0.03,
+        diameter_m=0.016,
+        marks=(Mark(1, 1, 0.016, 0.007),),
+        flat_sd_m=(1e-5, 1e-5, 3e-5),
+    )
+    simulation = FieldSimulation(board, replace(preset("clean"), camera=camera, frames=2), 4)
+    (folder / "frames").mkdir(parents=True)
+    poses = [simulation.take(folder / "frames", number) for number in range(2)]
+    cv2.imwrite(str(folder / "frames" / "void.png"), np.full((240, 320), 90, np.uint8))
+    names = ("width", "height", "fx", "fy", "cx", "cy", "k1")
+    camera_lines = [f"{key} = {getattr(camera, key)!r}" for key in names]
+    ring = "outer_diameter_m = 0.9\ninner_diameter_m = 0.45\ncode_diameter_m = 0.64"
+    lines = ["[camera]", *camera_lines, 'response = "linear"', "[[target]]", 'name = "A"', ring]
+    lines += ["dot_diameter_m = 0.12", "code_deg = [0, 43, 78]"]
+    (folder / "flight.toml").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "field.toml").write_text(field_toml(board), encoding="utf-8")
+    return poses
+
+
+def test_a_field_orients_frames_in_its_own_frame(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    poses = field_flight(folder)
+    result = run("orient", folder, "--field", folder / "field.toml", "--json")
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert (summary["field"], summary["frames"], summary["oriented"]) == ("board", 3, 2)
+    assert list(summary["not_oriented"]) == ["void.png"]
+    assert "void.png: not oriented: fewer than six discs like the field's" in result.stderr
+    table = pd.read_csv(folder / "kgcp" / "field_poses.csv")
+    assert "of 20 discs" in result.stderr
+    assert (table["discs_used"] >= 18).all()
+    for row, pose in zip(table.to_dict("records"), poses, strict=True):
+        centre = -pose.rotation.T @ pose.translation_m
+        off = (np.array([row[axis] for axis in "xyz"]) - centre) / [row[f"sd_{a}"] for a in "xyz"]
+        assert np.abs(off).max() < 4.0
+        assert max(row[f"sd_{axis}"] for axis in "xyz") < 0.002
+        assert row["rms_px"] < 0.3
+        assert row["focal_scale"] == 1.0
+    result = run("orient", folder, "--field", folder / "field.toml", "--frames", "void*")
+    assert result.exit_code == 1
+    assert "no frame can be oriented by the field 'board': fewer than six discs" in result.stderr
+
+
+def test_a_field_without_a_mark_does_not_tell_how_it_lies(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    field_flight(folder)
+    result = run("orient", folder, "--field", "grid:5x4:30mm:16mm")
+    assert result.exit_code == 1
+    assert "the field looks the same turned, and nothing tells how it lies" in result.stderr
 
 
 def test_a_symmetric_device_is_refused(tmp_path: Path) -> None:

@@ -264,9 +264,18 @@ def test_looks_only_where_it_is_told() -> None:
         assert outcome.reason is reason
 
 
-@pytest.mark.parametrize(("border_m", "least_px"), [(0.4, 2.5), (None, 3.0)])
-def test_the_smallest_disc_needs_even_ground(border_m: float | None, least_px: float) -> None:
-    pose, target = pose_at(90.4, 71.7), replace(DISC, border_m=border_m)
+@pytest.mark.parametrize(
+    ("target", "least_px"),
+    [
+        (DISC, 2.5),
+        (replace(DISC, border_m=None), 3.0),
+        (replace(DISC, normal_enu=None), 4.0),
+    ],
+)
+def test_the_smallest_disc_needs_even_ground_and_a_normal(
+    target: PlainTarget, least_px: float
+) -> None:
+    pose = pose_at(90.4, 71.7)
     grey = frame_with((target, pose))
     for radius_px, is_too_small in ((least_px - 0.01, True), (least_px + 0.01, False)):
         outcome = looked(grey, replace(prediction_of(pose), radius_px=radius_px), target)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,6 +16,7 @@ from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
 from kgcp.network.ground.frame_poses import FramePose
+from kgcp.network.ground.resection import CameraPose
 
 _AXES = "xyz"
 _ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
@@ -159,4 +160,27 @@ def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
                 frame, row.position_map, row.opk_deg, row.cov, is_geographic=is_geographic
             )
         )
+    return stream.getvalue()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnFramePose:
+    """A frame's pose in the frame of what it shows, and what else its row tells."""
+
+    frame: str
+    pose: CameraPose
+    cov: FloatArray  # (6, 6) or (7, 7): as of `Resection`
+    more: tuple[str, ...]
+
+
+def own_frame_poses_csv(rows: Iterable[OwnFramePose], more: Sequence[str]) -> str:
+    """Return poses in the columns of reference poses, with `focal_scale` and some more columns."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([*POSE_CSV_HEADER, "focal_scale", *more])
+    for row in rows:
+        pose = row.pose
+        opk_deg = opk_from_rotation((pose.world_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
+        cells = pose_csv_cells(row.frame, pose.centre_m, opk_deg, row.cov)
+        writer.writerow([*cells, f"{pose.focal_scale:.6f}", *row.more])
     return stream.getvalue()

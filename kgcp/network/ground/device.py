@@ -62,6 +62,11 @@ class DevicePose:
     rms_px: float
     margin: float
 
+    @property
+    def in_words(self) -> str:
+        """How well it fits."""
+        return f"RMS {self.rms_px:.3f} px, margin {self.margin:.0f}"
+
 
 def require_distinct(points_m: FloatArray) -> None:
     """Refuse a device (n, 3) that looks the same with its points exchanged.

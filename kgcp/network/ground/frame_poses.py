@@ -32,8 +32,11 @@ from kgcp.network.ground.resection import (
 FOCAL_SCALES = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 """Starts for an unknown focal length, as multiples of the camera's."""
 
-_SD_FOCAL = 0.7  # of the logarithm: a factor of two
-_DETERMINED = 0.05  # of a focal length that is determined
+SD_FOCAL = 0.7
+"""Of the logarithm of such a focal length: a factor of two."""
+FOCAL_DETERMINED = 0.05
+"""Relative standard deviation of a focal length that is determined, at most."""
+
 _LEAST_PLATE_FRAMES = 3  # that tell how a plate lies
 _AGREEING_CHI2 = 25.0  # of three coordinates, at most
 
@@ -170,12 +173,12 @@ def _by_points(
             point_images(usable, positions),
             min_points=min_points,
             focals=FOCAL_SCALES if has_free_focal else (1.0,),
-            sd_focal=_SD_FOCAL if has_free_focal else 0.0,
+            sd_focal=SD_FOCAL if has_free_focal else 0.0,
         )
     except NoPoseError as error:
         return FramePose(frame, names, None, None, (), str(error))
     sd_focal = math.sqrt(found.cov[6, 6]) if has_free_focal else None
-    if sd_focal is not None and sd_focal > _DETERMINED:
+    if sd_focal is not None and sd_focal > FOCAL_DETERMINED:
         reason = f"the focal length is not determined (± {100.0 * sd_focal:.0f} %)"
         return FramePose(frame, names, None, None, (), reason)
     return _of_resection(frame, names, found, sd_focal)

@@ -46,7 +46,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
-_LEARNED_FROM = 5  # photographs, what the camera does to grey values
+LEARNED_FROM = 5  # photographs, what the camera does to grey values
 _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
@@ -193,7 +193,7 @@ def calibrate_photos(
 
 def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> CameraTone | None:
     """Learn from some photographs what the camera does to all discs; None: each for itself."""
-    some = tuple(photos[:: max(len(photos) // _LEARNED_FROM, 1)][:_LEARNED_FROM])
+    some = tuple(photos[:: max(len(photos) // LEARNED_FROM, 1)][:LEARNED_FROM])
     with closing(pool.map(partial(learn_from_photos, task), [some])) as outcomes:
         ((_, learned),) = outcomes
     if isinstance(learned, TaskFailure):

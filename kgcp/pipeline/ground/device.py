@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from kgcp.errors import KgcpError, Rejection
-from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.io.files.atomic import write_bytes
 from kgcp.io.flight.device_file import EoDevice
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames, matching_frames, read_grey
-from kgcp.io.tables.poses import POSE_CSV_HEADER, pose_csv_cells
+from kgcp.io.tables.poses import OwnFramePose, own_frame_poses_csv
 from kgcp.measurement.enclosed_discs import centres_and_covariances, enclosed_discs
 from kgcp.network.ground.device import DevicePose, orient_by_device
 from kgcp.network.ground.resection import NoPoseError
@@ -97,22 +94,16 @@ def write_device_poses(frames: Sequence[DeviceFrame], folder: Path) -> Path:
     KgcpError
         If it cannot be written.
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*POSE_CSV_HEADER, "focal_scale", "rms_px", "margin"])
-    for each in frames:
-        if each.pose is None:
-            continue
-        pose = each.pose.pose
-        opk_deg = opk_from_rotation((pose.world_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
-        writer.writerow(
-            [
-                *pose_csv_cells(each.frame, pose.centre_m, opk_deg, each.pose.cov),
-                f"{pose.focal_scale:.6f}",
-                f"{each.pose.rms_px:.4f}",
-                f"{each.pose.margin:.1f}",
-            ]
+    rows = (
+        OwnFramePose(
+            each.frame,
+            each.pose.pose,
+            each.pose.cov,
+            (f"{each.pose.rms_px:.4f}", f"{each.pose.margin:.1f}"),
         )
+        for each in frames
+        if each.pose is not None
+    )
     path = folder / "device_poses.csv"
-    write_bytes(path, stream.getvalue().encode())
+    write_bytes(path, own_frame_poses_csv(rows, ("rms_px", "margin")).encode())
     return path
