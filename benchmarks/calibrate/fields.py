@@ -23,6 +23,7 @@ from kgcp.geometry.calibration import CALIBRATION_PARAMETERS
 from kgcp.geometry.camera import Camera, Response
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration_records import CalibrationSettings
+from kgcp.pipeline.calibration.results import light_of
 from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, find_photos
 from kgcp.pipeline.detect import NoProgress
 from kgcp.quality.calibration_verdict import calibration_numbers
@@ -206,7 +207,8 @@ def run(name: str, seed: int, jobs: int) -> tuple[np.ndarray, str]:
         made = calibrate_photos(photos, case.session.field, out, options, NoProgress())
         seconds = time.perf_counter() - began_s
     calibration = made.calibration
-    numbers, terms = calibration_numbers(calibration), calibration.network.model.names
+    light, terms = light_of(made), calibration.network.model.names
+    numbers = calibration_numbers(calibration, light)
     truth, camera = case.session.camera, calibration.camera
     listed, z = [], []
     for index, parameter in enumerate(CALIBRATION_PARAMETERS):
@@ -221,7 +223,7 @@ def run(name: str, seed: int, jobs: int) -> tuple[np.ndarray, str]:
         f"{numbers.discs:5}{numbers.rms_px:9.4f}{numbers.operator_sd_px:9.4f}"
         f"{calibration.precision.variance_factor:6.2f}{numbers.sd[0]:7.3f}{seconds:6.0f} s  "
     )
-    return np.array(z), f"{head}{rms(np.array(z)):5.2f}  {'  '.join(listed)}"
+    return np.array(z), f"{head}{rms(np.array(z)):5.2f}  {'  '.join(listed)}  {light.doubt}"
 
 
 def rms(values: np.ndarray) -> float:

@@ -35,6 +35,7 @@ from kgcp.network.calibration_records import (
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
 from kgcp.network.covariance import precision
 from kgcp.pipeline.calibration.photographs import Photo
+from kgcp.pipeline.calibration.results import light_of
 from kgcp.pipeline.calibration.run import (
     CalibrationOptions,
     PhotoCalibration,
@@ -64,6 +65,7 @@ class Set:
     focal: tuple[float, float] | None = None  # truth and largest error [px]
     centre: tuple[float, float, float] | None = None  # truth and largest error [px]
     is_centre_unknown: bool = False  # the principal point must not be claimed
+    is_negative: bool = False  # which the verdict must say
 
 
 SETS = (
@@ -91,7 +93,7 @@ SETS = (
     # negatives of dice_dark's first eleven: light adds to these discs, and does not multiply them
     Set(
         "dice_white", "dice_sim", "white_dot_*.jpeg", "sim_white_dot_input.xml", None,
-        11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5), None,
+        11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5), is_negative=True,
     ),
 )  # fmt: skip
 
@@ -129,7 +131,8 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     seconds = time.perf_counter() - began_s
     stiff = made.calibration
     fixed, free = (_by_all_terms(made, points) for points in (PointModel.FIXED, PointModel.FREE))
-    numbers = calibration_numbers(stiff)
+    light = light_of(made)
+    numbers = calibration_numbers(stiff, light)
     z = halves_z(stiff, halves) if halves else {}
     camera = stiff.camera
     eccentricity = np.linalg.norm(stiff.eccentricity.total_px, axis=1)
@@ -148,6 +151,8 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     if z:
         print("    halves z:", ", ".join(f"{name} {value:.2f}" for name, value in z.items()))
     failures = _failures(chosen, fixed, stiff, free, photos)
+    if bool(light.doubt) is not chosen.is_negative:
+        failures.append(f"light: {light.doubt or 'no doubt'}")
     for failure in failures:
         print(f"    {failure}")
     return len(failures)

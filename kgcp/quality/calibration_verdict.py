@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.records import PointPrior
+from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
 
@@ -55,6 +56,7 @@ class CalibrationNumbers:
     # (h, w): standard deviation of a pixel's ray, with turns of the camera taken out [px]
     ray_sd_px: FloatArray
     flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
+    light: DiscLight | None  # None: levels are not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,16 @@ class CalibrationVerdict:
         return f"{first}: {'; '.join(self.reasons)}." if self.reasons else f"{first}."
 
 
-def calibration_numbers(calibration: CameraCalibration) -> CalibrationNumbers:
-    """Return what the verdict and the report need."""
+def calibration_numbers(
+    calibration: CameraCalibration, light: DiscLight | None = None
+) -> CalibrationNumbers:
+    """Return what the verdict and the report need.
+
+    Parameters
+    ----------
+    light : DiscLight, optional
+        By `light_on_discs`, of the photographs that were used.
+    """
     camera, estimate = calibration.camera, calibration.solution.estimate
     places = np.concatenate([view.vectors[:, :2] for view in calibration.views])
     size = np.array([camera.width, camera.height])
@@ -100,6 +110,7 @@ def calibration_numbers(calibration: CameraCalibration) -> CalibrationNumbers:
         None
         if calibration.points_used is PointModel.FIXED
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
+        light,
     )
 
 
@@ -186,6 +197,8 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
         )
     if calibration.dropped:
         doubts.append(f"{len(calibration.dropped)} photographs do not fit the others")
+    if numbers.light is not None and numbers.light.doubt:
+        doubts.append(numbers.light.doubt)
     return doubts
 
 
@@ -211,4 +224,8 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
         advice.append(f"Not determined by these photographs: {names}; come nearer, and tilt more.")
     if calibration.is_turn_unclear:
         advice.append("Give the field a mark: one disc that is hollow, larger or missing.")
+    if numbers.light is not None and numbers.light.doubt:
+        advice.append(
+            "Give photographs as the camera took them, no negatives, and white not burnt."
+        )
     return tuple(advice)

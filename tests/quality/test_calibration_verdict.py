@@ -29,6 +29,7 @@ from kgcp.quality.calibration_verdict import (
     change_if_neglected,
     judge,
 )
+from kgcp.quality.disc_light import DiscLight
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
@@ -219,6 +220,14 @@ def test_a_fisheye_is_told() -> None:
     verdict = judge(result, calibration_numbers(result))
     assert verdict.grade is Grade.UNUSABLE
     assert "fisheye" in verdict.sentence
+
+
+def test_negatives_are_to_be_looked_at() -> None:
+    result = calibrated(views(), lens=LensModel.AUTO)
+    verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
+    assert verdict.grade is Grade.LOOK
+    assert "they look like negatives" in verdict.sentence
+    assert any("no negatives" in text for text in verdict.advice)
 
 
 def test_one_photograph_three_times_is_no_traceback() -> None:

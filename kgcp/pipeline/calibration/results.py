@@ -40,6 +40,7 @@ from kgcp.quality.calibration_verdict import (
     change_if_neglected,
     judge,
 )
+from kgcp.quality.disc_light import DiscLight, light_on_discs
 from kgcp.quality.frame_rays import compare_cameras
 from kgcp.report.calibration.figures import draw_comparison, draw_figures
 from kgcp.report.calibration.page import CalibrationPage, CameraComparison, render_calibration
@@ -86,6 +87,14 @@ def _require_formats(formats: Sequence[str], *, is_same_aspect: bool, k4: float)
         camera_file(CalibratedCamera(camera, np.eye(size), 0.0), form)
 
 
+def light_of(made: PhotoCalibration) -> DiscLight:
+    """Return what light does to the levels of the discs of all photographs that took part."""
+    return light_on_discs(
+        (discs.vectors[:, :2], discs.appearance[:, :2], discs.appearance[:, 3])
+        for discs in made.discs.values()
+    )
+
+
 def write_results(
     made: PhotoCalibration,
     out: Path,
@@ -107,7 +116,7 @@ def write_results(
         If a format cannot hold the camera, or a file cannot be written.
     """
     calibration = made.calibration
-    numbers = calibration_numbers(calibration)
+    numbers = calibration_numbers(calibration, light_of(made))
     verdict = judge(calibration, numbers)
     comparison = None
     if other is not None:
