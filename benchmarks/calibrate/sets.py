@@ -19,9 +19,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from benchmarks.calibrate.order import order_of
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Response
 from kgcp.io.flight.field_file import read_field
 from kgcp.measurement.discs.records import Operator
@@ -150,12 +152,33 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     print(f"    free, less what bends each photograph: {_unbent_px(free):.4f} px")
     if z:
         print("    halves z:", ", ".join(f"{name} {value:.2f}" for name, value in z.items()))
+    paths = {photo.name: photo.path for photo in photos}
+    greys = {view.photo: _grey(paths[view.photo]) for view in stiff.views}
+    order = order_of(made, greys)
+    print(f"    {order.line}")
+    print(f"    free, by photograph: {_by_photograph(free)} px")
     failures = _failures(chosen, fixed, stiff, free, photos)
+    failures += [f"wrong order: {photo}" for photo in order.wrong]
     if bool(light.doubt) is not chosen.is_negative:
         failures.append(f"light: {light.doubt or 'no doubt'}")
     for failure in failures:
         print(f"    {failure}")
     return len(failures)
+
+
+def _grey(path: Path) -> GreyArray:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+def _by_photograph(calibration: CameraCalibration) -> str:
+    """Return the RMS per point of the photographs with the best and the worst fit [px]."""
+    solution, view_of = calibration.solution, calibration.network.observations.view
+    each = [
+        (float(np.sqrt(np.mean(np.sum(solution.residuals[mine] ** 2, axis=1)))), view.photo)
+        for index, view in enumerate(calibration.views)
+        for mine in [solution.is_used & (view_of == index)]
+    ]
+    return " to ".join(f"{rms:.4f} ({photo})" for rms, photo in (min(each), max(each)))
 
 
 def _unbent_px(calibration: CameraCalibration) -> float:
