@@ -30,7 +30,7 @@ from kgcp.measurement.adjustment.plateaus import (
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.random_levels import asks_for_levels, even_field, fit_levels
 from kgcp.measurement.adjustment.skewed import asks_for_skew, with_skew
-from kgcp.measurement.adjustment.solver import adjust
+from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
 from kgcp.measurement.image_model.blur import Blur
@@ -40,8 +40,8 @@ from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
-# by which residuals that are alike enlarge the covariance: in 58 frames with dirt it is 3.9 to 5.7
-# of the five whose fit is beside the minimum, and below 3 of all but one of the others
+# by which residuals that are alike enlarge the covariance where levels vary: in 58 frames with dirt
+# it is 3.9 to 5.7 of the five whose fit is beside the minimum, and below 3 of nearly all others
 _STRAY_INFLATION = 3.0
 
 
@@ -84,7 +84,7 @@ def fit_in_any_light(
         except Rejection as rejection:
             failure = rejection
         else:
-            if each is base and pose_covariance(fits[each].best).inflation < _STRAY_INFLATION:
+            if each is base and _is_at_rest(fits[each].best):
                 break
     if not fits:
         raise failure
@@ -95,6 +95,11 @@ def fit_in_any_light(
     if advantage > 0.0:
         return FitsByTone(over_line, over_srgb, advantage)
     return FitsByTone(over_srgb, over_line, -advantage)
+
+
+def _is_at_rest(fit: TargetFit) -> bool:
+    """Tell whether a fit leaves nothing that looks as if it had come to rest beside the minimum."""
+    return fit.varied is None or pose_covariance(fit).inflation < _STRAY_INFLATION
 
 
 def _fit_in_any_light(

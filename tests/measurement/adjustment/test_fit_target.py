@@ -23,6 +23,8 @@ from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import InitialPose, Measurement, ToneBase
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
+from kgcp.simulation.light_field import Cloud, PlateLight
+from kgcp.simulation.light_settings import Dirt
 
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
@@ -169,7 +171,8 @@ def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
     """Residuals that are alike may mean a fit that came to rest beside the minimum."""
     camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
     pose = random_pose(camera, 40.0, rng)
-    grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=1.0)
+    dirt = PlateLight(cloud=Cloud.drawn(Dirt(sd=0.06, correlation_m=0.12), rng))
+    grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=1.0, field=dirt)
     start, known = start_near(camera, pose, rng), PlatePrior(tone_base=ToneBase.LINE)
     by_both = measure_by_model(grey, camera, TARGET, start)
     with monkeypatch.context() as patch:
