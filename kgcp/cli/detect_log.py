@@ -220,7 +220,8 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
     if summary.tone_base is not None:
         lines.append(
             f"tone curve near {summary.tone_base}, learnt from {summary.measured_with_tone}"
-            f" measurements; {summary.overruled_by_tone} of them would have taken another one"
+            f" measurements; {summary.overruled_by_tone} alone would have taken another one,"
+            f" {summary.kept_other_tone} keep another"
         )
     if summary.not_drawn:
         lines.append(f"rings not drawn because their frames are missing: {summary.not_drawn}")

@@ -59,10 +59,8 @@ _MOST_TRIES = 24  # edges that are measured per target
 # stretches than the arcs that the covariance is made from.
 _BARE = 3.0
 _SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
-_FREE_RATIO, _FREE_SCALE = (
-    0.5,
-    0.8,
-)  # of an edge's axes, at least; and what is sought, of the largest
+# of a normal that is free: least ratio of an edge's axes; what is sought, of the largest image
+_FREE_RATIO, _FREE_SCALE = 0.5, 0.8
 _SAME_NORMAL = 1.0 - 1e-8  # cosine between two solutions that are one
 _INNER_REACH, _LEAST_INNER_REACH_PX = 0.08, 1.2  # of the outer radius, of inner circles
 # Edges nearer to each other than this leave each other too few pixels, and are measured as one. On

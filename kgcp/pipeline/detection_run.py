@@ -57,6 +57,7 @@ from kgcp.quality.learnt_imaging import (
     by_base,
     learn_imaging,
 )
+from kgcp.settings import Method
 
 _REASONS = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
 
@@ -77,7 +78,7 @@ class ProgressListener(Protocol):
 
 
 class FirstSizes:
-    """The sizes of the first frames: all wrong and the same, they are not this camera's.
+    """The sizes of the first frames looked at: all wrong and the same, they are not this camera's.
 
     Parameters
     ----------
@@ -147,12 +148,13 @@ class DetectionRun:
             frame_input.frame: None if stamp is None else stamp[0]
             for frame_input, stamp in zip(inputs, stamps, strict=True)
         }
-        self._stamps, self._keys = stamps, [""] * len(inputs)  # no key: not looked at yet
+        self._stamps = stamps
+        self._keys = [""] * len(inputs)  # empty of frames that were not looked at yet
         self._stage, self._done, self._total = "", 0, 0
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
         self.learnt: LearntImaging | None = None
-        self._told_base: ToneBase | None = None
+        self._asked: set[str] = set()  # the frames that have told the base of the tone curve
         self._preferences: Mapping[Place, float] = {}
 
     def first_pass(self) -> None:
@@ -164,14 +166,21 @@ class DetectionRun:
             If the first frames all have one size, which is not the camera's, or frames vanish.
         """
         sizes = FirstSizes(len(self._inputs))
-        self._tell_what_is_kept()
-        self._begin("first look", 0, len(self._inputs))
-        batches = self._batches()
-        for rows in batches:
+        has_begun = False
+        for number, rows in enumerate(self._batches()):
+            if number:
+                self._settle_tone_base()
             todo = [row for row in rows if not self._is_kept(row, sizes)]
+            if todo and not has_begun:
+                self._tell_what_is_kept()
+                self._begin("first look", self.kept, len(self._inputs))
+                has_begun = True
+            elif has_begun:  # kept from before, after a frame that was not
+                self._advance(len(rows) - len(todo))
             self._look_at(todo, sizes)
-            if rows is not batches[-1]:
-                self._ask_for_tone_base()
+        if not has_begun:
+            self._tell_what_is_kept()
+            self._begin("first look", self.kept, len(self._inputs))
 
     def _batches(self) -> list[list[int]]:
         """Return the rows in the batches after which is asked what they say of the tone curve.
@@ -180,7 +189,9 @@ class DetectionRun:
         depends neither on the number of workers nor on interruptions.
         """
         count, camera = len(self._inputs), self._job.camera
-        if not self._job.settings.is_learning or camera.response is not Response.UNKNOWN:
+        settings = self._job.settings
+        is_asked = settings.is_learning and settings.method is Method.MODEL
+        if not is_asked or camera.response is not Response.UNKNOWN:
             return [[*range(count)]]
         spread = sorted(range(count), key=_bits_reversed)
         batches, first, last = [], 0, _FIRST_BATCH
@@ -191,7 +202,7 @@ class DetectionRun:
 
     def _is_kept(self, row: int, sizes: FirstSizes) -> bool:
         """Take the result of a frame from the journal, if it is there."""
-        key = _key(self._inputs[row], self._stamps[row], self._job.tone_base)
+        key = self._key(row, self._job.tone_base)
         self._keys[row] = key
         kept = self._journal.get(key)
         if kept is None:
@@ -199,7 +210,6 @@ class DetectionRun:
         self.tracks.add(row, kept)
         sizes.add(kept)
         self.kept += 1
-        self._advance()
         return True
 
     def _look_at(self, todo: Sequence[int], sizes: FirstSizes) -> None:
@@ -220,13 +230,16 @@ class DetectionRun:
                             f" looked at are all {sizes.wrong}; {Reason.WRONG_SIZE.remedy}"
                         )
 
-    def _ask_for_tone_base(self) -> None:
-        """Measure the other frames over one base alone, if those so far say which."""
+    def _settle_tone_base(self) -> None:
+        """Settle the base of frames that are not looked at yet, if those so far tell it."""
         if self._job.tone_base is None:
-            so_far = [self._journal.read(key) for key in self._keys if key]
-            self._told_base = base_of_some(so_far)
-            base = self._told_base or base_of_no_matter(so_far)
+            base = base_of_some(self._results_so_far())
+            base = base or base_of_no_matter(self._results_so_far())
             self._job = replace(self._job, tone_base=base)
+            self._asked = {result.frame for result in self._results_so_far()}
+
+    def _results_so_far(self) -> Iterator[FrameResult]:
+        return (self._journal.read(key) for key in self._keys if key)
 
     def guided_pass(
         self,
@@ -298,8 +311,9 @@ class DetectionRun:
         which of two normals is the likelier one, as far as the settings ask for either.
         """
         if self._job.settings.is_learning:
-            results = map(self._journal.read, self._keys)
-            self.learnt = learn_imaging(results, self._told_base)
+            base = self._job.tone_base
+            asked = None if base is None else self._asked
+            self.learnt = learn_imaging(self._results_so_far(), base, asked)
         if self._job.settings.is_guided:
             kept = map(self._journal.read, self._keys)
             self._preferences = preferences_of_neighbours(
@@ -356,8 +370,8 @@ class DetectionRun:
         if total:
             self._listener.progress(stage, done, total, self.tracks.found)
 
-    def _advance(self) -> None:
-        self._done += 1
+    def _advance(self, frames: int = 1) -> None:
+        self._done += frames
         self._listener.progress(self._stage, self._done, self._total, self.tracks.found)
 
     def _require_frame(self, result: FrameResult) -> None:
@@ -378,35 +392,41 @@ class DetectionRun:
             )
         in_journal = set(self._journal)
         names = {_name_of(key) for key in in_journal}
-        kept = changed = 0
-        for frame_input, stamp in zip(self._inputs, self._stamps, strict=True):
-            keys = {_key(frame_input, stamp, base) for base in (None, *ToneBase)}
-            if not keys.isdisjoint(in_journal):
-                kept += 1
-            elif _name_of(keys.pop()) in names:
+        is_settled = self._job.tone_base is not None
+        bases = (self._job.tone_base,) if is_settled else (None, *ToneBase)
+        later = changed = 0
+        for row, key in enumerate(self._keys):
+            if key in in_journal:
+                continue
+            keys = [key] if key else [self._key(row, base) for base in bases]
+            if not in_journal.isdisjoint(keys):
+                later += 1
+            elif _name_of(keys[0]) in names:
                 changed += 1
-        if kept or changed:
+        if self.kept or later or changed:
+            most = "up to " if later and not is_settled else ""
             self._listener.note(
-                f"going on with an interrupted run: results of {kept} of {len(self._inputs)}"
-                f" frames are kept, {changed} have changed since"
+                f"going on with an interrupted run: results of {most}{self.kept + later} of"
+                f" {len(self._keys)} frames are kept, {changed} have changed since"
             )
+
+    def _key(self, row: int, tone_base: ToneBase | None) -> str:
+        """Return the key of a first look."""
+        frame_input, file = self._inputs[row], self._stamps[row]
+        name = fingerprint(frame_input.frame)[:16]
+        known = (
+            frame_input.time_s,
+            frame_input.may_use_exif_time,
+            frame_input.priors,
+            frame_input.plain,
+            tone_base,
+        )
+        return f"first-{name}-{fingerprint(file, *known)[:16]}"
 
 
 def _bits_reversed(number: int) -> int:
     """Return a number's 32 bits in reverse order: multiples of large powers of 2 come first."""
     return int(f"{number:032b}"[::-1], 2)
-
-
-def _key(frame_input: FrameInput, file: tuple[int, int] | None, tone_base: ToneBase | None) -> str:
-    name = fingerprint(frame_input.frame)[:16]
-    known = (
-        frame_input.time_s,
-        frame_input.may_use_exif_time,
-        frame_input.priors,
-        frame_input.plain,
-        tone_base,
-    )
-    return f"first-{name}-{fingerprint(file, *known)[:16]}"
 
 
 def _key_of_second_look(

@@ -207,7 +207,7 @@ def shows_negative(job: DetectionJob, frame_input: FrameInput) -> bool:
     except Rejection:
         return False
     negative = np.iinfo(grey.dtype).max - grey
-    examination = examine(negative, job.camera, job.targets, job.settings, job.priors(frame_input))
+    examination = examine(negative, job.camera, job.targets, job.settings, frame_input.priors)
     return any(isinstance(outcome, Measurement) for outcome in examination.outcomes)
 
 

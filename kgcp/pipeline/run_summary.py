@@ -66,8 +66,8 @@ class DetectionSummary:
         Why reference poses and trajectory could not say where to look again, if they could not.
     tone_base : str or None
         What the tone curve of all frames is near to; None: not learnt, or near nothing known.
-    measured_with_tone, overruled_by_tone : int
-        Measurements from which it was learnt, and those that it has changed.
+    measured_with_tone, overruled_by_tone, kept_other_tone : int
+        Measurements from which it was learnt, those that it has changed, and those too far from it.
     stages_s : dict of float
         Time that each stage of the work took [s].
     """
@@ -92,6 +92,7 @@ class DetectionSummary:
     tone_base: str | None
     measured_with_tone: int
     overruled_by_tone: int
+    kept_other_tone: int
     stages_s: Mapping[str, float]
 
     @property
@@ -222,6 +223,7 @@ class SummaryBuilder:
             tone_base=None if learnt is None or learnt.base is None else learnt.base.value,
             measured_with_tone=0 if learnt is None else learnt.measurements,
             overruled_by_tone=0 if learnt is None else learnt.overruled,
+            kept_other_tone=0 if learnt is None else learnt.kept_other,
             stages_s=dict(stages_s),
         )
 

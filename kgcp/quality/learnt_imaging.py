@@ -9,7 +9,7 @@ shares").
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,11 +34,11 @@ _MOST_AGAINST = 0.2
 # Before all frames are measured, so much of it decides for the others: 5 clear frames or more.
 _ENOUGH = 5.0 * _MOST_OF_ONE
 # The base does not matter where four of five distances differ by less than this share of their
-# standard deviations, of at least so many. Of flights with rolling shutters it is 0.02, with film-
-# like curves 0.2 to 0.3; under highlights, in phones and with dirt 0.5 to 1.3.
+# standard deviations, of at least so many frames. Of flights with rolling shutters it is 0.02, with
+# film-like curves 0.2 to 0.3; under highlights, in phones and with dirt 0.5 to 1.3.
 _ALIKE, _ALIKE_QUANTILE, _FEWEST_ALIKE = 0.35, 0.8, 12
-# A frame so much against the base of all others was not explained over it: with dirt, its fit over
-# that base has often come to rest where errors are up to 3 σ, and 0.1 σ over the other.
+# A measurement that is likelier by more than this over another base than that of all keeps its own:
+# with dirt, its fit over the common base has often come to rest up to 3 σ off.
 _BEYOND_DOUBT = 100.0
 _STEPS = 64  # of the curve, over the whole range of grey values
 _ROUNDS = 3
@@ -56,9 +56,12 @@ class LearntImaging:
         The base of the tone curve that makes all measurements together likelier; None: they do not
         agree, so that the curve is near neither.
     advantages : mapping of ToneBase to float
-        Sums of the log-likelihoods by which measurements prefer a base, each at most 30.
-    measurements, overruled : int
-        Measurements by both bases, and those that by themselves would have taken the other.
+        Sums of the log-likelihoods by which frames prefer a base, each at most 30.
+    measurements : int
+        By both bases, in the frames that were asked.
+    overruled, kept_other : int
+        Measurements that by themselves would have taken another base: those that take the base of
+        all, and those that are too far from it.
     grey : (n,) array
         Grey values, 0…1 of their range.
     light : (3, n) array
@@ -76,6 +79,7 @@ class LearntImaging:
     advantages: Mapping[ToneBase, float]
     measurements: int
     overruled: int
+    kept_other: int
     grey: FloatArray
     light: FloatArray
     sharpening: FloatArray
@@ -88,27 +92,34 @@ def base_of_some(results: Iterable[FrameResult]) -> ToneBase | None:
 
     None: they do not.
     """
-    advantages = _advantages([measurement for *_, measurement in _of_unknown_tone(results)])
+    advantages = _advantages(results)
     base = _agreed(advantages)
     return None if base is None or advantages[base] < _ENOUGH else base
 
 
 def base_of_no_matter(results: Iterable[FrameResult]) -> ToneBase | None:
     """Return the likelier base if some frames have nearly the same distances over both; or None."""
-    measurements = [measurement for *_, measurement in _of_unknown_tone(results)]
-    differences = [
-        abs(each.distance_m - each.rival.measurement.distance_m) / each.sd_distance_m
-        for each in measurements
-        if each.rival is not None
-    ]
+    told: list[FrameResult] = []
+    differences = []
+    for result in results:
+        of_frame = [
+            abs(each.distance_m - each.rival.measurement.distance_m) / each.sd_distance_m
+            for each in _of_unknown_tone(result)
+            if each.rival is not None
+        ]
+        if of_frame:
+            told.append(result)
+            differences.append(max(of_frame))
     if len(differences) < _FEWEST_ALIKE or np.quantile(differences, _ALIKE_QUANTILE) > _ALIKE:
         return None
-    advantages = _advantages(measurements)
+    advantages = _advantages(told)
     return max(advantages, key=lambda each: advantages[each])
 
 
 def learn_imaging(
-    results: Iterable[FrameResult], base: ToneBase | None = None
+    results: Iterable[FrameResult],
+    base: ToneBase | None = None,
+    asked: Collection[str] | None = None,
 ) -> LearntImaging | None:
     """Return what all measurements say together; None if no tone is unknown.
 
@@ -118,17 +129,18 @@ def learn_imaging(
         Of all frames. Their order does not matter.
     base : ToneBase, optional
         Of the tone curve, by `base_of_some`; by default, what all measurements say.
+    asked : collection of str, optional
+        The frames that have told it; by default, all.
     """
-    chosen = [
-        measurement
-        for *_, measurement in sorted(_of_unknown_tone(results), key=lambda each: each[:3])
-    ]
-    doubtful = [measurement for measurement in chosen if measurement.rival is not None]
+    results = sorted(results, key=lambda result: result.frame)
+    deciding = [result for result in results if asked is None or result.frame in asked]
+    doubtful = [each for result in deciding for each in _by_both_bases(result)]
     if not doubtful:
         return None
-    advantages = _advantages(doubtful)
+    advantages = _advantages(deciding)
     if base is None:
         base = _agreed(advantages)
+    chosen = [each for result in results for each in _of_unknown_tone(result)]
     learnt = chosen if base is None else [by_base(each, base) for each in chosen]
     images = [each.imaging for each in learnt if each.imaging is not None]
     grey = np.linspace(0.0, 1.0, _STEPS + 1)
@@ -138,6 +150,7 @@ def learn_imaging(
         advantages=advantages,
         measurements=len(doubtful),
         overruled=sum(after is not before for before, after in zip(chosen, learnt, strict=True)),
+        kept_other=sum(base is not None and imaging.base is not base for imaging in images),
         grey=grey,
         light=_common_curve(images, grey),
         sharpening=np.percentile(strengths, _BAND),
@@ -161,14 +174,15 @@ def by_base(measurement: Measurement, base: ToneBase) -> Measurement:
     )
 
 
-def _of_unknown_tone(
-    results: Iterable[FrameResult],
-) -> Iterator[tuple[str, str, int, Measurement]]:
-    """Yield the measurements over a base of the tone curve: frame, target, instance, and it."""
-    for result in results:
-        for outcome in result.outcomes:
-            if isinstance(outcome, Measurement) and outcome.imaging is not None:
-                yield result.frame, outcome.target, outcome.instance, outcome
+def _of_unknown_tone(result: FrameResult) -> list[Measurement]:
+    """Return the measurements over a base of the tone curve, by target and instance."""
+    measured = [each for each in result.outcomes if isinstance(each, Measurement)]
+    toned = [each for each in measured if each.imaging is not None]
+    return sorted(toned, key=lambda each: (each.target, each.instance))
+
+
+def _by_both_bases(result: FrameResult) -> list[Measurement]:
+    return [each for each in _of_unknown_tone(result) if each.rival is not None]
 
 
 def _agreed(advantages: Mapping[ToneBase, float]) -> ToneBase | None:
@@ -177,12 +191,16 @@ def _agreed(advantages: Mapping[ToneBase, float]) -> ToneBase | None:
     return base if sum(advantages.values()) <= (1.0 + _MOST_AGAINST) * advantages[base] else None
 
 
-def _advantages(measurements: Sequence[Measurement]) -> dict[ToneBase, float]:
-    """Return the sums of the log-likelihoods by which measurements prefer a base, within bounds."""
+def _advantages(results: Iterable[FrameResult]) -> dict[ToneBase, float]:
+    """Return the sums of the log-likelihoods by which frames prefer a base, within bounds."""
     total = dict.fromkeys(ToneBase, 0.0)
-    for measurement in measurements:
-        if measurement.rival is not None and measurement.imaging is not None:
-            total[measurement.imaging.base] += min(measurement.rival.advantage, _MOST_OF_ONE)
+    for result in results:
+        of_frame = dict.fromkeys(ToneBase, 0.0)
+        for each in _by_both_bases(result):
+            if each.rival is not None and each.imaging is not None:
+                of_frame[each.imaging.base] += each.rival.advantage
+        for base, advantage in of_frame.items():
+            total[base] += min(advantage, _MOST_OF_ONE)
     return total
 
 

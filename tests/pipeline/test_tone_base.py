@@ -10,12 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
+from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.io.flight.flight import read_flight
-from kgcp.measurement.records import FrameResult, Measurement, ToneBase
+from kgcp.measurement.guided import Prediction
+from kgcp.measurement.plate_prior import PlatePrior, SceneRotation
+from kgcp.measurement.records import ExposureSettings, FrameResult, Measurement, Miss, ToneBase
 from kgcp.pipeline.detect import RunOptions, detect_flight
-from kgcp.pipeline.frame_task import DetectionJob, FrameInput, examine_frame
+from kgcp.pipeline.frame_task import (
+    DetectionJob,
+    FrameInput,
+    GuidedInput,
+    examine_frame,
+    examine_frame_again,
+)
 from kgcp.pipeline.run_summary import DetectionSummary
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
@@ -167,7 +176,7 @@ def test_what_decides_does_not_depend_on_the_number_of_workers(
     assert table(tmp_path / "0") == table(tmp_path / "2")
 
 
-def test_a_frame_that_has_changed_no_longer_decides(
+def test_where_frames_that_decided_have_changed_the_others_follow(
     flight: Path, tmp_path: Path, bases: dict[str, ToneBase | None]
 ) -> None:
     copy = shutil.copytree(flight, tmp_path / "flight")
@@ -175,9 +184,54 @@ def test_a_frame_that_has_changed_no_longer_decides(
         detect(copy, tmp_path / "out", StopAfter(FRAMES - 1))
     film = dict.fromkeys(range(FRAMES), ToneCurve.FILM)
     other = written_flight(tmp_path / "other", film, ToneCurve.FILM)
-    for frame in (other / "frames").iterdir():
-        shutil.copyfile(frame, copy / "frames" / frame.name)
+    for frame in list(bases)[:ASKED]:
+        shutil.copyfile(other / "frames" / frame, copy / "frames" / frame)
     bases.clear()
-    summary = detect(copy, tmp_path / "out")
-    assert len(bases) == FRAMES
-    assert summary.tone_base == "a straight line"
+    listener = StopAfter(1000)
+    summary = detect(copy, tmp_path / "out", listener)
+    (note,) = listener.notes
+    assert f"results of up to 3 of {FRAMES} frames are kept, {ASKED} have changed" in note
+    assert summary.kept == 0
+    assert list(bases.values()) == [None] * FRAMES, "which is all that these frames say"
+    detect(copy, tmp_path / "fresh")
+    assert table(tmp_path / "out") == table(tmp_path / "fresh")
+
+
+def test_where_the_base_does_not_matter_the_likelier_one_is_that_of_all(
+    flight: Path,
+    tmp_path: Path,
+    bases: dict[str, ToneBase | None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("_ENOUGH", np.inf), ("_FEWEST_ALIKE", ASKED), ("_ALIKE", 100.0)):
+        monkeypatch.setattr(f"kgcp.quality.learnt_imaging.{name}", value)
+    summary = detect(flight, tmp_path)
+    assert list(bases.values()) == [None] * ASKED + [ToneBase.SRGB] * (FRAMES - ASKED)
+    assert (summary.tone_base, summary.measured_with_tone) == ("sRGB", ASKED)
+
+
+def test_the_base_is_added_to_what_is_known_of_a_target() -> None:
+    rotation = SceneRotation((0.1, 0.0, 0.0), 0.01)
+    target = TARGET_PLATE.target
+    job = DetectionJob(Path(), CAMERA, None, (target,), DetectSettings(), tone_base=ToneBase.LINE)
+    known = FrameInput("f.png", None, {target.name: PlatePrior(rotation=rotation)})
+    assert job.priors(known) == {target.name: PlatePrior(None, rotation, ToneBase.LINE)}
+    unknown = FrameInput("g.png", None, {})
+    assert job.priors(unknown) == {target.name: PlatePrior(tone_base=ToneBase.LINE)}
+
+
+def test_a_second_look_is_over_the_same_base(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target, asked = TARGET_PLATE.target, []
+
+    def look(*arguments: object) -> tuple[None, tuple[()]]:
+        asked.append(arguments[5])
+        return None, ()
+
+    monkeypatch.setattr("kgcp.pipeline.frame_task.look_again", look)
+    folder = read_flight(flight).frames_folder
+    job = DetectionJob(folder, CAMERA, None, (target,), DetectSettings(), tone_base=ToneBase.LINE)
+    known = FrameInput("f_00.png", None, {})
+    missed = FrameResult("f_00.png", None, ExposureSettings(), (Miss("A", Reason.NO_CANDIDATE),))
+    expected = Prediction(np.array([160.0, 120.0]), 2.0, 40.0, 0.1, "trajectory")
+    examine_frame_again(job, GuidedInput(known, missed, {"A": expected}))
+    assert asked == [PlatePrior(tone_base=ToneBase.LINE)]

@@ -107,12 +107,21 @@ def test_some_frames_decide_only_where_they_say_it_clearly(
     assert base_of_some(results) is base
 
 
+def test_the_plates_of_one_frame_count_as_one() -> None:
+    (plate, _) = frame("a", LINE, 1e3).outcomes
+    assert isinstance(plate, Measurement)
+    plates = tuple(replace(plate, instance=k) for k in range(9))
+    crowded = FrameResult("a", 0.0, ExposureSettings(), plates)
+    assert base_of_some([crowded]) is None
+    assert base_of_some([replace(crowded, frame=f"f{k}") for k in range(5)]) is LINE
+
+
 def test_a_frame_that_is_far_from_the_base_of_the_others_keeps_its_own() -> None:
     results = [frame(f"f{k}", SRGB, 30.0) for k in range(11)]
     results += [frame("near", LINE, 99.0), frame("far", LINE, 101.0)]
     learnt = learn_imaging(results)
     assert learnt is not None
-    assert (learnt.base, learnt.overruled) == (SRGB, 1)
+    assert (learnt.base, learnt.overruled, learnt.kept_other) == (SRGB, 1, 1)
     near, far = (first_of(result) for result in results[-2:])
     assert by_base(near, SRGB).distance_m == 11.0
     assert by_base(far, SRGB) is far
@@ -138,10 +147,13 @@ def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:
     both = [frame(f"f{k}", SRGB, 30.0) for k in range(6)]
     one = replace(first_of(frame("g", SRGB, 1.0)), rival=None)
     alone = FrameResult("g", 0.0, ExposureSettings(), (one,))
-    learnt = learn_imaging([*both, alone], SRGB)
+    stray = frame("h", LINE, 300.0)
+    asked = {result.frame for result in both}
+    learnt = learn_imaging([stray, *both, alone], SRGB, asked)
     assert learnt is not None
-    assert (learnt.base, learnt.measurements) == (SRGB, 6)
-    assert learnt.noise.shape == (14, 2)
+    assert (learnt.base, learnt.measurements, learnt.kept_other) == (SRGB, 6, 1)
+    assert learnt.advantages == {SRGB: 180.0, LINE: 0.0}
+    assert learnt.noise.shape == (16, 2)
 
 
 def test_nothing_is_learnt_where_the_tone_is_known() -> None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit, ndtri
 
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import cross_matrix
@@ -78,16 +79,25 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
 
     From the scatter of its scores over arcs, plus what a small common displacement of each circle's
     edge would do.
+
+    Raises
+    ------
+    Rejection
+        `POOR_FIT`, if the pixels leave something open.
     """
     misfit = fit.misfit
     if fit.varied is None:
         scaled = fit.scaled_jacobian
-        inverse = np.linalg.inv(normal_matrix(scaled, misfit, fit.unknowns))
+        normal = normal_matrix(scaled, misfit, fit.unknowns)
     else:
         scaled = fit.varied.rows()
-        inverse = np.linalg.inv(fit.varied.normal)
+        normal = fit.varied.normal
+    try:
+        inverse = np.linalg.inv(normal)
+        root = np.linalg.cholesky(inverse[:6, :6])
+    except np.linalg.LinAlgError as error:
+        raise Rejection(Reason.POOR_FIT, "the pixels do not determine the pose") from error
     circle, arc = _nearest_edges(fit)
-    root = np.linalg.cholesky(inverse[:6, :6])
     to_pose = np.linalg.solve(root, inverse[:6])  # in units of N⁻¹
     by_pixel = np.zeros((scaled.shape[1], -(-len(scaled) // _VECTOR) * _VECTOR))
     by_pixel[:, : len(scaled)] = scaled.T

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -50,8 +50,10 @@ class FitsByTone:
     """The fits of one target by the tones that its camera may have."""
 
     likelier: TwoPoses
-    rival: TwoPoses | None  # over the other base; None: it leads nowhere, or the tone is known
+    # over the other base; None: it leads nowhere, was not tried, or the tone is known
+    rival: TwoPoses | None
     advantage: float = 0.0  # of the log-likelihood, by which the likelier one is so
+    untried: ToneBase | None = None  # the other base, where it was not tried
 
 
 def fit_in_any_light(
@@ -77,19 +79,39 @@ def fit_in_any_light(
     if problem.tone is not Tone.UNKNOWN:
         return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
     fits: dict[ToneBase, TwoPoses] = {}
-    for each in sorted(ToneBase, key=lambda each: each is not base):
+    failures: dict[ToneBase, Rejection] = {}
+    for each in sorted(ToneBase, key=lambda each: each is not base):  # first what others have told
+        if base in fits and _is_at_rest(fits[base].best):
+            return FitsByTone(fits[base], None, untried=each)
         toned = replace(problem, tone=TONE_OF_BASE[each])
         try:
             fits[each] = _fit_in_any_light(toned, pose, blur, find_plateaus)
         except Rejection as rejection:
-            failure = rejection
-        else:
-            if each is base and _is_at_rest(fits[each].best):
-                break
+            failures[each] = rejection
     if not fits:
-        raise failure
+        raise failures[ToneBase.LINE]  # whichever came first
+    return _by_likelihood(fits)
+
+
+def with_untried_base(fits: FitsByTone, problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
+    """Return the fits with the one over the base that was not tried, if that leads anywhere."""
+    if fits.untried is None:
+        return fits
+    toned = replace(problem, tone=TONE_OF_BASE[fits.untried])
+    find_plateaus = partial(look_at_plateaus, problem, pose, blur.mean_sd_px)
+    try:
+        other = _fit_in_any_light(toned, pose, blur, find_plateaus)
+    except Rejection:
+        return replace(fits, untried=None)
+    (tried,) = set(ToneBase) - {fits.untried}
+    return _by_likelihood({tried: fits.likelier, fits.untried: other})
+
+
+def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
+    """Put the likelier one of the fits over one base or both first."""
     if len(fits) == 1:
-        return FitsByTone(next(iter(fits.values())), None)
+        (alone,) = fits.values()
+        return FitsByTone(alone, None)
     over_srgb, over_line = fits[ToneBase.SRGB], fits[ToneBase.LINE]
     advantage = advantage_over(over_srgb.best, over_line.best)
     if advantage > 0.0:

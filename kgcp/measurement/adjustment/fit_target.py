@@ -19,7 +19,7 @@ from kgcp.geometry.pose import Pose, image_heading_deg
 from kgcp.measurement.adjustment.acceptance import check_code, check_fit, check_precision
 from kgcp.measurement.adjustment.appearance import appearance_of, imaging_of
 from kgcp.measurement.adjustment.covariance import pose_covariance, propagate, spread_over_both
-from kgcp.measurement.adjustment.extensions import fit_in_any_light
+from kgcp.measurement.adjustment.extensions import fit_in_any_light, with_untried_base
 from kgcp.measurement.adjustment.problem import FitProblem, apparent_tone
 from kgcp.measurement.adjustment.random_levels import even_field, fit_levels
 from kgcp.measurement.adjustment.smoothing import contour_smoothing, with_smoothing
@@ -86,10 +86,10 @@ def measure_by_model(
     try:
         measurement = _checked(camera, target, start, fits.likelier, prior.normal)
     except Rejection:
-        if prior.tone_base is None:
+        if fits.untried is None:
             raise
-        by_both = replace(prior, tone_base=None)  # this frame may be unlike those that told it
-        return measure_by_model(grey, camera, target, start, by_both, visible)
+        fits = with_untried_base(fits, problem, pose, blur)
+        measurement = _checked(camera, target, start, fits.likelier, prior.normal)
     if fits.rival is not None:
         with contextlib.suppress(Rejection):  # then the likelier one has no rival
             rival = _checked(camera, target, start, fits.rival, prior.normal)

@@ -57,8 +57,9 @@ def learnt_sentence(learnt: LearntImaging) -> str:
     about = (
         _NOT_AGREED
         if learnt.base is None
-        else f"The tone curve departs from {learnt.base.value}; {learnt.overruled} of"
-        f" {learnt.measurements} measurements alone would have taken another base."
+        else f"The tone curve departs from {learnt.base.value}, learnt from {learnt.measurements}"
+        f" measurements; {learnt.overruled} alone would have taken another base, and"
+        f" {learnt.kept_other} are so far from it that they keep another."
     )
     smoothing = learnt.smoothing
     return (

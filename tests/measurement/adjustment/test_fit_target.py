@@ -17,6 +17,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.adjustment.two_poses import TwoPoses
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.plate_prior import PlatePrior
@@ -191,6 +192,28 @@ def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
     monkeypatch.setattr(extensions, "_fit_in_any_light", fit_over_srgb)
     rescued = measure_by_model(grey, camera, TARGET, start, known)
     assert rescued.distance_m == by_both.distance_m
+
+
+def test_a_base_whose_fit_is_refused_gives_way_to_the_other(
+    photograph: Photograph, start_near: StartNear, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera, rng = replace(LENS, response=Response.UNKNOWN), np.random.default_rng(7)
+    pose = random_pose(camera, 40.0, rng)
+    grey = photograph(camera, pose, rng, sensor=Sensor(tone=ToneCurve.SRGB), gain=1.0)
+    start, known = start_near(camera, pose, rng), PlatePrior(tone_base=ToneBase.LINE)
+    by_both = measure_by_model(grey, camera, TARGET, start)
+    tones = []
+
+    def check(fit: TargetFit) -> None:
+        tones.append(fit.sample.problem.tone)
+        if fit.sample.problem.tone is Tone.UNKNOWN_FROM_LINE:
+            raise Rejection(Reason.POOR_FIT)
+
+    monkeypatch.setattr("kgcp.measurement.adjustment.fit_target.check_fit", check)
+    rescued = measure_by_model(grey, camera, TARGET, start, known)
+    assert tones[0] is Tone.UNKNOWN_FROM_LINE
+    assert rescued.distance_m == by_both.distance_m
+    assert rescued.rival is None
 
 
 def test_a_clipped_film_curve_is_read_to_some_hundredths_of_a_per_cent(

@@ -66,6 +66,7 @@ LEARNT = LearntImaging(
     advantages={ToneBase.SRGB: 240.0, ToneBase.LINE: 9.0},
     measurements=20,
     overruled=2,
+    kept_other=1,
     grey=GREY,
     light=np.outer([0.98, 1.0, 1.02], GREY**2.2),
     sharpening=np.array([0.35, 0.4, 0.45]),
