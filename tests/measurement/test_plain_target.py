@@ -285,20 +285,26 @@ def test_the_smallest_disc_needs_even_ground_and_a_normal(
             assert f"below {least_px:g} px" in outcome.detail
 
 
-@pytest.mark.parametrize("blur_px", [0.8, 2.0])
-def test_refuses_a_smooth_blob(blur_px: float) -> None:
-    along = pose_at(90.0, 70.0).translation_m
-    radius_px = 3.5
-    pose = Pose(np.eye(3), along * RADIUS_PX / radius_px)
-    rows, columns = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
-    inside = np.clip(radius_px - np.hypot(rows - 70.0, columns - 90.0) + 0.5, 0.0, 1.0)
-    light = cv2.GaussianBlur(0.2 + 0.5 * inside, (0, 0), blur_px)
-    grey = Sensor().expose(np.asarray(light), 1.0, np.random.default_rng(1))
-    level = NormalPrior(np.array([0.0, 0.0, 1.0]), 3.0)
-    prediction = replace(prediction_of(pose), normal=level, radius_px=radius_px)
-    outcome = looked(grey, prediction, replace(DISC, border_m=0.8))
-    assert isinstance(outcome, Measurement) is (blur_px < 1.0)
-    if isinstance(outcome, Miss):
+@pytest.mark.parametrize("tilt_deg", [0.0, 50.0])
+@pytest.mark.parametrize("share", [0.3, 0.42, 0.58, 0.9])
+def test_refuses_a_smooth_blob(share: float, tilt_deg: float) -> None:
+    """Spread by so much of the smaller semi-axis, which a tilt shortens: half is the limit."""
+    radius_px, tilt_rad = 4.5, math.radians(tilt_deg)
+    along = RADIUS_PX / radius_px * pose_at(90.0, 70.0).translation_m
+    toward = along / np.linalg.norm(along)
+    across = np.cross(toward, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    pose = pose_towards(along, math.cos(tilt_rad) * toward + math.sin(tilt_rad) * across)
+    target = replace(DISC, border_m=0.8)
+    light: FloatArray = np.full((CAMERA.height, CAMERA.width), 0.3)
+    blur_px = share * radius_px * math.cos(tilt_rad)
+    image_plate(CAMERA, PlainPlate(target), pose, Optics(blur_px)).paste(light)
+    grey = Sensor().expose(light, 1.0, np.random.default_rng(1))
+    normal = NormalPrior(pose.normal, 3.0)
+    prediction = replace(prediction_of(pose), normal=normal, radius_px=radius_px)
+    outcome = looked(grey, prediction, target)
+    assert isinstance(outcome, Measurement) is (share < 0.5)
+    if isinstance(outcome, Miss) and share < 0.6:  # far beyond the limit it has no edge at all
         assert outcome.reason is Reason.TOO_BLURRED
 
 
