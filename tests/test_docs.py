@@ -22,7 +22,7 @@ from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from kgcp.io.tables.places import PLACE_COLUMNS, PLACE_RESIDUAL_COLUMNS
-from kgcp.io.tables.poses import POSE_COLUMNS
+from kgcp.io.tables.poses import POSE_COLUMNS, POSE_RESIDUAL_COLUMNS
 from kgcp.quality.checks.doubt import Cause
 from tests.test_layers import LAYERS, module_names
 
@@ -61,6 +61,7 @@ def first_column(text: str) -> list[str]:
         ("bias.parquet", BIAS_COLUMNS),
         ("places.parquet", PLACE_COLUMNS),
         ("poses.parquet", POSE_COLUMNS),
+        ("pose_residuals.parquet", POSE_RESIDUAL_COLUMNS),
         ("place_residuals.parquet", PLACE_RESIDUAL_COLUMNS),
     ],
 )

@@ -10,6 +10,8 @@ import argparse
 import itertools
 import math
 import os
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +22,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.device import orient_by_device
-from kgcp.network.ground.resection import CameraPose, NoPoseError, PointImages, orient
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.resection import NoPoseError, orient
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
 _CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)
@@ -30,6 +33,7 @@ _WRONG = 0.3  # share of wrong names
 _RIGHT_CHI2 = 50.0  # of six numbers: beyond it once in a hundred million times
 _POINTS = (3, 4, 5, 6, 8, 12, 20, 30)
 _LEAST_RIGHT = 0.999
+_NUMBERS = re.compile(r"\d+(\.\d+)?")
 _SD_FOCAL, _LEAST_DEVICES = 0.2, 0.995
 
 DEVICE_M: FloatArray = np.array(
@@ -53,7 +57,7 @@ class Outcome:
     """What became of the frames of one setup."""
 
     setup: Setup
-    refused: int
+    refused: Counter[str]  # by reason, without its numbers
     wrong: int
     z: FloatArray  # (n, 6): standardised errors of right poses
 
@@ -111,13 +115,14 @@ def _scene(setup: Setup, rng: np.random.Generator) -> tuple[CameraPose, PointIma
 def measure(setup: Setup) -> Outcome:
     """Orient frames of one setup."""
     rng = np.random.default_rng([setup.seed, setup.points, setup.has_distance])
-    refused, wrong, z = 0, 0, []
+    refused: Counter[str] = Counter()
+    wrong, z = 0, []
     for _ in range(setup.frames):
         truth, images = _scene(setup, rng)
         try:
             found = orient(_CAMERA, images)
-        except NoPoseError:
-            refused += 1
+        except NoPoseError as refusal:
+            refused[_NUMBERS.sub("#", str(refusal))] += 1
             continue
         turn = found.pose.world_from_camera @ truth.world_from_camera.T
         odd = 0.5 * (turn - turn.T)
@@ -135,12 +140,12 @@ def line(outcome: Outcome) -> str:
     kind = "places and distances" if setup.has_distance else "places alone"
     if not len(outcome.z):
         verdict = f", {outcome.wrong} wrong  MISSED" if outcome.wrong else ""
-        return f"{setup.points:2d} points, {kind}: {outcome.refused} refused{verdict}"
+        return f"{setup.points:2d} points, {kind}: {outcome.refused.total()} refused{verdict}"
     z = np.sqrt(np.mean(outcome.z**2, axis=0))
     is_reached = outcome.right_share >= _LEAST_RIGHT and 0.9 <= float(np.sqrt(np.mean(z**2))) <= 1.1
     return (
         f"{setup.points:2d} points, {kind}: right {100 * outcome.right_share:.2f} % of"
-        f" {len(outcome.z) + outcome.wrong}, {outcome.refused} refused, z"
+        f" {len(outcome.z) + outcome.wrong}, {outcome.refused.total()} refused, z"
         f" {' '.join(f'{each:.2f}' for each in z)}{'' if is_reached else '  MISSED'}"
     )
 
@@ -149,14 +154,15 @@ def total_line(outcomes: Sequence[Outcome]) -> str:
     """Return the share of right poses in all frames together."""
     right = sum(len(outcome.z) for outcome in outcomes)
     wrong = sum(outcome.wrong for outcome in outcomes)
-    refused = sum(outcome.refused for outcome in outcomes)
+    refused = sum((outcome.refused for outcome in outcomes), Counter())
+    reasons = "".join(f"\n  {count} {reason}" for reason, count in refused.most_common())
     share = right / max(right + wrong, 1)
     z = np.vstack([outcome.z for outcome in outcomes])
     is_reached = share >= _LEAST_RIGHT
     return (
-        f"all: right {100 * share:.2f} % of {right + wrong} poses, {wrong} wrong, {refused} frames"
-        f" refused, z {' '.join(f'{each:.2f}' for each in np.sqrt(np.mean(z**2, axis=0)))}"
-        f"{'' if is_reached else '  MISSED'}"
+        f"all: right {100 * share:.2f} % of {right + wrong} poses, {wrong} wrong, {refused.total()}"
+        f" frames refused, z {' '.join(f'{each:.2f}' for each in np.sqrt(np.mean(z**2, axis=0)))}"
+        f"{'' if is_reached else '  MISSED'}{reasons}"
     )
 
 

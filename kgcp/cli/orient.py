@@ -83,8 +83,8 @@ def command(
 
     Computes the camera's pose in every frame with three or more targets that have a position_m, and
     rejects targets that do not agree. A frame with one ring is oriented once other frames have told
-    how that ring lies. Writes poses.parquet and poses.csv to FLIGHT/kgcp. poses.csv can be given as
-    [reference] poses. Run 'kgcp detect' first.
+    how that ring lies. Writes poses.parquet, pose_residuals.parquet and poses.csv to FLIGHT/kgcp.
+    poses.csv can be given as [reference] poses. Run 'kgcp detect' first.
 
     With --device, frames are oriented by plain discs within a closed boundary, whose arrangement
     tells which is which. With --field, by the discs of a field, as 'kgcp calibrate' finds and names

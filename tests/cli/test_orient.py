@@ -78,6 +78,19 @@ def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["rejected_targets"] == {"f_002.png": ["B"]}
     assert "B left out in f_002.png" in result.stderr
+    table = pd.read_parquet(folder / "kgcp" / "pose_residuals.parquet")
+    assert sorted(set(table["frame"])) == ["f_001.png", "f_002.png", "f_003.png"]
+    assert list(zip(table["frame"], table["target"], strict=True)) == [
+        (frame, name) for frame in sorted(set(table["frame"])) for name in "ABCD"
+    ]
+    left_out = table[~table["used"]]
+    assert list(zip(left_out["frame"], left_out["target"], strict=True)) == [("f_002.png", "B")]
+    off_px = np.hypot(table["residual_x_px"], table["residual_y_px"])
+    assert (off_px[table["used"]] < 0.5).all()
+    assert (off_px[~table["used"]] > 5.0).all()
+    assert (table["chi2"][table["used"]] < 25.0).all()
+    assert (table["chi2"][~table["used"]] > 100.0).all()
+    assert (table["residual_distance_percent"][table["used"]].abs() < 0.5).all()
 
 
 def test_a_target_that_is_elsewhere_is_told_once(tmp_path: Path) -> None:

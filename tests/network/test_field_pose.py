@@ -12,7 +12,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, circle_images, plane_axes
 from kgcp.geometry.pose import rotation_about
 from kgcp.network.ground.field_pose import FieldPose, orient_by_field
-from kgcp.network.ground.resection import CameraPose, NoPoseError
+from kgcp.network.ground.point_images import CameraPose
+from kgcp.network.ground.resection import NoPoseError
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 from kgcp.targets.fields.points import AnyField, FieldPoint, PointField
 

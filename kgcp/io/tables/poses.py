@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,9 +14,9 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
+from kgcp.io.tables.columns import BOOLEAN, INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
 from kgcp.network.ground.frame_poses import FramePose
-from kgcp.network.ground.resection import CameraPose
+from kgcp.network.ground.point_images import CameraPose
 
 _AXES = "xyz"
 _ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
@@ -110,6 +110,46 @@ POSE_COLUMNS: tuple[Column[MapPose], ...] = (
     Column("focal_scale", NUMBER, _focal),
     Column("sd_focal_scale", NUMBER, lambda row: row.frame_pose.sd_focal_scale),
 )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseResidual:
+    """One target's share in the pose of a frame."""
+
+    frame: str
+    target: str
+    is_used: bool
+    residual: FloatArray  # (3,): place [px], and logarithm of the distance
+    chi2: float
+
+
+def _distance_percent(row: PoseResidual) -> float | None:
+    log = float(row.residual[2])
+    return 100.0 * math.expm1(log) if math.isfinite(log) else None
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+POSE_RESIDUAL_COLUMNS: tuple[Column[PoseResidual], ...] = (
+    Column("frame", TEXT, lambda row: row.frame),
+    Column("target", TEXT, lambda row: row.target),
+    Column("used", BOOLEAN, lambda row: row.is_used),
+    Column("chi2", NUMBER, lambda row: _finite(row.chi2)),
+    Column("residual_x_px", NUMBER, lambda row: _finite(float(row.residual[0]))),
+    Column("residual_y_px", NUMBER, lambda row: _finite(float(row.residual[1]))),
+    Column("residual_distance_percent", NUMBER, _distance_percent),
+)
+
+
+def pose_residuals(poses: Sequence[FramePose]) -> Iterator[PoseResidual]:
+    """Yield every target of the frames that three targets or more have oriented."""
+    for pose in poses:
+        if pose.residuals is None or pose.chi2 is None:
+            continue
+        for name, residual, chi2 in zip(pose.targets, pose.residuals, pose.chi2, strict=True):
+            yield PoseResidual(pose.frame, name, name in pose.used, residual, float(chi2))
 
 
 POSE_CSV_HEADER = ("frame", *_AXES, *_ANGLES, *(f"sd_{axis}" for axis in _AXES), "sd_angle_deg")

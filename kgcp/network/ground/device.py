@@ -19,13 +19,10 @@ from kgcp.errors import SettingError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.attitude import rotation_onto
 from kgcp.geometry.camera import Camera
-from kgcp.network.ground.resection import (
-    CameraPose,
-    NoPoseError,
-    PointImages,
-    adjusted_pose,
-    three_point_poses,
-)
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.pose_adjustment import adjusted_pose
+from kgcp.network.ground.pose_hypotheses import three_point_poses
+from kgcp.network.ground.resection import NoPoseError
 
 MIN_MARGIN = 3.0
 """RMS of the next best permutation over that of the best, from which on the best counts."""

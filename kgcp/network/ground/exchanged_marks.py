@@ -12,12 +12,9 @@ import numpy as np
 from kgcp.geometry.camera import Camera
 from kgcp.georef.plain_prediction import MarkedPlace
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.ground.resection import (
-    CameraPose,
-    PointImages,
-    adjusted_pose,
-    three_point_poses,
-)
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.pose_adjustment import adjusted_pose
+from kgcp.network.ground.pose_hypotheses import three_point_poses
 
 _MOST_TRIPLES = 6  # that poses start from: one with right names is enough
 _START_SHARE = 0.1  # of the frame's width, that marks may be off a pose from three of them

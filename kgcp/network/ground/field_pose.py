@@ -11,13 +11,8 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import Circles3D, eccentricity, plane_axes
 from kgcp.network.ground.frame_poses import FOCAL_DETERMINED, FOCAL_SCALES, SD_FOCAL
-from kgcp.network.ground.resection import (
-    CameraPose,
-    NoPoseError,
-    PointImages,
-    Resection,
-    orient,
-)
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.resection import NoPoseError, Resection, orient
 from kgcp.targets.fields.points import AnyField
 
 # What discs are off besides their noise, by lens and board: as little as usual, then much. Of more,

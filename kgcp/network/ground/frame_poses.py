@@ -19,15 +19,8 @@ from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
-from kgcp.network.ground.resection import (
-    MIN_MARGIN,
-    MIN_POINTS,
-    CameraPose,
-    NoPoseError,
-    PointImages,
-    Resection,
-    orient,
-)
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.resection import MIN_MARGIN, MIN_POINTS, NoPoseError, Resection, orient
 
 FOCAL_SCALES = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 """Starts for an unknown focal length, as multiples of the camera's."""
@@ -66,6 +59,11 @@ class FramePose:
         Squares of the residuals per degree of freedom; None: there is none.
     sd_focal_scale : float or None
         Relative standard deviation of the focal length; None: it was known.
+    residuals : (n, 3) array or None
+        Observed minus computed places of the targets [px], and logarithms of their distances, NaN
+        where they are not known; None: not by three targets.
+    chi2 : (n,) array or None
+        Their squares over their covariances.
     """
 
     frame: str
@@ -78,6 +76,8 @@ class FramePose:
     margin: float | None = None
     variance_factor: float | None = None
     sd_focal_scale: float | None = None
+    residuals: FloatArray | None = None
+    chi2: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +197,8 @@ def _of_resection(
         margin=None if math.isinf(found.margin) else found.margin,
         variance_factor=found.variance_factor,
         sd_focal_scale=sd_focal,
+        residuals=found.residuals,
+        chi2=found.chi2,
     )
 
 

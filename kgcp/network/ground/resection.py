@@ -9,19 +9,24 @@ within hundredths of a pixel.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.special import chdtri
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.geometry.attitude import cross_matrix, rotation_onto
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
+from kgcp.network.ground.point_images import CameraPose, PointImages
+from kgcp.network.ground.pose_adjustment import (
+    bend_cov,
+    covariance_and_residuals,
+    minimised,
+    squared_residuals,
+)
+from kgcp.network.ground.pose_hypotheses import hypotheses
 
 MIN_POINTS = 4
 """Points that must agree by default: three have up to four poses, a fourth tells them apart."""
@@ -29,69 +34,18 @@ MIN_POINTS = 4
 MIN_MARGIN = 13.8
 """Δχ² of the next best pose from which on a pose counts: odds of 1000 to 1."""
 
-_MOST_TRIPLES = 200
 _REJECTED_CHI2 = 25.0  # of three numbers: by chance once in 65 000
 _REFINED = 4  # best hypotheses that are adjusted
-_MOST_STEPS, _ROUND_STEPS = 40, 3  # of an adjustment, and between two reweightings
-_CONVERGED = 1e-5  # decrease of χ² that means nothing
+_ROUND_STEPS = 3  # of an adjustment between two reweightings
 _ROUNDS = 10
 _SAME_RAD, _SAME_SHARE = 2e-3, 2e-3  # of two poses that are one: turn, and shift over distance
 _START_PX, _START_SHARE = 2.0, 0.01  # what a hypothesis of three points with noise is off by
 # Four points without distances leave two numbers to check a name by. In one of 1800 frames a wrong
 # one passed the limit of single points; this one is for all together.
 _FEW_CHECKS, _FEW_CHECKS_CHANCE = 2, 0.01
-_MOST_TURN_SD = 0.02  # [rad]: beyond it covariances of first order do not hold
-_NO_DISTANCE = 1e6  # deviation of the logarithm of a distance that is not measured
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PointImages:
-    """n points of known position in one frame."""
-
-    positions_m: FloatArray  # (n, 3): in a Cartesian frame, called the world
-    position_cov: FloatArray  # (n, 3, 3): zeros: exact
-    pixels: FloatArray  # (n, 2): images of the points, raw pixels
-    pixel_cov: FloatArray  # (n, 2, 2)
-    distances_m: FloatArray  # (n,): camera to point, as the image's size says; NaN: not known
-    sd_distances_m: FloatArray  # (n,)
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def chosen(self, which: BoolArray) -> PointImages:
-        """Return some of the points."""
-        return PointImages(
-            self.positions_m[which],
-            self.position_cov[which],
-            self.pixels[which],
-            self.pixel_cov[which],
-            self.distances_m[which],
-            self.sd_distances_m[which],
-        )
-
-    @property
-    def has_distance(self) -> BoolArray:
-        """Whether the distance of each point is known (n,)."""
-        return np.asarray(np.isfinite(self.distances_m))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraPose:
-    """Exterior orientation of one frame."""
-
-    centre_m: FloatArray  # (3,): projection centre in the world
-    world_from_camera: FloatArray  # (3, 3): camera axes in the world, as columns
-    focal_scale: float = 1.0  # of the camera's principal distances
-
-    def moved(self, step: FloatArray) -> CameraPose:
-        """Return the pose after a step: shift [m], left rotation [rad], relative focal length."""
-        turn = rotation_about(np.ascontiguousarray(step[3:6]))
-        scale = self.focal_scale * math.exp(step[6]) if len(step) > 6 else self.focal_scale
-        return CameraPose(self.centre_m + step[:3], turn @ self.world_from_camera, scale)
-
-    def in_camera(self, points_m: FloatArray) -> FloatArray:
-        """Bring points (n, 3) of the world into the camera frame."""
-        return (points_m - self.centre_m) @ self.world_from_camera
+# Standard deviations of a turn [rad]: from the first one on, poses that are nearly as likely lie on
+# a noticeable bend; beyond the second one, bends of second order are not enough.
+_BENT_TURN_SD, _MOST_TURN_SD = 0.005, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,16 +128,16 @@ def orient(
     """
     if len(images) < 3:
         raise NoPoseError(f"{len(images)} known points; a pose needs three")
-    hypotheses = list(_hypotheses(camera, images, focals, seed))
-    if not hypotheses:
+    starts = list(hypotheses(camera, images, focals, seed))
+    if not starts:
         raise NoPoseError("no triple of points has a pose in front of the camera")
-    costs = _hypothesis_costs(camera, images, hypotheses)
+    costs = _hypothesis_costs(camera, images, starts)
     fits: list[tuple[float, CameraPose, BoolArray]] = []
     tried: list[CameraPose] = []
     for row in np.argsort(costs, kind="stable"):
         if len(tried) == _REFINED:
             break
-        start = hypotheses[row]
+        start = starts[row]
         if any(_is_same(start, other, 10.0) for other in tried):
             continue
         tried.append(start)
@@ -197,16 +151,29 @@ def orient(
     _require_agreement(images, used, min_points)
     if margin < MIN_MARGIN:
         raise NoPoseError(f"two poses fit alike (Δχ² {margin:.1f})")
-    result = _result(camera, images, pose, used, sd_focal)
+    cov, residuals, chi2 = _determined(camera, images, pose, used, sd_focal)
+    oriented = Resection(pose, cov, residuals, chi2, used, margin, other)
+    _require_fit(oriented)
+    return oriented
+
+
+def _determined(
+    camera: Camera, images: PointImages, pose: CameraPose, used: BoolArray, sd_focal: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return covariance, residuals and their squares of a pose that is determined well enough."""
+    result = covariance_and_residuals(camera, images, pose, used, sd_focal)
     if result is None:
         raise NoPoseError("the points do not determine the pose: they lie in a line")
     cov, residuals, chi2 = result
     turn_sd = math.sqrt(float(np.linalg.eigvalsh(cov[3:6, 3:6])[-1]))
     if turn_sd > _MOST_TURN_SD:
         raise NoPoseError(f"the points hardly determine the pose (± {math.degrees(turn_sd):.1f}°)")
-    oriented = Resection(pose, cov, residuals, chi2, used, margin, other)
-    _require_fit(oriented)
-    return oriented
+    if turn_sd > _BENT_TURN_SD:
+        bend = bend_cov(camera, images.chosen(used), pose, cov, sd_focal)
+        if bend is None:
+            raise NoPoseError("the points hardly determine the pose")
+        cov = cov + bend
+    return cov, residuals, chi2
 
 
 def _require_fit(oriented: Resection) -> None:
@@ -224,145 +191,6 @@ def _require_agreement(images: PointImages, used: BoolArray, min_points: int) ->
         raise NoPoseError(f"{count} of {len(images)} points agree; {needed} are needed")
     if 2 * count < len(images):
         raise NoPoseError(f"only {count} of {len(images)} points agree with each other")
-
-
-def _hypotheses(
-    camera: Camera, images: PointImages, focals: Sequence[float], seed: int
-) -> Iterator[CameraPose]:
-    """Yield all poses of triples of points, none of them behind the camera."""
-    triples = _triples(len(images), seed)
-    for focal in focals:
-        rays = _normalised(camera, images.pixels, focal)
-        for triple in triples:
-            for pose in three_point_poses(images.positions_m[triple], rays[triple]):
-                yield CameraPose(pose.centre_m, pose.world_from_camera, focal)
-            if images.has_distance[triple].all():
-                distances = focal * images.distances_m[triple]
-                aligned = _aligned_pose(images.positions_m[triple], rays[triple], distances)
-                if aligned is not None:
-                    yield CameraPose(aligned.centre_m, aligned.world_from_camera, focal)
-
-
-def _aligned_pose(
-    positions_m: FloatArray, rays: FloatArray, distances_m: FloatArray
-) -> CameraPose | None:
-    """Return the pose in which points (3, 3) best lie at distances along rays; None: in a line.
-
-    Where noise leaves no exact pose of three points, near their critical cylinder, this is one.
-    """
-    directions = np.column_stack((rays, np.ones(len(rays))))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    in_camera = directions * distances_m[:, None]
-    if _are_in_line(positions_m) or _are_in_line(in_camera):
-        return None
-    rotation = rotation_onto(in_camera, positions_m)
-    return CameraPose(positions_m.mean(axis=0) - rotation @ in_camera.mean(axis=0), rotation)
-
-
-def _are_in_line(points: FloatArray) -> bool:
-    """Tell whether three points (3, 3) lie in a line, but for rounding."""
-    first, second = points[1] - points[0], points[2] - points[0]
-    limit = 1e-9 * float(first @ first + second @ second)
-    return not float(np.linalg.norm(np.cross(first, second))) > limit
-
-
-def _triples(count: int, seed: int) -> list[list[int]]:
-    """Return triples of points: all, or some that are drawn."""
-    if math.comb(count, 3) <= _MOST_TRIPLES:
-        return [list(triple) for triple in itertools.combinations(range(count), 3)]
-    rng = np.random.default_rng([seed, count])
-    return [sorted(rng.choice(count, 3, replace=False).tolist()) for _ in range(_MOST_TRIPLES)]
-
-
-def three_point_poses(positions_m: FloatArray, rays: FloatArray) -> Iterator[CameraPose]:
-    """Yield the poses, at most four, in which three points (3, 3) lie on rays (3, 2).
-
-    Rays are normalised coordinates. Points behind the camera are no pose.
-    """
-    middle = positions_m.mean(axis=0)
-    try:
-        _, turns, shifts = cv2.solveP3P(
-            np.ascontiguousarray(positions_m - middle).reshape(3, 1, 3),
-            np.ascontiguousarray(rays).reshape(3, 1, 2),
-            np.eye(3),
-            None,
-            flags=cv2.SOLVEPNP_AP3P,
-        )
-    except cv2.error:  # three points in a line
-        return
-    for turn, shift in zip(turns or (), shifts or (), strict=True):
-        if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
-            continue
-        rotation = rotation_about(np.ascontiguousarray(turn.ravel()))
-        depths = (positions_m - middle) @ rotation[2] + float(shift[2, 0])
-        if np.all(depths > 0.0):
-            yield CameraPose(middle - rotation.T @ shift.ravel(), rotation.T)
-
-
-def _normalised(camera: Camera, pixels: FloatArray, focal: float) -> FloatArray:
-    """Return normalised coordinates (n, 2) for a focal length that is a multiple of the camera's.
-
-    The distortion stays where it is in the image.
-    """
-    return np.asarray(camera.undistort(pixels) / focal)
-
-
-def _projected(
-    camera: Camera, pose: CameraPose, points_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (n, 2), NaN behind the camera, and points in the camera frame (n, 3)."""
-    points = pose.in_camera(points_m)
-    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-    return camera.distort(pose.focal_scale * points[:, :2] / depth[:, None]), points
-
-
-def _residuals(camera: Camera, images: PointImages, pose: CameraPose) -> FloatArray:
-    """Return observed minus computed places [px] and logarithms of distances (n, 3)."""
-    pixels, points = _projected(camera, pose, images.positions_m)
-    logs = np.log(images.distances_m * pose.focal_scale / np.linalg.norm(points, axis=1))
-    return np.column_stack((images.pixels - pixels, logs))
-
-
-def _design(camera: Camera, images: PointImages, pose: CameraPose) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (n, 3, 7) by the pose's step and (n, 3, 3) by the points' positions.
-
-    A distance by an image's size grows with the focal length; it belongs to the camera's own.
-    """
-    points = pose.in_camera(images.positions_m)
-    normalised = pose.focal_scale * points[:, :2] / points[:, 2:]
-    lens = camera.distort_jacobian(normalised)
-    to_plane = np.zeros((len(images), 2, 3))
-    to_plane[:, 0, 0] = to_plane[:, 1, 1] = pose.focal_scale
-    to_plane[:, :, 2] = -normalised
-    by_camera_point = np.empty((len(images), 3, 3))
-    by_camera_point[:, :2] = lens @ (to_plane / points[:, 2, None, None])
-    by_camera_point[:, 2] = points / np.sum(points**2, axis=1)[:, None]
-    by_point = by_camera_point @ pose.world_from_camera.T
-    by_focal = np.zeros((len(images), 3, 1))
-    by_focal[:, :2, 0] = np.einsum("nij,nj->ni", lens, normalised)
-    by_focal[:, 2, 0] = -1.0
-    # with R' = exp(ω) R a point moves by (X − C) × ω in the world's axes
-    by_turn = by_point @ cross_matrix(images.positions_m - pose.centre_m)
-    return np.concatenate((-by_point, by_turn, by_focal), axis=2), by_point
-
-
-def _covariances(images: PointImages, by_point: FloatArray) -> FloatArray:
-    """Return the covariances (n, 3, 3) of the observations, those of the positions included."""
-    cov = by_point @ images.position_cov @ np.swapaxes(by_point, 1, 2)
-    cov[:, :2, :2] += images.pixel_cov
-    known = images.has_distance
-    cov[~known, 2, :] = cov[~known, :, 2] = 0.0
-    cov[known, 2, 2] += (images.sd_distances_m[known] / images.distances_m[known]) ** 2
-    cov[~known, 2, 2] = _NO_DISTANCE**2
-    return np.asarray(cov)
-
-
-def _chi2(residuals: FloatArray, cov: FloatArray) -> FloatArray:
-    """Return squared residuals (n,) over covariances; infinite behind the camera."""
-    behind = ~np.isfinite(residuals[:, 0])
-    known = np.nan_to_num(residuals)
-    squares = np.einsum("nm,nm->n", known, np.linalg.solve(cov, known[..., None])[..., 0])
-    return np.asarray(np.where(behind, np.inf, squares))
 
 
 def _hypothesis_costs(
@@ -433,161 +261,36 @@ def _robust_fit(
 ) -> tuple[float, CameraPose, BoolArray] | None:
     """Return cost, pose and points that agree; None: fewer than three do."""
     pose = start
-    weights = _cauchy(_total_chi2(camera, images, pose, _START_PX))
+    weights = _cauchy(squared_residuals(camera, images, pose, _START_PX))
     for _ in range(_ROUNDS):
-        moved = _minimised(camera, images, pose, weights, sd_focal, _ROUND_STEPS)
+        moved = minimised(camera, images, pose, weights, sd_focal, _ROUND_STEPS)
         if moved is None:
             return None
         pose = moved
-        renewed = _cauchy(_total_chi2(camera, images, pose, 0.0))
+        renewed = _cauchy(squared_residuals(camera, images, pose, 0.0))
         is_settled = np.allclose(renewed, weights, atol=1e-2)
         weights = renewed
         if is_settled:
             break
     used = np.zeros(len(images), dtype=np.bool_)
     for _ in range(_ROUNDS):
-        agree = _total_chi2(camera, images, pose, 0.0) <= _REJECTED_CHI2
+        agree = squared_residuals(camera, images, pose, 0.0) <= _REJECTED_CHI2
         if np.count_nonzero(agree) < 3:
             return None
         if np.array_equal(agree, used):
             break
         used = agree
-        moved = _minimised(camera, images, pose, used.astype(np.float64), sd_focal)
+        moved = minimised(camera, images, pose, used.astype(np.float64), sd_focal)
         if moved is None:
             return None
         pose = moved
-    chi2 = _total_chi2(camera, images, pose, 0.0)
+    chi2 = squared_residuals(camera, images, pose, 0.0)
     prior = (math.log(pose.focal_scale) / sd_focal) ** 2 if sd_focal else 0.0
     return float(np.sum(np.minimum(chi2, _REJECTED_CHI2))) + prior, pose, used
 
 
-def adjusted_pose(
-    camera: Camera, images: PointImages, start: CameraPose, sd_focal: float
-) -> tuple[CameraPose, FloatArray, FloatArray] | None:
-    """Return pose, covariance and residuals (n, 3) of an adjustment to all points.
-
-    Parameters
-    ----------
-    start : CameraPose
-        Near enough that all points lie in front of the camera.
-    sd_focal : float
-        As for `orient`.
-
-    Returns
-    -------
-    tuple or None
-        None: a point falls behind the camera, or the pose is not determined.
-    """
-    used = np.ones(len(images), dtype=np.bool_)
-    pose = _minimised(camera, images, start, used.astype(np.float64), sd_focal)
-    result = None if pose is None else _result(camera, images, pose, used, sd_focal)
-    if pose is None or result is None:
-        return None
-    return pose, result[0], result[1]
-
-
 def _cauchy(chi2: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + chi2 / 9.0))
-
-
-def _total_chi2(
-    camera: Camera, images: PointImages, pose: CameraPose, slack_px: float
-) -> FloatArray:
-    residuals = _residuals(camera, images, pose)
-    ahead = np.isfinite(residuals[:, 0])
-    chi2 = np.full(len(images), np.inf)
-    if ahead.any():
-        kept = images.chosen(ahead)
-        _, by_point = _design(camera, kept, pose)
-        cov = _covariances(kept, by_point)
-        cov[:, :2, :2] += slack_px**2 * np.eye(2)
-        chi2[ahead] = _chi2(residuals[ahead], cov)
-    return chi2
-
-
-def _minimised(
-    camera: Camera,
-    images: PointImages,
-    start: CameraPose,
-    weights: FloatArray,
-    sd_focal: float,
-    most_steps: int = _MOST_STEPS,
-) -> CameraPose | None:
-    """Return the pose with the least weighted squares; None if a point falls behind the camera."""
-    counted = weights > 1e-9
-    kept, weight = images.chosen(counted), weights[counted]
-    if np.count_nonzero(counted) < 3:
-        return None
-    pose, damping = start, 1e-6
-    normal, right, cost = _normal_equations(camera, kept, pose, weight, sd_focal)
-    if not math.isfinite(cost):
-        return None
-    for _ in range(most_steps):
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        unit = normal * np.outer(scale, scale)
-        while True:
-            step = scale * np.linalg.solve(unit + damping * np.eye(len(unit)), scale * right)
-            trial = pose.moved(step)
-            trial_normal, trial_right, trial_cost = _normal_equations(
-                camera, kept, trial, weight, sd_focal
-            )
-            if trial_cost < cost or damping > 1e6:
-                break
-            damping = max(10.0 * damping, 1e-6)
-        if not trial_cost < cost:
-            return pose
-        is_done = cost - trial_cost <= _CONVERGED
-        pose, normal, right, cost = trial, trial_normal, trial_right, trial_cost
-        damping *= 0.1
-        if is_done:
-            break
-    return pose
-
-
-def _normal_equations(
-    camera: Camera,
-    images: PointImages,
-    pose: CameraPose,
-    weights: FloatArray,
-    sd_focal: float,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return normal matrix, right-hand side and weighted squares; the focal length if unknown."""
-    residuals = _residuals(camera, images, pose)
-    unknowns = 7 if sd_focal else 6
-    if not np.isfinite(residuals[:, 0]).all():
-        return np.eye(unknowns), np.zeros(unknowns), math.inf
-    design, by_point = _design(camera, images, pose)
-    design, known = design[:, :, :unknowns], np.nan_to_num(residuals)
-    cov = _covariances(images, by_point)
-    try:
-        solved = np.linalg.solve(cov, np.concatenate((design, known[..., None]), axis=2))
-    except np.linalg.LinAlgError:  # a step to where a point is in the camera
-        return np.eye(unknowns), np.zeros(unknowns), math.inf
-    weighted = weights[:, None, None] * solved
-    normal = np.einsum("nmp,nmq->pq", design, weighted[..., :-1])
-    right = np.einsum("nmp,nm->p", design, weighted[..., -1])
-    cost = float(np.einsum("nm,nm->", known, weighted[..., -1]))
-    if sd_focal:
-        off = math.log(pose.focal_scale)
-        normal[6, 6] += 1.0 / sd_focal**2
-        right[6] -= off / sd_focal**2
-        cost += (off / sd_focal) ** 2
-    return normal, right, cost
-
-
-def _result(
-    camera: Camera, images: PointImages, pose: CameraPose, used: BoolArray, sd_focal: float
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return covariance, residuals and their squares; None: the pose is not determined."""
-    kept = images.chosen(used)
-    normal, _, _ = _normal_equations(camera, kept, pose, np.ones(len(kept)), sd_focal)
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    unit = normal * np.outer(scale, scale)
-    if not np.linalg.cond(unit) < 1e13:
-        return None
-    cov = np.linalg.inv(unit) * np.outer(scale, scale)
-    chi2 = _total_chi2(camera, images, pose, 0.0)
-    return 0.5 * (cov + cov.T), _residuals(camera, images, pose), chi2
 
 
 def _is_same(first: CameraPose, second: CameraPose, factor: float) -> bool:

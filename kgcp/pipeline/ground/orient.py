@@ -20,7 +20,13 @@ from kgcp.io.images.frames import matching_frames
 from kgcp.io.tables.columns import row_of
 from kgcp.io.tables.detections import read_attempts
 from kgcp.io.tables.parquet import write_table
-from kgcp.io.tables.poses import POSE_COLUMNS, on_map, poses_csv
+from kgcp.io.tables.poses import (
+    POSE_COLUMNS,
+    POSE_RESIDUAL_COLUMNS,
+    on_map,
+    pose_residuals,
+    poses_csv,
+)
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.frame_poses import FramePose, orient_frames
 from kgcp.network.ground.resection import MIN_POINTS
@@ -166,7 +172,7 @@ def orient_flight(
 
 
 def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
-    """Write `poses.parquet` and `poses.csv`; return their paths.
+    """Write `poses.parquet`, `pose_residuals.parquet` and `poses.csv`; return their paths.
 
     Raises
     ------
@@ -177,7 +183,11 @@ def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
     crs = poses.local_frame.crs
     table, text = folder / "poses.parquet", folder / "poses.csv"
     cells = (row_of(POSE_COLUMNS, row) for row in rows)
-    write_table(table, POSE_COLUMNS, cells, {**poses.provenance, "crs": crs})
+    about = {**poses.provenance, "crs": crs}
+    write_table(table, POSE_COLUMNS, cells, about)
+    residuals = folder / "pose_residuals.parquet"
+    cells = (row_of(POSE_RESIDUAL_COLUMNS, row) for row in pose_residuals(poses.poses))
+    write_table(residuals, POSE_RESIDUAL_COLUMNS, cells, about)
     is_geographic = bool(parse_crs(crs).is_geographic)
     write_bytes(text, poses_csv(rows, is_geographic=is_geographic).encode())
-    return table, text
+    return table, residuals, text
