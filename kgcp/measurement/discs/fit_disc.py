@@ -405,7 +405,9 @@ def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoi
     """Return the noise of every pixel; clipped ones would make their own."""
     limits = sample.censoring
     usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
-    return estimate_noise(sample.levels - levels, share, usable, sample.window.levels_per_count)
+    return estimate_noise(
+        sample.levels - levels, share, usable, sample.window.levels_per_count, from_edges=True
+    )
 
 
 def _minimise(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:

@@ -126,6 +126,7 @@ def estimate_noise(
     count: float,
     *,
     in_bands: bool = False,
+    from_edges: bool = False,
 ) -> GreyNoise:
     """Return the noise of every pixel from the residuals of a fit.
 
@@ -141,10 +142,12 @@ def estimate_noise(
         One grey value's step.
     in_bands : bool
         Whether the noise between ink and plate follows its own course, band by band.
+    from_edges : bool
+        Whether edges tell the noise of ink, or of plate, where there is too little of it.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
     floor = (_MIN_NOISE_COUNTS * count) ** 2
-    _estimate(residuals, share, usable, floor, in_bands, sd, plateau_sd)
+    _estimate(residuals, share, usable, floor, (in_bands, from_edges), sd, plateau_sd)
     return GreyNoise(sd, plateau_sd)
 
 
@@ -154,11 +157,14 @@ def _estimate(
     share: FloatArray,
     usable: BoolArray,
     floor: float,
-    in_bands: bool,  # noqa: FBT001 - compiled functions have no keywords
+    choices: tuple[bool, bool],
     sd: FloatArray,
     plateau_sd: FloatArray,
 ) -> None:
-    ink, white = _plateau_variances(residuals, share, usable, floor)
+    in_bands, from_edges = choices
+    ink, white, is_ink_seen, is_white_seen = _plateau_variances(residuals, share, usable, floor)
+    if from_edges and is_ink_seen != is_white_seen:
+        ink, white = _with_edges(residuals, share, usable, (ink, white, floor), is_ink_seen)
     edge, of_edge = np.empty(len(share)), 0
     for i in range(len(share)):
         within = min(max(share[i], 0.0), 1.0)
@@ -250,10 +256,40 @@ def _by_band(
 
 
 @compiled
+def _with_edges(
+    residuals: FloatArray,
+    share: FloatArray,
+    usable: BoolArray,
+    known: tuple[float, float, float],
+    is_ink_seen: bool,  # noqa: FBT001 - compiled functions have no keywords
+) -> tuple[float, float]:
+    """Return the variances of ink and plate, one of which edges must tell: it is linear between.
+
+    That of ink is at most that of plate.
+    """
+    ink, white, floor = known
+    squares, number, total = np.empty(len(share)), 0, 0.0
+    for i in range(len(share)):
+        if usable[i] and 0.2 < share[i] < 0.8:
+            squares[number] = residuals[i] * residuals[i]
+            number, total = number + 1, total + share[i]
+    variance = _trimmed_variance(squares[:number])
+    if math.isnan(variance):
+        return ink, white
+    middle = total / number
+    if is_ink_seen:
+        return ink, max((variance - (1.0 - middle) * ink) / middle, ink)
+    return min(max((variance - middle * white) / (1.0 - middle), floor), white), white
+
+
+@compiled
 def _plateau_variances(
     residuals: FloatArray, share: FloatArray, usable: BoolArray, floor: float
-) -> tuple[float, float]:
-    """Return the variances of ink and plate; one for both, where there is too little of either."""
+) -> tuple[float, float, bool, bool]:
+    """Return the variances of ink and plate, and whether they are their own.
+
+    One is for both, where there is too little of either.
+    """
     dark, bright, both = np.empty((3, len(share)))
     of_dark = of_bright = of_both = 0
     for i in range(len(share)):
@@ -269,11 +305,15 @@ def _plateau_variances(
             of_bright += 1
     ink, white = _trimmed_variance(dark[:of_dark]), _trimmed_variance(bright[:of_bright])
     if not math.isnan(ink + white):
-        return ink, white
-    for variance in (ink, white, _trimmed_variance(both[:of_both])):
-        if not math.isnan(variance):
-            return variance, variance
-    return floor, floor
+        return ink, white, True, True
+    if not math.isnan(ink):
+        return ink, ink, True, False
+    if not math.isnan(white):
+        return white, white, False, True
+    variance = _trimmed_variance(both[:of_both])
+    if math.isnan(variance):
+        variance = floor
+    return variance, variance, False, False
 
 
 @compiled

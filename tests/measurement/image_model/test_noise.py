@@ -104,6 +104,31 @@ def test_noise_follows_the_level() -> None:
     assert np.std(found, axis=0)[0] < 0.1 * 0.008
 
 
+@pytest.mark.parametrize("is_ink_seen", [False, True])
+def test_edges_tell_the_noise_of_what_is_nowhere_seen(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
+    """Of a narrow ring no pixel is wholly ink: it has not the noise of the plate."""
+    rng = np.random.default_rng(9)
+    found: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}
+    for _ in range(20):
+        residuals, share = scattered(rng, 1.0)
+        usable = (share > 0.0) if not is_ink_seen else (share < 1.0)
+        for from_edges, noise in found.items():
+            made = estimate_noise(residuals, share, usable, COUNT, from_edges=from_edges)
+            noise.append((made.sd[0], made.sd[300], float(np.median(made.sd[600:]))))
+    ink, plate, edge = np.sqrt(np.mean(np.square(found[True]), axis=0))
+    assert ink == pytest.approx(0.008, rel=0.3)
+    assert plate == pytest.approx(0.02, rel=0.1)
+    assert edge == pytest.approx(0.0152, rel=0.1)
+    ink, plate, _ = np.mean(found[False], axis=0)
+    assert ink == pytest.approx(plate, rel=1e-9)
+
+
+def test_ink_is_no_noisier_than_plate_for_noisy_edges() -> None:
+    residuals, share = scattered(np.random.default_rng(10), 3.0)
+    noise = estimate_noise(residuals, share, share > 0.0, COUNT, from_edges=True)
+    assert noise.plateau_sd[0] == pytest.approx(noise.plateau_sd[300])
+
+
 @pytest.mark.parametrize(("factor", "low", "high"), [(1.0, 1.0, 1.1), (3.0, 2.5, 3.3)])
 def test_edges_have_the_scatter_they_show(factor: float, low: float, high: float) -> None:
     residuals, share = scattered(np.random.default_rng(7), factor)
