@@ -35,7 +35,10 @@ from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.discs.tone_curve import WAVES
 from kgcp.measurement.image_model.photometry import Tone
 
-_MOST_DISCS = 9
+# Discs of a photograph to learn from: as many as have so long an edge together, as a sum of radii,
+# and at least so many. Nine of R 5 px under film's curve leave a third of its second wave, and
+# displace centres by 0.005 px.
+_RADII_PX, _FEWEST_DISCS = 110.0, 9
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 # From there on, the two levels fall off differently enough to tell, but for an unknown curve.
 _LARGE_RADIUS_PX = 20.0
@@ -109,13 +112,17 @@ def first_blur_px(task: DiscTask, camera: CameraTone) -> float:
 def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     """Return the tasks of some large discs of high contrast, evenly drawn from the larger half."""
     large = [task for task in tasks if task.radius_px >= _LEAST_RADIUS_PX]
-    if len(large) < min(_MOST_DISCS, len(tasks)):  # a mark alone does not speak for all
+    count = _FEWEST_DISCS
+    if len(large) < min(count, len(tasks)):  # a mark alone does not speak for all
         large = list(tasks)
+    elif large:
+        radius_px = float(np.median([task.radius_px for task in large]))
+        count = max(round(_RADII_PX / radius_px), count)
     worth = [task.radius_px * task.outline.contrast for task in large]
     order = sorted(range(len(large)), key=lambda i: (-worth[i], i))
-    half = order[: max(len(order) // 2, min(len(order), _MOST_DISCS))]
-    step = max(len(half) // _MOST_DISCS, 1)
-    return [large[i] for i in half[::step][:_MOST_DISCS]]
+    half = order[: max(len(order) // 2, min(len(order), count))]
+    step = max(len(half) // count, 1)
+    return [large[i] for i in half[::step][:count]]
 
 
 def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
@@ -135,7 +142,7 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
             is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
             if not is_burnt and not is_in_curved_light(fit, task):
                 clean.append(fit)
-    return clean if len(clean) >= min(_MOST_DISCS, len(fits) // 2) else fits
+    return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
 def _likeliest(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> JointFit | None:
