@@ -67,7 +67,6 @@ class Set:
     focal: tuple[float, float] | None = None  # truth and largest error [px]
     centre: tuple[float, float, float] | None = None  # truth and largest error [px]
     is_centre_unknown: bool = False  # the principal point must not be claimed
-    is_negative: bool = False  # which the verdict must say
 
 
 SETS = (
@@ -92,10 +91,10 @@ SETS = (
         "dice_dark", "dice_sim", "dot_*.jpeg", "sim_dot_input.xml", None,
         21, 2600, 0.006, 0.0046, "OpenCV none", (6673.3159, 1.0), (872.1577, 579.955, 0.15),
     ),
-    # negatives of dice_dark's first eleven: light adds to these discs, and does not multiply them
+    # negatives of dice_dark's first eleven: light adds to these discs, and white is burnt
     Set(
         "dice_white", "dice_sim", "white_dot_*.jpeg", "sim_white_dot_input.xml", None,
-        11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5), is_negative=True,
+        11, 1300, 0.006, 0.0046, "OpenCV none", (6671.8, 2.5),
     ),
 )  # fmt: skip
 
@@ -159,8 +158,8 @@ def _run(chosen: Set, sets: Path, jobs: int, halves: int, operator: Operator) ->
     print(f"    free, by photograph: {_by_photograph(free)} px")
     failures = _failures(chosen, fixed, stiff, free, photos)
     failures += [f"wrong order: {photo}" for photo in order.wrong]
-    if bool(light.doubt) is not chosen.is_negative:
-        failures.append(f"light: {light.doubt or 'no doubt'}")
+    if light.doubt:
+        failures.append(f"light: {light.doubt}")
     for failure in failures:
         print(f"    {failure}")
     return len(failures)
