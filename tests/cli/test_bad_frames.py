@@ -113,12 +113,12 @@ def test_frames_of_another_size_end_the_run_early(flight: Path) -> None:
     sized(flight, 30, (640, 400))
     line = one_line_of_error(run("detect", str(flight), "--jobs", "0"))
     assert (
-        "frames: the first 20 frames are all 640 x 400 px, the camera has 320 x 200; give"
+        "frames: the first 20 frames looked at are all 640 x 400 px, the camera has 320 x 200; give"
         " flight.toml the size and calibration of these frames"
     ) in line
     assert not (flight / "kgcp" / "detections.parquet").exists()
     line = one_line_of_error(run("detect", str(flight), "--jobs", "0"))
-    assert "the first 20 frames are all 640 x 400 px" in line, "also of a run that is resumed"
+    assert "the first 20 frames looked at are all 640 x 400 px" in line, "also when resumed"
 
 
 @pytest.mark.parametrize(
