@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.search.templates import ANGLES, edge_rows
 from kgcp.targets.layout import Ring
 
 SMALLEST_UNEVEN_PX = 12.5
 """Radius below which rings hardly show ink and plate beside their edges: their light is even."""
-_INK_RANK = 0.35  # of grey values near an angle: dots that blur spreads are brighter than ink
-_HALF_INK, _HALF_PLATE = 10, 5  # samples to either side: more than a dot, less than a shadow
+# samples to either side of an angle: more than a dot, less than a shadow
+_HALF_INK, _HALF_PLATE = 10, 5
+# which of them is the level, by size: the plate's is the median; dots that blur spreads are
+# brighter than ink
+_INK_RANK, _PLATE_RANK = 7, 5
 _SMOOTHED = 3.0  # samples
+_REACH = 8  # samples that it reaches to either side
+_KERNEL = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SMOOTHED) ** 2)
+_KERNEL /= _KERNEL.sum()
 _UNEVEN = 0.15  # of the contrast: below, one pair of levels does
 _LEAST_CONTRAST = 0.2  # of the typical one: what is fainter is something else
 
@@ -32,7 +40,7 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
         Of the template that fits best.
     """
     plate, outside, disc, inside = (row + shift for row in edge_rows(ring))
-    white_out, white_in = (_around(patch[r], 0.5, _HALF_PLATE) for r in (plate, disc))
+    white_out, white_in = (_around(patch[r], _PLATE_RANK, _HALF_PLATE) for r in (plate, disc))
     black_out, black_in = (_around(patch[r], _INK_RANK, _HALF_INK) for r in (outside, inside))
     steps = np.stack((white_out - black_out, white_in - black_in))
     typical = float(np.median(steps))
@@ -51,11 +59,14 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
     return np.asarray(middle + typical * (patch - black) / contrast)
 
 
-def _around(values: FloatArray, rank: float, half: int) -> FloatArray:
-    """Return a running quantile of values (angles,) on a circle, smoothed."""
-    steps = np.arange(-half, half + 1)
-    near = np.quantile(values[(np.arange(ANGLES)[:, None] + steps) % ANGLES], rank, axis=1)
-    reach = np.arange(-8, 9)
-    kernel = np.exp(-0.5 * (reach / _SMOOTHED) ** 2)
-    kernel /= kernel.sum()
-    return np.asarray(near[(np.arange(ANGLES)[:, None] + reach) % ANGLES] @ kernel)
+def _around(values: FloatArray, rank: int, half: int) -> FloatArray:
+    """Return the value of a rank among those near, at all angles of a circle, smoothed."""
+    near = values[_near(half)]
+    near.partition(rank, axis=1)
+    return np.asarray(near[:, rank][_near(_REACH)] @ _KERNEL)
+
+
+@cache
+def _near(half: int) -> IndexArray:
+    """Return the indices (angles, 2 half + 1) of the samples near every angle."""
+    return (np.arange(ANGLES)[:, None] + np.arange(-half, half + 1)) % ANGLES
