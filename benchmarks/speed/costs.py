@@ -5,18 +5,20 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.images.frames import read_grey
+from kgcp.measurement.frame import examine
+from kgcp.measurement.plate_prior import PlatePrior
 from kgcp.measurement.records import Measurement
 from kgcp.measurement.search.candidates import find_rings
-from kgcp.pipeline.measure import measure_frame
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
@@ -103,13 +105,18 @@ def cost_and_memory(
     return cost_of(path, camera, targets), peak_memory_bytes()
 
 
-def cost_of(path: Path, camera: Camera, targets: tuple[Target, ...]) -> FrameCost:
-    """Time what becomes of one frame."""
+def cost_of(
+    path: Path,
+    camera: Camera,
+    targets: tuple[Target, ...],
+    priors: Mapping[str, PlatePrior] = MappingProxyType({}),
+) -> FrameCost:
+    """Time what becomes of one frame, where so much is known of the targets before."""
     settings = DetectSettings()
     decode_s, grey = _timed(lambda: read_grey(path, camera))
     search_s, _ = _timed(lambda: find_rings(grey, settings))
-    measure_s, seen = _timed(lambda: measure_frame(grey, camera, targets, settings))
-    found = sum(isinstance(outcome, Measurement) for outcome in seen)
+    measure_s, seen = _timed(lambda: examine(grey, camera, targets, settings, priors))
+    found = sum(isinstance(outcome, Measurement) for outcome in seen.outcomes)
     return FrameCost(grey.size, decode_s, search_s, measure_s, found)
 
 
@@ -129,7 +136,7 @@ def cost_of_all(source: Source) -> Iterable[Costs]:
     flight = source.flight
     paths = [flight.frames_folder / name for name in source.frames]
     cost_of(paths[0], flight.camera, flight.targets)  # compiles
-    costs = [cost_of(path, flight.camera, flight.targets) for path in paths]
+    costs = [cost_of(path, flight.camera, flight.targets, source.priors) for path in paths]
     for targets, chosen in (("with", _found(costs)), ("without", _missed(costs))):
         if chosen:
             yield Costs(source.name, targets, tuple(chosen))

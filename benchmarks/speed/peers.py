@@ -7,7 +7,8 @@ Each has one thread, and its time includes decoding the frame, which comes right
 tight loop, decoding is up to twice as fast as in a run. Of AprilTag 3 (pupil-apriltags, `pip
 install pupil-apriltags`) tag36h11 with decimation 2; of OpenCV's ArUco 6x6_250, both by default.
 They look for their own markers, of which there are none: this is what their search costs. kgcp also
-measures its targets, where the frames have some.
+measures its targets, where the frames have some; an unknown tone curve over the base that a run
+settles, where the frames tell it.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ def _aruco() -> Callable[[GreyArray], object]:
 def ratios_of(source: Source) -> Iterator[tuple[float, list[float]]]:
     """Yield the time of decoding each frame [s], and that of each detector over it, decoded."""
     from kgcp.io.images.frames import read_grey
+    from kgcp.measurement.frame import examine
     from kgcp.measurement.search.pyramid import eight_bit
-    from kgcp.pipeline.measure import measure_frame
     from kgcp.settings import DetectSettings
 
     flight, settings = source.flight, DetectSettings()
 
     def kgcp(grey: GreyArray) -> object:
-        return measure_frame(grey, flight.camera, flight.targets, settings)
+        return examine(grey, flight.camera, flight.targets, settings, source.priors)
 
     detectors = [kgcp, _april_tags(), _aruco()]
     for frame in source.frames:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from kgcp.geometry.camera import Camera
+from kgcp.geometry.camera import Camera, Response
 from kgcp.io.flight.flight import Flight, read_flight
-from kgcp.io.images.frames import list_frames
+from kgcp.io.images.frames import list_frames, read_grey
+from kgcp.measurement.plate_prior import PlatePrior
+from kgcp.measurement.records import ExposureSettings, FrameResult, ToneBase
 from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.measure import measure_frame
 from kgcp.pipeline.simulate import write_simulated_flight
+from kgcp.quality.learnt_imaging import base_of_no_matter, base_of_some
 from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.presets import preset
 
 _PRESETS = ("clean", "consumer")
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_DECIDING = 32  # frames that tell the base of a tone curve
 _FOCAL = 1.2  # of a photograph's width
 
 
@@ -32,11 +37,20 @@ class Source:
         Its frames folder, camera and targets.
     frames : tuple of str
         Paths relative to that folder.
+    tone_base : ToneBase or None
+        What a run settles for the tone curve, if that is unknown and the frames tell it.
     """
 
     name: str
     flight: Flight
     frames: tuple[str, ...]
+    tone_base: ToneBase | None = None
+
+    @property
+    def priors(self) -> Mapping[str, PlatePrior]:
+        """What a run knows of the targets once the base is settled, by their names."""
+        prior = PlatePrior(tone_base=self.tone_base)
+        return {target.name: prior for target in self.flight.targets}
 
     def spread(self, count: int) -> Source:
         """Return the source with some of its frames, or all of them if there are fewer."""
@@ -60,7 +74,21 @@ def flights_of(folder: Path | None, work: Path, count: int) -> list[Source]:
 
 def _source(name: str, folder: Path) -> Source:
     flight = read_flight(folder)
-    return Source(name, flight, tuple(list_frames(flight.frames_folder)))
+    source = Source(name, flight, tuple(list_frames(flight.frames_folder)))
+    return replace(source, tone_base=_tone_base_of(source))
+
+
+def _tone_base_of(source: Source) -> ToneBase | None:
+    """Return what a run settles for an unknown tone curve; None: it is known, or not settled."""
+    flight = source.flight
+    if flight.camera.response is not Response.UNKNOWN:
+        return None
+    results = []
+    for name in source.spread(_DECIDING).frames:
+        grey = read_grey(flight.frames_folder / name, flight.camera)
+        outcomes = measure_frame(grey, flight.camera, flight.targets)
+        results.append(FrameResult(name, None, ExposureSettings(), tuple(outcomes)))
+    return base_of_some(results) or base_of_no_matter(results)
 
 
 def photographs_of(folder: Path | None, like: Source) -> list[Source]:
