@@ -1,0 +1,87 @@
+"""What the residuals of a fit ask for beyond the plain model, and when they ask for it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment import extensions, random_levels
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.random_levels import asks_for_levels
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.records import ToneBase
+
+
+def stand_in(**members: object) -> Any:  # noqa: ANN401 - for whichever record has these members
+    return SimpleNamespace(**members)
+
+
+@pytest.mark.parametrize(
+    ("has_levels", "inflation", "tones"),
+    [
+        (False, 10.0, [Tone.UNKNOWN_FROM_LINE]),
+        (True, 2.9, [Tone.UNKNOWN_FROM_LINE]),
+        (True, 3.9, [Tone.UNKNOWN_FROM_LINE, Tone.UNKNOWN]),  # of fits beside the minimum, 3.9…5.7
+    ],
+)
+def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
+    monkeypatch: pytest.MonkeyPatch, *, has_levels: bool, inflation: float, tones: list[Tone]
+) -> None:
+    tried = []
+
+    def fit(problem: FitProblem, *_: object) -> object:
+        tried.append(problem.tone)
+        return stand_in(best=stand_in(varied=object() if has_levels else None))
+
+    monkeypatch.setattr(extensions, "_fit_in_any_light", fit)
+    monkeypatch.setattr(extensions, "pose_covariance", lambda _: stand_in(inflation=inflation))
+    monkeypatch.setattr(extensions, "advantage_over", lambda *_: 2.0)
+    problem = FitProblem(
+        window=stand_in(),
+        circles=stand_in(),
+        measured_count=2,
+        outer_radius_m=0.45,
+        outer_radius_px=30.0,
+        centre_px=np.array([160.0, 120.0]),
+        focal_px=900.0,
+        censoring=stand_in(),
+        tone=Tone.UNKNOWN,
+        sharpening_px=1.2,
+    )
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    fits = extensions.fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), ToneBase.LINE)
+    assert tried == tones
+    assert fits.untried == (None if len(tones) == 2 else ToneBase.SRGB)
+    assert (fits.rival is None) == (len(tones) == 1)
+
+
+@pytest.mark.parametrize(
+    ("excess", "inflation", "binning", "is_asked"),
+    [
+        (1.0, 6.5, 1, False),  # even light, whatever else is wrong
+        (1.3, 3.5, 1, False),  # of a coarse renderer in even light
+        (1.3, 6.5, 1, True),  # dirt on a small ring
+        (1.8, 1.0, 1, False),
+        (2.0, 1.0, 1, True),
+        (2.0, 6.5, 2, False),  # bins: a tone curve within them displaces edges
+        (2.6, 1.0, 2, True),
+    ],
+)
+def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    excess: float,
+    inflation: float,
+    binning: int,
+    is_asked: bool,
+) -> None:
+    monkeypatch.setattr(random_levels, "excess_of_cells", lambda _: excess)
+    monkeypatch.setattr(random_levels, "pose_covariance", lambda _: stand_in(inflation=inflation))
+    window = stand_in(binning=binning)
+    fit = stand_in(sample=stand_in(problem=stand_in(window=window)))
+    assert asks_for_levels(fit) == is_asked
