@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from kgcp.io.images.remote import StoredFolder
-    from kgcp.pipeline.ground.device import DeviceFrame
-    from kgcp.pipeline.ground.field import FieldFrame
     from kgcp.pipeline.ground.orient import FlightPoses
+    from kgcp.pipeline.ground.own_frame import OrientedFrame, PoseT
 
 _MIN_POINTS = 4
 _FEW_FRAMES = 3  # that are named
@@ -227,7 +226,7 @@ def _orient_by_field(
 
 def _report_frames(
     about: Mapping[str, str],
-    frames: Sequence[DeviceFrame] | Sequence[FieldFrame],
+    frames: Sequence[OrientedFrame[PoseT]],
     path: Path,
     *,
     as_json: bool,

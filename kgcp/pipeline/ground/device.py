@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from kgcp.errors import KgcpError, Rejection
-from kgcp.io.files.atomic import write_bytes
+from kgcp.errors import Rejection
 from kgcp.io.flight.device_file import EoDevice
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import list_frames, matching_frames, read_grey
-from kgcp.io.tables.poses import OwnFramePose, own_frame_poses_csv
 from kgcp.measurement.enclosed_discs import centres_and_covariances, enclosed_discs
 from kgcp.network.ground.device import DevicePose, orient_by_device
 from kgcp.network.ground.resection import NoPoseError
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.pipeline.ground.own_frame import OrientedFrame, require_a_pose, write_own_frame_poses
 
 _SD_FOCAL = 0.2  # relative, of a focal length that is only roughly known
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DeviceFrame:
-    """What became of one frame: a pose, or why there is none."""
-
-    frame: str
-    pose: DevicePose | None
-    reason: str
 
 
 @single_threaded()
@@ -36,7 +25,7 @@ def orient_frames_by_device(
     patterns: Sequence[str] = (),
     *,
     has_free_focal: bool = False,
-) -> list[DeviceFrame]:
+) -> list[OrientedFrame[DevicePose]]:
     """Orient frames in the frame of a device.
 
     Parameters
@@ -51,25 +40,21 @@ def orient_frames_by_device(
     KgcpError
         If no frame matches, or none can be oriented.
     """
-    frames = list_frames(flight.frames_folder)
-    chosen = matching_frames(frames, patterns) if patterns else frames
+    chosen = matching_frames(list_frames(flight.frames_folder), patterns)
     sd_focal = _SD_FOCAL if has_free_focal else 0.0
     made = [_oriented(flight, device, frame, sd_focal) for frame in chosen]
-    if not any(each.pose is not None for each in made):
-        reason = made[0].reason if made else "there is no frame"
-        raise KgcpError(
-            f"{flight.frames_folder}: no frame can be oriented by the device {device.name!r}:"
-            f" {reason}"
-        )
+    require_a_pose(made, flight, f"device {device.name!r}")
     return made
 
 
-def _oriented(flight: Flight, device: EoDevice, frame: str, sd_focal: float) -> DeviceFrame:
+def _oriented(
+    flight: Flight, device: EoDevice, frame: str, sd_focal: float
+) -> OrientedFrame[DevicePose]:
     camera, count = flight.camera, len(device.points_m)
     try:
         grey = read_grey(flight.frames_folder / frame, camera)
     except Rejection as rejection:
-        return DeviceFrame(frame, None, rejection.detail)
+        return OrientedFrame(frame, None, rejection.detail)
     groups = enclosed_discs(grey, count, camera.response)
     poses, reasons = [], []
     for group in groups:
@@ -82,11 +67,11 @@ def _oriented(flight: Flight, device: EoDevice, frame: str, sd_focal: float) -> 
             reasons.append(str(error))
     if not poses:
         found = f"no closed region with {count} discs" if not groups else reasons[0]
-        return DeviceFrame(frame, None, found)
-    return DeviceFrame(frame, min(poses, key=lambda pose: pose.rms_px), "")
+        return OrientedFrame(frame, None, found)
+    return OrientedFrame(frame, min(poses, key=lambda pose: pose.rms_px), "")
 
 
-def write_device_poses(frames: Sequence[DeviceFrame], folder: Path) -> Path:
+def write_device_poses(frames: Sequence[OrientedFrame[DevicePose]], folder: Path) -> Path:
     """Write `device_poses.csv`, and return its path.
 
     Raises
@@ -94,16 +79,11 @@ def write_device_poses(frames: Sequence[DeviceFrame], folder: Path) -> Path:
     KgcpError
         If it cannot be written.
     """
-    rows = (
-        OwnFramePose(
-            each.frame,
-            each.pose.pose,
-            each.pose.cov,
-            (f"{each.pose.rms_px:.4f}", f"{each.pose.margin:.1f}"),
-        )
-        for each in frames
-        if each.pose is not None
+    return write_own_frame_poses(
+        frames,
+        folder / "device_poses.csv",
+        {
+            "rms_px": lambda pose: f"{pose.rms_px:.4f}",
+            "margin": lambda pose: f"{pose.margin:.1f}",
+        },
     )
-    path = folder / "device_poses.csv"
-    write_bytes(path, own_frame_poses_csv(rows, ("rms_px", "margin")).encode())
-    return path
