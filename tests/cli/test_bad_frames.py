@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from tests.flight_toml import RING_A
 
 WIDTH, HEIGHT = 320, 200
 FLIGHT = f"""\
@@ -22,14 +23,7 @@ fx = 400.0
 fy = 400.0
 cx = 160.0
 cy = 100.0
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+{RING_A}"""
 
 
 def run(*arguments: str) -> Result:

@@ -20,33 +20,8 @@ from kgcp.io.tables.consistency import CONSISTENCY_COLUMNS
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
+from tests.flight_toml import ON_A_VEHICLE
 
-_TOML = """\
-crs = "EPSG:25831"
-
-[camera]
-width = 1600
-height = 1200
-fx = 2300.0
-fy = 2300.0
-cx = 800.0
-cy = 600.0
-
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-
-[vehicle]
-trajectory = "vehicle.csv"
-lever_arm_m = [0.0, 0.0, -2.0]
-
-[reference]
-poses = "reference.csv"
-"""
 _ORIGIN = np.array([430606.1, 4583523.0, 120.0])
 _LOCAL_FRAME = LocalFrame.at("EPSG:25831", _ORIGIN)
 _UNIX_S, _LATE_S, _FRAMES = 1777887000.0, 0.025, 40
@@ -63,7 +38,7 @@ def _drive(time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "frames").mkdir()
-    (tmp_path / "flight.toml").write_text(_TOML, encoding="utf-8")
+    (tmp_path / "flight.toml").write_text(ON_A_VEHICLE, encoding="utf-8")
     rng = np.random.default_rng(4)
     times = np.arange(0.0, 1.5 * _FRAMES + 4.0, 0.1)
     lines = ["time,x,y,z,roll_deg,pitch_deg,heading_deg,sd_x,sd_y,sd_z"]

@@ -22,34 +22,9 @@ from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.gcps import BIAS_COLUMNS, GCP_COLUMNS
 from kgcp.io.tables.parquet import read_table, write_table
 from kgcp.report.bias.reexposure import Reexposed
+from tests.flight_toml import ON_A_VEHICLE
 
-_TOML = """\
-name = "six <frames>"
-crs = "EPSG:25831"
-
-[camera]
-width = 1600
-height = 1200
-fx = 2300.0
-fy = 2300.0
-cx = 800.0
-cy = 600.0
-
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-
-[vehicle]
-trajectory = "vehicle.csv"
-lever_arm_m = [0.0, 0.0, -2.0]
-
-[reference]
-poses = "reference.csv"
-"""
+_TOML = f'name = "six <frames>"\n{ON_A_VEHICLE}'
 _START = np.array([430606.1, 4583523.0, 120.0])
 _UNIX_S = 1777887000.0
 _FRAMES = tuple(f"f_{index}.jpg" for index in range(6))

@@ -10,8 +10,9 @@ from click.testing import CliRunner, Result
 from PIL import Image
 
 from kgcp.cli import main
+from tests.flight_toml import RING_A
 
-FLIGHT = """
+FLIGHT = f"""
 [camera]
 width = 1200
 height = 900
@@ -23,14 +24,7 @@ sd_fx = 1.0
 sd_fy = 1.0
 response = "linear"
 
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+{RING_A}"""
 
 
 @pytest.fixture

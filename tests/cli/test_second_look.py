@@ -17,30 +17,11 @@ from kgcp.geometry.pose import Pose
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import image_plate
+from tests.flight_toml import REPLICA_OF_A, RING_A, camera_table
 
 CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
 HAZY, FRAMES = 4, 9
-FLIGHT = """\
-[camera]
-width = 480
-height = 360
-fx = 900.0
-fy = 904.0
-cx = 236.3
-cy = 184.2
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-[[target]]
-name = "A-inner"
-replica_of = "A"
-scale = 0.2
-code_deg = [10, 80, 150, 250, 290]
-"""
+FLIGHT = camera_table(CAMERA) + RING_A + REPLICA_OF_A
 
 
 def pose_of(number: int) -> Pose:

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from tests.flight_toml import RING_A
 
 FRAMES, FEW = 160, 4
 TELLING_ALL = """\
@@ -22,7 +23,7 @@ from kgcp.cli import detect_log, main
 detect_log._JSON_PROGRESS_S = 0.0
 main(prog_name="kgcp")
 """
-FLIGHT = """\
+FLIGHT = f"""\
 [camera]
 width = 640
 height = 480
@@ -30,14 +31,7 @@ fx = 800.0
 fy = 800.0
 cx = 320.0
 cy = 240.0
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+{RING_A}"""
 
 
 def rough_ground(folder: Path, frames: int) -> Path:

@@ -25,6 +25,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.io.tables.columns import time_cell
 from kgcp.io.tables.detections import DETECTION_COLUMNS
 from kgcp.io.tables.parquet import write_table
+from tests.flight_toml import RING_A
 
 WIDTH, HEIGHT = 64, 48
 LIMIT_S, _PATIENCE = 5.0, 12.0
@@ -44,14 +45,7 @@ fx = 100.0
 fy = 100.0
 cx = 31.0
 cy = 24.0
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-[vehicle]
+{RING_A}[vehicle]
 trajectory = "vehicle.csv"
 lever_arm_m = [-0.8, 0.15, -1.95]
 [reference]

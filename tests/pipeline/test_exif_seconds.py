@@ -9,9 +9,10 @@ from PIL import Image
 
 from kgcp.io.flight.flight import read_flight
 from kgcp.pipeline.detect import RunOptions, detect_flight
+from tests.flight_toml import RING_A
 
 EXIF_IFD, DATE_TIME, OFFSET, SUBSEC = 0x8769, 0x9003, 0x9011, 0x9291
-FLIGHT = """\
+FLIGHT = f"""\
 [camera]
 width = 64
 height = 48
@@ -20,14 +21,7 @@ fy = 90
 cx = 31
 cy = 24
 
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+{RING_A}"""
 
 
 def frame(folder: Path, name: str, subsec: str) -> None:

@@ -31,32 +31,13 @@ from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import image_plate
+from tests.flight_toml import REPLICA_OF_A, RING_A, camera_table
 
 CAMERA = Camera(320, 240, 600.0, 600.0, 158.0, 121.0, k1=-0.05)
 POSE = Pose(np.eye(3), np.array([0.54, -0.36, 9.0]))
-FLIGHT = """\
+FLIGHT = f"""\
 name = "<b>Süd</b>"
-[camera]
-width = 320
-height = 240
-fx = 600.0
-fy = 600.0
-cx = 158.0
-cy = 121.0
-k1 = -0.05
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-[[target]]
-name = "A-inner"
-replica_of = "A"
-scale = 0.2
-code_deg = [10, 80, 150, 250, 290]
-"""
+{camera_table(CAMERA)}{RING_A}{REPLICA_OF_A}"""
 SEEN, OTHER, EMPTY, BROKEN = "a #1 & 'x'.png", "b.png", "c.png", "d.png"
 
 

@@ -30,26 +30,11 @@ from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.plate import image_plate
+from tests.flight_toml import RING_A, camera_table
 
 CAMERA = Camera(320, 240, 900.0, 904.0, 156.3, 124.2)
 FRAMES, ASKED = 12, 8
-FLIGHT = """\
-[camera]
-width = 320
-height = 240
-fx = 900.0
-fy = 904.0
-cx = 156.3
-cy = 124.2
-response = "unknown"
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+FLIGHT = f'{camera_table(CAMERA)}response = "unknown"\n{RING_A}'
 
 
 class StopAfter:

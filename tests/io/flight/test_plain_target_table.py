@@ -9,8 +9,9 @@ import pytest
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
 from kgcp.targets.plain import PlainPolarity, PlainTarget
+from tests.flight_toml import RING_A
 
-_HEAD = """\
+_HEAD = f"""\
 crs = "EPSG:25832"
 [camera]
 width = 480
@@ -19,14 +20,7 @@ fx = 700
 fy = 700
 cx = 240
 cy = 180
-[[target]]
-name = "A"
-outer_diameter_m = 0.9
-inner_diameter_m = 0.45
-code_diameter_m = 0.642857143
-dot_diameter_m = 0.128571429
-code_deg = [0, 43, 78, 180]
-"""
+{RING_A}"""
 _DISC = """\
 [[target]]
 name = "W"
