@@ -272,10 +272,32 @@ def test_both_poses_are_reported_whichever_the_start(
         assert seen.pose.normal @ pose.normal > np.cos(np.radians(1.0))
         assert seen.alternative.pose.normal @ pose.mirrored().normal > np.cos(np.radians(5.0))
         assert seen.alternative.ambiguity > 20.0
+        assert seen.alternative.pose_cov is None, "the image is sure"
         assert seen.ring == "A"
     assert one.uncertainty is not None
     sd = np.sqrt(np.diag(one.uncertainty.pose_cov))[:3]
     assert np.all(np.abs(one.pose.translation_m - other.pose.translation_m) < 0.5 * sd)
+
+
+@pytest.mark.parametrize(("tilt_deg", "is_ruled_out"), [(2.0, False), (6.0, True)])
+def test_a_pose_that_the_image_does_not_rule_out_has_its_own_covariance(
+    photograph: Photograph, start_near: StartNear, *, tilt_deg: float, is_ruled_out: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    rotation = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
+    pose = Pose(rotation, np.array([0.3, 0.2, 0.45 * LENS.mean_focal_px / 12.0]))
+    grey = photograph(LENS, pose, rng)
+    seen = measure_by_model(grey, LENS, TARGET, start_near(LENS, pose, rng))
+    assert seen.alternative is not None
+    assert seen.uncertainty is not None
+    cov = seen.alternative.pose_cov
+    if is_ruled_out:
+        assert 11.0 < seen.alternative.ambiguity < 40.0
+        assert cov is None
+    else:
+        assert 0.0 <= seen.alternative.ambiguity < 8.0
+        assert cov is not None
+        assert cov[2, 2] == pytest.approx(seen.uncertainty.pose_cov[2, 2], rel=0.6)
 
 
 @pytest.mark.parametrize("radius_px", [12.0, 30.0])

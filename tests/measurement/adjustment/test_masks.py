@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from kgcp.measurement.adjustment.masks import _fill_ellipse, _mark_foreign, _mark_other, _plateaus
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.masks import (
+    _fill_ellipse,
+    _mark_foreign,
+    _mark_other,
+    _plateaus,
+    occluded_mask,
+    see_plate,
+)
+from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.image_model.blur import Blur
+from kgcp.measurement.image_model.photometry import light_of_levels
+from kgcp.targets.layout import Target
 
 PIXELS = 4000
 BLACK, WHITE, RADIUS_M, SD_M, SLACK_M = 0.1, 0.8, 0.45, 0.02, 0.004
@@ -98,3 +113,29 @@ def test_the_reach_of_a_blur_is_its_ellipse(blur: tuple[float, float, float]) ->
     for row, column in np.ndindex(9, 9):
         offset = np.array([column - 4, row - 4])
         assert kernel[row, column] == (offset @ inverse @ offset <= 4.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("black", "white", "share"),
+    [
+        (0.08, 0.75, 0.0),
+        (0.08, 0.33, 0.4),  # all plate is off its level, and what surrounds it
+        (0.45, 0.75, 0.0),  # all ink, which is most of the ring: the light is wrong
+    ],
+)
+def test_what_would_hide_most_of_a_plate_is_another_light(
+    target: Target,
+    camera: Camera,
+    place_plate: Callable[..., Pose],
+    draw_frame: Callable[..., GreyArray],
+    imaging_of: Callable[..., FitProblem],
+    black: float,
+    white: float,
+    share: float,
+) -> None:
+    pose = place_plate((205.0, 190.0), 40.0)
+    problem = imaging_of(draw_frame((target, pose), noise=0.003), camera, target, pose)
+    seen = see_plate(problem, pose, Blur(0.6, 0.6, 0.0))
+    occluded = occluded_mask(seen, light_of_levels(black, white, problem.tone), slack_px=0.5)
+    within = seen.unblurred.rho_m < 0.45
+    assert np.mean(occluded[within]) == pytest.approx(share, abs=0.1)

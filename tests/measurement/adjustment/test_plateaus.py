@@ -55,6 +55,19 @@ def test_even_light_is_even(
     assert step_across(problem, plateaus) is None
 
 
+def test_where_no_ink_or_plate_is_seen_the_levels_are_those_of_what_is_farther_off(
+    look: Callable[..., tuple[FitProblem, Plateaus]],
+    target: Target,
+    place_plate: Callable[..., Pose],
+) -> None:
+    problem, _ = look(target)
+    third = replace(problem, visible=np.arange(72) < 24)
+    plateaus = look_at_plateaus(third, place_plate(CENTRE_PX, 60.0, tilt_deg=10.0), 0.8)
+    assert plateaus is not None
+    typical = np.array(plateaus.typical)
+    assert np.abs(plateaus.levels - typical[:, None]).max() < 0.05
+
+
 def test_a_shadow_s_edge_is_found_where_it_lies(
     look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:

@@ -36,6 +36,22 @@ def test_edge_points_lie_on_a_blurred_edge() -> None:
     assert len(edge_points(patch, start, AROUND, dark_inside=False)) == 0
 
 
+def test_edges_much_fainter_than_the_rest_are_left_out() -> None:
+    """Two sectors of an eighth each, of which one has 0.4 of the contrast and one 0.2."""
+    rows, columns = np.indices((240, 260))
+    radius = np.hypot(columns - 130.0, rows - 120.0)
+    sector = np.degrees(np.arctan2(rows - 120.0, columns - 130.0)) // 45.0
+    contrast = 150.0 * np.select([sector == 1.0, sector == -3.0], [0.4, 0.2], 1.0)
+    frame = 40.0 + contrast / (1.0 + np.exp(-(radius - 90.25) / 0.6))
+    start = Ellipse(130.0, 120.0, 90.3, 90.3, 0.0)
+    points = edge_points(spline_patch_around(frame, start), start, AROUND, dark_inside=True)
+    seen = np.degrees(np.arctan2(points[:, 1] - 120.0, points[:, 0] - 130.0)) // 45.0
+    kept = [int(np.sum(seen == each)) for each in (1.0, -3.0)]
+    assert kept[0] == pytest.approx(25, abs=2)
+    assert kept[1] <= 2
+    assert len(points) == pytest.approx(175, abs=4)
+
+
 def test_edges_outside_the_frame_are_left_out() -> None:
     rows, columns = np.indices((120, 100))
     frame = np.where(np.hypot(columns - 90.0, rows - 60.0) < 30.0, 20.0, 200.0)

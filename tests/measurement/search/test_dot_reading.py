@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from kgcp.errors import Reason
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.records import Miss
-from kgcp.measurement.search.dot_reading import describe_dots, turned_to
+from kgcp.measurement.search.dot_reading import describe_dots, read_dots, turned_to
 from kgcp.pipeline.measure import measure_frame
 from kgcp.targets.layout import Ring, Target
 
@@ -73,6 +74,18 @@ def test_a_wrong_code_is_read_from_the_frame(
     dots = np.array([float(angle) for angle in read[1].split(", ")])
     assert turned_to(dots, code_deg, HALF_DEG).is_code, miss.detail
     assert ("these are its mirror image" in miss.detail) == (code_deg is MIRRORED)
+
+
+def test_dots_are_read_where_they_leave_little_ink_between_them(
+    camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
+) -> None:
+    many = tuple(360.0 / 11.0 * number for number in range(11))
+    pose = place_plate((240.0, 180.0), 50.0)
+    frame = draw_frame((coded(many), pose))
+    (x, y), radius_px = camera.project(pose.translation_m), 50.0
+    dots = read_dots(frame, Ellipse(x, y, radius_px, radius_px, 0.0), RING)
+    assert len(dots) == len(many)
+    np.testing.assert_allclose(np.diff(dots), 360.0 / 11.0, atol=1.5)
 
 
 def test_the_ring_that_has_failed_is_shown_and_not_its_replica(
