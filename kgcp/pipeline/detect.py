@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -147,81 +147,39 @@ def detect_flight(
     if options.scheduler is not None:
         # as the folder is called in whatever folder another process works
         flight = replace(flight, frames_folder=flight.frames_folder.absolute())
-    frames_folder = options.stored_frames or flight.frames_folder
     with stopwatch.stage("preparation"):
-        all_frames = frames_below(frames_folder)
-        frames = matching_frames(all_frames, options.frame_patterns)
-        data = FlightData(flight, all_frames)
-        times = data.frame_times.time_s
-        inputs = _frame_inputs(flight, data, frames)
-        marks = _marks(flight, data, all_frames, options.places)
-        sheet = None if options.overlay is None else _sheet(flight, options.overlay)
-    job = DetectionJob(
-        frames_folder,
-        flight.camera,
-        flight.calibration_covariance,
-        flight.targets,
-        settings,
-        keeps_dropped=options.overlay is not None and options.all_candidates,
-        plain_targets=flight.plain_targets,
-    )
-    table = out / DETECTIONS
-    builder = SummaryBuilder(_without(times, set(all_frames).difference(frames)))
-    not_drawn = 0
+        task = _prepared_task(flight, settings, options)
+    job = _job_of(task)
     path, is_new = out / ".detections.journal", options.is_restart
     with Journal(path, _making(job), (FrameResult,), is_new=is_new) as journal:
         with (
             _kept_frames(out, settings, options) as kept,
-            open_pool(
-                options.jobs,
-                options.frame_timeout_s,
-                options.scheduler,
-                frames_folder,
-                _STAGE_CALLERS if options.is_profiled else (),
-                Preparation(load_compiled_code, compile_code),
-            ) as pool,
+            _open_pool(options, job.frames_folder) as pool,
         ):
             job = replace(job, kept_frames=kept)
-            run = DetectionRun(job, inputs, journal, pool, listener or NoProgress())
+            run = DetectionRun(job, task.inputs, journal, pool, listener or NoProgress())
             pool.import_meanwhile("pandas")  # pyarrow loads it to write a table
             with stopwatch.stage("first look"):
                 run.first_pass()
             with stopwatch.stage("second look"):
-                predictions, guide_problem = _measure_missing_targets(
-                    run, flight, data, settings, marks
-                )
+                predictions, guide_problem = _measure_missing_targets(run, task)
             with stopwatch.stage("learning"):
                 run.learn()
             likely_cause = _likely_cause(run, stopwatch)
-            if sheet is not None:
-                sheet.clear()
+            if task.sheet is not None:
+                task.sheet.clear()
             with stopwatch.stage("table"):
-                rows = _rows(run, predictions, flight, builder)
-                about = detections_provenance(
-                    flight,
-                    settings,
-                    run.frame_sizes,
-                    data.frame_times,
-                    run.learnt,
-                    options.frame_patterns,
-                    options.places,
-                )
-                write_table(table, DETECTION_COLUMNS, rows, about)
-            if sheet is not None:
+                builder = _write_detections(out / DETECTIONS, run, task, predictions)
+            not_drawn = 0
+            if task.sheet is not None:
                 with stopwatch.stage("overlay"):
-                    not_drawn = draw_overlay(sheet, flight.name, run, job, predictions)
-        is_level = flight.vehicle is not None and flight.vehicle.settings.level_sd_deg is not None
+                    not_drawn = draw_overlay(task.sheet, flight.name, run, job, predictions)
         summary = builder.summary(
-            table=table,
+            table=out / DETECTIONS,
             likely_cause=likely_cause,
-            frames_not_chosen=len(all_frames) - len(frames),
+            frames_not_chosen=len(task.all_frames) - len(task.inputs),
             kept=run.kept,
-            frames_without_attitude=sum(
-                all(prior.normal is None for prior in frame_input.priors.values())
-                for frame_input in inputs
-            )
-            if is_level
-            else 0,
+            frames_without_attitude=_frames_without_attitude(task),
             not_drawn=not_drawn,
             guide_problem=guide_problem,
             learnt=run.learnt,
@@ -231,6 +189,62 @@ def detect_flight(
         write_run_record(out / "run.json", record)  # when all workers have ended: it has their peak
         journal.remove()
     return summary
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _DetectionTask:
+    """A flight and what to do with it, before any frame is read."""
+
+    flight: Flight
+    settings: DetectSettings
+    options: RunOptions
+    data: FlightData
+    all_frames: Sequence[str]
+    inputs: Sequence[FrameInput]  # the frames that are wanted
+    marks: Mapping[str, Sequence[Mark]]  # of static targets, by frame
+    sheet: ContactSheet | None
+
+
+def _prepared_task(flight: Flight, settings: DetectSettings, options: RunOptions) -> _DetectionTask:
+    all_frames = frames_below(options.stored_frames or flight.frames_folder)
+    frames = matching_frames(all_frames, options.frame_patterns)
+    data = FlightData(flight, all_frames)
+    return _DetectionTask(
+        flight=flight,
+        settings=settings,
+        options=options,
+        data=data,
+        all_frames=all_frames,
+        inputs=_frame_inputs(flight, data, frames),
+        marks=_marks(flight, data, all_frames, options.places),
+        sheet=None if options.overlay is None else _sheet(flight, options.overlay),
+    )
+
+
+def _job_of(task: _DetectionTask) -> DetectionJob:
+    flight, options = task.flight, task.options
+    return DetectionJob(
+        options.stored_frames or flight.frames_folder,
+        flight.camera,
+        flight.calibration_covariance,
+        flight.targets,
+        task.settings,
+        keeps_dropped=options.overlay is not None and options.all_candidates,
+        plain_targets=flight.plain_targets,
+    )
+
+
+def _open_pool(
+    options: RunOptions, frames_folder: Path | StoredFolder
+) -> AbstractContextManager[WorkerPool]:
+    return open_pool(
+        options.jobs,
+        options.frame_timeout_s,
+        options.scheduler,
+        frames_folder,
+        _STAGE_CALLERS if options.is_profiled else (),
+        Preparation(load_compiled_code, compile_code),
+    )
 
 
 def _kept_frames(
@@ -261,11 +275,7 @@ def _frame_inputs(flight: Flight, data: FlightData, frames: Sequence[str]) -> li
 
 
 def _measure_missing_targets(
-    run: DetectionRun,
-    flight: Flight,
-    data: FlightData,
-    settings: DetectSettings,
-    marks: Mapping[str, Sequence[Mark]],
+    run: DetectionRun, task: _DetectionTask
 ) -> tuple[Mapping[int, Mapping[str, Prediction]], str | None]:
     """Look where the first look, or marks, say that targets must be.
 
@@ -278,21 +288,16 @@ def _measure_missing_targets(
     """
     predictions: Mapping[int, Mapping[str, Prediction]] = {}
     problem = None
-    if settings.is_guided:
-        predictions, problem = predict_missing(flight, data, run.tracks)
+    is_guided = task.settings.is_guided
+    if is_guided:
+        predictions, problem = predict_missing(task.flight, task.data, run.tracks)
     run.guided_pass(predictions, {})
-    if settings.is_guided or marks:
-        _look_for_plain(run, flight, data, marks, _MOST_LOOKS if settings.is_guided else 1)
+    if is_guided or task.marks:
+        _look_for_plain(run, task, _MOST_LOOKS if is_guided else 1)
     return predictions, problem
 
 
-def _look_for_plain(
-    run: DetectionRun,
-    flight: Flight,
-    data: FlightData,
-    marks: Mapping[str, Sequence[Mark]],
-    looks: int,
-) -> None:
+def _look_for_plain(run: DetectionRun, task: _DetectionTask, looks: int) -> None:
     """Look for plain targets where the frames' results say that they must be, until nothing is new.
 
     What is found in a frame tells where others are, in this one and in those beside it. Where that
@@ -300,7 +305,9 @@ def _look_for_plain(
     """
     tried: set[tuple[int, str]] = set()
     for look in range(looks):
-        plain = plain_by_results(flight, data, run.results(), run.tracks.time_s, marks, tried)
+        plain = plain_by_results(
+            task.flight, task.data, run.results(), run.tracks.time_s, task.marks, tried
+        )
         sure = {
             row: {name: each for name, each in predictions.items() if each.is_sure}
             for row, predictions in plain.items()
@@ -318,10 +325,6 @@ def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:
         return None
     with stopwatch.stage("trial of negatives"):
         return _NEGATIVE if run.is_negative() else None
-
-
-def _without(times: Mapping[str, float], left_out: Collection[str]) -> dict[str, float]:
-    return {name: time_s for name, time_s in times.items() if name not in left_out}
 
 
 def _marks(
@@ -386,6 +389,41 @@ def _making(job: DetectionJob) -> dict[str, str]:
         "the targets": fingerprint(job.all_targets),
         "what is shown of dropped rings": to_text(job.keeps_dropped),
     }
+
+
+def _frames_without_attitude(task: _DetectionTask) -> int:
+    """Return how many frames have no vehicle's attitude to tell which pose a level plate has."""
+    vehicle = task.flight.vehicle
+    if vehicle is None or vehicle.settings.level_sd_deg is None:
+        return 0
+    return sum(
+        all(prior.normal is None for prior in frame_input.priors.values())
+        for frame_input in task.inputs
+    )
+
+
+def _write_detections(
+    table: Path,
+    run: DetectionRun,
+    task: _DetectionTask,
+    predictions: Mapping[int, Mapping[str, Prediction]],
+) -> SummaryBuilder:
+    """Write the table, and return the counts of its rows."""
+    left_out = set(task.all_frames).difference(each.frame for each in task.inputs)
+    times = task.data.frame_times.time_s
+    builder = SummaryBuilder({name: times[name] for name in times if name not in left_out})
+    about = detections_provenance(
+        task.flight,
+        task.settings,
+        run.frame_sizes,
+        task.data.frame_times,
+        run.learnt,
+        task.options.frame_patterns,
+        task.options.places,
+    )
+    rows = _rows(run, predictions, task.flight, builder)
+    write_table(table, DETECTION_COLUMNS, rows, about)
+    return builder
 
 
 def _rows(
