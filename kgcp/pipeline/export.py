@@ -14,6 +14,7 @@ from kgcp.georef.camera_priors import CameraPrior, camera_priors
 from kgcp.georef.gcp import Gcp, SkippedSighting, build_gcps, transform_gcps
 from kgcp.georef.local_frame import CrsTransform
 from kgcp.georef.selection import Selection, explain_none_left, leave_out, select
+from kgcp.georef.sighting import Attempt, Sighting
 from kgcp.georef.target_positions import Vehicle
 from kgcp.io.exporters.formats import DEFAULT_FORMATS, FORMATS
 from kgcp.io.exporters.points import MapPoints
@@ -105,15 +106,7 @@ def make_gcps(
     """
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     attempts = read_attempts(table, flight)
-    measured = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    if not measured:
-        raise KgcpError(
-            f"{table}: no target was measured in any frame;"
-            " see the reasons that 'kgcp detect' gives"
-        )
-    sightings, excluded = leave_out(measured, selection.excluded)
-    if not sightings:
-        raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
+    sightings, excluded = _sightings(table, attempts, selection)
     data = FlightData(flight, sorted({attempt.frame for attempt in attempts}))
     inputs = FlightInputs.detected(flight, data, attempts)
     with naming_causes(inputs.plausibility):
@@ -155,6 +148,28 @@ def make_gcps(
         ),
         doubts=doubts,
     )
+
+
+def _sightings(
+    table: Path, attempts: Sequence[Attempt], selection: Selection
+) -> tuple[Sequence[Sighting], Sequence[SkippedSighting]]:
+    """Return the sightings that points are made of, and those that are excluded.
+
+    Raises
+    ------
+    KgcpError
+        If there is none of the former.
+    """
+    measured = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    if not measured:
+        raise KgcpError(
+            f"{table}: no target was measured in any frame;"
+            " see the reasons that 'kgcp detect' gives"
+        )
+    sightings, excluded = leave_out(measured, selection.excluded)
+    if not sightings:
+        raise KgcpError(f"{table}: all {len(measured)} sightings are excluded; exclude fewer")
+    return sightings, excluded
 
 
 @single_threaded()

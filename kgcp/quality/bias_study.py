@@ -156,8 +156,8 @@ def study_bias(
         If nothing was measured, no measured frame has a pose, or as `TargetPositions.positions`.
     """
     ours = _with_measured_target(attempts)
-    rows = {frame: row for row, frame in enumerate(poses.frames)}
-    posed = [attempt for attempt in ours if attempt.frame in rows]
+    has_pose = set(poses.frames)
+    posed = [attempt for attempt in ours if attempt.frame in has_pose]
     if not any(attempt.sighting for attempt in posed):
         raise KgcpError(_no_pose(ours, poses))
     times = [
@@ -165,19 +165,42 @@ def study_bias(
         for attempt in posed
     ]
     positions = target_positions.positions([attempt.target for attempt in posed], times)
-    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
-    diameters = {target.name: target.outer_diameter_m for target in targets}
     placed = [
-        (attempt, position, rows[attempt.frame])
+        (attempt, position)
         for attempt, position in zip(posed, positions, strict=True)
         if isinstance(position, TargetPosition)
     ]
+    orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
+    compared = _compare_all(placed, poses.frames, orientations, camera, targets)
+    measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
+    agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
+    return BiasStudy(
+        method=method,
+        measured=measured,
+        expected_visible=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
+        attitudes_agree=agree,
+        frames_without_pose=tuple(sorted({each.frame for each in ours} - has_pose)),
+        absences=tuple(position for position in positions if isinstance(position, NoPosition)),
+    )
+
+
+def _compare_all(
+    placed: Sequence[tuple[Attempt, TargetPosition]],
+    frames: Sequence[str],
+    orientations: ExteriorOrientations,
+    camera: Camera,
+    targets: Sequence[AnyTarget],
+) -> list[Comparison]:
+    """Compare attempts with the poses of their frames; `frames` names those of the orientations."""
+    row_of = {frame: row for row, frame in enumerate(frames)}
+    rows = [row_of[attempt.frame] for attempt, _ in placed]
+    diameters = {target.name: target.outer_diameter_m for target in targets}
     in_camera = [
         (position.position_m - orientations.centre_m[row]) @ orientations.enu_from_camera[row]
-        for _, position, row in placed
+        for (_, position), row in zip(placed, rows, strict=True)
     ]
     pixels = visible_pixels(camera, np.reshape(in_camera, (-1, 3)))
-    compared = [
+    return [
         _compare(
             attempt,
             position,
@@ -186,18 +209,8 @@ def study_bias(
             pixel,
             0.5 * diameters[attempt.target] * camera.mean_focal_px,
         )
-        for (attempt, position, row), pixel in zip(placed, pixels, strict=True)
+        for (attempt, position), row, pixel in zip(placed, rows, pixels, strict=True)
     ]
-    measured = tuple(pair for pair in compared if pair.attempt.sighting is not None)
-    agree = 2 * sum(pair.is_misplaced for pair in measured) < len(measured)
-    return BiasStudy(
-        method=method,
-        measured=measured,
-        expected_visible=tuple(pair for pair in compared if not agree or pair.is_whole_in(camera)),
-        attitudes_agree=agree,
-        frames_without_pose=tuple(sorted({attempt.frame for attempt in ours} - rows.keys())),
-        absences=tuple(position for position in positions if isinstance(position, NoPosition)),
-    )
 
 
 def _with_measured_target(attempts: Sequence[Attempt]) -> list[Attempt]:

@@ -177,25 +177,7 @@ def place_flight(
             min_frames=options.min_frames,
             has_exact_poses=options.has_exact_poses,
         )
-    if not placement.targets:
-        name, reason = next(iter(placement.skipped.items()))
-        raise KgcpError(f"no target can be placed: {name!r} {reason}")
-    if placement.noise.centre_px >= MOST_EXTRA_PX:
-        raise KgcpError(
-            f"{options.poses or flight.folder / 'flight.toml'}: the poses do not fit the images, by"
-            f" {MOST_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
-            " whether each pose has its own frame's name",
-            option=None if options.poses is None else "poses",
-        )
-    used = {
-        (placed.target, frame)
-        for placed in placement.targets
-        for frame, is_used in zip(placed.frames, placed.is_used, strict=True)
-        if is_used
-    }
-    chosen = tuple(
-        each for each in sightings if (each.target, each.frame) in used and not each.instance
-    )
+    _require_fit(placement, flight, options.poses)
     choices = {
         "targets": options.targets,
         "min_frames": options.min_frames,
@@ -204,7 +186,34 @@ def place_flight(
     provenance = derived_provenance(
         flight, table, choices, has_reference=options.poses is None and data.has_reference
     )
-    return FlightPlaces(flight, placement, chosen, local_frame, provenance)
+    used = _used_sightings(placement, sightings)
+    return FlightPlaces(flight, placement, used, local_frame, provenance)
+
+
+def _require_fit(placement: Placement, flight: Flight, poses: Path | None) -> None:
+    """Refuse a placement without targets, or by poses that are not those of the images."""
+    if not placement.targets:
+        name, reason = next(iter(placement.skipped.items()))
+        raise KgcpError(f"no target can be placed: {name!r} {reason}")
+    if placement.noise.centre_px >= MOST_EXTRA_PX:
+        raise KgcpError(
+            f"{poses or flight.folder / 'flight.toml'}: the poses do not fit the images, by"
+            f" {MOST_EXTRA_PX:.0f} px or more; look whether angles are of the stated kind, and"
+            " whether each pose has its own frame's name",
+            option=None if poses is None else "poses",
+        )
+
+
+def _used_sightings(placement: Placement, sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+    used = {
+        (placed.target, frame)
+        for placed in placement.targets
+        for frame, is_used in zip(placed.frames, placed.is_used, strict=True)
+        if is_used
+    }
+    return tuple(
+        each for each in sightings if (each.target, each.frame) in used and not each.instance
+    )
 
 
 def write_places(
