@@ -100,7 +100,7 @@ def test_dirt_on_a_small_ring_is_told_by_its_edges(
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert abs(seen.distance_m / pose.distance_m - 1.0) < 5e-4
     assert abs(seen.distance_m - pose.distance_m) < 1.5 * seen.sd_distance_m
-    monkeypatch.setattr("kgcp.measurement.adjustment.random_levels._ASKS_BY_EDGES", math.inf)
+    monkeypatch.setattr("kgcp.measurement.adjustment.random_levels._UNEVEN_INFLATION", math.inf)
     by_cells = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert by_cells.distance_m / pose.distance_m - 1.0 > 1e-3
 
@@ -164,7 +164,7 @@ def test_in_even_light_nothing_changes(
     pose = some_pose(rng)
     grey, start = photograph(LENS, pose, rng), start_near(LENS, pose, rng)
     seen = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
-    for gate in ("asks_for_levels", "asks_for_skew"):
+    for gate in ("needs_varying_levels", "needs_skew"):
         monkeypatch.setattr(extensions, gate, lambda _: False)
     plain = measure_by_model(grey, LENS, TARGET_PLATE.target, start)
     assert seen.pose.matrix.tobytes() == plain.pose.matrix.tobytes()

@@ -1,6 +1,6 @@
-"""What the residuals ask for beyond the plain model: levels that vary, a point spread that is skew.
+"""Extensions of the plain model where its residuals need them: varying levels, a skew point spread.
 
-The plain model comes first, and where its residuals ask for nothing its result is the result.
+The plain model is fitted first. If its residuals need no extension, its result stands.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from kgcp.measurement.adjustment.plateaus import (
     step_across,
 )
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.adjustment.random_levels import asks_for_levels, even_field, fit_levels
-from kgcp.measurement.adjustment.skewed import asks_for_skew, with_skew
+from kgcp.measurement.adjustment.random_levels import even_field, fit_levels, needs_varying_levels
+from kgcp.measurement.adjustment.skewed import needs_skew, with_skew
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
 from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
@@ -40,9 +40,10 @@ from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
-# by which residuals that are alike enlarge the covariance where levels vary: in 58 frames with dirt
-# it is 3.9 to 5.7 of the five whose fit is beside the minimum, and below 3 of nearly all others
-_STRAY_INFLATION = 3.0
+# Inflation of the covariance by residuals that agree along edges, where levels vary: above, the fit
+# has probably ended beside its minimum. Of 58 frames with dirt, the five whose fit did have 3.9 to
+# 5.7, and nearly all others less than 3.
+_OFF_MINIMUM_INFLATION = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,10 +51,10 @@ class FitsByTone:
     """The fits of one target by the tones that its camera may have."""
 
     likelier: TwoPoses
-    # over the other base; None: it leads nowhere, was not tried, or the tone is known
+    # over the other base; None: that fit failed or was not tried, or the tone is known
     rival: TwoPoses | None
-    advantage: float = 0.0  # of the log-likelihood, by which the likelier one is so
-    untried: ToneBase | None = None  # the other base, where it was not tried
+    advantage: float = 0.0  # of the likelier one, in log-likelihood
+    untried_base: ToneBase | None = None  # None: both were tried, or the tone is known
 
 
 def fit_in_any_light(
@@ -66,13 +67,13 @@ def fit_in_any_light(
     Parameters
     ----------
     base : ToneBase, optional
-        Which of them other frames have told. The other one is tried only if this leads nowhere, or
-        leaves what looks as if the fit had come to rest beside the minimum.
+        The one that other frames agree on. The other one is tried only if this fit fails, or seems
+        to have ended beside its minimum.
 
     Raises
     ------
     Rejection
-        As `_fit_in_any_light`, if neither leads anywhere.
+        As `_fit_in_any_light`, if the fits over both fail.
     """
     # the same whatever the tone
     find_plateaus = cache(partial(look_at_plateaus, problem, pose, blur.mean_sd_px))
@@ -80,9 +81,9 @@ def fit_in_any_light(
         return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
     fits: dict[ToneBase, TwoPoses] = {}
     failures: dict[ToneBase, Rejection] = {}
-    for each in sorted(ToneBase, key=lambda each: each is not base):  # first what others have told
-        if base in fits and _is_at_rest(fits[base].best):
-            return FitsByTone(fits[base], None, untried=each)
+    for each in sorted(ToneBase, key=lambda each: each is not base):  # the given one first
+        if base in fits and _is_at_minimum(fits[base].best):
+            return FitsByTone(fits[base], None, untried_base=each)
         toned = replace(problem, tone=TONE_OF_BASE[each])
         try:
             fits[each] = _fit_in_any_light(toned, pose, blur, find_plateaus)
@@ -94,21 +95,21 @@ def fit_in_any_light(
 
 
 def with_untried_base(fits: FitsByTone, problem: FitProblem, pose: Pose, blur: Blur) -> FitsByTone:
-    """Return the fits with the one over the base that was not tried, if that leads anywhere."""
-    if fits.untried is None:
+    """Return the fits with the one over the base that was not tried, unless it fails."""
+    if fits.untried_base is None:
         return fits
-    toned = replace(problem, tone=TONE_OF_BASE[fits.untried])
+    toned = replace(problem, tone=TONE_OF_BASE[fits.untried_base])
     find_plateaus = partial(look_at_plateaus, problem, pose, blur.mean_sd_px)
     try:
         other = _fit_in_any_light(toned, pose, blur, find_plateaus)
     except Rejection:
-        return replace(fits, untried=None)
-    (tried,) = set(ToneBase) - {fits.untried}
-    return _by_likelihood({tried: fits.likelier, fits.untried: other})
+        return replace(fits, untried_base=None)
+    (tried,) = set(ToneBase) - {fits.untried_base}
+    return _by_likelihood({tried: fits.likelier, fits.untried_base: other})
 
 
 def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
-    """Put the likelier one of the fits over one base or both first."""
+    """Return the fits over one base or both, the likelier one first."""
     if len(fits) == 1:
         (alone,) = fits.values()
         return FitsByTone(alone, None)
@@ -119,21 +120,21 @@ def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
     return FitsByTone(over_srgb, over_line, -advantage)
 
 
-def _is_at_rest(fit: TargetFit) -> bool:
-    """Tell whether a fit leaves nothing that looks as if it had come to rest beside the minimum."""
-    return fit.varied is None or pose_covariance(fit).inflation < _STRAY_INFLATION
+def _is_at_minimum(fit: TargetFit) -> bool:
+    """Tell whether nothing suggests that a fit has ended beside its minimum."""
+    return fit.varied is None or pose_covariance(fit).inflation < _OFF_MINIMUM_INFLATION
 
 
 def _fit_in_any_light(
     problem: FitProblem, pose: Pose, blur: Blur, find_plateaus: Callable[[], Plateaus | None]
 ) -> TwoPoses:
-    """Adjust both poses by the plain model, and by what its residuals ask for beyond it.
+    """Adjust both poses by the plain model, and with the extensions that its residuals need.
 
     Raises
     ------
     Rejection
-        As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; and `POOR_FIT` where levels that
-        vary explain nothing either.
+        As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; `POOR_FIT` if varying levels do
+        not explain the image either.
     """
     is_small = problem.outer_radius_px < SMALLEST_UNEVEN_PX
     try:
@@ -143,7 +144,7 @@ def _fit_in_any_light(
         if plateaus is None or not plateaus.is_uneven:
             raise
     else:
-        if is_small or not asks_for_levels(plain.best):
+        if is_small or not needs_varying_levels(plain.best):
             return plain
         plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
@@ -153,9 +154,9 @@ def _fit_in_any_light(
 
 
 def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let the point spread be skew, where the residuals ask for it."""
+    """Let the point spread be skew, if the residuals need it."""
     best, other = poses.best, poses.other
-    if not asks_for_skew(best):
+    if not needs_skew(best):
         return poses
     spreads = [(best.parameters, best.unknowns)]
     blur = best.parameters.blur
@@ -192,7 +193,7 @@ def _fit_skewed(
 
 
 def _with_levels(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
-    """Let levels vary that are even but for little: from the plain fit, and from a shadow."""
+    """Let nearly even levels vary: start from the plain fit, and from a shadow's edge."""
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px)
     shadows = [] if plateaus is None else _shadow_across(problem, first, plateaus)
@@ -200,7 +201,7 @@ def _with_levels(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
 
 
 def _with_seen_levels(problem: FitProblem, poses: TwoPoses, plateaus: Plateaus) -> TwoPoses:
-    """Let the levels vary from those seen on ink and plate, and from a shadow."""
+    """Let the levels vary: start from those seen on ink and plate, and from a shadow's edge."""
     first = poses.best.parameters
     plateaus = look_at_plateaus(problem, first.pose, first.blur.mean_sd_px) or plateaus
     black, white = decoded(np.array(plateaus.extremes), problem.tone).tolist()

@@ -86,7 +86,7 @@ def measure_by_model(
     try:
         measurement = _checked(camera, target, start, fits.likelier, prior.normal)
     except Rejection:
-        if fits.untried is None:
+        if fits.untried_base is None:
             raise
         fits = with_untried_base(fits, problem, pose, blur)
         measurement = _checked(camera, target, start, fits.likelier, prior.normal)

@@ -49,7 +49,7 @@ class Sample:
 
     problem: FitProblem
     index: IndexArray  # (n,): the pixels, in the flattened window
-    is_thinned: bool  # there would be more
+    is_thinned: bool  # whether more pixels would have been useful
     levels: FloatArray  # (n,)
     rays: FloatArray  # (6, n): as in `Window`
     photometry: PhotometricModel
@@ -71,11 +71,11 @@ def select_pixels(
     blur: Blur,
     light: Light | None,
     *,
-    most: int | None = None,
+    max_pixels: int | None = None,
     slack_px: float = 0.0,
-    plateau: int = _PLATEAU_PIXELS,
+    plateau_pixels: int = _PLATEAU_PIXELS,
 ) -> Sample:
-    """Choose the pixels near edges, and a share of the plateaus; `most` of them, where given.
+    """Choose pixels near edges and a share of the plateaus, at most `max_pixels` of both.
 
     Pixels that blur may mix with what is foreign are not used: surroundings of the plate,
     and what hides a part of the target. It is seen from the levels, once they are known (`light`),
@@ -96,10 +96,10 @@ def select_pixels(
         unused |= occluded_mask(seen, light, slack_px)
     if problem.visible is not None:
         unused |= ~problem.visible[_steps_about(seen.unblurred.points_m, len(problem.visible))]
-    index = _useful_pixels(seen, unused, plateau)
-    is_thinned = most is not None and len(index) > most
-    if most is not None and is_thinned:
-        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < most / len(index)]
+    index = _useful_pixels(seen, unused, plateau_pixels)
+    is_thinned = max_pixels is not None and len(index) > max_pixels
+    if max_pixels is not None and is_thinned:
+        index = index[_GOLDEN * np.arange(len(index)) % 1.0 < max_pixels / len(index)]
     if len(index) < 4 * PLAIN_COUNT:
         raise Rejection(Reason.EDGES_LOST, f"{len(index)} pixels of the target")
     return _sample(seen, pose, light, index, is_thinned=is_thinned)

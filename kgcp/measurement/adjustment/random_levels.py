@@ -55,10 +55,11 @@ from kgcp.measurement.image_model.photometry import (
 )
 
 # Tuning of the levels, by the light flights of `benchmarks.accuracy.evaluate`. Fits of large plates
-# in glare end before the minimum; but four phases of 16 or 24 steps take 40 % longer, and leave 36
-# simulated ones with 0.042 instead of 0.021 %, 29 with 0.017 … 0.027 instead of 0.020 %.
+# in glare end before the minimum. Four phases of 16 or 24 steps are no better: they take 40 %
+# longer, and the errors of 36 simulated plates were 0.042 instead of 0.021 %, of 29 others 0.017 …
+# 0.027 instead of 0.020 %.
 _ROUNDS, _PHASES, _STEPS = 2, 3, 8
-_ENOUGH = 0.05  # of log-likelihood
+_LEAST_GAIN = 0.05  # of log-likelihood
 # Of the contrast. With 0.01 one plate of forty with a highlight ended beside the minimum.
 _LARGE_CHANGE = 0.002
 _LIKE_A_TILT = 0.07  # as in `normal_equations`
@@ -68,14 +69,15 @@ _FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8  # knots: px, per radius, and radii a
 _SLACK_PX = 0.4
 _PLATEAU_PIXELS = 1200
 _LEAST_CONTRAST = 0.05
-# Mean square of the residuals' sums over cells, of what independent residuals make it: above, the
-# levels vary. Frames in even light have about 1.
-_ASKS, _ASKS_OF_BINS = 1.9, 2.5
-# In small rings cells say less than edges do: of 58 frames with dirt, one of R 15 px had 1.3, its
-# covariance 6.5-fold by residuals that agree along edges, and an error of 4.6 σ in even light. In
-# even light the most is 3.5-fold where cells have more than 1.2 (the flight of a coarse renderer).
-_MAY_ASK, _ASKS_BY_EDGES = 1.2, 4.0
-_ENOUGH_POWER = 0.05  # of the cell that tells most
+# Mean square of the residuals' sums over cells, relative to that of independent residuals. Above
+# this, the levels vary; frames in even light have about 1.
+_UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 2.5
+# In small rings, cells say less than edges do. An excess that leaves a doubt is enough if residuals
+# that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
+# an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
+# light, with an excess above 1.2, the largest inflation is 3.5 (the flight of a coarse renderer).
+_DOUBTFUL_EXCESS, _UNEVEN_INFLATION = 1.2, 4.0
+_TELLING_POWER = 0.05  # of the cell that tells most
 
 
 def even_field(problem: FitProblem) -> LightField:
@@ -95,7 +97,7 @@ def even_field(problem: FitProblem) -> LightField:
 
 
 def excess_of_cells(fit: TargetFit) -> float:
-    """Return the mean square of sums over cells, of what independent residuals make it."""
+    """Return the mean square of the residuals' sums over cells; 1 if residuals are independent."""
     sample, light = fit.sample, fit.parameters.light
     field = even_field(sample.problem)
     knots, weights = field.knots.weights(sample.problem.window.pixels(sample.index))
@@ -106,23 +108,23 @@ def excess_of_cells(fit: TargetFit) -> float:
     sums = gather(finest, by_level, fit.misfit.score, count)
     squares = AtKnots(finest.knots, finest.weights**2)
     power = gather(squares, by_level**2, fit.misfit.weight, count)
-    telling = power > _ENOUGH_POWER * power.max()
+    telling = power > _TELLING_POWER * power.max()
     return float(np.mean(sums[telling] ** 2 / power[telling]))
 
 
-def asks_for_levels(fit: TargetFit) -> bool:
-    """Tell whether residuals go together over the cells of the finest grid, or along edges."""
+def needs_varying_levels(fit: TargetFit) -> bool:
+    """Tell whether residuals agree within the cells of the finest grid, or along edges."""
     excess, is_binned = excess_of_cells(fit), fit.sample.problem.window.binning > 1
-    if excess > (_ASKS_OF_BINS if is_binned else _ASKS):
+    if excess > (_UNEVEN_EXCESS_OF_BINS if is_binned else _UNEVEN_EXCESS):
         return True
-    is_doubtful = excess > _MAY_ASK and not is_binned
-    return is_doubtful and pose_covariance(fit).inflation > _ASKS_BY_EDGES
+    is_doubtful = excess > _DOUBTFUL_EXCESS and not is_binned
+    return is_doubtful and pose_covariance(fit).inflation > _UNEVEN_INFLATION
 
 
 def fit_levels(
     problem: FitProblem, starts: list[Parameters], other: Pose, unknowns: Unknowns
 ) -> tuple[TargetFit, TargetFit]:
-    """Adjust with a field from the first start that leads anywhere, and so at another pose.
+    """Adjust with a field of levels, from the first start that succeeds; then the other pose.
 
     Returns
     -------
@@ -132,7 +134,7 @@ def fit_levels(
     Raises
     ------
     Rejection
-        `POOR_FIT`, or as `select_pixels`, if no start leads anywhere.
+        `POOR_FIT`, or as `select_pixels`, if the fits from all starts fail.
     """
     for start in starts:
         try:
@@ -153,7 +155,7 @@ def fit_levels(
 
 
 def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -> TargetFit:
-    """Adjust with a field of levels, in rounds: pixels are chosen anew in each."""
+    """Adjust with a field of levels, in rounds with their own choice of pixels."""
     parameters = start if start.field is not None else replace(start, field=even_field(problem))
     for _ in range(_ROUNDS):
         sample = select_pixels(
@@ -162,7 +164,7 @@ def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -
             parameters.blur,
             parameters.light,
             slack_px=_SLACK_PX,
-            plateau=_PLATEAU_PIXELS,
+            plateau_pixels=_PLATEAU_PIXELS,
         )
         fit = _adjust_on(replace(sample, problem=problem), parameters, unknowns)
         before, parameters = parameters.matrix[:, 3], fit.parameters
@@ -173,7 +175,7 @@ def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -
 
 
 def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
-    """Return a window of which the smooth image is as if the light were even."""
+    """Return a problem whose smooth image is what it would be in even light."""
     field, window = parameters.field, problem.window
     if field is None:
         return problem
@@ -202,7 +204,7 @@ def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> Ta
 
 
 def _with_variances(fit: TargetFit) -> LightField:
-    """Return the field with the prior that its values ask for (MacKay's fixed point).
+    """Return the field with the prior estimated from its own values (MacKay's fixed point).
 
     The variance of a group is Σ c² / γ, with γ the number of values that the pixels determine;
     groups are the grids, of ink and of plate.
@@ -227,7 +229,7 @@ def _minimise(
     at_knots: AtKnots,
     linear: tuple[PredictedImage, FloatArray] | None = None,
 ) -> TargetFit:
-    """Minimise the negative log-likelihood with all priors; return the last equations, too."""
+    """Minimise the negative log-likelihood with all priors; the fit has the last equations."""
 
     def equations_of(parameters: Parameters, jacobian: FloatArray, current: Misfit) -> _WithLevels:
         equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
@@ -239,7 +241,7 @@ def _minimise(
         sd,
         unknowns,
         steps=_STEPS,
-        enough=_ENOUGH,
+        least_gain=_LEAST_GAIN,
         large_change=_LARGE_CHANGE,
         linear=linear,
         equations_of=equations_of,

@@ -15,7 +15,7 @@ from kgcp.measurement.adjustment.fit_target import fit_problem_of
 from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import whole_plate
-from kgcp.measurement.adjustment.random_levels import asks_for_levels
+from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
@@ -74,7 +74,7 @@ def residual_image_of(
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
-    if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and asks_for_levels(fit):
+    if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and needs_varying_levels(fit):
         best = fit_in_any_light(problem, pose, start.blur).likelier.best
         fit = best if best.parameters.field is not None else fit
     problem = fit.sample.problem  # which says over which curve an unknown tone was fitted

@@ -13,10 +13,10 @@ from kgcp.measurement.image_model.photometry import SKEW_PARAMS
 _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
 # have 13 at most, the 14 of light/lens 35 and more.
-_ASKS = 25.0
+_SKEW_CHI2 = 25.0
 
 
-def asks_for_skew(fit: TargetFit) -> bool:
+def needs_skew(fit: TargetFit) -> bool:
     """Tell whether third moments would take more of the residuals than chance (score test).
 
     Levels that vary would take part of a skew that is not asked for: with them it always is, which
@@ -31,7 +31,7 @@ def asks_for_skew(fit: TargetFit) -> bool:
     score, weighted = by_skew @ fit.misfit.score, by_skew * fit.misfit.weight
     mixed = scaled @ weighted.T
     own = weighted @ by_skew.T - mixed.T @ np.linalg.solve(normal, mixed)
-    return bool(score @ np.linalg.solve(own, score) > _ASKS)
+    return bool(score @ np.linalg.solve(own, score) > _SKEW_CHI2)
 
 
 def _by_skew(fit: TargetFit) -> FloatArray:

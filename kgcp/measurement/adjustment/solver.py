@@ -26,10 +26,10 @@ from kgcp.measurement.image_model.photometry import Param
 
 EquationsOf = Callable[[Parameters, FloatArray, Misfit], Equations]
 
-# Settled is what moves little against its scatter. Where much is unknown, a start that is nearly
-# right stays nearly right: with limits of 0.4 px and 15 % of the blur, and steps down to 0.05 of
-# log-likelihood, distances depended by 1 σ on where a fit came from, and errors of phones were
-# twice as large (0.065 % at R 13-26 px instead of 0.027 %).
+# A fit is settled if it moves little against its scatter. These limits are tight because a fit with
+# many unknowns that stops early stays near its start: with limits of 0.4 px and 15 % of the blur,
+# and steps down to 0.05 of log-likelihood, distances depended by 1 σ on the start, and errors of
+# phones were twice as large (0.065 % at R 13-26 px instead of 0.027 %).
 _MAX_ROUNDS = 6
 _EARLY_STEPS, _STEPS = 4, 8
 _EARLY_GAIN, _LAST_GAIN = 2.0, 0.01  # of log-likelihood; the error left is its square, about
@@ -104,8 +104,7 @@ def _with_edge_terms(
     """Add what skew point spreads, and light that changes across edges, do to the white share.
 
     Derivatives by pose, blur and levels stay as they are: these terms change them by a few per
-    cent. Also returned is what the levels of ink and plate (2, n) have more where the light is
-    uneven.
+    cent. Also returned is what uneven light adds to the levels of ink and plate (2, n).
     """
     value, jacobian, field = share.value, share.jacobian, parameters.field
     covariance = parameters.blur.total_covariance
@@ -126,16 +125,16 @@ def _with_edge_terms(
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:
     """Come near the minimum from a rough start, on pixels chosen for that start."""
     return _fit_with_noise(
-        sample, start, unknowns, steps=_EARLY_STEPS, enough=_EARLY_GAIN, is_near=False
+        sample, start, unknowns, steps=_EARLY_STEPS, least_gain=_EARLY_GAIN, is_near=False
     )
 
 
 def adjust(
-    problem: FitProblem, start: Parameters, unknowns: Unknowns, most: int | None = None
+    problem: FitProblem, start: Parameters, unknowns: Unknowns, max_pixels: int | None = None
 ) -> TargetFit:
-    """Estimate the unknowns, in rounds: pixels, noise and outliers are settled anew in each.
+    """Estimate the unknowns in rounds, each with its own choice of pixels, noise and outliers.
 
-    With at most so many pixels, where `most` is given; where there are more, only roughly.
+    At most `max_pixels` are used, if that is given; if there are more, the estimate is a rough one.
 
     Raises
     ------
@@ -145,10 +144,12 @@ def adjust(
     parameters = start
     for _ in range(_MAX_ROUNDS):
         pose, blur, light = parameters.pose, parameters.blur, parameters.light
-        sample = select_pixels(problem, pose, blur, light, most=most, slack_px=_SLACK_PX)
-        enough = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
+        sample = select_pixels(
+            problem, pose, blur, light, max_pixels=max_pixels, slack_px=_SLACK_PX
+        )
+        least_gain = _EARLY_GAIN if sample.is_thinned else _LAST_GAIN
         fit = _fit_with_noise(
-            sample, parameters, unknowns, steps=_STEPS, enough=enough, is_near=True
+            sample, parameters, unknowns, steps=_STEPS, least_gain=least_gain, is_near=True
         )
         if _is_settled(parameters, fit):
             break
@@ -162,13 +163,13 @@ def _fit_with_noise(
     unknowns: Unknowns,
     *,
     steps: int,
-    enough: float,
+    least_gain: float,
     is_near: bool,
 ) -> TargetFit:
-    """Minimise until the noise that the residuals show is the one that they were weighed by.
+    """Minimise until the noise of the residuals is the one that they were weighted with.
 
-    A start that is near need not be followed to the minimum for the noise to show; one that is not
-    might then be drawn to a wrong one.
+    From a start that is near, the noise shows before the minimum is reached, and the first
+    minimisation may stop early. Elsewhere it might then go to a wrong minimum.
     """
     linear = linearise(sample, parameters)
     sd = noise_of(sample, linear[0]).sd
@@ -179,9 +180,9 @@ def _fit_with_noise(
             sd,
             unknowns,
             steps=steps,
-            enough=enough,
+            least_gain=least_gain,
             linear=linear,
-            pauses=is_near and number == 0,
+            stops_at_new_jacobian=is_near and number == 0,
         )
         parameters, linear = fit.parameters, (fit.prediction, fit.jacobian)
         before, sd = sd, noise_of(sample, fit.prediction).sd
@@ -191,17 +192,17 @@ def _fit_with_noise(
 
 
 def _is_settled(before: Parameters, fit: TargetFit) -> bool:
-    """Tell whether the pixels of a round are right for what it found.
+    """Tell whether the pixels of a round also suit the fit that was made with them.
 
-    They follow blur, direction and size: off the axis, too, a move along the ray is growth alone.
+    They depend on blur, direction and size. A move along the ray changes the size alone.
     """
     problem, after = fit.sample.problem, fit.parameters
     blur = after.blur.largest_sd_px / before.blur.largest_sd_px
     (x, y, depth), (x0, y0, depth0) = after.matrix[:, 3].tolist(), before.matrix[:, 3].tolist()
     across_px = math.hypot(x / depth - x0 / depth0, y / depth - y0 / depth0) * problem.focal_px
     growth_px = abs(depth / depth0 - 1.0) * problem.outer_radius_px
-    enough = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
-    return abs(blur - 1.0) < enough and max(across_px, growth_px) < _SETTLED_PX
+    limit = _SETTLED_STREAK if after.blur.has_streak else _SETTLED_BLUR
+    return abs(blur - 1.0) < limit and max(across_px, growth_px) < _SETTLED_PX
 
 
 def noise_of(sample: Sample, prediction: PredictedImage, *, is_even: bool = True) -> GreyNoise:
@@ -228,19 +229,20 @@ def minimise(
     unknowns: Unknowns,
     *,
     steps: int,
-    enough: float,
+    least_gain: float,
     linear: tuple[PredictedImage, FloatArray] | None = None,
     large_change: float = _LARGE_CHANGE,
-    pauses: bool = False,
+    stops_at_new_jacobian: bool = False,
     equations_of: EquationsOf | None = None,
 ) -> TargetFit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
-    At most `steps` of them, and none after one that gained less than `enough`. The Jacobian is made
-    anew only while steps change the grey values by more than the share `large_change` of the
-    contrast, and the equations with it: near the minimum they hardly change, and cost most. With
-    `pauses`, a Jacobian that is made anew ends it. `equations_of` makes the equations at some
-    parameters; None: those of pose, blur and light.
+    At most `steps` of them, and none after one that gained less than `least_gain`. The Jacobian,
+    and the equations with it, is computed again only while steps change the grey values by more
+    than the share `large_change` of the contrast: near the minimum it hardly changes, and it takes
+    most of the time. With `stops_at_new_jacobian`, the step after which it is computed again is the
+    last one. `equations_of` makes the equations at some parameters; None: those of pose, blur and
+    light.
     """
     damping, light = _DAMPING, parameters.light
     contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
@@ -261,7 +263,7 @@ def minimise(
             trial = misfit(sample.levels, attempt.levels, sd, sample.censoring)
             trial_total = negative_log_posterior(trial, unknowns, candidate)
             is_better = trial_total <= total + _NEGLIGIBLE
-            if is_better or promised < enough or damping > _MAX_DAMPING:
+            if is_better or promised < least_gain or damping > _MAX_DAMPING:
                 break
             damping = max(10.0 * damping, _DAMPED)
         if not is_better:
@@ -270,11 +272,11 @@ def minimise(
         parameters, prediction, current = candidate, attempt, trial
         if attempt_jacobian is not jacobian:
             jacobian = attempt_jacobian
-            if pauses:
+            if stops_at_new_jacobian:
                 break
             equations = equations_of(parameters, jacobian, current)
         damping = max(0.1 * damping, 1e-9)
-        if gain < enough or abs(gain - promised) < _AS_PROMISED:
+        if gain < least_gain or abs(gain - promised) < _AS_PROMISED:
             break
     return TargetFit(sample, parameters, prediction, jacobian, sd, current, unknowns)
 

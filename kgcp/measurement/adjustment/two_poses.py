@@ -73,7 +73,7 @@ def _off_the_saddle(rough: TargetFit) -> TargetFit:
         rough.sd,
         rough.unknowns,
         steps=_ACROSS_STEPS,
-        enough=_MIRRORED_GAIN,
+        least_gain=_MIRRORED_GAIN,
     )
     return other if other.total < rough.total else rough
 
@@ -107,7 +107,7 @@ def _approach(problem: FitProblem, pose: Pose, blur: Blur) -> TargetFit:
     light = first_levels(problem, pose)
     plain = replace(problem, sharpening_px=0.0)
     few = plain.few_pixels
-    sample = select_pixels(plain, pose, blur, light, most=few, slack_px=_START_SLACK_PX)
+    sample = select_pixels(plain, pose, blur, light, max_pixels=few, slack_px=_START_SLACK_PX)
     unknowns = unknowns_of(problem, has_streak=False)
     return approach(sample, Parameters.of(pose, blur, light), unknowns)
 
@@ -151,7 +151,7 @@ def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
             fit.sd,
             fit.unknowns,
             steps=steps,
-            enough=_MIRRORED_GAIN,
+            least_gain=_MIRRORED_GAIN,
             linear=linear,
         )
         if other.total - fit.total > hopeless:
@@ -170,5 +170,5 @@ def fit_at(fit: TargetFit, pose: Pose) -> TargetFit:
         return there
     steps = _MIRRORED_STEPS[-1]
     return minimise(
-        fit.sample, parameters, fit.sd, fit.unknowns, steps=steps, enough=_MIRRORED_GAIN
+        fit.sample, parameters, fit.sd, fit.unknowns, steps=steps, least_gain=_MIRRORED_GAIN
     )

@@ -11,7 +11,7 @@ import pytest
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions, random_levels
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.adjustment.random_levels import asks_for_levels
+from kgcp.measurement.adjustment.random_levels import needs_varying_levels
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.records import ToneBase
@@ -56,7 +56,7 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
     pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
     fits = extensions.fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), ToneBase.LINE)
     assert tried == tones
-    assert fits.untried == (None if len(tones) == 2 else ToneBase.SRGB)
+    assert fits.untried_base == (None if len(tones) == 2 else ToneBase.SRGB)
     assert (fits.rival is None) == (len(tones) == 1)
 
 
@@ -84,4 +84,4 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
     monkeypatch.setattr(random_levels, "pose_covariance", lambda _: stand_in(inflation=inflation))
     window = stand_in(binning=binning)
     fit = stand_in(sample=stand_in(problem=stand_in(window=window)))
-    assert asks_for_levels(fit) == is_asked
+    assert needs_varying_levels(fit) == is_asked

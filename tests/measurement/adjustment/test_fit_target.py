@@ -177,7 +177,7 @@ def test_a_base_that_explains_a_frame_badly_is_compared_with_the_other(
     start, known = start_near(camera, pose, rng), PlatePrior(tone_base=ToneBase.LINE)
     by_both = measure_by_model(grey, camera, TARGET, start)
     with monkeypatch.context() as patch:
-        patch.setattr("kgcp.measurement.adjustment.extensions._STRAY_INFLATION", 0.0)
+        patch.setattr("kgcp.measurement.adjustment.extensions._OFF_MINIMUM_INFLATION", 0.0)
         compared = measure_by_model(grey, camera, TARGET, start, known)
     assert compared.rival is not None
     assert compared.imaging == by_both.imaging
