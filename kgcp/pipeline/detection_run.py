@@ -52,10 +52,10 @@ from kgcp.pipeline.frame_task import (
 from kgcp.pipeline.guidance import FrameTracks
 from kgcp.quality.learnt_imaging import (
     LearntImaging,
-    base_of_no_matter,
-    base_of_some,
-    by_base,
+    base_if_distances_agree,
+    clearly_agreed_base,
     learn_imaging,
+    over_base,
 )
 from kgcp.settings import Method
 
@@ -154,7 +154,7 @@ class DetectionRun:
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
         self.kept = 0
         self.learnt: LearntImaging | None = None
-        self._asked: set[str] = set()  # the frames that have told the base of the tone curve
+        self._deciding_frames: set[str] = set()  # that have decided the base of the tone curve
         self._preferences: Mapping[Place, float] = {}
 
     def first_pass(self) -> None:
@@ -233,10 +233,10 @@ class DetectionRun:
     def _settle_tone_base(self) -> None:
         """Settle the base of frames that are not looked at yet, if those so far tell it."""
         if self._job.tone_base is None:
-            base = base_of_some(self._results_so_far())
-            base = base or base_of_no_matter(self._results_so_far())
+            base = clearly_agreed_base(self._results_so_far())
+            base = base or base_if_distances_agree(self._results_so_far())
             self._job = replace(self._job, tone_base=base)
-            self._asked = {result.frame for result in self._results_so_far()}
+            self._deciding_frames = {result.frame for result in self._results_so_far()}
 
     def _results_so_far(self) -> Iterator[FrameResult]:
         return (self._journal.read(key) for key in self._keys if key)
@@ -312,8 +312,8 @@ class DetectionRun:
         """
         if self._job.settings.is_learning:
             base = self._job.tone_base
-            asked = None if base is None else self._asked
-            self.learnt = learn_imaging(self._results_so_far(), base, asked)
+            deciding_frames = None if base is None else self._deciding_frames
+            self.learnt = learn_imaging(self._results_so_far(), base, deciding_frames)
         if self._job.settings.is_guided:
             kept = map(self._journal.read, self._keys)
             self._preferences = preferences_of_neighbours(
@@ -341,7 +341,7 @@ class DetectionRun:
         learnt = measurement
         if self.learnt is not None:
             if self.learnt.base is not None:
-                learnt = by_base(learnt, self.learnt.base)
+                learnt = over_base(learnt, self.learnt.base)
             learnt = with_smoothing(self._job.camera, learnt, self.learnt.smoothing)
         preference = self._preferences.get((frame, learnt.target, learnt.instance))
         if preference is not None:

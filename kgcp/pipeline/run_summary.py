@@ -30,7 +30,7 @@ class DetectionSummary:
     Attributes
     ----------
     table : Path
-        The detections, that were written.
+        File of the detections.
     frames : int
         Frames examined.
     status : dict of int
@@ -38,36 +38,37 @@ class DetectionSummary:
     reasons : dict of int
         Rows per reason, most frequent first.
     details : dict of str
-        What is behind a reason in most of its rows, where something is.
+        The commonest detail of a reason, for reasons that have any.
     likely_cause : str or None
-        Why nothing was measured, where a trial has told.
+        Why nothing was measured, if a trial has shown it.
     frames_not_chosen : int
-        Frames that were not wanted.
+        Frames that match no wanted pattern.
     frames_without_time : int
-        Frames that neither the times file nor EXIF gives a time.
+        Frames to which neither the times file nor EXIF gives a time.
     frames_not_in_times_file : int
         Frames that the times file, if there is one, does not name.
     times_without_frame : int
         Entries of the times file that name no frame.
     name_difference : str or None
-        How a name of such an entry differs from that of a frame which it probably means.
+        How the name in such an entry differs from that of the frame that it probably means.
     exif_times_in_whole_seconds : int
         Frames whose time is EXIF's, if all of these times are whole seconds; else 0.
     frames_without_attitude : int
-        Frames whose camera attitude is not known, so that a level plate tells nothing about them;
-        0 where the plate is not said to be level.
+        Frames whose camera attitude is not known, so that the level plate does not help to choose
+        between two poses; 0 if the plate is not stated to be level.
     kept : int
-        Frames that a run before, which did not end, had examined.
+        Frames that an interrupted run had already examined.
     guided : int
-        Rows measured by a second look only.
+        Rows that only a second look has measured.
     not_drawn : int
         Rings that are not in the contact sheet, since their frame could not be read again.
     guide_problem : str or None
-        Why reference poses and trajectory could not say where to look again, if they could not.
+        Why reference poses and trajectory could not predict where to look again; None: they could.
     tone_base : str or None
-        What the tone curve of all frames is near to; None: not learnt, or near nothing known.
+        The known curve that the frames' tone curve is near to; None: not learnt, or near neither.
     measured_with_tone, overruled_by_tone, kept_other_tone : int
-        Measurements from which it was learnt, those that it has changed, and those too far from it.
+        Measurements from which it was learnt; those that were changed by it; those that keep
+        another base because they are much likelier over that.
     stages_s : dict of float
         Time that each stage of the work took [s].
     """
@@ -223,7 +224,7 @@ class SummaryBuilder:
             tone_base=None if learnt is None or learnt.base is None else learnt.base.value,
             measured_with_tone=0 if learnt is None else learnt.measurements,
             overruled_by_tone=0 if learnt is None else learnt.overruled,
-            kept_other_tone=0 if learnt is None else learnt.kept_other,
+            kept_other_tone=0 if learnt is None else learnt.kept_own_base,
             stages_s=dict(stages_s),
         )
 

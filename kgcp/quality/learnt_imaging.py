@@ -1,10 +1,10 @@
 """What the frames of a flight say together of their camera: tone curve, sharpening, noise.
 
-An unknown tone curve is fitted over two bases, of which one frame alone may take the wrong one. All
-frames have the same: their log-likelihoods are added up. Within a base, tone and sharpening of a
-frame are its own: to know them beforehand would make distances better by 2 % of their standard
-deviations. Smoothing along contours is learnt from all frames (docs/method.md, "What a flight
-shares").
+An unknown tone curve is fitted over two bases. One frame alone may prefer the wrong one, but all
+frames come from one camera: their log-likelihoods are added up. Within a base, each frame keeps its
+own tone and sharpening, since knowing them beforehand would improve distances by only 2 % of their
+standard deviations. Smoothing along contours is learnt from all frames (docs/method.md, "What a
+flight shares").
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from kgcp.measurement.image_model.photometry import (
 )
 from kgcp.measurement.records import FrameResult, Imaging, Measurement, ToneBase
 
-_MOST_OF_ONE = 30.0  # of log-likelihood: no single frame decides
-# … and so much of the sum for a base may speak against it. Of simulated frames, 40 of a film-like
-# curve have less than 0.01, 40 of sRGB's 0.1; 54 of a film-like curve with sharpening and JPEG have
-# 0.5, as flights of sRGB cameras with dirt do against the right one.
-_MOST_AGAINST = 0.2
-# Before all frames are measured, so much of it decides for the others: 5 clear frames or more.
-_ENOUGH = 5.0 * _MOST_OF_ONE
-# The base does not matter where four of five distances differ by less than this share of their
-# standard deviations, of at least so many frames. Of flights with rolling shutters it is 0.02, with
-# film-like curves 0.2 to 0.3; under highlights, in phones and with dirt 0.5 to 1.3.
-_ALIKE, _ALIKE_QUANTILE, _FEWEST_ALIKE = 0.35, 0.8, 12
-# A measurement that is likelier by more than this over another base than that of all keeps its own:
-# with dirt, its fit over the common base has often come to rest up to 3 σ off.
-_BEYOND_DOUBT = 100.0
+_MAX_FRAME_ADVANTAGE = 30.0  # of log-likelihood: no single frame decides
+# Share of the sum for a base that may speak against it. Of simulated frames, 40 with a film-like
+# curve have less than 0.01 and 40 with sRGB's curve 0.1; 54 with a film-like curve, sharpening and
+# JPEG have 0.5, and so do flights of sRGB cameras with dirt, against the right base.
+_MAX_SHARE_AGAINST = 0.2
+# Advantage from which the first frames decide for all others: that of 5 clear frames or more.
+_CLEAR_ADVANTAGE = 5.0 * _MAX_FRAME_ADVANTAGE
+# The base does not matter if four of five distances, in at least so many frames, differ by less
+# than this share of their standard deviations. In flights with rolling shutters the share is 0.02,
+# with film-like curves 0.2 to 0.3; under highlights, with phones and with dirt 0.5 to 1.3.
+_SAME_DISTANCE_SIGMAS, _SAME_DISTANCE_QUANTILE, _MIN_FRAMES = 0.35, 0.8, 12
+# A measurement that prefers its own base to that of all by more than this keeps it: with dirt, its
+# fit over the common base has often ended up to 3 σ off.
+_MAX_OVERRULED_ADVANTAGE = 100.0
 _STEPS = 64  # of the curve, over the whole range of grey values
 _ROUNDS = 3
 _BAND = (16.0, 50.0, 84.0)  # percentiles: ±1σ
-_FEWEST = 3  # measurements at a grey value
+_MIN_MEASUREMENTS = 3  # measurements at a grey value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,15 +53,15 @@ class LearntImaging:
     Attributes
     ----------
     base : ToneBase or None
-        The base of the tone curve that makes all measurements together likelier; None: they do not
-        agree, so that the curve is near neither.
+        The base of the tone curve that makes all measurements together likelier; None if they do
+        not agree, because the curve is near neither.
     advantages : mapping of ToneBase to float
         Sums of the log-likelihoods by which frames prefer a base, each at most 30.
     measurements : int
-        By both bases, in the frames that were asked.
-    overruled, kept_other : int
-        Measurements that by themselves would have taken another base: those that take the base of
-        all, and those that are too far from it.
+        Those made over both bases, in the frames that decided.
+    overruled, kept_own_base : int
+        Measurements that by themselves prefer another base: how many take the base of all, and how
+        many keep their own because they are much likelier over it.
     grey : (n,) array
         Grey values, 0…1 of their range.
     light : (3, n) array
@@ -79,7 +79,7 @@ class LearntImaging:
     advantages: Mapping[ToneBase, float]
     measurements: int
     overruled: int
-    kept_other: int
+    kept_own_base: int
     grey: FloatArray
     light: FloatArray
     sharpening: FloatArray
@@ -87,19 +87,19 @@ class LearntImaging:
     smoothing: CameraSmoothing
 
 
-def base_of_some(results: Iterable[FrameResult]) -> ToneBase | None:
-    """Return the base that some frames say so clearly that the others need not be asked.
+def clearly_agreed_base(results: Iterable[FrameResult]) -> ToneBase | None:
+    """Return the base that some frames agree on so clearly that the others need not decide.
 
-    None: they do not.
+    None if they do not.
     """
     advantages = _advantages(results)
     base = _agreed(advantages)
-    return None if base is None or advantages[base] < _ENOUGH else base
+    return None if base is None or advantages[base] < _CLEAR_ADVANTAGE else base
 
 
-def base_of_no_matter(results: Iterable[FrameResult]) -> ToneBase | None:
-    """Return the likelier base if some frames have nearly the same distances over both; or None."""
-    told: list[FrameResult] = []
+def base_if_distances_agree(results: Iterable[FrameResult]) -> ToneBase | None:
+    """Return the likelier base if frames have nearly the same distances over both; else None."""
+    compared: list[FrameResult] = []
     differences = []
     for result in results:
         of_frame = [
@@ -108,18 +108,20 @@ def base_of_no_matter(results: Iterable[FrameResult]) -> ToneBase | None:
             if each.rival is not None
         ]
         if of_frame:
-            told.append(result)
+            compared.append(result)
             differences.append(max(of_frame))
-    if len(differences) < _FEWEST_ALIKE or np.quantile(differences, _ALIKE_QUANTILE) > _ALIKE:
+    if len(differences) < _MIN_FRAMES:
         return None
-    advantages = _advantages(told)
+    if np.quantile(differences, _SAME_DISTANCE_QUANTILE) > _SAME_DISTANCE_SIGMAS:
+        return None
+    advantages = _advantages(compared)
     return max(advantages, key=lambda each: advantages[each])
 
 
 def learn_imaging(
     results: Iterable[FrameResult],
     base: ToneBase | None = None,
-    asked: Collection[str] | None = None,
+    deciding_frames: Collection[str] | None = None,
 ) -> LearntImaging | None:
     """Return what all measurements say together; None if no tone is unknown.
 
@@ -128,29 +130,31 @@ def learn_imaging(
     results : iterable of FrameResult
         Of all frames. Their order does not matter.
     base : ToneBase, optional
-        Of the tone curve, by `base_of_some`; by default, what all measurements say.
-    asked : collection of str, optional
-        The frames that have told it; by default, all.
+        Of the tone curve, if it is already decided; by default, all measurements decide.
+    deciding_frames : collection of str, optional
+        Those that have decided it; by default, all.
     """
     results = sorted(results, key=lambda result: result.frame)
-    deciding = [result for result in results if asked is None or result.frame in asked]
-    doubtful = [each for result in deciding for each in _by_both_bases(result)]
-    if not doubtful:
+    deciding = [
+        result for result in results if deciding_frames is None or result.frame in deciding_frames
+    ]
+    over_both = [each for result in deciding for each in _over_both_bases(result)]
+    if not over_both:
         return None
     advantages = _advantages(deciding)
     if base is None:
         base = _agreed(advantages)
     chosen = [each for result in results for each in _of_unknown_tone(result)]
-    learnt = chosen if base is None else [by_base(each, base) for each in chosen]
+    learnt = chosen if base is None else [over_base(each, base) for each in chosen]
     images = [each.imaging for each in learnt if each.imaging is not None]
     grey = np.linspace(0.0, 1.0, _STEPS + 1)
     strengths = [imaging.sharpening for imaging in images]
     return LearntImaging(
         base=base,
         advantages=advantages,
-        measurements=len(doubtful),
+        measurements=len(over_both),
         overruled=sum(after is not before for before, after in zip(chosen, learnt, strict=True)),
-        kept_other=sum(base is not None and imaging.base is not base for imaging in images),
+        kept_own_base=sum(base is not None and imaging.base is not base for imaging in images),
         grey=grey,
         light=_common_curve(images, grey),
         sharpening=np.percentile(strengths, _BAND),
@@ -159,12 +163,12 @@ def learn_imaging(
     )
 
 
-def by_base(measurement: Measurement, base: ToneBase) -> Measurement:
-    """Return a measurement by a base of its tone curve, if it has one that may be as good."""
+def over_base(measurement: Measurement, base: ToneBase) -> Measurement:
+    """Return a measurement over a base, unless it has none over that or is much worse there."""
     rival, imaging = measurement.rival, measurement.imaging
     if rival is None or imaging is None or imaging.base is base:
         return measurement
-    if rival.advantage > _BEYOND_DOUBT:
+    if rival.advantage > _MAX_OVERRULED_ADVANTAGE:
         return measurement
     return replace(
         rival.measurement,
@@ -181,46 +185,47 @@ def _of_unknown_tone(result: FrameResult) -> list[Measurement]:
     return sorted(toned, key=lambda each: (each.target, each.instance))
 
 
-def _by_both_bases(result: FrameResult) -> list[Measurement]:
+def _over_both_bases(result: FrameResult) -> list[Measurement]:
     return [each for each in _of_unknown_tone(result) if each.rival is not None]
 
 
 def _agreed(advantages: Mapping[ToneBase, float]) -> ToneBase | None:
-    """Return the base that most of the likelihood speaks for; None if much speaks against it."""
+    """Return the base with most of the likelihood; None if much of it speaks against it."""
     base = max(advantages, key=lambda each: advantages[each])
-    return base if sum(advantages.values()) <= (1.0 + _MOST_AGAINST) * advantages[base] else None
+    is_agreed = sum(advantages.values()) <= (1.0 + _MAX_SHARE_AGAINST) * advantages[base]
+    return base if is_agreed else None
 
 
 def _advantages(results: Iterable[FrameResult]) -> dict[ToneBase, float]:
-    """Return the sums of the log-likelihoods by which frames prefer a base, within bounds."""
+    """Return the sums of the log-likelihoods by which frames prefer a base, each bounded."""
     total = dict.fromkeys(ToneBase, 0.0)
     for result in results:
         of_frame = dict.fromkeys(ToneBase, 0.0)
-        for each in _by_both_bases(result):
+        for each in _over_both_bases(result):
             if each.rival is not None and each.imaging is not None:
                 of_frame[each.imaging.base] += each.rival.advantage
         for base, advantage in of_frame.items():
-            total[base] += min(advantage, _MOST_OF_ONE)
+            total[base] += min(advantage, _MAX_FRAME_ADVANTAGE)
     return total
 
 
 def _noise_of(imaging: Imaging) -> FloatArray:
     levels = encoded(np.array((imaging.black, imaging.white)), TONE_OF_BASE[imaging.base])
     noise = np.stack((levels, (imaging.noise_black, imaging.noise_white)), axis=1)
-    return np.asarray(noise[levels < 1.0])  # of a plate burnt white none is seen
+    return np.asarray(noise[levels < 1.0])  # clipped white shows none
 
 
 def _common_curve(images: list[Imaging], grey: FloatArray) -> FloatArray:
     """Return percentiles (3, n) of the light of grey values.
 
-    A frame tells the curve between its ink and its plate, and there but for a factor and an offset:
-    those with which it comes nearest to the others.
+    A frame shows the curve only between its ink and its plate, and only up to a factor and an
+    offset. They are chosen so that it comes nearest to the other frames.
     """
     curves = np.array([_light_of_grey(imaging, grey) for imaging in images])
     middle = decoded(grey, Tone.SRGB)
     for _ in range(_ROUNDS):
         scaled = np.array([_scaled_to(curve, middle) for curve in curves])
-        is_known = np.sum(np.isfinite(scaled), axis=0) >= _FEWEST
+        is_known = np.sum(np.isfinite(scaled), axis=0) >= _MIN_MEASUREMENTS
         percentiles = np.full((len(_BAND), len(grey)), np.nan)
         percentiles[:, is_known] = np.nanpercentile(scaled[:, is_known], _BAND, axis=0)
         middle = np.where(is_known, percentiles[1], middle)
@@ -239,7 +244,7 @@ def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
 
 def _scaled_to(curve: FloatArray, middle: FloatArray) -> FloatArray:
     known = np.isfinite(curve)
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_MEASUREMENTS:
         return np.full(len(curve), np.nan)
     design = np.stack((curve[known], np.ones(known.sum())), axis=1)
     factor, offset = np.linalg.lstsq(design, middle[known])[0]

@@ -66,7 +66,7 @@ class Looks:
             raise KeyboardInterrupt
         return FrameResult(frame, None, ExposureSettings(), ABSENT)
 
-    def base_of_some(self, results: Iterable[FrameResult]) -> ToneBase | None:
+    def clearly_agreed_base(self, results: Iterable[FrameResult]) -> ToneBase | None:
         return self._base if sum(1 for _ in results) >= self._enough else None
 
 
@@ -82,7 +82,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Looks], No
         module = "kgcp.pipeline.detection_run"
         monkeypatch.setattr(f"{module}.examine_frame", looks.examine)
         monkeypatch.setattr(f"{module}.examine_frame_again", looks.examine_again)
-        monkeypatch.setattr(f"{module}.base_of_some", looks.base_of_some)
+        monkeypatch.setattr(f"{module}.clearly_agreed_base", looks.clearly_agreed_base)
         with Journal(tmp_path / "journal", {}, (FrameResult,), is_new=False) as journal:
             detection_run = DetectionRun(job, inputs, journal, pool, NoProgress())
             detection_run.first_pass()

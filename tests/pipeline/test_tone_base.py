@@ -188,7 +188,11 @@ def test_where_the_base_does_not_matter_the_likelier_one_is_that_of_all(
     bases: dict[str, ToneBase | None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name, value in (("_ENOUGH", np.inf), ("_FEWEST_ALIKE", ASKED), ("_ALIKE", 100.0)):
+    for name, value in (
+        ("_CLEAR_ADVANTAGE", np.inf),
+        ("_MIN_FRAMES", ASKED),
+        ("_SAME_DISTANCE_SIGMAS", 100.0),
+    ):
         monkeypatch.setattr(f"kgcp.quality.learnt_imaging.{name}", value)
     summary = detect(flight, tmp_path)
     assert list(bases.values()) == [None] * ASKED + [ToneBase.SRGB] * (FRAMES - ASKED)

@@ -22,7 +22,12 @@ from kgcp.measurement.records import (
     ToneBase,
     Uncertainty,
 )
-from kgcp.quality.learnt_imaging import base_of_no_matter, base_of_some, by_base, learn_imaging
+from kgcp.quality.learnt_imaging import (
+    base_if_distances_agree,
+    clearly_agreed_base,
+    learn_imaging,
+    over_base,
+)
 
 SRGB, LINE = ToneBase.SRGB, ToneBase.LINE
 
@@ -71,11 +76,11 @@ def test_the_base_that_most_of_the_likelihood_speaks_for_is_that_of_all() -> Non
     assert learnt is not None
     assert (learnt.base, learnt.measurements, learnt.overruled) == (SRGB, 6, 1)
     odd = first_of(results[-1])
-    turned = by_base(odd, SRGB)
+    turned = over_base(odd, SRGB)
     assert turned.distance_m == 11.0
     assert turned.is_guided
-    assert by_base(turned, LINE).distance_m == 10.0
-    assert by_base(first_of(results[0]), SRGB) is first_of(results[0])
+    assert over_base(turned, LINE).distance_m == 10.0
+    assert over_base(first_of(results[0]), SRGB) is first_of(results[0])
 
 
 @pytest.mark.parametrize("against", [[1e6], [15.0, 15.0]])
@@ -104,7 +109,7 @@ def test_some_frames_decide_only_where_they_say_it_clearly(
 ) -> None:
     results = [frame(f"f{k}", LINE, 1e3) for k in range(clear)]
     results += [frame(f"g{k}", SRGB, 0.5 * against) for k in range(2)]
-    assert base_of_some(results) is base
+    assert clearly_agreed_base(results) is base
 
 
 def test_the_plates_of_one_frame_count_as_one() -> None:
@@ -112,8 +117,8 @@ def test_the_plates_of_one_frame_count_as_one() -> None:
     assert isinstance(plate, Measurement)
     plates = tuple(replace(plate, instance=k) for k in range(9))
     crowded = FrameResult("a", 0.0, ExposureSettings(), plates)
-    assert base_of_some([crowded]) is None
-    assert base_of_some([replace(crowded, frame=f"f{k}") for k in range(5)]) is LINE
+    assert clearly_agreed_base([crowded]) is None
+    assert clearly_agreed_base([replace(crowded, frame=f"f{k}") for k in range(5)]) is LINE
 
 
 def test_a_frame_that_is_far_from_the_base_of_the_others_keeps_its_own() -> None:
@@ -121,10 +126,10 @@ def test_a_frame_that_is_far_from_the_base_of_the_others_keeps_its_own() -> None
     results += [frame("near", LINE, 99.0), frame("far", LINE, 101.0)]
     learnt = learn_imaging(results)
     assert learnt is not None
-    assert (learnt.base, learnt.overruled, learnt.kept_other) == (SRGB, 1, 1)
+    assert (learnt.base, learnt.overruled, learnt.kept_own_base) == (SRGB, 1, 1)
     near, far = (first_of(result) for result in results[-2:])
-    assert by_base(near, SRGB).distance_m == 11.0
-    assert by_base(far, SRGB) is far
+    assert over_base(near, SRGB).distance_m == 11.0
+    assert over_base(far, SRGB) is far
 
 
 @pytest.mark.parametrize(
@@ -139,8 +144,8 @@ def test_the_base_does_not_matter_where_nearly_all_distances_are_alike(
         replace(result, outcomes=(replace(first_of(result), uncertainty=uncertainty(sd_m)),))
         for result, sd_m in zip(results, sds_m, strict=True)
     ]
-    assert base_of_some(told) is None
-    assert base_of_no_matter(told) is base
+    assert clearly_agreed_base(told) is None
+    assert base_if_distances_agree(told) is base
 
 
 def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:
@@ -151,7 +156,7 @@ def test_frames_measured_over_one_base_take_part_in_what_is_learnt() -> None:
     asked = {result.frame for result in both}
     learnt = learn_imaging([stray, *both, alone], SRGB, asked)
     assert learnt is not None
-    assert (learnt.base, learnt.measurements, learnt.kept_other) == (SRGB, 6, 1)
+    assert (learnt.base, learnt.measurements, learnt.kept_own_base) == (SRGB, 6, 1)
     assert learnt.advantages == {SRGB: 180.0, LINE: 0.0}
     assert learnt.noise.shape == (16, 2)
 

@@ -26,7 +26,7 @@ def learnt_text(learnt: LearntImaging) -> str:
             "advantages": {base.value: round(x, 3) for base, x in learnt.advantages.items()},
             "measurements": learnt.measurements,
             "overruled": learnt.overruled,
-            "kept_other": learnt.kept_other,
+            "kept_other": learnt.kept_own_base,
             "grey": _plain(learnt.grey),
             "light": [_plain(percentile) for percentile in learnt.light],
             "sharpening": _plain(learnt.sharpening),
@@ -50,7 +50,7 @@ def learnt_from_text(text: str) -> LearntImaging:
         advantages={ToneBase(base): each for base, each in parts["advantages"].items()},
         measurements=parts["measurements"],
         overruled=parts["overruled"],
-        kept_other=parts.get("kept_other", 0),  # tables of before have none
+        kept_own_base=parts.get("kept_other", 0),  # tables of before have none
         grey=np.array(parts["grey"], dtype=np.float64),
         light=np.array(parts["light"], dtype=np.float64),
         sharpening=np.array(parts["sharpening"], dtype=np.float64),

@@ -59,7 +59,7 @@ def learnt_sentence(learnt: LearntImaging) -> str:
         if learnt.base is None
         else f"The tone curve departs from {learnt.base.value}, learnt from {learnt.measurements}"
         f" measurements; {learnt.overruled} alone would have taken another base, and"
-        f" {learnt.kept_other} are so far from it that they keep another."
+        f" {learnt.kept_own_base} are so far from it that they keep another."
     )
     smoothing = learnt.smoothing
     return (
