@@ -6,10 +6,8 @@ flight_place_argument : `flight`, Path or StoredFolder
     The same, which may be a URL.
 flight_places_argument : `flights`, tuple of Path or StoredFolder
     One or several such folders; the current folder by default.
-out_option : `out`, Path or None
-    Folder of the results; None means FLIGHT/kgcp.
 out_place_option : `out`, Path, StoredFolder or None
-    The same, which may be a URL.
+    Folder of the results, which may be a URL; None means FLIGHT/kgcp.
 detections_option : `detections`, Path or None
     The table of `kgcp detect`; None means the one in the results' folder.
 json_option : `as_json`, bool
@@ -58,14 +56,6 @@ flight_place_argument = click.argument("flight", metavar="[FLIGHT]", callback=_p
 
 flight_places_argument = click.argument(
     "flights", metavar="[FLIGHT]...", callback=_places, nargs=-1
-)
-
-out_option = click.option(
-    "--out",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path),
-    default=None,
-    help="Folder for the results.  [default: FLIGHT/kgcp]",
 )
 
 out_place_option = click.option(

@@ -22,7 +22,6 @@ class EoDevice:
     """An EO device."""
 
     name: str
-    point_names: tuple[str, ...]
     points_m: FloatArray  # (n, 3): in the device's own frame
 
 
@@ -49,4 +48,4 @@ def read_device(path: Path) -> EoDevice:
         require_distinct(positions)
     except SettingError as error:
         raise KgcpError(f"{path}: {error}") from None
-    return EoDevice(table.optional("name", table.name) or path.stem, names, positions)
+    return EoDevice(table.optional("name", table.name) or path.stem, positions)
