@@ -45,8 +45,8 @@ from kgcp.pipeline.frame_task import (
     completed,
     examine_frame,
     examine_frame_again,
-    kept_frame,
     lost_frame,
+    result_without_second_look,
     shows_negative,
 )
 from kgcp.pipeline.guidance import FrameTracks
@@ -291,7 +291,7 @@ class DetectionRun:
                 row = self._rows[guided_input.input.frame]
                 if isinstance(result, TaskFailure):
                     self._keys[row] = _key_of_lost(keys[row])
-                    self._keep(row, kept_frame(guided_input, _REASONS[result]))
+                    self._keep(row, result_without_second_look(guided_input, _REASONS[result]))
                 else:
                     self._keys[row] = keys[row]
                     self._keep(row, result)

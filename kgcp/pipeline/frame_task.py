@@ -105,7 +105,6 @@ class GuidedInput:
 @single_threaded()
 def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
     """Read and measure one frame; whatever a frame can do wrong becomes its result."""
-    place = job.frames_folder / frame_input.frame
     exif = Exif()
     outcomes: tuple[Outcome, ...]
     dropped: tuple[Considered, ...] = ()
@@ -115,8 +114,8 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
         plain = _look_for_plain(grey, job, frame_input, examination.outcomes)
-        outcomes = tuple(completed(job, one) for one in (*examination.outcomes, *plain))
-        if job.kept_frames is not None and any(isinstance(one, Miss) for one in outcomes):
+        outcomes = tuple(completed(job, outcome) for outcome in (*examination.outcomes, *plain))
+        if job.kept_frames is not None and any(isinstance(outcome, Miss) for outcome in outcomes):
             job.kept_frames.keep(frame_input.frame, grey)
         if job.keeps_dropped:
             dropped = _best_dropped(examination.considered)
@@ -124,28 +123,31 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         outcomes = tuple(
             Miss(target.name, rejection.reason, rejection.detail) for target in job.all_targets
         )
+    is_readable = not any(map(is_unreadable, outcomes))
+    time_s, time_source = _frame_time(job, frame_input, exif, is_readable=is_readable)
+    return FrameResult(
+        frame_input.frame, time_s, exif.exposure, outcomes, exif.time_s, dropped, time_source
+    )
+
+
+def _frame_time(
+    job: DetectionJob, frame_input: FrameInput, exif: Exif, *, is_readable: bool
+) -> tuple[float | None, TimeSource]:
+    """Return the mid-exposure of a frame [s], and where it is from."""
     time_s, time_source = frame_input.time_s, TimeSource.TIMES_FILE
     if time_s is None and frame_input.may_use_exif_time:
         time_s, time_source = exif.time_s, TimeSource.EXIF
     reference = job.camera.time_reference
     if time_s is not None and reference is not TimeReference.MIDDLE:
-        is_readable = not any(is_unreadable(outcome) for outcome in outcomes)
-        time_s = _mid_exposure_s(time_s, exif.exposure, reference, place) if is_readable else None
-    return FrameResult(
-        frame_input.frame,
-        time_s,
-        exif.exposure,
-        outcomes,
-        exif.time_s,
-        dropped,
-        TimeSource.NONE if time_s is None else time_source,
-    )
+        path = job.frames_folder / frame_input.frame
+        time_s = _mid_exposure_s(time_s, exif.exposure, reference, path) if is_readable else None
+    return time_s, TimeSource.NONE if time_s is None else time_source
 
 
 def _look_for_plain(
     grey: GreyArray, job: DetectionJob, frame_input: FrameInput, outcomes: Sequence[Outcome]
 ) -> tuple[Outcome, ...]:
-    measured = [one for one in outcomes if isinstance(one, Measurement)]
+    measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     return tuple(
         look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
         for target in job.plain_targets
@@ -156,7 +158,7 @@ def _look_for_plain(
 def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameResult:
     """Look once more for what was not found in a frame, where it must be."""
     grey = _read_again(job, guided_input.input.frame)
-    found = {
+    measured = {
         outcome.target: outcome
         for outcome in guided_input.first.outcomes
         if isinstance(outcome, Measurement) and outcome.instance == 0
@@ -165,19 +167,19 @@ def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameRe
     considered: list[Considered] = []
     for target in job.targets:
         if target.name in guided_input.predictions:
-            seen, more = look_again(
+            measurement, compared = look_again(
                 grey,
                 job.camera,
                 target,
                 guided_input.predictions[target.name],
                 job.settings,
                 priors.get(target.name, PlatePrior()),
-                tuple(found.values()),
+                tuple(measured.values()),
             )
-            considered += more
-            if seen is not None:
-                found[target.name] = seen
-    outcomes = _with_plain(job, guided_input, grey, found, considered)
+            considered += compared
+            if measurement is not None:
+                measured[target.name] = measurement
+    outcomes = _outcomes_of_second_look(job, guided_input, grey, measured, considered)
     dropped = guided_input.first.dropped
     if job.keeps_dropped:
         dropped = _best_dropped((*dropped, *considered))
@@ -222,27 +224,27 @@ def lost_frame(job: DetectionJob, frame_input: FrameInput, reason: Reason) -> Fr
     )
 
 
-def kept_frame(guided_input: GuidedInput, reason: Reason) -> FrameResult:
+def result_without_second_look(guided_input: GuidedInput, reason: Reason) -> FrameResult:
     """Return the result of the first look, where the second one ended its process."""
     outcomes = tuple(
-        replace(one, detail="; ".join(filter(None, (one.detail, f"second look: {reason}"))))
-        if isinstance(one, Miss)
-        else one
-        for one in guided_input.first.outcomes
+        replace(outcome, detail="; ".join(filter(None, (outcome.detail, f"second look: {reason}"))))
+        if isinstance(outcome, Miss)
+        else outcome
+        for outcome in guided_input.first.outcomes
     )
     return replace(guided_input.first, outcomes=outcomes)
 
 
-def _with_plain(
+def _outcomes_of_second_look(
     job: DetectionJob,
     guided_input: GuidedInput,
     grey: GreyArray,
-    found: Mapping[str, Measurement],
+    by_target: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
-    """Merge what was found, and look for plain targets that nothing else has predicted."""
-    outcomes = _merged(job, guided_input, grey, found, considered)
-    measured = [one for one in outcomes if isinstance(one, Measurement)]
+    """Return the outcomes of coded targets, then of plain ones where they are predicted now."""
+    outcomes = _coded_outcomes(job, guided_input, grey, by_target, considered)
+    measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     plain: dict[str, Outcome] = {}
     for target in job.plain_targets:
         prediction = guided_input.plain.get(target.name)
@@ -252,50 +254,64 @@ def _with_plain(
                 outcome = completed(job, replace(outcome, is_guided=True))
             plain[target.name] = outcome
     return tuple(
-        plain.get(one.target, one)
-        if isinstance(one, Miss) and one.reason is Reason.NO_PREDICTION
-        else one
-        for one in outcomes
+        plain.get(outcome.target, outcome)
+        if isinstance(outcome, Miss) and outcome.reason is Reason.NO_PREDICTION
+        else outcome
+        for outcome in outcomes
     )
 
 
-def _merged(
+def _coded_outcomes(
     job: DetectionJob,
     guided_input: GuidedInput,
     grey: GreyArray,
-    found: Mapping[str, Measurement],
+    measured: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
-    """Put what was found in the place of misses, and explain the others by what is known now."""
-    first = {one.target: one for one in guided_input.first.outcomes if isinstance(one, Miss)}
-    missed = tuple(target for target in job.targets if target.name not in found)
-    if first.keys() & found.keys():  # rings on those plates explain no other's miss any more
-        others = tuple(found.values())
+    """Replace misses by what is measured now, and the reasons of the others by what is known now.
+
+    Parameters
+    ----------
+    measured : mapping of str to Measurement
+        Of both looks, by target.
+    considered : sequence of Considered
+        Rings that the second look has compared with a target.
+    """
+    first_outcomes = guided_input.first.outcomes
+    misses = {outcome.target: outcome for outcome in first_outcomes if isinstance(outcome, Miss)}
+    missing = tuple(target for target in job.targets if target.name not in measured)
+    if misses.keys() & measured.keys():  # rings on those plates explain no other's miss any more
+        plates = tuple(measured.values())
         again = examine(
-            grey, job.camera, missed, job.settings, job.priors(guided_input.input), others
+            grey, job.camera, missing, job.settings, job.priors(guided_input.input), plates
         )
-        first |= {one.target: one for one in again.outcomes if isinstance(one, Miss)}
-    instead: dict[str, Outcome] = {}
-    for target in missed:
-        there = [one for one in considered if one.target == target.name and one.score >= CODE_LIKE]
-        known = (
-            miss_of(grey, target, there, job.settings, job.targets) if there else first[target.name]
+        misses |= {
+            outcome.target: outcome for outcome in again.outcomes if isinstance(outcome, Miss)
+        }
+    replacements: dict[str, Outcome] = {}
+    for target in missing:
+        code_like = [
+            ring for ring in considered if ring.target == target.name and ring.score >= CODE_LIKE
+        ]
+        replacements[target.name] = (
+            miss_of(grey, target, code_like, job.settings, job.targets)
+            if code_like
+            else misses[target.name]
         )
-        instead[target.name] = known
-    for name in first.keys() & found.keys():
-        instead[name] = completed(job, found[name])
+    for name in misses.keys() & measured.keys():
+        replacements[name] = completed(job, measured[name])
     return tuple(
-        instead.get(one.target, one) if isinstance(one, Miss) else one
-        for one in guided_input.first.outcomes
+        replacements.get(outcome.target, outcome) if isinstance(outcome, Miss) else outcome
+        for outcome in first_outcomes
     )
 
 
 def _best_dropped(considered: Sequence[Considered]) -> tuple[Considered, ...]:
     """Return the dropped rings that came farthest, one per outline."""
-    dropped = (one for one in considered if one.reason is not None)
+    dropped = (ring for ring in considered if ring.reason is not None)
     best: dict[Ellipse, Considered] = {}
-    for candidate in sorted(dropped, key=lambda one: (not one.is_match, -one.score)):
-        best.setdefault(candidate.outline, candidate)
+    for ring in sorted(dropped, key=lambda ring: (not ring.is_match, -ring.score)):
+        best.setdefault(ring.outline, ring)
     return tuple(best.values())[:_MOST_DROPPED]
 
 
@@ -303,11 +319,11 @@ def _mid_exposure_s(
     time_s: float,
     exposure: ExposureSettings,
     reference: TimeReference,
-    place: Path | StoredFolder,
+    path: Path | StoredFolder,
 ) -> float:
     if exposure.exposure_time_s is None:
         raise KgcpError(
-            f"{place}: has no exposure time in EXIF, which [camera] time_reference ="
+            f"{path}: has no exposure time in EXIF, which [camera] time_reference ="
             f" '{reference.value}' in flight.toml needs; write EXIF into the frames, or give times"
             " of mid-exposure and delete time_reference"
         )
@@ -321,7 +337,7 @@ def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
     target = next(target for target in job.all_targets if target.name == outcome.target)
     common = common_uncertainty(job.camera, job.calibration_covariance, target, outcome.pose)
     if outcome.image is not None:
-        off = outcome.image.moments[:2] - outcome.centre_px
+        eccentricity_px = outcome.image.moments[:2] - outcome.centre_px
     else:
         pose = outcome.pose
         circle = Circles3D(
@@ -329,5 +345,5 @@ def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
             pose.rotation[None, :, :2],
             np.array([0.5 * target.outer_diameter_m]),
         )
-        off = eccentricity(job.camera, circle).total_px[0]
-    return replace(outcome, common=common, eccentricity_px=off)
+        eccentricity_px = eccentricity(job.camera, circle).total_px[0]
+    return replace(outcome, common=common, eccentricity_px=eccentricity_px)
