@@ -379,7 +379,7 @@ def _report_consistency(found: Consistency) -> None:
     from kgcp.quality.advice import rms_m
 
     along, across, up = rms_m(found)
-    outliers = sum(one.is_outlier for one in found.discrepancies)
+    outliers = sum(each.is_outlier for each in found.discrepancies)
     click.echo(
         f"frames with a reference pose: {len(found.discrepancies)}; vehicle and camera differ by"
         f" {along:.3f} m along, {across:.3f} m across, {up:.3f} m up (RMS), {outliers} outliers",

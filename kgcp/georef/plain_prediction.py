@@ -98,7 +98,7 @@ def predict_plain(
     The deviations follow from those of the frame's orientation and of the target's position.
     """
     made = {target.name: _predicted(target, orientation, positions, camera) for target in targets}
-    return {name: one for name, one in made.items() if one is not None}
+    return {name: prediction for name, prediction in made.items() if prediction is not None}
 
 
 def _predicted(

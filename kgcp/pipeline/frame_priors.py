@@ -117,7 +117,7 @@ def _rotations(
             for row, (frame, time) in enumerate(zip(frames, time_s, strict=True))
             if time is not None and frame in posed
         ]
-        timed = sorted(dict(sorted(timed)).items())  # of frames of one time, one
+        timed = sorted(dict(sorted(timed)).items())  # one frame per time
         positions = target_positions.positions(
             [target.name] * len(timed), [time for time, _ in timed]
         )

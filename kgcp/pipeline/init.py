@@ -139,7 +139,7 @@ def _require_new(folder: Path) -> None:
 
 
 def _name_of(folder: Path) -> str:
-    name = "".join(one if one.isprintable() else "_" for one in folder.resolve().name)
+    name = "".join(letter if letter.isprintable() else "_" for letter in folder.resolve().name)
     return name.strip()[:100] or "flight"
 
 

@@ -62,12 +62,8 @@ def draw_overlay(
 
     Parameters
     ----------
-    sheet : ContactSheet
-    flight_name : str
-    run : DetectionRun
-    job : DetectionJob
     predictions : mapping of mappings
-        Where targets must be, by row and target: added to what is said of misses.
+        Where targets must be, by row and target: added to the texts of misses.
 
     Returns
     -------

@@ -35,7 +35,7 @@ def advice(consistency: Consistency) -> tuple[str, ...]:
 
 def is_explained(consistency: Consistency) -> bool:
     """Tell whether the corrections, if any are due, explain the disagreement."""
-    due = [one for one in consistency.estimate.corrections if one.is_significant]
+    due = [each for each in consistency.estimate.corrections if each.is_significant]
     is_credible = all(correction.is_credible for correction in due)
     return is_credible and consistency.estimate.variance_factor <= _EXPLAINED
 

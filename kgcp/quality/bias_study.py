@@ -260,11 +260,11 @@ def _compare(
 
 @dataclass(frozen=True, slots=True)
 class EdgeDistances:
-    """Distances of one target by its edges."""
+    """Distances of one target by its edges, which exposure displaces."""
 
-    one_m: float  # as the outer edge alone gives it, displaced by exposure as it is [m]
-    two_m: float  # with both edges, whose common displacement drops out [m]
-    one_px: float  # radius of the displaced outer edge [px]
+    by_outer_edge_m: float  # with its displacement [m]
+    by_both_edges_m: float  # whose common displacement cancels out [m]
+    outer_radius_px: float  # of the displaced outer edge [px]
 
 
 def edge_distances(pair: Comparison, method: Method) -> EdgeDistances | None:
@@ -283,5 +283,5 @@ def edge_distances(pair: Comparison, method: Method) -> EdgeDistances | None:
             sighting.distance_m, sighting.distance_m / (1.0 + share), exposure.radius_px
         )
     displaced_px = exposure.radius_px - exposure.edge_shift_px
-    one_m = sighting.distance_m * exposure.radius_px / displaced_px
-    return EdgeDistances(one_m, sighting.distance_m, displaced_px)
+    by_outer_edge_m = sighting.distance_m * exposure.radius_px / displaced_px
+    return EdgeDistances(by_outer_edge_m, sighting.distance_m, displaced_px)

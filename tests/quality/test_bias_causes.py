@@ -27,8 +27,8 @@ def by(study: BiasStudy, edges: int | None = None) -> Regression:
         assert found is not None
         assert one.attempt.sighting is not None
         reported = one.attempt.sighting.distance_m
-        measured.append({None: reported, 1: found.one_m, 2: found.two_m}[edges])
-        radii.append(found.one_px)
+        measured.append({None: reported, 1: found.by_outer_edge_m, 2: found.by_both_edges_m}[edges])
+        radii.append(found.outer_radius_px)
     radius = np.array(radii) if edges == 1 else None
     regression = regress(DistanceResiduals.of(compared, np.array(measured), radius))
     assert regression is not None

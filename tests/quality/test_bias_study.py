@@ -219,8 +219,8 @@ def test_one_edge_is_displaced_and_two_are_not(method: Method) -> None:
     )
     found = edge_distances(study.measured[0], method)
     assert found is not None
-    assert found.one_m == pytest.approx(displaced_m, rel=1e-12)
-    assert found.two_m == pytest.approx(true_m, rel=1e-12)
+    assert found.by_outer_edge_m == pytest.approx(displaced_m, rel=1e-12)
+    assert found.by_both_edges_m == pytest.approx(true_m, rel=1e-12)
 
 
 def test_without_edge_shift_there_are_no_edge_distances() -> None:

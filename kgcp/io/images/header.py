@@ -98,7 +98,7 @@ def upright(stream: BinaryIO) -> bytes:
     layout = _Layout.of(stream.read(16))
     places = []
     if layout is not None:
-        places = [one.place for one in _entries(stream, layout) if one.tag == _ORIENTATION]
+        places = [entry.place for entry in _entries(stream, layout) if entry.tag == _ORIENTATION]
     stream.seek(0)
     data = stream.read()
     if layout is None or not places:
@@ -120,10 +120,10 @@ def is_greedy(stream: BinaryIO) -> bool:
     if layout is None:
         return False
     entries = list(_entries(stream, layout))
-    below = [one.integer(layout.order) for one in entries if one.tag == _EXIF]
+    below = [entry.integer(layout.order) for entry in entries if entry.tag == _EXIF]
     for first in below[:1]:
         entries += _entries(stream, layout, first)
-    return sum(_BYTES.get(one.kind, 1) * one.count for one in entries) > 2 * stream.seek(0, 2)
+    return sum(_BYTES.get(entry.kind, 1) * entry.count for entry in entries) > 2 * stream.seek(0, 2)
 
 
 def is_cut_png(data: bytes) -> bool:

@@ -46,7 +46,7 @@ def write_consistency(
     summary, table = folder / "consistency.json", folder / "consistency.parquet"
     text = json.dumps(_summary(found), indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(summary, f"{text}\n".encode())
-    rows = (row_of(CONSISTENCY_COLUMNS, one) for one in found.discrepancies)
+    rows = (row_of(CONSISTENCY_COLUMNS, each) for each in found.discrepancies)
     write_table(table, CONSISTENCY_COLUMNS, rows, metadata)
     return summary, table
 
@@ -55,10 +55,10 @@ def _summary(found: Consistency) -> dict[str, object]:
     estimate = found.estimate
     return {
         "points": len(found.discrepancies),
-        "outliers": sum(one.is_outlier for one in found.discrepancies),
+        "outliers": sum(each.is_outlier for each in found.discrepancies),
         "rms_m": dict(zip(_AXES, rms_m(found), strict=True)),
         "corrections": [
-            {**asdict(one), "is_significant": one.is_significant} for one in estimate.corrections
+            {**asdict(each), "is_significant": each.is_significant} for each in estimate.corrections
         ],
         "chi2_before": estimate.chi2_before,
         "chi2_after": estimate.chi2_after,

@@ -57,7 +57,7 @@ def _comparison(get: Callable[[Comparison], object]) -> _Get:
 
 
 def _sighting(get: Callable[[Sighting], object]) -> _Get:
-    return _comparison(lambda one: one.attempt.sighting and get(one.attempt.sighting))
+    return _comparison(lambda pair: pair.attempt.sighting and get(pair.attempt.sighting))
 
 
 def _edges(get: Callable[[EdgeDistances], float]) -> _Get:
@@ -69,21 +69,23 @@ def _edges(get: Callable[[EdgeDistances], float]) -> _Get:
 
 
 def _exposure(name: str) -> _Get:
-    return _comparison(lambda one: getattr(one.attempt.exposure, name))
+    return _comparison(lambda pair: getattr(pair.attempt.exposure, name))
 
 
 BIAS_COLUMNS: tuple[Column[_Compared], ...] = (
-    Column("frame", TEXT, _comparison(lambda one: one.attempt.frame)),
-    Column("target", TEXT, _comparison(lambda one: one.attempt.target)),
-    Column("time", TIME, _comparison(lambda one: time_cell(one.attempt.time_s))),
+    Column("frame", TEXT, _comparison(lambda pair: pair.attempt.frame)),
+    Column("target", TEXT, _comparison(lambda pair: pair.attempt.target)),
+    Column("time", TIME, _comparison(lambda pair: time_cell(pair.attempt.time_s))),
     Column("distance_m", NUMBER, _sighting(lambda seen: seen.distance_m)),
     Column("sd_distance_m", NUMBER, _sighting(lambda seen: seen.sd_distance_m)),
-    Column("one_edge_distance_m", NUMBER, _edges(lambda edges: edges.one_m)),
-    Column("two_edge_distance_m", NUMBER, _edges(lambda edges: edges.two_m)),
-    Column("reference_distance_m", NUMBER, _comparison(lambda one: one.reference_distance_m)),
-    Column("sd_reference_distance_m", NUMBER, _comparison(lambda one: one.sds and one.sds.total_m)),
-    Column("residual_m", NUMBER, _comparison(lambda one: one.residual_m)),
-    Column("residual_percent", NUMBER, _comparison(lambda one: one.residual_percent)),
+    Column("one_edge_distance_m", NUMBER, _edges(lambda edges: edges.by_outer_edge_m)),
+    Column("two_edge_distance_m", NUMBER, _edges(lambda edges: edges.by_both_edges_m)),
+    Column("reference_distance_m", NUMBER, _comparison(lambda pair: pair.reference_distance_m)),
+    Column(
+        "sd_reference_distance_m", NUMBER, _comparison(lambda pair: pair.sds and pair.sds.total_m)
+    ),
+    Column("residual_m", NUMBER, _comparison(lambda pair: pair.residual_m)),
+    Column("residual_percent", NUMBER, _comparison(lambda pair: pair.residual_percent)),
     *(Column(field.name, NUMBER, _exposure(field.name)) for field in fields(Exposure)),
 )
 

@@ -177,8 +177,9 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     if not skewed:
         return poses
     likelier = skewed[0]
-    for one in skewed[1:]:
-        likelier = one if advantage_over(likelier.best, one.best) > 0.0 else likelier
+    for poses_skewed in skewed[1:]:
+        if advantage_over(likelier.best, poses_skewed.best) > 0.0:
+            likelier = poses_skewed
     return replace(likelier, even=poses.even)
 
 

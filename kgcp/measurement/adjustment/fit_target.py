@@ -63,10 +63,8 @@ def measure_by_model(
     ----------
     grey : (height, width) array
         Raw frame.
-    camera : Camera
     target : Target
         Its layout.
-    start : InitialPose
     prior : PlatePrior, optional
         Its normal only helps to choose between the two poses, whose values remain those of the
         image. Its base of the tone curve is the only one that is tried, unless it leads nowhere.

@@ -75,11 +75,12 @@ class Encounters:
         ]
         if vehicle is None or len(posed) < MIN_ENCOUNTERS:
             return None
-        posed.sort(key=lambda one: (one[0], one[1].frame))
+        posed.sort(key=lambda row: (row[0], row[1].frame))
         posed = [posed[index] for index in _thinned(len(posed))]
+        row_times_s, used, plate_poses, rows_of_poses = zip(*posed, strict=True)
+        row = [*rows_of_poses]
         orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
-        row = [one[3] for one in posed]
-        time_s = np.array([one[0] for one in posed]) + vehicle.settings.time_offset_s
+        time_s = np.array(row_times_s) + vehicle.settings.time_offset_s
         draft = cls(
             vehicle=vehicle,
             camera=camera,
@@ -87,13 +88,13 @@ class Encounters:
             position_m=np.empty((0, 3)),
             attitude_deg=np.empty((0, 3)),
             lever_arm_m=np.array(vehicle.settings.lever_arm_m),
-            pixel=np.array([one[1].centre_px for one in posed]),
-            in_camera_m=np.array([one[2].translation_m for one in posed]),
-            camera_from_plate=np.array([one[2].rotation for one in posed]),
+            pixel=np.array([sighting.centre_px for sighting in used]),
+            in_camera_m=np.array([pose.translation_m for pose in plate_poses]),
+            camera_from_plate=np.array([pose.rotation for pose in plate_poses]),
             centre_m=orientations.centre_m[row],
             enu_from_camera=orientations.enu_from_camera[row],
             opk_deg=poses.opk_deg[row],
-            variance_m2=_variance_m2([one[1] for one in posed], vehicle, poses, row),
+            variance_m2=_variance_m2(used, vehicle, poses, row),
             frame_from_ned=np.broadcast_to(ENU_FROM_NED, (len(row), 3, 3)),
         )
         place = draft.at(time_s).position_m

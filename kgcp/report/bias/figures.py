@@ -272,7 +272,8 @@ def one_edge_against_two(numbers: BiasNumbers, edges: EdgeNumbers) -> Picture:
     with sheet(5.6) as figure:
         upper, lower = figure.subplots(2, 1)
         upper.axhline(0.0, color="black", linewidth=0.8)
-        by_one, by_two = 100.0 * edges.one_m / distance, 100.0 * edges.two_m / distance
+        by_one = 100.0 * edges.outer_edge_m / distance
+        by_two = 100.0 * edges.both_edges_m / distance
         both = np.concatenate((by_one, by_two))
         points = [
             scatter(upper, rows, distance, by_one, "one edge", VERMILION, "x", both),

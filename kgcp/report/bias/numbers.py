@@ -92,16 +92,16 @@ class Influence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeNumbers:
-    """Distances by one edge against those by two."""
+    """Distances by the outer edge alone against those by both edges."""
 
     rows: IndexArray  # (m,): of the measurements that have both
-    # (m,): errors [m]
-    one_m: FloatArray
-    two_m: FloatArray
-    # of the errors [%]
-    one_percent: Spread
-    two_percent: Spread
-    # of the distances by one edge; None also if these are the measured distances
+    # (m,): residuals [m]
+    outer_edge_m: FloatArray
+    both_edges_m: FloatArray
+    # of the residuals [%]
+    outer_edge_percent: Spread
+    both_edges_percent: Spread
+    # of the distances by the outer edge; None also if these are the measured distances
     regression: Regression | None
 
 
@@ -299,15 +299,17 @@ def _edges(study: BiasStudy, compared: Sequence[Comparison]) -> EdgeNumbers | No
     if not rows.size:
         return None
     with_both = [compared[row] for row in rows.tolist()]
-    one_m, two_m, one_px = np.array([astuple(pair) for pair in pairs if pair is not None]).T
-    by_one = DistanceResiduals.of(with_both, one_m, one_px)
+    by_outer_m, by_both_m, radius_px = np.array(
+        [astuple(pair) for pair in pairs if pair is not None]
+    ).T
+    by_outer = DistanceResiduals.of(with_both, by_outer_m, radius_px)
     return EdgeNumbers(
         rows=rows,
-        one_m=by_one.residual_m,
-        two_m=two_m - by_one.distance_m,
-        one_percent=Spread.of(100.0 * by_one.residual_m / by_one.distance_m),
-        two_percent=Spread.of(100.0 * (two_m / by_one.distance_m - 1.0)),
-        regression=None if study.method is Method.PAPER else regress(by_one),
+        outer_edge_m=by_outer.residual_m,
+        both_edges_m=by_both_m - by_outer.distance_m,
+        outer_edge_percent=Spread.of(100.0 * by_outer.residual_m / by_outer.distance_m),
+        both_edges_percent=Spread.of(100.0 * (by_both_m / by_outer.distance_m - 1.0)),
+        regression=None if study.method is Method.PAPER else regress(by_outer),
     )
 
 

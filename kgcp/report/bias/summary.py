@@ -46,8 +46,8 @@ def summary_of(numbers: BiasNumbers, verdict: Verdict, reexposed: Sequence[Reexp
         "edges": None
         if edges is None
         else {
-            "one_edge_percent": asdict(edges.one_percent),
-            "two_edges_percent": asdict(edges.two_percent),
+            "one_edge_percent": asdict(edges.outer_edge_percent),
+            "two_edges_percent": asdict(edges.both_edges_percent),
             "one_edge_regression": _regression(edges.regression),
         },
         "detected": numbers.detected,
