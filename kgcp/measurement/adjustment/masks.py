@@ -38,8 +38,8 @@ _HIDDEN_CONTRAST = 0.25  # off the level of ink or plate
 _NO_EDGE_SIGMAS, _NO_EDGE_CONTRAST = 1.2, 0.5  # so near an edge, this side still looks like that
 _NO_EDGE_OUTSIDE_SIGMAS = 1.9  # beyond, the plate may end
 _HIDDEN_SIGMAS = 4.0  # from there through the next edge
-_SMALLEST_SIGMAS = 12.0  # a ring that is smaller hardly shows the level of ink anywhere
-_MAX_HIDDEN = 0.5  # of all that is looked at; more: it is not a plate, or in another light
+_SMALLEST_SIGMAS = 12.0  # radius; smaller rings hardly show the level of ink anywhere
+_MAX_HIDDEN = 0.5  # of the tested pixels; above, it is no plate, or the light is another
 _DOT_AREAS, _DOTS = 1.5, 1.6  # larger than a dot with what blur adds to it, or longer
 _SCALE_PIXELS = 100  # enough to see how the plate's scale varies
 _SMALL_SIGMAS = 3.0  # discs of smaller radii do not show their own level
@@ -64,7 +64,7 @@ class SeenPlate:
 
 
 def see_plate(problem: FitProblem, pose: Pose, blur: Blur, slack_px: float = 0.0) -> SeenPlate:
-    """Prepare a window for what is asked of it; the pose may be off by so many pixels."""
+    """Prepare a window for its masks and its pixels; the pose may be off by `slack_px`."""
     rays, sd_px = problem.window.rays, blur.largest_sd_px
     step = max(1, rays.shape[1] // _SCALE_PIXELS)
     scale = largest_metres_per_px(pose, np.ascontiguousarray(rays[:, ::step]))
@@ -92,13 +92,14 @@ def first_levels(problem: FitProblem, pose: Pose) -> Light:
         `NO_CONTRAST` if ink is not darker than the plate.
     """
     window = problem.window
-    some = slice(None, None, _uneven(window.rays.shape[1] // _ENOUGH_PIXELS, window.width))
+    step = _step_across_columns(window.rays.shape[1] // _ENOUGH_PIXELS, window.width)
+    some = slice(None, None, step)
     levels = np.ascontiguousarray(window.levels[some])
     outer_m, inner_m = problem.circles.radii_m[:2]  # dots are nowhere nearer than the ring's edges
     rays = np.ascontiguousarray(window.rays[:, some])
     circles, count = problem.circles, problem.measured_count
     unblurred = unblurred_plate(circles, count, pose, rays, reach_m=outer_m - inner_m)
-    black, white = _plateaus(
+    black, white = _median_levels(
         levels, unblurred.rho_m, unblurred.share, unblurred.off_edge_m, outer_m
     )
     if not white - black >= 4.0 * window.levels_per_count:
@@ -106,8 +107,8 @@ def first_levels(problem: FitProblem, pose: Pose) -> Light:
     return light_of_levels(black, white, problem.tone)
 
 
-def _uneven(step: int, width: int) -> int:
-    """Return a step of about this size that does not stay in the same columns of a window."""
+def _step_across_columns(step: int, width: int) -> int:
+    """Return a step of about this size that visits all columns of a window in turn."""
     step = max(1, step)
     while step > 1 and math.gcd(step, width) > 1:
         step -= 1
@@ -115,7 +116,7 @@ def _uneven(step: int, width: int) -> int:
 
 
 @compiled
-def _plateaus(
+def _median_levels(
     levels: FloatArray,
     rho_m: FloatArray,
     share: FloatArray,
@@ -219,18 +220,18 @@ def _fill_ellipse(xx: float, yy: float, xy: float, sigmas: float, kernel: GreyAr
 def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
     """Tell which pixels (n,) of the window show something other than ink and plate.
 
-    By levels that are neither ink nor plate where the plate is flat, and by missing edges: grey
-    values beside one that are those of its other side. The pose may be off by `slack_px`. If that
-    is more than half of all that is tested, it is rather the light or the pose that is wrong, and
-    nothing is left out.
+    They show by levels that are neither those of ink nor of plate where the plate is flat, and by
+    missing edges, beside which grey values are those of the other side. The pose may be off by
+    `slack_px`. If more than half of all tested pixels show something else, the light or the pose is
+    wrong rather than the target hidden, and nothing is left out.
     """
     problem, sd_px, unblurred = seen.problem, seen.blur.largest_sd_px, seen.unblurred
-    other = np.zeros(len(unblurred.rho_m), dtype=np.bool_)
+    hidden = np.zeros(len(unblurred.rho_m), dtype=np.bool_)
     if problem.outer_radius_px < _SMALLEST_SIGMAS * sd_px:
-        return other
+        return hidden
     black, white = plateau_levels(light, problem.tone)
     contrast, scale = min(white, 1.0) - black, seen.metres_per_px
-    found, tested = _mark_other(
+    hidden_count, tested_count = _mark_hidden(
         problem.window.smooth,
         unblurred.share,
         unblurred.off_edge_m,
@@ -240,25 +241,26 @@ def occluded_mask(seen: SeenPlate, light: Light, slack_px: float) -> BoolArray:
         problem.outer_radius_m,
         slack_px * scale,
         sd_px * scale,
-        other,
+        hidden,
     )
-    if found:
-        other = _without_dots(seen, other)
-        found = int(np.count_nonzero(other))
-    if not found or found > _MAX_HIDDEN * tested:
-        return np.zeros_like(other)
+    if hidden_count:
+        hidden = _without_dots(seen, hidden)
+        hidden_count = int(np.count_nonzero(hidden))
+    if not hidden_count or hidden_count > _MAX_HIDDEN * tested_count:
+        return np.zeros_like(hidden)
     half = math.ceil(_HIDDEN_SIGMAS * sd_px + slack_px)
     size = (2 * half + 1, 2 * half + 1)
-    return seen.dilated(other, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size).astype(np.uint8))
+    return seen.dilated(hidden, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size).astype(np.uint8))
 
 
-def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
-    """Leave out what may be a dot too many or too few: it lies in the ring and is not larger.
+def _without_dots(seen: SeenPlate, hidden: BoolArray) -> BoolArray:
+    """Unmark what may be a dot too many or too few: in the ring, and no larger than a dot.
 
-    Such a patch is evidence of another code. Masked, it would not count against the target.
+    Such a patch is evidence of another code. If it were masked, it would not count against the
+    target.
     """
     radii_m, rho_m, window = seen.problem.circles.radii_m, seen.unblurred.rho_m, seen.problem.window
-    mask = other.reshape(window.height, window.width).view(np.uint8)
+    mask = hidden.reshape(window.height, window.width).view(np.uint8)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(mask)
     beside = (rho_m > radii_m[0]) | (rho_m < radii_m[1])
     dot_px = 2.0 * radii_m[2] / seen.metres_per_px
@@ -270,7 +272,7 @@ def _without_dots(seen: SeenPlate, other: BoolArray) -> BoolArray:
 
 
 @compiled
-def _mark_other(
+def _mark_hidden(
     smooth: FloatArray,
     share: FloatArray,
     off_edge_m: FloatArray,
@@ -280,23 +282,23 @@ def _mark_other(
     outer_radius_m: float,
     slack_m: float,
     sd_m: float,
-    other: BoolArray,
+    hidden: BoolArray,
 ) -> tuple[int, int]:
-    """Mark pixels that are not what they should be; return their number, and that of all tested.
+    """Mark pixels that are not what they should be; return how many, and how many were tested.
 
     `share` is the white share without blur. A pixel is clear, and its level known to a quarter of
     the contrast, from 2.6 σ on beside any edge. From 1.2 σ on blur has moved it by at most 12 % of
     the contrast towards the other side: by half of the contrast only a missing edge does.
     """
-    found = tested = 0
+    hidden_count = tested_count = 0
     for i in range(len(smooth)):
         off_m, beyond_m = off_edge_m[i] - slack_m, rho_m[i] - outer_radius_m - slack_m
         is_clear = off_m > _CLEAR_SIGMAS * sd_m and beyond_m < 0.0
         is_near = off_m > _NO_EDGE_SIGMAS * sd_m and beyond_m < _NO_EDGE_OUTSIDE_SIGMAS * sd_m
-        tested += is_clear or is_near
+        tested_count += is_clear or is_near
         off_level = abs(smooth[i] - (black + contrast * share[i]))
-        other[i] = (is_clear and off_level > _HIDDEN_CONTRAST * contrast) or (
+        hidden[i] = (is_clear and off_level > _HIDDEN_CONTRAST * contrast) or (
             is_near and off_level > _NO_EDGE_CONTRAST * contrast
         )
-        found += other[i]
-    return found, tested
+        hidden_count += hidden[i]
+    return hidden_count, tested_count

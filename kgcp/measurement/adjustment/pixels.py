@@ -95,7 +95,8 @@ def select_pixels(
         unused = background_mask(seen, light, slack_px)
         unused |= occluded_mask(seen, light, slack_px)
     if problem.visible is not None:
-        unused |= ~problem.visible[_steps_about(seen.unblurred.points_m, len(problem.visible))]
+        sectors = _sectors_about_normal(seen.unblurred.points_m, len(problem.visible))
+        unused |= ~problem.visible[sectors]
     index = _useful_pixels(seen, unused, plateau_pixels)
     is_thinned = max_pixels is not None and len(index) > max_pixels
     if max_pixels is not None and is_thinned:
@@ -106,10 +107,9 @@ def select_pixels(
 
 
 def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
-    """Return all pixels of the ring and its border, hidden ones too: to be looked at.
+    """Return all pixels of the ring and its border, hidden ones too, for pictures of residuals.
 
-    Those that blur mixes with what surrounds the plate are left out, but for what shows only if the
-    pose is right.
+    Those that blur mixes with the surroundings of the plate are left out.
     """
     seen = see_plate(problem, pose, blur)
     reach_m = (1.0 + _BORDER_RADII) * problem.outer_radius_m
@@ -136,23 +136,23 @@ def _sample(
     )
 
 
-def _steps_about(points_m: FloatArray, count: int) -> IndexArray:
-    """Return in which of so many steps about the plate's normal points (2, n) are."""
+def _sectors_about_normal(points_m: FloatArray, count: int) -> IndexArray:
+    """Return in which of `count` equal sectors about the plate's normal points (2, n) lie."""
     turns = np.arctan2(points_m[1], points_m[0]) / (2.0 * math.pi)
     return np.asarray(np.rint(turns * count).astype(np.intp) % count)
 
 
-def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArray:
-    """Return the pixels near edges, and those of the plateaus, thinned; of the used ones.
+def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau_pixels: int) -> IndexArray:
+    """Return the pixels near edges and some of the plateaus', without those of `unused`.
 
-    Within circles that are not measured none is used.
+    None is used within circles that are not measured.
     """
     problem, sd_px, scale = seen.problem, seen.blur.largest_sd_px, seen.metres_per_px
     tail_m = REACH_SIGMAS * sd_px * scale
     border_px = _BORDER_SIGMAS * sd_px + _BORDER_PX
     limit = 1.0 + min(_BORDER_RADII, border_px / problem.outer_radius_px)
     index = np.empty(len(unused), dtype=np.intp)
-    count = _choose(
+    count = _fill_in_pixels(
         seen.unblurred.rho_m,
         seen.unblurred.off_measured_m,
         unused,
@@ -160,7 +160,7 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau: int) -> IndexArr
         tail_m,
         _unmeasured_m(seen),
         limit * problem.outer_radius_m,
-        plateau,
+        plateau_pixels,
         index,
     )
     return index[:count]
@@ -175,7 +175,7 @@ def _unmeasured_m(seen: SeenPlate) -> float:
 
 
 @compiled
-def _choose(
+def _fill_in_pixels(
     rho_m: FloatArray,
     off_edge_m: FloatArray,
     unused: BoolArray,
@@ -183,7 +183,7 @@ def _choose(
     tail_m: float,
     unmeasured_m: float,
     limit_m: float,
-    plateau: int,
+    plateau_pixels: int,
     index: IndexArray,
 ) -> int:
     """Fill in all pixels near edges, and a share of those clear of all edges; return how many."""
@@ -191,7 +191,7 @@ def _choose(
     for i in range(len(rho_m)):
         is_flat = off_edge_m[i] >= tail_m and unmeasured_m <= rho_m[i] < limit_m
         flat += is_flat and not unused[i]
-    step, number, count = max(1, flat // plateau), 0, 0
+    step, number, count = max(1, flat // plateau_pixels), 0, 0
     for i in range(len(rho_m)):
         if unused[i] or rho_m[i] >= limit_m:
             continue
@@ -213,15 +213,15 @@ def _photometric_model(
     if problem.sharpening_px == 0.0 or light is None:
         return PhotometricModel(offsets, problem.tone, None)
     is_small = problem.outer_radius_px < _SMALL_PX
-    shown = _shown(seen, pose, light, index) if is_small else seen.unblurred.share
+    shown = _white_share_shown(seen, pose, light, index) if is_small else seen.unblurred.share
     mask = unsharp_mask((window.height, window.width), index, shown, problem.sharpening_px)
     return PhotometricModel(offsets, problem.tone, mask)
 
 
-def _shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
-    """Return where between ink and plate the levels of all pixels are but those of `index`.
+def _white_share_shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexArray) -> FloatArray:
+    """Return the levels of all pixels but those of `index` as shares between ink and plate.
 
-    Under this pose, blur and light, for what sharpening takes from them.
+    They are those under this pose, blur and light, which sharpening takes them for.
     """
     problem, scale, shown = seen.problem, seen.metres_per_px, seen.unblurred.share.copy()
     is_other = seen.unblurred.off_edge_m < REACH_SIGMAS * seen.blur.largest_sd_px * scale

@@ -15,8 +15,8 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.masks import (
     _fill_ellipse,
     _mark_foreign,
-    _mark_other,
-    _plateaus,
+    _mark_hidden,
+    _median_levels,
     occluded_mask,
     see_plate,
 )
@@ -65,7 +65,7 @@ def test_hidden_is_what_is_off_its_level_or_beyond_a_missing_edge(seed: int) -> 
     off_edge_m = rng.uniform(0.0, 0.1, PIXELS)
     contrast = WHITE - BLACK
     hidden = np.zeros(PIXELS, dtype=bool)
-    counts = _mark_other(
+    counts = _mark_hidden(
         smooth, share, off_edge_m, rho_m, BLACK, contrast, RADIUS_M, SLACK_M, SD_M, hidden
     )
     expected, tested = np.zeros(PIXELS, dtype=bool), 0
@@ -94,12 +94,14 @@ def test_levels_are_medians_of_the_third_that_is_clearest_of_edges(seed: int) ->
         chosen = is_kind & (rho_m < RADIUS_M)
         clearest = np.argsort(off_edge_m[chosen])[int(0.7 * chosen.sum()) :]
         expected.append(float(np.median(levels[chosen][clearest])))
-    assert _plateaus(levels, rho_m, share, off_edge_m, RADIUS_M) == pytest.approx(tuple(expected))
+    assert _median_levels(levels, rho_m, share, off_edge_m, RADIUS_M) == pytest.approx(
+        tuple(expected)
+    )
 
 
 def test_without_ink_its_level_is_unknown() -> None:
     one = np.ones(10)
-    black, white = _plateaus(0.7 * one, 0.1 * one, one, one, RADIUS_M)
+    black, white = _median_levels(0.7 * one, 0.1 * one, one, one, RADIUS_M)
     assert math.isnan(black)
     assert white == pytest.approx(0.7)
 
