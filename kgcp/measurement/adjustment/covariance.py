@@ -86,12 +86,12 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         `POOR_FIT`, if the pixels leave something open.
     """
     misfit = fit.misfit
-    if fit.varied is None:
+    if fit.level_equations is None:
         scaled = fit.scaled_jacobian
         normal = normal_matrix(scaled, misfit, fit.unknowns)
     else:
-        scaled = fit.varied.rows()
-        normal = fit.varied.normal
+        scaled = fit.level_equations.rows()
+        normal = fit.level_equations.normal
     try:
         inverse = np.linalg.inv(normal)
         root = np.linalg.cholesky(inverse[:6, :6])
@@ -106,8 +106,8 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     products = products[:, :, : len(scaled)]
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
-    if fit.varied is not None:
-        left -= fit.varied.taken_over(of_pose, misfit.weight, arc)
+    if fit.level_equations is not None:
+        left -= fit.level_equations.taken_over(of_pose, misfit.weight, arc)
     ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
     mean = float(ratios.mean())
     if mean < 1.0:  # few arcs can agree by chance
@@ -159,7 +159,7 @@ def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
     skew = np.array(blur.skew)
     of_skew = variances[np.searchsorted(fit.unknowns.free, SKEW_PARAMS)]
     largest = math.sqrt(max(0.0, float(np.max(skew * skew - of_skew))))
-    share = _SKEW_SHARE if fit.varied is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
+    share = _SKEW_SHARE if fit.level_equations is None else _SKEW_SHARE_IN_UNEVEN_LIGHT
     return share * largest / (6.0 * blur.mean_sd_px**2)
 
 
@@ -176,7 +176,7 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     if problem.tone is Tone.OF_BINS:
         floor_px /= problem.window.binning
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
-    noise = noise_of(fit.sample, fit.prediction, is_even=fit.varied is None)
+    noise = noise_of(fit.sample, fit.prediction, is_even=fit.level_equations is None)
     excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
     black, white = plateau_levels(fit.parameters.light, problem.tone)
@@ -213,7 +213,7 @@ def _nearest_edges(fit: TargetFit) -> tuple[IndexArray, IndexArray]:
     problem = fit.sample.problem
     circles = problem.circles.part(slice(0, problem.measured_count))
     px_per_m = problem.outer_radius_px / problem.outer_radius_m
-    arc_px = _ARC_PX if fit.varied is None else _UNEVEN_ARC_PX
+    arc_px = _ARC_PX if fit.level_equations is None else _UNEVEN_ARC_PX
     counts = np.maximum(1, np.rint(2.0 * np.pi * circles.radii_m * px_per_m / arc_px))
     return _number_arcs(fit.prediction.points_m, circles.centres_m, circles.radii_m, counts)
 

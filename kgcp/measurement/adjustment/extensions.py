@@ -122,7 +122,7 @@ def _by_likelihood(fits: Mapping[ToneBase, TwoPoses]) -> FitsByTone:
 
 def _is_at_minimum(fit: TargetFit) -> bool:
     """Tell whether nothing suggests that a fit has ended beside its minimum."""
-    return fit.varied is None or pose_covariance(fit).inflation < _OFF_MINIMUM_INFLATION
+    return fit.level_equations is None or pose_covariance(fit).inflation < _OFF_MINIMUM_INFLATION
 
 
 def _fit_in_any_light(
@@ -180,7 +180,7 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     for poses_skewed in skewed[1:]:
         if advantage_over(likelier.best, poses_skewed.best) > 0.0:
             likelier = poses_skewed
-    return replace(likelier, even=poses.even)
+    return replace(likelier, in_even_light=poses.in_even_light)
 
 
 def _fit_skewed(

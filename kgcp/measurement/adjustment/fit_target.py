@@ -107,8 +107,8 @@ def _checked(
         poses = choose_by_prior(poses.best.sample.problem, poses, prior)
     check_fit(poses.best)
     check_code(poses.best, target.ring)
-    if poses.even is not None:
-        check_code(poses.even, target.ring)
+    if poses.in_even_light is not None:
+        check_code(poses.in_even_light, target.ring)
     measurement = _measurement(camera, target, start, poses, prior)
     check_precision(measurement)
     return measurement
@@ -207,7 +207,7 @@ def _measurement(
     ambiguity = max(0.0, advantage(poses, covariance, prior))
     pose_cov = covariance.pose_cov.copy()
     pose_cov[:3, :3] += spread_over_both(pose, other.parameters.pose, ambiguity)
-    if best.varied is not None and covariance.inflation > _UNEXPLAINED:
+    if best.level_equations is not None and covariance.inflation > _UNEXPLAINED:
         pose_cov[:3, :3] += _spread_over_starts(best, other)
     of_other = pose_covariance(other).pose_cov if ambiguity < _DOUBTFUL_SIDE else None
     measurement = Measurement(

@@ -23,7 +23,8 @@ def advantage_over(other: TargetFit, fit: TargetFit) -> float:
     advantage = 0.5 * sum(
         _loss(other, sample) - _loss(fit, sample) for sample in (fit.sample, other.sample)
     )
-    if fit.varied is None and other.varied is None:  # with levels, both have as many unknowns
+    is_even = fit.level_equations is None and other.level_equations is None
+    if is_even:  # where levels vary, both have as many unknowns
         advantage += _loss_of_volume(other) - _loss_of_volume(fit)
     return advantage
 

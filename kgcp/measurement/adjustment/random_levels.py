@@ -247,7 +247,7 @@ def _minimise(
         equations_of=equations_of,
     )
     last = equations_of(fit.parameters, fit.jacobian, fit.misfit)
-    return replace(fit, varied=last.reduced)
+    return replace(fit, level_equations=last.reduced)
 
 
 def _field_of(parameters: Parameters) -> LightField:
@@ -256,7 +256,7 @@ def _field_of(parameters: Parameters) -> LightField:
 
 
 def _equations_of(fit: TargetFit) -> LevelEquations:
-    return cast("LevelEquations", fit.varied)
+    return cast("LevelEquations", fit.level_equations)
 
 
 def _equations(

@@ -24,7 +24,7 @@ def needs_skew(fit: TargetFit) -> bool:
     """
     if fit.sample.problem.window.binning > 1 or fit.unknowns.free[-1] >= SKEW_PARAMS[0]:
         return False
-    if fit.varied is not None:
+    if fit.level_equations is not None:
         return True
     by_skew, scaled = _by_skew(fit) / fit.sd, fit.scaled_jacobian
     normal = normal_matrix(scaled, fit.misfit, fit.unknowns)

@@ -45,12 +45,12 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
         return None
     row, weight = _by_smoothing(fit) / fit.sd, fit.misfit.weight
     own, score = float(row @ (row * weight)), float(row @ fit.misfit.score)
-    if fit.varied is None:
+    if fit.level_equations is None:
         scaled = fit.scaled_jacobian
         normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
     else:
-        scaled, normal = fit.varied.rows(), fit.varied.normal
-        own -= fit.varied.taken_of(row, weight)
+        scaled, normal = fit.level_equations.rows(), fit.level_equations.normal
+        own -= fit.level_equations.taken_of(row, weight)
     mixed = scaled @ (row * weight)
     moves = np.asarray(-np.linalg.solve(normal, mixed), np.float64)
     precision = own + float(mixed @ moves)

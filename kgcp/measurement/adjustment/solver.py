@@ -65,7 +65,8 @@ class TargetFit:
     sd: FloatArray  # (n,): noise of every pixel, as level
     misfit: Misfit  # without the priors
     unknowns: Unknowns
-    varied: LevelEquations | None = None  # of levels that vary; None: the light is even
+    # of levels that vary, eliminated; None: the light is even
+    level_equations: LevelEquations | None = None
 
     @property
     def scaled_jacobian(self) -> FloatArray:

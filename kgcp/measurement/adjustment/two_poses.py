@@ -40,8 +40,8 @@ class TwoPoses:
     # the better and the worse one, on the same pixels with the same noise
     best: TargetFit
     other: TargetFit
-    # the better one before levels were let vary, which may hide a dot; None if they do not vary
-    even: TargetFit | None = None
+    # the better one with even levels: levels that vary may hide a dot; None if they do not vary
+    in_even_light: TargetFit | None = None
 
 
 def fit_both_poses(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
@@ -116,11 +116,11 @@ def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) ->
     """Let the poses change places where the prior outweighs the image; adjust the new best one."""
     if advantage(poses, pose_covariance(poses.best), prior) >= 0.0:
         return poses
-    if poses.best.varied is None:
+    if poses.best.level_equations is None:
         best = adjust(problem, poses.other.parameters, poses.best.unknowns)
         turned = TwoPoses(best, _mirrored_fit(best))
     else:
-        turned = TwoPoses(poses.other, poses.best, poses.even)
+        turned = TwoPoses(poses.other, poses.best, poses.in_even_light)
         best = turned.best
     is_better = advantage(turned, pose_covariance(best), prior) >= 0.0
     return turned if is_better else poses

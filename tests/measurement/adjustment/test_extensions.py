@@ -36,7 +36,7 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
 
     def fit(problem: FitProblem, *_: object) -> object:
         tried.append(problem.tone)
-        return stand_in(best=stand_in(varied=object() if has_levels else None))
+        return stand_in(best=stand_in(level_equations=object() if has_levels else None))
 
     monkeypatch.setattr(extensions, "_fit_in_any_light", fit)
     monkeypatch.setattr(extensions, "pose_covariance", lambda _: stand_in(inflation=inflation))
