@@ -218,11 +218,7 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
     if summary.guide_problem is not None:
         lines.append(f"second pass without reference poses: {summary.guide_problem}")
     if summary.tone_base is not None:
-        lines.append(
-            f"tone curve near {summary.tone_base}, learnt from {summary.measured_with_tone}"
-            f" measurements; {summary.overruled_by_tone} alone would have taken another one,"
-            f" {summary.kept_other_tone} keep another"
-        )
+        lines.append(_about_tone(summary))
     if summary.not_drawn:
         lines.append(f"rings not drawn because their frames are missing: {summary.not_drawn}")
     lines += _about_times(summary)
@@ -232,6 +228,16 @@ def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: fl
             " cannot tell their two poses apart: give [camera] plumb_sd_deg"
         )
     click.echo("\n".join(lines), err=True)
+
+
+def _about_tone(summary: DetectionSummary) -> str:
+    learnt_from = counted(summary.measured_with_tone, "measurement")
+    parts = [f"tone curve near {summary.tone_base}, learnt from {learnt_from}"]
+    if summary.overruled_by_tone:
+        parts.append(f"{summary.overruled_by_tone} alone would suggest another curve")
+    if summary.kept_other_tone:
+        parts.append(f"{summary.kept_other_tone} measured with another curve, which fits far better")
+    return "; ".join(parts)
 
 
 def _about(reason: str, summary: DetectionSummary) -> str:

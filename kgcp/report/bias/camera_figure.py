@@ -58,8 +58,8 @@ def learnt_sentence(learnt: LearntImaging) -> str:
         _NOT_AGREED
         if learnt.base is None
         else f"The tone curve departs from {learnt.base.value}, learnt from {learnt.measurements}"
-        f" measurements; {learnt.overruled} alone would have taken another base, and"
-        f" {learnt.kept_own_base} are so far from it that they keep another."
+        f" measurements. Alone, {learnt.overruled} would suggest another base;"
+        f" {learnt.kept_own_base} kept theirs, since it fits far better."
     )
     smoothing = learnt.smoothing
     return (
