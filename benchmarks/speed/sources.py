@@ -17,7 +17,7 @@ from kgcp.measurement.records import ExposureSettings, FrameResult, ToneBase
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.measure import measure_frame
 from kgcp.pipeline.simulate import write_simulated_flight
-from kgcp.quality.learnt_imaging import base_of_no_matter, base_of_some
+from kgcp.quality.learnt_imaging import base_if_distances_agree, clearly_agreed_base
 from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.presets import preset
 
@@ -88,7 +88,7 @@ def _tone_base_of(source: Source) -> ToneBase | None:
         grey = read_grey(flight.frames_folder / name, flight.camera)
         outcomes = measure_frame(grey, flight.camera, flight.targets)
         results.append(FrameResult(name, None, ExposureSettings(), tuple(outcomes)))
-    return base_of_some(results) or base_of_no_matter(results)
+    return clearly_agreed_base(results) or base_if_distances_agree(results)
 
 
 def photographs_of(folder: Path | None, like: Source) -> list[Source]:

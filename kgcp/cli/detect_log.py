@@ -236,7 +236,7 @@ def _about_tone(summary: DetectionSummary) -> str:
     if summary.overruled_by_tone:
         parts.append(f"{summary.overruled_by_tone} alone would suggest another curve")
     if summary.kept_other_tone:
-        parts.append(f"{summary.kept_other_tone} measured with another curve, which fits far better")
+        parts.append(f"{summary.kept_other_tone} kept another curve, which fits far better")
     return "; ".join(parts)
 
 
