@@ -193,6 +193,8 @@ def _name_of(folder: Path) -> str:
 
 def _read_flight_toml(folder: Path) -> tuple[TomlTable, str]:
     path = folder / "flight.toml"
+    if is_file(folder):
+        raise KgcpError(f"{folder}: is a file; name the flight folder, which has a flight.toml")
     if not is_file(path):
         raise KgcpError(
             f"{path}: does not exist; name a flight folder, which has a flight.toml ('kgcp init'"

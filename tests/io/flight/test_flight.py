@@ -261,6 +261,12 @@ def test_a_folder_without_flight_toml_says_what_it_lacks(tmp_path: Path) -> None
         read_flight(tmp_path)
 
 
+def test_a_file_is_no_flight_folder(write: Write) -> None:
+    path = write(FLIGHT) / "flight.toml"
+    with pytest.raises(KgcpError, match=r"flight.toml: is a file; name the flight folder"):
+        read_flight(path)
+
+
 def test_other_encodings_are_refused_and_a_byte_order_mark_is_not(write: Write) -> None:
     folder = write("\ufeff" + FLIGHT)
     assert read_flight(folder).toml_text == FLIGHT
