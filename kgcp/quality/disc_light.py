@@ -31,8 +31,8 @@ class DiscLight:
     Attributes
     ----------
     dark, bright : float
-        Standard deviation over a photograph of what changes smoothly, RMS of the photographs; of
-        full scale.
+        Standard deviation over a photograph of what changes smoothly, median of the photographs; of
+        full scale. Single photographs may be burnt.
     clipped : float
         Median share of clipped pixels; NaN: not known.
     """
@@ -69,7 +69,7 @@ def light_on_discs(photographs: Iterable[tuple[FloatArray, FloatArray, FloatArra
         ordered = np.sort(levels, axis=1)
         changes.append([_smooth_change(terms, level) for level in ordered.T])
         clipped.append(share)
-    dark, bright = np.sqrt(np.mean(np.square(changes), axis=0)).tolist()
+    dark, bright = np.median(changes, axis=0).tolist()
     return DiscLight(dark, bright, float(np.median(np.concatenate(clipped))))
 
 

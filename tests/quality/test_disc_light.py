@@ -55,6 +55,16 @@ def test_burnt_white_may_be_the_cause(clipped: float) -> None:
     assert "white is burnt, or they are negatives" in found.doubt
 
 
+def test_single_burnt_photographs_are_no_doubt() -> None:
+    """Where white is burnt, discs may be fitted without their ink: its level is anything."""
+    levels = np.column_stack((0.2 * light(0.3), 0.8 * light(0.3)))
+    burnt = np.column_stack((0.2 + 0.5 * light(0.9), np.ones(len(PLACES_PX))))
+    clipped = np.zeros(len(PLACES_PX))
+    good = [(PLACES_PX, levels, clipped)] * 4
+    assert light_on_discs([*good, (PLACES_PX, burnt, clipped + 0.5)] * 2).doubt == ""
+    assert "burnt" in light_on_discs([(PLACES_PX, burnt, clipped + 0.5)] * 2).doubt
+
+
 def test_even_light_says_nothing() -> None:
     assert of_levels(1.0 - 0.1 * light(0.05), 1.0 - 0.8 * light(0.05)).doubt == ""
 
