@@ -37,6 +37,9 @@ _LEAST_CONTRAST = 0.03  # of the grey values' range
 _NEAR, _ALIKE = 0.3, 1.25  # centres, of the radius, and ratio of radii of one and the same edge
 _CONCENTRIC = 0.2  # of the larger radius: how far the centre of a hole may be off
 _LARGEST_HOLE = 0.95  # of the radius
+# Sharpening leaves a faint edge on either side of an edge, 2 to 4 px off and of a tenth of its
+# contrast; up to so much are sought.
+_RIPPLE_PX, _RIPPLE = 5.0, 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +66,7 @@ def find_outlines(grey: GreyArray) -> tuple[DiscOutline, ...]:
         From top to bottom and left to right. Each edge of a ring has an outline of its own.
     """
     blobs, polarities = find_blobs(grey)
-    return _nested(_follow(grey, blobs, polarities))
+    return _nested(_without_ripples(_follow(grey, blobs, polarities)))
 
 
 def follow_outlines(
@@ -235,6 +238,25 @@ def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[
             if signs[j] == signs[i] and 1.0 / _ALIKE < ratio < _ALIKE:
                 taken[other] = True
     return sorted(kept, key=lambda i: (round(found.ellipses[i, 1]), found.ellipses[i, 0]))
+
+
+def _without_ripples(outlines: list[DiscOutline]) -> list[DiscOutline]:
+    """Leave out what sharpening makes of the edges of others: they would hide the disc inside."""
+    if not outlines:
+        return []
+    centres = np.array([each.ellipse.centre for each in outlines])
+    radii = np.array([each.ellipse.mean_radius for each in outlines])
+    tree = cKDTree(centres)
+
+    def is_ripple(i: int) -> bool:
+        return any(
+            abs(radii[i] - radii[j]) <= _RIPPLE_PX
+            and outlines[i].polarity is outlines[j].polarity.other
+            and outlines[i].contrast < _RIPPLE * outlines[j].contrast
+            for j in tree.query_ball_point(centres[i], _CONCENTRIC * radii[i])
+        )
+
+    return [outline for i, outline in enumerate(outlines) if not is_ripple(i)]
 
 
 def _nested(outlines: list[DiscOutline]) -> tuple[DiscOutline, ...]:

@@ -25,7 +25,7 @@ from kgcp.measurement.discs.records import (
     moments_of_ellipse,
 )
 from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
-from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 CAMERA = Camera(330, 250, 640.0, 640.0, 165.3, 122.8, -0.12, 0.03)
 POSE = Pose(rotation_about(np.array([0.25, -0.35, 0.2])), np.array([0.0, 0.0, 0.62]))
@@ -63,6 +63,19 @@ def bright() -> Rendered:
     return render(ground=0.1, ink=0.6)
 
 
+def sharpened(light: float, sharpening: float) -> Rendered:
+    """Large discs by a camera that sharpens: beside their edges is a fainter one."""
+    discs = tuple(
+        FieldDisc((0.07 * i, 0.07 * j, 0.0), 0.045, 0.02 if i == j == 0 else 0.0)
+        for j in (-1, 0, 1)
+        for i in (-1, 0, 1)
+    )
+    scene = FieldScene(discs, 0.7 * light, 0.05 * light)
+    sensor = Sensor(tone=ToneCurve.FILM, sharpening=sharpening, sharpening_px=1.1)
+    photo = photograph(CAMERA, POSE, scene, Optics(0.8), sensor, np.random.default_rng(1))
+    return Rendered(photo, circle_images(CAMERA, field_circles(POSE, discs)).moments, discs)
+
+
 def outer(outlines: tuple[DiscOutline, ...]) -> list[DiscOutline]:
     return [each for each in outlines if not each.is_hole]
 
@@ -70,6 +83,22 @@ def outer(outlines: tuple[DiscOutline, ...]) -> list[DiscOutline]:
 def nearest(centres: FloatArray, moments: FloatArray) -> IndexArray:
     apart = np.linalg.norm(centres[:, None] - moments[None, :, :2], axis=2)
     return np.asarray(apart.argmin(axis=1))
+
+
+@pytest.mark.parametrize(("light", "sharpening"), [(0.7, 1.0), (1.3, 0.6)])
+def test_what_sharpening_leaves_beside_edges_hides_no_disc(light: float, sharpening: float) -> None:
+    """It was taken for a hole, and discs were measured without their ink."""
+    rendered = sharpened(light, sharpening)
+    outlines = find_outlines(rendered.photo)
+    assert len(outlines) == 10
+    assert sum(each.is_hole for each in outlines) == 1
+    measured = measure_discs(rendered.photo, outlines, response=Response.UNKNOWN)
+    discs = [each for each in measured if isinstance(each, Disc) and not each.outline.is_hole]
+    ink = float(np.quantile(rendered.photo, 0.05)) / 255.0
+    assert [each.inside for each in discs] == pytest.approx([ink] * 9, abs=0.03)
+    vectors = np.array([each.vector for each in discs])
+    off = vectors - rendered.moments[nearest(vectors[:, :2], rendered.moments)]
+    assert np.abs(off[:, :2]).max() < 0.03
 
 
 @pytest.mark.parametrize("field", ["dark", "bright"])
