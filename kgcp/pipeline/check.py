@@ -84,7 +84,7 @@ def doubts_before_detecting(
         flight,
         frames,
         stored_frames,
-        most_headers=SAMPLED_FRAMES,
+        max_headers=SAMPLED_FRAMES,
         headers_of=matching_frames(frames, frame_patterns),
     )
     return inputs.plausibility

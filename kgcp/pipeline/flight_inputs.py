@@ -82,7 +82,7 @@ class FlightInputs:
         frames: Sequence[str],
         folder: StoredFolder | None = None,
         *,
-        most_headers: int | None = None,
+        max_headers: int | None = None,
         headers_of: Sequence[str] | None = None,
     ) -> FlightInputs:
         """Read the headers of a flight's frames.
@@ -91,7 +91,7 @@ class FlightInputs:
         ----------
         folder : StoredFolder, optional
             Where the frames are, if not in the flight's folder.
-        most_headers : int, optional
+        max_headers : int, optional
             How many headers to read; by default all.
         headers_of : sequence of str, optional
             The frames whose headers count; by default all.
@@ -100,7 +100,7 @@ class FlightInputs:
             flight,
             FlightData(flight, frames),
             tuple(frames),
-            read_headers(flight, headers_of or frames, folder, most_headers),
+            read_headers(flight, headers_of or frames, folder, max_headers),
         )
 
     @classmethod
@@ -112,7 +112,7 @@ class FlightInputs:
         times_s = {
             attempt.frame: attempt.time_s for attempt in attempts if attempt.time_s is not None
         }
-        headers = read_headers(flight, frames, most=SAMPLED_FRAMES)
+        headers = read_headers(flight, frames, max_headers=SAMPLED_FRAMES)
         return cls(flight, data, tuple(frames), headers, times_s)
 
     @cached_property
@@ -196,7 +196,7 @@ class FlightInputs:
     def plausibility(self) -> tuple[Doubt, ...]:
         """What does not fit, grave doubts first; without what cannot be read."""
         flight = self.flight
-        found = [
+        doubts = [
             *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
             *check_targets(flight.all_targets),
             *check_frames(self.headers, flight.camera),
@@ -204,23 +204,23 @@ class FlightInputs:
             *self._doubts_of_times(),
         ]
         if flight.vehicle is not None:
-            found += check_lever_arm(flight.vehicle.settings)
-        if self.target_positions is not None and not _is_lost(found):
-            found += check_attitude(self.course)
+            doubts += check_lever_arm(flight.vehicle.settings)
+        if self.target_positions is not None and not _has_wrong_places(doubts):
+            doubts += check_attitude(self.course)
             if self.reference_poses is not None:
-                found += check_reference(self.reference_poses, self.target_positions)
+                doubts += check_reference(self.reference_poses, self.target_positions)
         poses = self.reference_poses
-        is_doubted = any(doubt.is_grave or doubt.code in _OF_TIMES for doubt in found)
+        is_doubted = any(doubt.is_grave or doubt.code in _OF_TIMES for doubt in doubts)
         if poses is not None and not is_doubted:
-            found += check_visibility(poses.frames, self.frames, self.expected_radii_px)
-        return ranked(found)
+            doubts += check_visibility(poses.frames, self.frames, self.expected_radii_px)
+        return ranked(doubts)
 
     def doubts(self) -> tuple[Doubt, ...]:
         """Return what does not fit or cannot be read, grave doubts first."""
-        found = self.plausibility
-        if _is_lost(found):
-            return found  # what cannot be read then is the consequence
-        return ranked((*self.problems, *found))
+        doubts = self.plausibility
+        if _has_wrong_places(doubts):
+            return doubts  # what cannot be read then is the consequence
+        return ranked((*self.problems, *doubts))
 
     def _doubts_of_places(self) -> list[Doubt]:
         crs = self.flight.crs
@@ -236,14 +236,14 @@ class FlightInputs:
         ]
         if self.reference_poses is not None and len(self.reference_poses.frames):
             places.append((self.reference_poses.position_map, "the reference poses"))
-        found = self._read(lambda: self._doubts_of_areas(crs, places)) or []
-        if places and not found and not self.problems:
+        doubts = self._read(lambda: self._doubts_of_areas(crs, places)) or []
+        if places and not doubts and not self.problems:
             position, where = places[0]
             few = position[:: max(1, len(position) // _PLACES), :2]
             ground = longitude_latitude(crs, few)
             ground = ground[np.isfinite(ground).all(axis=1)]
-            found += check_camera_position(self.headers, crs, ground, where)
-        return found
+            doubts += check_camera_position(self.headers, crs, ground, where)
+        return doubts
 
     @staticmethod
     def _doubts_of_areas(crs: str, places: Sequence[tuple[FloatArray, str]]) -> list[Doubt]:
@@ -251,23 +251,23 @@ class FlightInputs:
 
     def _doubts_of_times(self) -> list[Doubt]:
         times = self.times_s
-        found: list[Doubt] = []
+        doubts: list[Doubt] = []
         if self.trajectory is not None and self.flight.vehicle is not None:
             offset_s = self.flight.vehicle.settings.time_offset_s
             frame_s = np.array([times[frame] for frame in sorted(times)])
-            found += check_overlap(frame_s, self.trajectory.time_s, offset_s)
+            doubts += check_overlap(frame_s, self.trajectory.time_s, offset_s)
         if self.flight.vehicle is not None:
             is_by_header = self.detected_s is None and self.flight.times_file is None
-            asked = [header.frame for header in self.headers] if is_by_header else self.frames
-            found += check_completeness(asked, times)
+            frames = [header.frame for header in self.headers] if is_by_header else self.frames
+            doubts += check_completeness(frames, times)
         if self.flight.times_file is not None:
             both = [
                 (times[header.frame], header.time_s)
                 for header in self.headers
                 if header.time_s is not None and header.frame in times
             ]
-            found += check_exif_times(*zip(*both, strict=True)) if both else ()
-        return found
+            doubts += check_exif_times(*zip(*both, strict=True)) if both else ()
+        return doubts
 
     def _read(self, read: Callable[[], _Input]) -> _Input | None:
         try:
@@ -280,8 +280,8 @@ class FlightInputs:
             return None
 
 
-def _is_lost(doubts: Sequence[Doubt]) -> bool:
-    """Tell whether places are not where they seem to be, so that nothing about them means much."""
+def _has_wrong_places(doubts: Sequence[Doubt]) -> bool:
+    """Tell whether places are so doubtful that what follows from them means nothing."""
     return any(doubt.code in _OF_PLACES for doubt in doubts)
 
 
@@ -307,17 +307,18 @@ def read_headers(
     flight: Flight,
     frames: Sequence[str],
     folder: StoredFolder | None = None,
-    most: int | None = None,
+    max_headers: int | None = None,
 ) -> tuple[FrameHeader, ...]:
-    """Read the headers of frames, of at most so many, evenly spaced.
+    """Read the headers of frames, at most `max_headers` of them, evenly spaced.
 
     Objects of a store are read as a whole, so that only a few of them are.
     """
     if folder is not None:
-        most = min(most or _STORED_FRAMES, _STORED_FRAMES)
+        max_headers = min(max_headers or _STORED_FRAMES, _STORED_FRAMES)
     chosen = frames
-    if most is not None and most < len(frames):
-        chosen = [frames[row] for row in np.linspace(0, len(frames) - 1, most).astype(int).tolist()]
+    if max_headers is not None and max_headers < len(frames):
+        rows = np.linspace(0, len(frames) - 1, max_headers).astype(int)
+        chosen = [frames[row] for row in rows.tolist()]
     headers = []
     for frame in chosen:
         with at_hand(folder or flight.frames_folder, frame) as path:

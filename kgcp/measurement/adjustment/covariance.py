@@ -107,7 +107,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
     left = np.sum(products.sum(axis=0) * to_pose) - np.sum((products @ inverse) * products)
     if fit.level_equations is not None:
-        left -= fit.level_equations.taken_over(of_pose, misfit.weight, arc)
+        left -= fit.level_equations.scatter_taken_over(of_pose, misfit.weight, arc)
     ratios, directions = np.linalg.eigh(sums.T @ sums / max(left / 6.0, _LEAST_LEFT))
     mean = float(ratios.mean())
     if mean < 1.0:  # few arcs can agree by chance

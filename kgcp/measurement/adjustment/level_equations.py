@@ -1,4 +1,4 @@
-"""Normal equations with many values of levels, of which each pixel knows few.
+"""Normal equations with many values of levels, of which each pixel depends on few.
 
 The levels are random: they have a prior of zero mean. They are eliminated from the equations of all
 else by the Schur complement, so that those remain as small as without levels:
@@ -72,24 +72,24 @@ class LevelEquations:
         _take_over(*self.at_knots, self.by_level, by_knot, rows)
         return rows
 
-    def taken_over(self, of_pose: FloatArray, weight: FloatArray, arc: IndexArray) -> float:
-        """Return how much the levels take of the scatter (trace) of sums over arcs.
+    def scatter_taken_over(self, of_pose: FloatArray, weight: FloatArray, arc: IndexArray) -> float:
+        """Return how much of the scatter (its trace) of sums over arcs the levels take over.
 
-        The sums are of the scores with the derivatives `of_pose` (n, 6).
+        The sums are those of the scores times the derivatives `of_pose` (n, 6).
         """
         parts = _by_arc(*self.at_knots, self.by_level, weight, of_pose, arc, self.count)
         half = solved(self.root, parts.reshape(-1, 2 * self.count)[:, self.used].T)
         return float(np.sum(half * half))
 
-    def taken_of(self, row: FloatArray, weight: FloatArray) -> float:
-        """Return how much the levels take of the weighted square of a row (n,)."""
+    def square_taken_over(self, row: FloatArray, weight: FloatArray) -> float:
+        """Return how much of the weighted square of a row (n,) the levels take over."""
         half = self.half_solved(
             gather(self.at_knots, self.by_level, row * weight, self.count)[self.used]
         )
         return float(half @ half)
 
     def variances(self) -> FloatArray:
-        """Return the variances (q,) of the levels, all else being unknown, too."""
+        """Return the variances (q,) of the levels; all other parameters are unknown, too."""
         inverse, _ = dpotri(self.root, lower=1)
         by_others = np.linalg.lstsq(self.normal, self.projected, rcond=1e-12)[0]
         return np.asarray(np.diag(inverse) + np.sum(self.projected * by_others, axis=0))
@@ -167,8 +167,9 @@ def _products(
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Return the levels' own normal matrix, the mixed one (p, q), and the values that are used.
 
-    Of the former the upper triangle alone. Pixels are taken cell by cell: those of a cell have the
-    same knots, and what they add is summed side by side before it goes to its places.
+    Of the levels' own matrix only the upper triangle is filled in. Pixels are visited cell by cell:
+    those of a cell have the same knots, so that their contributions are summed before they are
+    added to the large matrices.
     """
     reach, rows = knots.shape[1], scaled.shape[0]
     used, number = _used(knots, weights, count)

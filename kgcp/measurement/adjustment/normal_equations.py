@@ -16,7 +16,7 @@ from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.image_model.noise import Misfit
 from kgcp.measurement.image_model.photometry import PARAM_COUNT
 
-_LIKE_A_TILT = 0.07  # of the distance: so great a change is held back like a tilt of 1 rad, at most
+_LIKE_A_TILT = 0.07  # of the distance: a tilt of 1 rad is damped at least like such a change
 _DEPTH, _FIRST_TURN, _LAST_TURN = 2, 3, 5  # among the parameters
 
 
@@ -44,7 +44,7 @@ class Unknowns:
 def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> FloatArray:
     """Return the normal matrix for a Jacobian (p, n) in units of the noise.
 
-    Of a plate that a step has turned edge-on it is not finite, and cannot be solved.
+    It is not finite, and cannot be solved, if a step has turned the plate edge-on.
     """
     return weighted_products(scaled, current.weight, unknowns.free_precision)
 
@@ -53,22 +53,22 @@ def normal_matrix(scaled: FloatArray, current: Misfit, unknowns: Unknowns) -> Fl
 def weighted_products(scaled: FloatArray, weight: FloatArray, precision: FloatArray) -> FloatArray:
     """Return Σ weight · row · rowᵀ with the precision on the diagonal, two by two rows at a time.
 
-    It takes half the time of a general product, which makes both of its like halves.
+    It takes half the time of a general product, which computes both halves of a symmetric result.
     """
     rows, pixels = scaled.shape
-    normal, one, two = np.empty((rows, rows)), np.empty(pixels), np.empty(pixels)
+    normal, first, second = np.empty((rows, rows)), np.empty(pixels), np.empty(pixels)
     for k in range(0, rows, 2):
         k2 = min(k + 1, rows - 1)
         for i in range(pixels):
-            one[i], two[i] = scaled[k, i] * weight[i], scaled[k2, i] * weight[i]
+            first[i], second[i] = scaled[k, i] * weight[i], scaled[k2, i] * weight[i]
         for m in range(k, rows, 2):
             m2 = min(m + 1, rows - 1)
             a, b, c, d = 0.0, 0.0, 0.0, 0.0
             for i in range(pixels):
-                a += one[i] * scaled[m, i]
-                b += one[i] * scaled[m2, i]
-                c += two[i] * scaled[m, i]
-                d += two[i] * scaled[m2, i]
+                a += first[i] * scaled[m, i]
+                b += first[i] * scaled[m2, i]
+                c += second[i] * scaled[m, i]
+                d += second[i] * scaled[m2, i]
             normal[k, m] = normal[m, k] = a
             normal[k, m2] = normal[m2, k] = b
             normal[k2, m] = normal[m, k2] = c
@@ -160,8 +160,9 @@ def _damped_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the damped normal matrix (p, p), and the gradient (p,) with the pull of the priors.
 
-    A plate seen from straight above hardly changes with its tilt. Unless that is held back like
-    the distance, every step turns it over, fails, and the distance stays where it is.
+    The image of a plate seen from straight above hardly changes with its tilt. Unless the tilt is
+    damped like the distance, every step turns the plate over and fails, and the distance never
+    changes.
     """
     damped, gradient = normal.copy(), scaled @ score
     reach_m = _LIKE_A_TILT * math.sqrt((translation_m**2).sum())

@@ -109,7 +109,8 @@ def select_pixels(
 def whole_plate(problem: FitProblem, pose: Pose, blur: Blur, light: Light) -> Sample:
     """Return all pixels of the ring and its border, hidden ones too, for pictures of residuals.
 
-    Those that blur mixes with the surroundings of the plate are left out.
+    Those that blur mixes with the surroundings of the plate are left out, where that shows whatever
+    the pose.
     """
     seen = see_plate(problem, pose, blur)
     reach_m = (1.0 + _BORDER_RADII) * problem.outer_radius_m

@@ -1,4 +1,4 @@
-"""What a measured pose leaves of the image: the model's grey values less the frame's."""
+"""Residuals around a target at its measured pose: the model's grey values less the frame's."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ResidualImage:
 def residual_image_of(
     grey: GreyArray, camera: Camera, target: Target, pose: Pose, blur_px: float | None
 ) -> ResidualImage:
-    """Return what the image of a target at this pose leaves of the grey values.
+    """Return the residuals of the grey values around a target at this pose.
 
     Blur and light are adjusted; the pose is not, by whichever method it was measured. Uneven light
     is that of a fit in which the pose is free.
@@ -57,8 +57,6 @@ def residual_image_of(
     ----------
     grey : (height, width) array
         Raw frame.
-    camera : Camera
-    target : Target
     pose : Pose
         Target → camera.
     blur_px : float or None

@@ -1,9 +1,10 @@
 """Smoothing along contours as one more unknown, linear since it is small.
 
-It is estimated after all others, at their minimum. How it would move the pose is kept with it,
-since all frames of a flight tell it better than one: a camera smooths alike in all of them, but for
-what depends on light and focus. So values scatter about a mean of the camera. Both are estimated
-from all measurements (empirical Bayes), and of one alone they are what cameras have in general.
+It is estimated after all others, at their minimum, and kept with its effect on the pose, because
+all frames of a flight together determine it better: a camera smooths all of them nearly alike,
+apart from effects of light and focus. The values of frames scatter about a mean of the camera. Mean
+and scatter are estimated from all measurements (empirical Bayes); for a single measurement, they
+are those of cameras in general.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ _SCATTERS_PX2 = np.linspace(0.0, 4.0 * _SCATTER_PX2, 41)
 
 
 def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | None:
-    """Return what a fit says of smoothing along contours; None where none is expected.
+    """Return a fit's estimate of smoothing along contours; None if none is expected.
 
-    Cameras whose tone is unknown are those that make pictures, not measurements. In bins no contour
-    is curved enough.
+    It is expected of cameras of unknown tone, which process their pictures. In bins no contour is
+    curved enough to show it.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
         normal = normal_matrix(scaled, fit.misfit, fit.unknowns)
     else:
         scaled, normal = fit.level_equations.rows(), fit.level_equations.normal
-        own -= fit.level_equations.taken_of(row, weight)
+        own -= fit.level_equations.square_taken_over(row, weight)
     mixed = scaled @ (row * weight)
     moves = np.asarray(-np.linalg.solve(normal, mixed), np.float64)
     precision = own + float(mixed @ moves)
@@ -75,13 +76,13 @@ def _by_smoothing(fit: TargetFit) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class CameraSmoothing:
-    """What measurements say together of smoothing along contours."""
+    """Smoothing along contours by all measurements together."""
 
     mean_px2: float
     sd_mean_px2: float
     scatter_px2: float  # of single measurements about the mean
 
-    def of_one(self, smoothing: ContourSmoothing) -> tuple[float, float]:
+    def in_measurement(self, smoothing: ContourSmoothing) -> tuple[float, float]:
         """Return the smoothing in one measurement among these, and its standard deviation [px²]."""
         variance, scatter = smoothing.sd_seen_px2**2, self.scatter_px2**2
         own = scatter / (scatter + variance)
@@ -90,7 +91,7 @@ class CameraSmoothing:
 
 
 def camera_smoothing(smoothings: Sequence[ContourSmoothing]) -> CameraSmoothing:
-    """Return what measurements say together, with what is known of cameras beforehand.
+    """Estimate mean and scatter from all measurements, with a prior from cameras in general.
 
     The scatter is the root of its mean square under its posterior distribution, over a grid; the
     mean is that of a normal distribution, given the scatter.
@@ -116,15 +117,16 @@ def camera_smoothing(smoothings: Sequence[ContourSmoothing]) -> CameraSmoothing:
 def with_smoothing(
     camera: Camera, measurement: Measurement, learnt: CameraSmoothing | None = None
 ) -> Measurement:
-    """Return a measurement with its contours as smoothed as all say; None: as it says alone.
+    """Return a measurement corrected for smoothing along contours.
 
-    The other pose goes with it, nearer or farther.
+    It is corrected by what all measurements say, or (`learnt` is None) by its own estimate alone.
+    The other pose is moved with it, nearer or farther.
     """
     smoothing, uncertainty = measurement.smoothing, measurement.uncertainty
     if smoothing is None or uncertainty is None:
         return measurement
     learnt = camera_smoothing([smoothing]) if learnt is None else learnt
-    value, sd = learnt.of_one(smoothing)
+    value, sd = learnt.in_measurement(smoothing)
     step = (value - smoothing.taken_px2) * smoothing.pose_by_smoothing
     added_cov = (sd**2 - smoothing.sd_taken_px2**2) * np.outer(
         smoothing.pose_by_smoothing, smoothing.pose_by_smoothing

@@ -112,6 +112,6 @@ def test_values_of_single_frames_are_as_good_as_stated() -> None:
         seen = truth + rng.normal(0.0, sd)
         alike = [ContourSmoothing(*pair, np.zeros(6)) for pair in zip(seen, sd, strict=True)]
         learnt = camera_smoothing(alike)
-        told = np.array([learnt.of_one(each) for each in alike])
+        told = np.array([learnt.in_measurement(each) for each in alike])
         sigmas.append((told[:, 0] - truth) / told[:, 1])
     assert 0.85 < np.sqrt(np.mean(np.square(sigmas))) < 1.15
