@@ -25,7 +25,7 @@ from kgcp.measurement.image_model.blur import (
     find_edge_incidence,
     reach_px,
 )
-from kgcp.measurement.image_model.blurred_plate import white_level
+from kgcp.measurement.image_model.blurred_plate import white_share_only
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import (
     PLAIN_COUNT,
@@ -232,7 +232,7 @@ def _white_share_shown(seen: SeenPlate, pose: Pose, light: Light, index: IndexAr
         np.take(a, others, axis=1) for a in (problem.window.rays, seen.unblurred.points_m)
     )
     incidence = find_edge_incidence(points_m, scale, problem.circles, seen.blur, seen.spread)
-    share = white_level(pose.matrix, rays, seen.blur.vector, incidence).value
+    share = white_share_only(pose.matrix, rays, seen.blur.vector, incidence).value
     even = PhotometricModel(np.zeros((2, len(others))), problem.tone, None)
     black, white = plateau_levels(light, problem.tone)
     shown[others] = (even.levels(share, light) - black) / (white - black)
@@ -251,5 +251,5 @@ def _edge_incidence(
         return incidence
     others = problem.circles.part(slice(problem.measured_count, None))
     replicas = find_edge_incidence(points_m, scale, others, blur, seen.spread)
-    added = white_level(pose.matrix, rays, blur.vector, replicas).value - 1.0
+    added = white_share_only(pose.matrix, rays, blur.vector, replicas).value - 1.0
     return replace(incidence, background=incidence.background + added)

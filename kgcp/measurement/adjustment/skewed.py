@@ -40,7 +40,7 @@ def _by_skew(fit: TargetFit) -> FloatArray:
     rows = skew_rows(
         parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
     )
-    return sample.photometry.carried(fit.prediction.share, parameters.light, rows)
+    return sample.photometry.level_changes(fit.prediction.share, parameters.light, rows)
 
 
 def with_skew(unknowns: Unknowns) -> Unknowns:

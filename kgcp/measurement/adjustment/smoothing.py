@@ -70,8 +70,8 @@ def _by_smoothing(fit: TargetFit) -> FloatArray:
     )
     field, pixels = parameters.field, sample.problem.window.pixels(sample.index)
     added = None if field is None else field.added(pixels)
-    carried = sample.photometry.carried(share, parameters.light, row[None], added)
-    return np.asarray(carried[0])
+    changes = sample.photometry.level_changes(share, parameters.light, row[None], added)
+    return np.asarray(changes[0])
 
 
 @dataclass(frozen=True, slots=True)

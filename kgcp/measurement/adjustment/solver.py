@@ -19,7 +19,7 @@ from kgcp.measurement.adjustment.normal_equations import (
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_level, white_share
+from kgcp.measurement.image_model.blurred_plate import WhiteShare, white_share, white_share_only
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
 from kgcp.measurement.image_model.noise import GreyNoise, Misfit, estimate_noise, misfit
 from kgcp.measurement.image_model.photometry import Param
@@ -81,7 +81,9 @@ class TargetFit:
 
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
     """Model the grey values of a sample."""
-    share = white_level(parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence)
+    share = white_share_only(
+        parameters.matrix, sample.rays, parameters.blur.vector, sample.incidence
+    )
     share, added = _with_edge_terms(share, sample, parameters)
     levels = sample.photometry.levels(share.value, parameters.light, added)
     return PredictedImage(share.points_m, share.value, levels)

@@ -31,8 +31,8 @@ class WhiteShare:
     points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
     value: FloatArray  # (n,): 0: ink, 1: plate
     # (11, n): with respect to translation [m], rotation vector [rad] (left perturbation in the
-    # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) where only
-    # the levels were asked for
+    # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) by
+    # `white_share_only`
     jacobian: FloatArray
 
 
@@ -56,10 +56,10 @@ def white_share(
     return WhiteShare(views[:2], on_plate[0], slopes)
 
 
-def white_level(
+def white_share_only(
     pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence
 ) -> WhiteShare:
-    """Return the white share of every pixel alone, at less than half the cost."""
+    """Return the white share of every pixel without derivatives, at less than half the cost."""
     views, on_plate = _rendered(pose, rays, blur, incidence, 1)
     return WhiteShare(views[:2], on_plate[0], np.empty((0, rays.shape[1])))
 

@@ -46,7 +46,9 @@ class Knots:
             part = slice(g * reach, (g + 1) * reach)
             counts = self.columns[g], self.rows[g]
             corner = self.x0, self.y0
-            _weigh(pixels, corner, spacing, counts, first, knots[:, part], weights[:, part])
+            _fill_in_weights(
+                pixels, corner, spacing, counts, first, knots[:, part], weights[:, part]
+            )
             first += self.counts[g]
         return knots, weights
 
@@ -65,7 +67,7 @@ def knots_over(
 
 
 @compiled
-def _weigh(
+def _fill_in_weights(
     pixels: FloatArray,
     corner: tuple[float, float],
     spacing: float,
@@ -177,7 +179,7 @@ class LightField:
             first += self.knots.counts[g]
         added, gradient = seen[:2], seen[2:]
         for edge in self.edges:
-            z = beyond(edge, pixels - self.centre_px[:, None])
+            z = sigmas_beyond(edge, pixels - self.centre_px[:, None])
             added += edge[INK:, None] * ndtr(z)
             slope = (edge[PLATE] - edge[INK]) * math.exp(-edge[LOG_WIDTH]) * _density(z)
             gradient[0] += math.cos(edge[ANGLE]) * slope
@@ -192,7 +194,7 @@ class LightField:
         offsets = pixels - self.centre_px[:, None]
         rows = np.empty((len(self.edges), 5, pixels.shape[1]))
         for k, edge in enumerate(self.edges):
-            z = beyond(edge, offsets)
+            z = sigmas_beyond(edge, offsets)
             across = -math.sin(edge[ANGLE]) * offsets[0] + math.cos(edge[ANGLE]) * offsets[1]
             by_z = (edge[INK] * by_level[0] + edge[PLATE] * by_level[1]) * _density(z)
             per_px = math.exp(-edge[LOG_WIDTH])
@@ -207,7 +209,7 @@ class LightField:
         return replace(self, values=self.values + values, edges=self.edges + edges)
 
 
-def beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
+def sigmas_beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
     """Return how far places (2, n) [px] are beyond a shadow's edge, in penumbra's σ."""
     along = np.cos(edge[ANGLE]) * offsets[0] + np.sin(edge[ANGLE]) * offsets[1]
     return np.asarray((along - edge[OFFSET]) / np.exp(edge[LOG_WIDTH]))
@@ -218,6 +220,8 @@ def _density(z: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
 
 
+# Weak priors of a shadow's edge, ANGLE to PLATE: a penumbra of σ = 2 px within a factor of e, and
+# steps of half the contrast. Direction and offset have none.
 EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
 EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
 

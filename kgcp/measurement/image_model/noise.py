@@ -19,22 +19,25 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
 _OUTLIER_SIGMAS = 3.5
-_FARTHEST_CLIPPED = (
-    3.23249  # sigmas short of the limit: there the pull is as strong as an outlier's
-)
+# Sigmas short of the limit at which a clipped pixel pulls as strongly as an outlier.
+_FARTHEST_CLIPPED = 3.23249
 _MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
 _TRIM = 0.9
 _TRIMMED_VARIANCE = 0.6230  # of a unit normal variable within its central 90 %
 _MIN_SAMPLES = 8
-_PILED_UP, _BELOW_TOP = 0.05, 0.98  # share of pixels at the top, and what is just below it
+# Values pile up at a top if it has more than this share of the pixels, and less than that lies just
+# below, above this share of the top.
+_PILED_UP, _BELOW_TOP = 0.05, 0.98
 _MOST_SMEARED = 6  # grey values below the top in which smeared pixels are looked for
-_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5  # least excess there, of the pixels at the top; reach of it
+# Compression smears if these exceed the next six by this share of the pixels at the top. What lies
+# within so many standard deviations of the excess then counts as clipped.
+_SMEARED, _SMEAR_SIGMAS = 0.15, 2.5
 
 # Bands of the white share: limits and middles. They are narrow at both ends, where demosaicing and
 # tone curves change the noise most. Errors of the flight `consumer` fell from 0.0103 to 0.0087 %.
 _LIMITS = np.array([0.02, 0.15, 0.35, 0.65, 0.85, 0.98])
 _MIDDLES = np.array([0.005, 0.07, 0.25, 0.5, 0.75, 0.93, 0.995])
-_WORTH_PIXELS = 10.0  # that the variance between ink and white counts for in each band
+_LINE_PIXELS = 10.0  # of a band, that the line between the variances of ink and plate is worth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +57,7 @@ class Censoring:
         return float(np.mean(self.at_high | self.at_low))
 
 
-def find_censoring(levels: FloatArray, count: float) -> Censoring:
+def find_censoring(levels: FloatArray, levels_per_count: float) -> Censoring:
     """Find where a window is clipped: at the ends of the range, or where values pile up.
 
     Compression smears clipped pixels over some grey values below, which say no more than they do.
@@ -63,28 +66,28 @@ def find_censoring(levels: FloatArray, count: float) -> Censoring:
     ----------
     levels : (n,) array
         Grey values, 0…1 of the data type's range.
-    count : float
-        One grey value's step.
+    levels_per_count : float
+        Step from one grey value to the next.
     """
-    high, low = 1.0 - 0.5 * count, 0.5 * count
-    top, near_top, near_bottom = float(levels.max()), *_numbers_at_ends(levels, count)
+    high, low = 1.0 - 0.5 * levels_per_count, 0.5 * levels_per_count
+    top, near_top, near_bottom = float(levels.max()), *_pixels_near_ends(levels, levels_per_count)
     # a sensor of fewer bits than its files saturates below the end of the range
     if top < high:
         at_top = float(np.mean(levels == top))
         if at_top > _PILED_UP > float(np.mean(levels > _BELOW_TOP * top)) - at_top:
-            high = top - 0.5 * count
+            high = top - 0.5 * levels_per_count
     else:
-        high -= _smeared_over(near_top, len(levels)) * count
-    low += _smeared_over(near_bottom, len(levels)) * count
+        high -= _smeared_over(near_top, len(levels)) * levels_per_count
+    low += _smeared_over(near_bottom, len(levels)) * levels_per_count
     return Censoring(high, low, levels >= high, levels <= low)
 
 
 @compiled
-def _numbers_at_ends(levels: FloatArray, count: float) -> IndexArray:
+def _pixels_near_ends(levels: FloatArray, levels_per_count: float) -> IndexArray:
     """Count pixels (2, 13) by their distance in grey values from the top and from the bottom."""
     number = np.zeros((2, 2 * _MOST_SMEARED + 1), np.intp)
     for level in levels:
-        from_top, from_bottom = (1.0 - level) / count, level / count
+        from_top, from_bottom = (1.0 - level) / levels_per_count, level / levels_per_count
         if from_top < number.shape[1] - 0.5:
             number[0, int(np.rint(from_top))] += 1
         if from_bottom < number.shape[1] - 0.5:
@@ -123,7 +126,7 @@ def estimate_noise(
     residuals: FloatArray,
     share: FloatArray,
     usable: BoolArray,
-    count: float,
+    levels_per_count: float,
     *,
     in_bands: bool = False,
     from_edges: bool = False,
@@ -138,15 +141,15 @@ def estimate_noise(
         White share.
     usable : (n,) array of bool
         Not clipped.
-    count : float
-        One grey value's step.
+    levels_per_count : float
+        Step from one grey value to the next.
     in_bands : bool
-        Whether the noise between ink and plate follows its own course, band by band.
+        Whether noise is estimated in bands of the share, instead of along a line from ink to plate.
     from_edges : bool
-        Whether edges tell the noise of ink, or of plate, where there is too little of it.
+        Whether the noise of ink, or of plate, is taken from edges where there is too little of it.
     """
     sd, plateau_sd = np.empty_like(residuals), np.empty_like(residuals)
-    floor = (_MIN_NOISE_COUNTS * count) ** 2
+    floor = (_MIN_NOISE_COUNTS * levels_per_count) ** 2
     _estimate(residuals, share, usable, floor, (in_bands, from_edges), sd, plateau_sd)
     return GreyNoise(sd, plateau_sd)
 
@@ -219,7 +222,7 @@ def _band_variances(
     usable: BoolArray,
     of_line: tuple[float, float, float, float],
 ) -> FloatArray:
-    """Return the variances that the bands show, drawn to `_variance_at` where pixels are few."""
+    """Return the variances of the bands, shrunk towards `_variance_at` where pixels are few."""
     ink, white, excess, floor = of_line
     squares, starts = _by_band(residuals, share, usable)
     variances = np.empty(len(_MIDDLES))
@@ -228,7 +231,7 @@ def _band_variances(
         number = starts[band + 1] - starts[band]
         shown = _trimmed_variance(squares[starts[band] : starts[band + 1]])
         if not math.isnan(shown):
-            weight = number / (number + _WORTH_PIXELS)
+            weight = number / (number + _LINE_PIXELS)
             variances[band] = max(weight * shown + (1.0 - weight) * variances[band], floor)
     return variances
 
@@ -263,9 +266,9 @@ def _with_edges(
     known: tuple[float, float, float],
     is_ink_seen: bool,  # noqa: FBT001 - compiled functions have no keywords
 ) -> tuple[float, float]:
-    """Return the variances of ink and plate, one of which edges must tell: it is linear between.
+    """Return the variances of ink and plate, with the unseen one from edges.
 
-    That of ink is at most that of plate.
+    The variance is linear in the share, and that of ink is at most that of plate.
     """
     ink, white, floor = known
     squares, number, total = np.empty(len(share)), 0, 0.0
@@ -286,9 +289,9 @@ def _with_edges(
 def _plateau_variances(
     residuals: FloatArray, share: FloatArray, usable: BoolArray, floor: float
 ) -> tuple[float, float, bool, bool]:
-    """Return the variances of ink and plate, and whether they are their own.
+    """Return the variances of ink and plate, and whether each is seen.
 
-    One is for both, where there is too little of either.
+    If one of them is not, it is that of the other; if neither is, both are that of all pixels.
     """
     dark, bright, both = np.empty((3, len(share)))
     of_dark = of_bright = of_both = 0

@@ -188,10 +188,12 @@ class PhotometricModel:
             return value
         return value + light.sharpening * self._detail(self.mask, value, light, added)
 
-    def carried(
+    def level_changes(
         self, share: FloatArray, light: Light, rows: FloatArray, added: FloatArray | None = None
     ) -> FloatArray:
-        """Return what changes (k, n) of the share make of the levels, to first order.
+        """Return the changes (k, n) of the levels that follow from changes of the share.
+
+        They are to first order; `rows` (k, n) are the changes of the share.
 
         `added` as in `levels`.
         """

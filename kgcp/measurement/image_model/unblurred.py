@@ -58,13 +58,12 @@ def unblurred_plate(
     centres_m, radii_m, signs = circles.centres_m, circles.radii_m, circles.signs
     circle_table = np.vstack((centres_m, radii_m, signs))
     skips = find_skips(centres_m, radii_m)
-    return UnblurredPlate(
-        points_m, *_look(points_m, circle_table, *skips, measured_count, small_m, reach_m, spread)
-    )
+    seen = _see_circles(points_m, circle_table, *skips, measured_count, small_m, reach_m, spread)
+    return UnblurredPlate(points_m, *seen)
 
 
 @compiled
-def _look(
+def _see_circles(
     points_m: FloatArray,
     circles: FloatArray,
     out_m: FloatArray,

@@ -18,7 +18,7 @@ from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.image_model.blur import Blur, find_edge_incidence
-from kgcp.measurement.image_model.blurred_plate import white_level
+from kgcp.measurement.image_model.blurred_plate import white_share_only
 from kgcp.measurement.image_model.photometry import PhotometricModel, Tone, light_of_levels
 from kgcp.measurement.image_model.plate import EVEN, plate_points
 from kgcp.simulation.imaging import Optics, Sensor
@@ -174,7 +174,7 @@ def test_sharpening_feels_the_far_tails_of_edges(
     window = problem.window
     points_m, px_m = plate_points(pose, window.rays), 0.45 / 12.0
     incidence = find_edge_incidence(points_m, 1.07 * px_m, problem.circles, BLUR, EVEN)
-    share = white_level(pose.matrix, window.rays, BLUR.vector, incidence).value
+    share = white_share_only(pose.matrix, window.rays, BLUR.vector, incidence).value
     plain = PhotometricModel(np.zeros((2, len(share))), problem.tone, None).levels(share, light)
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
     kernel /= kernel.sum()

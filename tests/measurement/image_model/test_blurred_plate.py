@@ -13,7 +13,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.blur import Blur, EdgeIncidence, find_edge_incidence
-from kgcp.measurement.image_model.blurred_plate import white_level, white_share
+from kgcp.measurement.image_model.blurred_plate import white_share, white_share_only
 from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.plate import (
     EVEN,
@@ -79,7 +79,7 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
     incidence = pairs_of(POSE, RAYS, blur)
     share = white_share(POSE.matrix, RAYS, blur.vector, incidence)
     assert np.allclose(
-        white_level(POSE.matrix, RAYS, blur.vector, incidence).value, share.value, atol=1e-12
+        white_share_only(POSE.matrix, RAYS, blur.vector, incidence).value, share.value, atol=1e-12
     )
     assert np.allclose(share.points_m, plate_points(POSE, RAYS), rtol=0.0, atol=1e-12)
     step = np.zeros(11)
@@ -87,7 +87,7 @@ def test_jacobian_is_that_of_the_value(index: int) -> None:
     levels = []
     for sign in (1.0, -1.0):
         pose, other = moved(sign * step)
-        levels.append(white_level(pose.matrix, RAYS, other.vector, incidence).value)
+        levels.append(white_share_only(pose.matrix, RAYS, other.vector, incidence).value)
     numeric = (levels[0] - levels[1]) / 2e-5
     # rotations and streaks leave out how they change the blur on the plate: second order; and all
     # leave out derivatives of what oblique blur adds
@@ -121,7 +121,7 @@ def test_levels_are_those_of_a_finely_sampled_blurred_plate(distance_m: float) -
     expected = blurred.reshape(size, fine, size, fine).mean(axis=(1, 3)).ravel()
     blur = Blur(0.75**2 + 1.0 / 12.0, 0.75**2 + 1.0 / 12.0, 0.0)
     rays = rays_of(pixels)
-    seen = white_level(pose.matrix, rays, blur.vector, pairs_of(pose, rays, blur))
+    seen = white_share_only(pose.matrix, rays, blur.vector, pairs_of(pose, rays, blur))
     difference = (seen.value - expected)[np.hypot(*seen.points_m) < 0.6]
     assert np.abs(difference).max() < 0.02  # 16 × 16 samples know an edge to 1/32 px
     assert abs(difference.mean()) < 5e-4
@@ -141,7 +141,7 @@ def test_rules_hold_on_a_steep_plate(streak: tuple[float, float]) -> None:
     closest = incidence.circles.copy()
     closest[closest[:, 4] < Quadrature.EDGE, 4] = Quadrature.CHORDS_70
     chosen, exact = (
-        white_level(pose.matrix, rays, blur.vector, each).value
+        white_share_only(pose.matrix, rays, blur.vector, each).value
         for each in (incidence, replace(incidence, circles=closest))
     )
     assert np.abs(chosen - exact).max() < 4e-4
@@ -156,7 +156,7 @@ def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> 
     incidence = find_edge_incidence(plate_points(POSE, rays), scale, circles, sharp, EVEN)
 
     def share_at(pixels: FloatArray) -> FloatArray:
-        return white_level(POSE.matrix, rays_of(pixels), sharp.vector, incidence).value
+        return white_share_only(POSE.matrix, rays_of(pixels), sharp.vector, incidence).value
 
     step = 0.05
     along_x, along_y = np.array([step, 0.0]), np.array([0.0, step])
