@@ -97,31 +97,46 @@ def command(
     """  # noqa: D301 - \b is click's mark for lines that stay
     if unit is not None and field_text is None:
         raise click.UsageError("--unit is that of a --field; leave it out")
-    if device_file is not None or field_text is not None:
-        _refuse_together(
-            {
-                "--device": device_file is not None,
-                "--field": field_text is not None,
-                "--detections": detections is not None,
-                "--min-points": min_points is not None,
-            }
+    if device_file is None and field_text is None:
+        least = _MIN_POINTS if min_points is None else min_points
+        _orient_by_targets(
+            flight, out, patterns, detections, least, free_focal=free_focal, as_json=as_json
         )
-        folder, target = _own_frame_folders(flight, out)
-        if device_file is not None:
-            _orient_by_device(
-                folder, target, patterns, device_file, free_focal=free_focal, as_json=as_json
-            )
-        elif field_text is not None:
-            _orient_by_field(
-                folder, target, patterns, (field_text, unit), free_focal=free_focal, as_json=as_json
-            )
         return
+    _refuse_together(
+        {
+            "--device": device_file is not None,
+            "--field": field_text is not None,
+            "--detections": detections is not None,
+            "--min-points": min_points is not None,
+        }
+    )
+    folder, results = _own_frame_folders(flight, out)
+    if device_file is not None:
+        _orient_by_device(
+            folder, results, patterns, device_file, free_focal=free_focal, as_json=as_json
+        )
+    elif field_text is not None:
+        _orient_by_field(
+            folder, results, patterns, (field_text, unit), free_focal=free_focal, as_json=as_json
+        )
+
+
+def _orient_by_targets(
+    flight: Path | StoredFolder,
+    out: Path | StoredFolder | None,
+    patterns: tuple[str, ...],
+    detections: Path | None,
+    min_points: int,
+    *,
+    free_focal: bool,
+    as_json: bool,
+) -> None:
     from kgcp.io.flight.flight import read_flight
     from kgcp.pipeline.ground.orient import OrientOptions, orient_flight, write_poses
     from kgcp.pipeline.workspace import DETECTIONS, open_workspace
 
-    least = _MIN_POINTS if min_points is None else min_points
-    options = OrientOptions(patterns, least, has_free_focal=free_focal)
+    options = OrientOptions(patterns, min_points, has_free_focal=free_focal)
     with open_workspace(flight, out, (DETECTIONS,)) as workspace:
         the_flight = read_flight(workspace.flight)
         poses = orient_flight(the_flight, detections or workspace.out / DETECTIONS, options)
