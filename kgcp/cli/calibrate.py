@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from kgcp.cli.detect_log import log_to_stderr, stopping
-from kgcp.cli.options import json_option
+from kgcp.cli.options import (
+    json_option,
+    log_json_option,
+    quiet_option,
+    restart_option,
+    unit_option,
+)
 
 if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
@@ -34,11 +40,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     " grid:10x8:25mm:15mm (columns x rows, pitch, diameter; also asymmetric: and hexagonal:, and"
     " :bright at the end for bright discs).",
 )
-@click.option(
-    "--unit",
-    type=click.Choice(("mm", "cm", "m", "in")),
-    help="Unit of a board file that does not say its unit, as BoofCV's.",
-)
+@unit_option
 @click.option(
     "--out",
     metavar="FOLDER",
@@ -104,18 +106,9 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
     default=None,
     help="Number of worker processes; 0 runs in this process.  [default: the usable cores]",
 )
-@click.option(
-    "--restart",
-    "is_restart",
-    is_flag=True,
-    help="Discard the results of an interrupted run and start over.",
-)
-@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
-@click.option(
-    "--log-json",
-    is_flag=True,
-    help="Print progress and summary to stderr as one JSON object per line.",
-)
+@restart_option
+@quiet_option
+@log_json_option
 @json_option
 def command(
     photos: tuple[Path, ...],

@@ -10,7 +10,14 @@ import click
 
 from kgcp.cli import STARTED_S
 from kgcp.cli.detect_log import log_to_stderr, report, report_stages, stopping
-from kgcp.cli.options import flight_place_argument, json_option, out_place_option
+from kgcp.cli.options import (
+    flight_place_argument,
+    json_option,
+    log_json_option,
+    out_place_option,
+    quiet_option,
+    restart_option,
+)
 from kgcp.errors import KgcpError
 from kgcp.settings import DetectSettings, Method
 
@@ -80,14 +87,14 @@ _DEFAULTS = DetectSettings()
     "is_learning",
     default=_DEFAULTS.is_learning,
     show_default=True,
-    help="Learn from all frames together what an unknown tone curve of the camera is near to.",
+    help="Learn from all frames together which known curve an unknown tone curve is near.",
 )
 @click.option(
     "--places",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
     help="Look for plain discs and rings where they are marked by hand, in frames without a pose:"
-    " CSV with frame,target,x_px,y_px; two static targets of a frame at least.",
+    " CSV with frame,target,x_px,y_px and at least two static targets per frame.",
 )
 @click.option(
     "--overlay",
@@ -102,12 +109,7 @@ _DEFAULTS = DetectSettings()
     help="With --overlay: also show the rings that were compared with a target and dropped, and"
     " why.",
 )
-@click.option(
-    "--restart",
-    "is_restart",
-    is_flag=True,
-    help="Discard the results of an interrupted run and start over.",
-)
+@restart_option
 @click.option(
     "--frame-timeout",
     type=click.FloatRange(1.0),
@@ -125,12 +127,8 @@ _DEFAULTS = DetectSettings()
 @click.option(
     "--profile", "is_profiled", is_flag=True, help="Print the time per stage, at a small cost."
 )
-@click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
-@click.option(
-    "--log-json",
-    is_flag=True,
-    help="Print progress and summary to stderr as one JSON object per line.",
-)
+@quiet_option
+@log_json_option
 @json_option
 def command(
     flight: Path | StoredFolder,

@@ -145,7 +145,7 @@ def command(
         if out is None:
             raise click.UsageError("several flights need a folder for their points: give --out")
         if detections is not None:
-            raise click.UsageError("--detections is of one flight; leave it out")
+            raise click.UsageError("--detections applies to one flight only; leave it out")
         _export_several(flights, out, choice, files, as_json=as_json)
     else:
         _export_one(

@@ -10,6 +10,14 @@ out_place_option : `out`, Path, StoredFolder or None
     Folder of the results, which may be a URL; None means FLIGHT/kgcp.
 detections_option : `detections`, Path or None
     The table of `kgcp detect`; None means the one in the results' folder.
+unit_option : `unit`, str or None
+    Unit of a field's board file.
+restart_option : `is_restart`, bool
+    Whether to discard what an interrupted run has left.
+quiet_option : `is_quiet`, bool
+    Whether to print errors only.
+log_json_option : `log_json`, bool
+    Whether progress is printed for machines.
 json_option : `as_json`, bool
     Print a machine-readable summary to stdout.
 selection_options : the fields of `kgcp.georef.selection.Selection`
@@ -72,6 +80,27 @@ detections_option = click.option(
     type=click.Path(path_type=Path),
     default=None,
     help="Table written by 'kgcp detect'.  [default: detections.parquet in the results' folder]",
+)
+
+unit_option = click.option(
+    "--unit",
+    type=click.Choice(("mm", "cm", "m", "in")),
+    help="Unit of a board file that does not state one, such as BoofCV's.",
+)
+
+restart_option = click.option(
+    "--restart",
+    "is_restart",
+    is_flag=True,
+    help="Discard the results of an interrupted run and start over.",
+)
+
+quiet_option = click.option("-q", "--quiet", "is_quiet", is_flag=True, help="Print errors only.")
+
+log_json_option = click.option(
+    "--log-json",
+    is_flag=True,
+    help="Print progress and summary to stderr as one JSON object per line.",
 )
 
 json_option = click.option(

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kgcp.cli.options import detections_option, flight_place_argument, json_option, out_place_option
+from kgcp.cli.options import (
+    detections_option,
+    flight_place_argument,
+    json_option,
+    out_place_option,
+    unit_option,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -58,11 +64,7 @@ _FEW_FRAMES = 3  # that are named
     help="Orient frames by a field of discs in them instead, in its own frame: a field.toml,"
     " another program's board file, or a shorthand, as for 'kgcp calibrate'.",
 )
-@click.option(
-    "--unit",
-    type=click.Choice(("mm", "cm", "m", "in")),
-    help="Unit of a board file that does not say its unit, as BoofCV's.",
-)
+@unit_option
 @detections_option
 @json_option
 def command(
@@ -96,7 +98,7 @@ def command(
       kgcp orient FLIGHT --field field.toml
     """  # noqa: D301 - \b is click's mark for lines that stay
     if unit is not None and field_text is None:
-        raise click.UsageError("--unit is that of a --field; leave it out")
+        raise click.UsageError("--unit applies to --field only; leave it out")
     if device_file is None and field_text is None:
         least = _MIN_POINTS if min_points is None else min_points
         _orient_by_targets(

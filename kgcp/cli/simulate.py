@@ -40,7 +40,7 @@ PRESET_NAMES = (
 @click.option(
     "--unit",
     type=click.Choice(("mm", "cm", "m", "in")),
-    help="With --field: unit of a board file that does not say its unit, as BoofCV's.",
+    help="With --field: unit of a board file that does not state one, such as BoofCV's.",
 )
 @click.option(
     "--frames",
@@ -163,7 +163,7 @@ def command(
         _simulate_field(out, field, settings, frames, seed, jobs or usable_cores(), as_json=as_json)
         return
     if unit is not None:
-        raise click.UsageError("--unit concerns the file of --field; leave it out")
+        raise click.UsageError("--unit applies to --field only; leave it out")
     if frames is not None:
         settings = replace(settings, frames=frames)
     if not survey_errors:

@@ -335,7 +335,8 @@ def _marks(
     if not flight.plain_targets or flight.crs is None:
         lacks = "crs" if flight.plain_targets else "target without a code, which marks are for"
         raise KgcpError(
-            f"{flight.folder / 'flight.toml'}: has no {lacks}; give one, or no marked places",
+            f"{flight.folder / 'flight.toml'}: has no {lacks}; give one, or leave out the marked"
+            " places",
             option="places",
         )
     static = {target.name for target in flight.all_targets if target.position_m is not None}

@@ -381,14 +381,14 @@ class DetectionRun:
             return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
             raise KgcpError(
-                f"{path}: has vanished; when the frames are there again, the same command goes on"
+                f"{path}: has vanished; when the frames are back, repeat the command, which resumes"
             )
 
     def _tell_what_is_kept(self) -> None:
         if self._journal.changes:
             changes = ", ".join(self._journal.changes)
             self._listener.note(
-                f"starting anew, not with the interrupted run's results: {changes} changed since"
+                f"starting over instead of resuming the interrupted run: {changes} changed since"
             )
         in_journal = set(self._journal)
         names = {_name_of(key) for key in in_journal}
@@ -406,7 +406,7 @@ class DetectionRun:
         if self.kept or later or changed:
             most = "up to " if later and not is_settled else ""
             self._listener.note(
-                f"going on with an interrupted run: results of {most}{self.kept + later} of"
+                f"resuming an interrupted run: results of {most}{self.kept + later} of"
                 f" {len(self._keys)} frames are kept, {changed} have changed since"
             )
 

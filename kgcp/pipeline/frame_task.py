@@ -195,8 +195,8 @@ def _read_again(job: DetectionJob, frame: str) -> GreyArray:
             return read_grey(path, job.camera)
     except Rejection as rejection:
         raise KgcpError(
-            f"{job.frames_folder / frame}: could be read, and cannot any more"
-            f" ({rejection.detail}); put it back, and the same command goes on"
+            f"{job.frames_folder / frame}: was readable before, but is not any more"
+            f" ({rejection.detail}); restore it and repeat the command, which resumes"
         ) from rejection
 
 

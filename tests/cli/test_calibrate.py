@@ -197,7 +197,7 @@ def test_another_calibration_is_compared_with(
     options = ("--same-aspect", "--against", wide)
     result = run(photos, "--field", field, "--out", out, *QUIET, *options)
     assert result.exit_code == 1
-    assert "wide.toml: is of frames of 401 x 300 px" in result.stderr
+    assert "wide.toml: is for frames of 401 x 300 px" in result.stderr
 
 
 def test_too_few_photographs_are_one_line(photos: Path, tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ def test_a_device_orients_a_frame_whatever_the_focal_length(tmp_path: Path) -> N
         (("--device", "device.toml", "--min-points", "5"), "--device takes no --min-points;"),
         (("--field", "grid:5x4:30mm", "--detections", "d"), "--field takes no --detections;"),
         (("--device", "device.toml", "--field", "grid:5x4:30mm"), "--device takes no --field;"),
-        (("--unit", "mm"), "--unit is that of a --field;"),
+        (("--unit", "mm"), "--unit applies to --field only;"),
     ],
 )
 def test_options_that_do_not_go_together(

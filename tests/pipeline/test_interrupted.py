@@ -167,7 +167,7 @@ def test_a_run_stopped_after_every_look_does_nothing_twice(
     assert listener.found == (rows["status"] == "measured").sum() > FRAMES // 2
     (note,) = listener.notes
     assert note == (
-        f"going on with an interrupted run: results of {FRAMES} of {FRAMES} frames are kept,"
+        f"resuming an interrupted run: results of {FRAMES} of {FRAMES} frames are kept,"
         " 0 have changed since"
     )
 
@@ -204,12 +204,12 @@ def test_what_changed_is_done_again(flight: Path, looks: Counter[str]) -> None:
             with pytest.raises(KeyboardInterrupt):
                 detect(flight, listener)
             assert listener.notes[0].startswith(
-                "going on with an interrupted run: results of up to 5 of 9 frames are kept, 3 have"
+                "resuming an interrupted run: results of up to 5 of 9 frames are kept, 3 have"
             )
         else:
             detect(flight, listener)
             assert listener.notes[0].startswith(
-                "going on with an interrupted run: results of up to 7 of 9 frames are kept, 1 have"
+                "resuming an interrupted run: results of up to 7 of 9 frames are kept, 1 have"
             )
     twice = {"f_1.png", "f_2.png", "f_7.png"}
     first = {frame: times for frame, times in looks.items() if "again" not in frame}
@@ -240,7 +240,7 @@ def test_what_all_depends_on_starts_anew(
     listener = Stop()
     detect(flight, listener, min_radius_px=min_radius_px)
     assert listener.notes == [
-        f"starting anew, not with the interrupted run's results: {what} changed since"
+        f"starting over instead of resuming the interrupted run: {what} changed since"
     ]
     assert looks["f_0.png"] == 2
 
@@ -268,7 +268,7 @@ def test_frames_that_vanish_stop_the_run_and_are_no_rows(
             if done == 4:
                 frames.rename(elsewhere)
 
-    with pytest.raises(KgcpError, match=r"f_\d\.png: has vanished; when the frames are there"):
+    with pytest.raises(KgcpError, match=r"f_\d\.png: has vanished; when the frames are back"):
         detect(flight, Unmount())
     elsewhere.rename(frames)
     detect(flight)

@@ -39,8 +39,8 @@ def read_other(path: Path, photos: Sequence[Photo]) -> OtherCalibration:
     camera, _ = read_camera_file(path)
     if sizes and usual != (camera.width, camera.height):
         raise KgcpError(
-            f"{path}: is of frames of {camera.width} x {camera.height} px, and the photographs have"
-            f" {usual[0]} x {usual[1]} px; give a calibration of the same frames",
+            f"{path}: is for frames of {camera.width} x {camera.height} px, but the photographs"
+            f" have {usual[0]} x {usual[1]} px; give a calibration of the same frames",
             option="against",
         )
     return OtherCalibration(path.name, camera)

@@ -75,8 +75,8 @@ def measure_photo_again(task: PhotoTask, look: SecondLook) -> PhotoDiscs | Photo
         grey = _read(look.photo.path)
     except Rejection as rejection:
         raise KgcpError(
-            f"{look.photo.path}: could be read, and cannot any more ({rejection.detail}); put it"
-            " back, and the same command goes on"
+            f"{look.photo.path}: was readable before, but is not any more ({rejection.detail});"
+            " restore it and repeat the command, which resumes"
         ) from rejection
     return measure_more(grey, task, look.first, look.predicted, look.point.astype(np.intp))
 
