@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from kgcp.errors import Reason
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
@@ -58,6 +58,27 @@ def test_what_was_missed_is_found_where_it_must_be(
     assert seen.is_guided
     assert np.linalg.norm(seen.centre_px - camera.project(pose.translation_m)) < 0.1
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=0.02)
+
+
+def test_a_score_may_be_lower_by_some_hundredths_where_a_target_must_be(
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    draw_frame: DrawFrame,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    least = []
+
+    def refuse(*arguments: object) -> Measurement:
+        (settings,) = (each for each in arguments if isinstance(each, DetectSettings))
+        least.append(settings.min_score)
+        raise Rejection(Reason.CODE_MISMATCH)
+
+    monkeypatch.setattr("kgcp.measurement.guided.measure_match", refuse)
+    grey = draw_frame((target, place_plate((201.0, 150.0), 12.0, turn_deg=20.0)))
+    assert look(grey, camera, target, expected_at(201.0, 150.0, 12.0)) is None
+    assert least
+    assert all(0.02 < SETTINGS.min_score - score < 0.1 for score in least)
 
 
 @pytest.mark.parametrize(

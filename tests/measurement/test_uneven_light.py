@@ -11,10 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kgcp.errors import Reason, Rejection
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment import extensions, fit_target, random_levels
+from kgcp.measurement.adjustment.covariance import PoseCovariance, pose_covariance
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
@@ -124,6 +125,34 @@ def test_light_that_is_not_explained_makes_what_another_start_finds_part_of_the_
     assert seen.uncertainty.centre_cov_px2 == pytest.approx(
         explained.uncertainty.centre_cov_px2 if explained.uncertainty else 0.0, rel=0.2
     )
+
+
+@pytest.mark.parametrize(("inflation", "is_repeated"), [(7.0, False), (9.0, True)])
+def test_only_light_that_is_hardly_explained_is_fitted_from_another_start(
+    photograph: Photograph,
+    start_near: StartNear,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    inflation: float,
+    is_repeated: bool,
+) -> None:
+    repeated = []
+
+    def inflated(fit: TargetFit) -> PoseCovariance:
+        return replace(pose_covariance(fit), inflation=inflation)
+
+    def spread(best: TargetFit, other: TargetFit) -> FloatArray:
+        repeated.append((best, other))
+        return np.zeros((3, 3))
+
+    monkeypatch.setattr(fit_target, "pose_covariance", inflated)
+    monkeypatch.setattr(fit_target, "_spread_over_starts", spread)
+    rng = np.random.default_rng(12)
+    pose = some_pose(rng)
+    pose = Pose(pose.rotation, 2.0 * pose.translation_m)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=shadow_edge(rng))
+    measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
+    assert bool(repeated) == is_repeated
 
 
 def resting_at(pose: Pose) -> Callable[..., tuple[TargetFit, TargetFit]]:

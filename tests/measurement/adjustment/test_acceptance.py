@@ -56,6 +56,30 @@ def test_the_target_s_own_code_passes(
     check_code(fit, target.ring)
 
 
+@pytest.mark.parametrize(("outlying", "is_refused"), [(0.25, False), (0.35, True)])
+def test_a_third_of_outliers_is_no_fit(
+    fit_plate: FitPlate, *, outlying: float, is_refused: bool
+) -> None:
+    """Clipped pixels are none, whatever their weight."""
+    fit = fit_plate(CODE, 40.0)
+    count = len(fit.sample.levels)
+    weight, at_high = np.ones(count), np.arange(count) < 0.4 * count
+    weight[at_high] = 0.1
+    weight[-round(outlying * (count - at_high.sum())) :] = 0.1
+    censoring = replace(fit.sample.censoring, at_high=at_high, at_low=np.zeros(count, np.bool_))
+    doubtful = replace(
+        fit,
+        sample=replace(fit.sample, censoring=censoring),
+        misfit=replace(fit.misfit, weight=weight),
+    )
+    if not is_refused:
+        check_fit(doubtful)
+        return
+    with pytest.raises(Rejection, match="35% outliers") as caught:
+        check_fit(doubtful)
+    assert caught.value.reason is Reason.POOR_FIT
+
+
 MORE, ELSEWHERE = (*CODE, 260.0), (0.0, 43.0, 78.0, 210.0)
 MISSING, ANOTHER = (0.0, 180.0), (0.0, 60.0, 150.0, 240.0)
 MOVED = (0.0, 43.0, 88.0, 180.0)  # by less than half a dot

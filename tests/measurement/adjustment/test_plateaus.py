@@ -80,6 +80,52 @@ def test_a_shadow_s_edge_is_found_where_it_lies(
     assert edge[PLATE] == pytest.approx(-0.75 * (1.0 - LEFT), rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("on_ink", "on_plate", "is_light"),
+    [
+        (0.0, -0.3, True),
+        (-0.05, -0.3, True),
+        (0.1, 0.3, True),
+        (0.2, 0.1, False),
+        (0.1, -0.3, False),
+    ],
+    ids=["shade", "shade on both", "glare", "mostly on ink", "against each other"],
+)
+def test_a_step_is_one_that_shade_or_glare_can_make(
+    look: Callable[..., tuple[FitProblem, Plateaus]],
+    target: Target,
+    *,
+    on_ink: float,
+    on_plate: float,
+    is_light: bool,
+) -> None:
+    problem, plateaus = look(target)
+    smooth, right = problem.window.smooth.copy(), problem.centre_px[0] + OFF_PX
+    for flat, step in zip(plateaus.flat, (on_ink, on_plate), strict=True):
+        smooth[flat[problem.window.pixels(flat)[0] > right]] += step
+    stepped = replace(problem, window=replace(problem.window, smooth=smooth))
+    assert (step_across(stepped, plateaus) is not None) == is_light
+
+
+def test_ink_under_glare_is_ink(
+    target: Target,
+    camera: Camera,
+    place_plate: Callable[..., Pose],
+    draw_frame: Callable[..., GreyArray],
+    imaging_of: Callable[..., FitProblem],
+) -> None:
+    """It is nearly as bright as half of the plate elsewhere, and so is the plate around it."""
+    pose = place_plate(CENTRE_PX, 60.0)
+    grey = draw_frame((target, pose), white=0.55)
+    glare_px = CENTRE_PX[0] + 15.0
+    grey[:, round(glare_px) :] += np.uint8(64)
+    problem = imaging_of(grey, camera, target, pose)
+    plateaus = look_at_plateaus(problem, pose, 0.8)
+    assert plateaus is not None
+    ink, _ = plateaus.flat
+    assert 0.2 < np.mean(problem.window.pixels(ink)[0] > glare_px + 5.0) < 0.4
+
+
 def test_dots_of_another_code_are_not_light(
     look: Callable[..., tuple[FitProblem, Plateaus]], target: Target
 ) -> None:

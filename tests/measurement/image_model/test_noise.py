@@ -104,6 +104,20 @@ def test_noise_follows_the_level() -> None:
     assert np.std(found, axis=0)[0] < 0.1 * 0.008
 
 
+def test_bands_of_many_pixels_have_their_own_noise_and_others_follow_the_line() -> None:
+    """Demosaicing makes the dark side of edges three times as noisy."""
+    rng = np.random.default_rng(12)
+    share = np.concatenate((np.zeros(300), np.ones(300), rng.uniform(0.03, 0.14, 900), [0.75] * 7))
+    sd = np.where((share > 0.0) & (share < 0.15), 0.03, 0.01)
+    sd[1500:] = 0.001
+    noise = estimate_noise(
+        rng.normal(0.0, sd), share, np.full(len(share), fill_value=True), COUNT, in_bands=True
+    )
+    assert noise.sd[np.abs(share - 0.07) < 0.003] == pytest.approx(0.03, rel=0.08)
+    assert noise.sd[share == 1.0] == pytest.approx(0.01, rel=0.1)
+    assert noise.sd[1500:] == pytest.approx(noise.plateau_sd[1500:], rel=0.05)
+
+
 @pytest.mark.parametrize("is_ink_seen", [False, True])
 def test_edges_tell_the_noise_of_what_is_nowhere_seen(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
     """Of a narrow ring no pixel is wholly ink: it has not the noise of the plate."""
