@@ -26,7 +26,7 @@ from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc, Operator, Polarity
 from kgcp.pipeline.execution.threads import use_one_thread_each
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 _FOCAL_PX = 200_000.0  # so long that images are affine
@@ -178,7 +178,7 @@ def _scene(setup: Setup, pitch_px: float, fall: float, rng: np.random.Generator)
         place = np.array([column - 0.5 * (_COLUMNS - 1), row - 0.5 * (_ROWS - 1)]) * pitch_px
         x, y = ((place + rng.uniform(-0.5, 0.5, 2)) / _FOCAL_PX).tolist()
         normal = _normal(setup.ratio, rng.uniform(0.0, 2.0 * math.pi))
-        discs.append(FieldDisc((x, y, 0.0), 2.0 * setup.radius_px / _FOCAL_PX, 0.0, normal))
+        discs.append(SimulatedDisc((x, y, 0.0), 2.0 * setup.radius_px / _FOCAL_PX, 0.0, normal))
     turn = rng.uniform(0.0, 2.0 * math.pi)
     gradient = (fall * math.cos(turn), fall * math.sin(turn))
     return FieldScene(tuple(discs), *_levels(setup.polarity), gradient=gradient)
@@ -220,7 +220,7 @@ def _bound(setup: Setup, sensor: Sensor, fall: float) -> FloatArray:
     camera = Camera(side, side, _FOCAL_PX, _FOCAL_PX, 0.5 * (side - 1), 0.5 * (side - 1))
     place = (0.31 / _FOCAL_PX, 0.17 / _FOCAL_PX, 0.0)
     normal = _normal(setup.ratio, 0.6)
-    disc = FieldDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, normal)
+    disc = SimulatedDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, normal)
     scene = FieldScene((disc,), *_levels(setup.polarity), gradient=(fall, 0.0))
     return centroid_bound(
         camera,

@@ -25,7 +25,7 @@ from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 
 _FOCAL_PX = 200_000.0  # so long that images are affine
@@ -67,7 +67,7 @@ def errors(
     off, sd = [], []
     for _ in range(photographs):
         discs = tuple(
-            FieldDisc(
+            SimulatedDisc(
                 (x_px / _FOCAL_PX, y_px / _FOCAL_PX, 0.0),
                 2.0 * radius_px / _FOCAL_PX,
             )

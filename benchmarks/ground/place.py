@@ -29,7 +29,7 @@ from kgcp.network.ground.target_places import ring_images
 from kgcp.network.ground.target_plane import PlacedCircle, place_circles
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.pipeline.measure import measure_frame
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.flight import TARGET_PLATE, grow_ground, plan_flight, render_frame
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.presets import preset
@@ -84,7 +84,7 @@ def _camera_poses(
 
 
 def _photographed(
-    camera: Camera, poses: Sequence[Pose], discs: Sequence[FieldDisc], rng: np.random.Generator
+    camera: Camera, poses: Sequence[Pose], discs: Sequence[SimulatedDisc], rng: np.random.Generator
 ) -> list[list[Disc | None]]:
     """Return by photograph the measured disc that lies where each one must; None: not found."""
     cv2.setNumThreads(1)
@@ -149,7 +149,7 @@ def level_table(diameter_px: float, seed: int = 0) -> Placings:
     distance_m = camera.fx * diameter_m / diameter_px
     pitch_m = _TABLE_PITCH_PX * distance_m / camera.fx
     discs = [
-        FieldDisc((pitch_m * (column - 3.5), pitch_m * (row - 3.5), 0.0), diameter_m)
+        SimulatedDisc((pitch_m * (column - 3.5), pitch_m * (row - 3.5), 0.0), diameter_m)
         for row in range(_ROWS)
         for column in range(_COLUMNS)
     ]
@@ -176,7 +176,7 @@ def sine_surface(seed: int = 0) -> tuple[Placings, float]:
             slope_x = 0.5 * math.cos(2.0 * x)
             normal = np.array([-slope_x, 0.0, 1.0]) / math.hypot(slope_x, 1.0)
             height = 0.25 * math.sin(2.0 * x)
-            discs.append(FieldDisc((x, y, height), diameter_m, normal=_numbers(normal)))
+            discs.append(SimulatedDisc((x, y, height), diameter_m, normal=_numbers(normal)))
     poses = _camera_poses(_SINE_IMAGES, _SINE_DISTANCE_M, (10.0, 45.0), rng)
     images = _photographed(camera, poses, discs, rng)
     views = [_views(poses, column) for column in zip(*images, strict=True)]
@@ -193,7 +193,7 @@ def _numbers(vector: FloatArray) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _truth(disc: FieldDisc) -> SpaceCircle:
+def _truth(disc: SimulatedDisc) -> SpaceCircle:
     return SpaceCircle(np.array(disc.position_m), -np.array(disc.normal), 0.5 * disc.diameter_m)
 
 

@@ -35,7 +35,7 @@ from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
 from kgcp.pipeline.execution.threads import use_one_thread_each
-from kgcp.simulation.disc_field import FieldDisc, FieldScene
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc
 from kgcp.simulation.flight import grow_ground
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster
@@ -253,9 +253,9 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     pattern = np.linalg.inv(moved @ moved.T / 180.0)  # the centre's has the variance 1
     outer_m, *inner_m = (2.0 * share * radius_px / camera.fx for share in shares)
     if radius_px * (1.0 - min(shares)) < _APART_PX:
-        discs = [FieldDisc((0.0, 0.0, 0.0), outer_m, sum(inner_m))]
+        discs = [SimulatedDisc((0.0, 0.0, 0.0), outer_m, sum(inner_m))]
     else:
-        discs = [FieldDisc((0.0, 0.0, 0.0), diameter_m) for diameter_m in (outer_m, *inner_m)]
+        discs = [SimulatedDisc((0.0, 0.0, 0.0), diameter_m) for diameter_m in (outer_m, *inner_m)]
     covs = []
     for disc in discs:
         scene = FieldScene((disc,), ground=outside, ink=inside)

@@ -21,7 +21,7 @@ from benchmarks.reliability.torture import Life, torture
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.flight.field_file import field_toml
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 
@@ -35,7 +35,7 @@ def make_photos(folder: Path, count: int) -> Path:
     """Write photographs of a field from all sides, and its field.toml; return the latter."""
     folder.mkdir()
     discs = tuple(
-        FieldDisc(tuple(point), 2.0 * radius, 2.0 * inner)
+        SimulatedDisc(tuple(point), 2.0 * radius, 2.0 * inner)
         for point, radius, inner in zip(
             _FIELD.points_m().tolist(),
             _FIELD.radii_m().tolist(),

@@ -10,7 +10,7 @@ from pathlib import Path
 from kgcp.errors import KgcpError
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.marks import Mark, read_marks
+from kgcp.io.formats.marks import HandMark, read_marks
 from kgcp.io.images.frames import RESULTS_NAME, matching_frames
 from kgcp.io.images.remote import StoredFolder, frames_below
 from kgcp.io.tables.columns import Row
@@ -201,7 +201,7 @@ class _DetectionTask:
     data: FlightData
     all_frames: Sequence[str]
     inputs: Sequence[FrameInput]  # the frames that are wanted
-    marks: Mapping[str, Sequence[Mark]]  # of static targets, by frame
+    marks: Mapping[str, Sequence[HandMark]]  # of static targets, by frame
     sheet: ContactSheet | None
 
 
@@ -329,7 +329,7 @@ def _likely_cause(run: DetectionRun, stopwatch: Stopwatch) -> str | None:
 
 def _marks(
     flight: Flight, data: FlightData, frames: Sequence[str], places: Path | None
-) -> Mapping[str, Sequence[Mark]]:
+) -> Mapping[str, Sequence[HandMark]]:
     if places is None:
         return {}
     if not flight.plain_targets or flight.crs is None:

@@ -30,7 +30,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
 from kgcp.quality.checks.place import check_place
-from kgcp.quality.checks.plate import check_targets
+from kgcp.quality.checks.plate import check_plates
 from kgcp.quality.checks.reference import check_reference, check_visibility
 
 SAMPLED_FRAMES = 100
@@ -198,7 +198,7 @@ class FlightInputs:
         flight = self.flight
         doubts = [
             *check_camera(flight.camera, is_guessed=flight.is_camera_guessed),
-            *check_targets(flight.all_targets),
+            *check_plates(flight.all_targets),
             *check_frames(self.headers, flight.camera),
             *self._doubts_of_places(),
             *self._doubts_of_times(),

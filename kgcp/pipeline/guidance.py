@@ -24,7 +24,7 @@ from kgcp.georef.sighting import Sighting, sighting_of
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
-from kgcp.io.formats.marks import Mark
+from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames
@@ -136,7 +136,7 @@ def plain_by_results(
     data: FlightData,
     results: Iterable[FrameResult],
     time_s: FloatArray,
-    marks: Mapping[str, Sequence[Mark]],
+    marks: Mapping[str, Sequence[HandMark]],
     tried: Collection[tuple[int, str]] = (),
 ) -> dict[int, Predictions]:
     """Return by row where plain targets must be of which nothing else has said it so far.

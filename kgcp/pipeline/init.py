@@ -21,7 +21,7 @@ from kgcp.io.formats.name_times import times_of_names
 from kgcp.io.formats.point_table import PointTable
 from kgcp.io.images.exif import read_frame_header
 from kgcp.pipeline.init_camera import camera_section
-from kgcp.pipeline.init_records import Finding, Gap, InitOptions, Section
+from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Section
 from kgcp.pipeline.init_vehicle import crs_key, vehicle_section
 from kgcp.quality.checks.clock import time_span
 from kgcp.quality.checks.frame_header import FrameHeader
@@ -63,7 +63,7 @@ class FlightDraft:
         The file.
     frames_csv : str or None
         Times of the frames, where their names have them; None: another file has, or none.
-    findings : tuple of Finding
+    findings : tuple of InitFinding
         What the folder tells, and where it stands.
     gaps : tuple of Gap
         What it does not tell, and what to do about it.
@@ -71,7 +71,7 @@ class FlightDraft:
 
     toml_text: str
     frames_csv: str | None
-    findings: tuple[Finding, ...]
+    findings: tuple[InitFinding, ...]
     gaps: tuple[Gap, ...]
 
 
@@ -150,7 +150,7 @@ def _frames_section(
     suffixes = Counter(PurePosixPath(frame).suffix.lower() for frame in contents.frames)
     kinds = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common())
     folder = contents.relative(contents.frames_folder)
-    found = Finding("frames", f"{kinds} in {'this folder' if folder == '.' else f'{folder}/'}")
+    found = InitFinding("frames", f"{kinds} in {'this folder' if folder == '.' else f'{folder}/'}")
     times = _times(contents, headers)
     keys = (DraftKey("folder", folder, kinds), *times.keys)
     section = Section((DraftTable("[frames]", keys),), (found, *times.findings), times.gaps)
@@ -163,7 +163,7 @@ class _Times:
 
     time_s: Mapping[str, float]  # Unix UTC [s]
     keys: tuple[DraftKey, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[InitFinding, ...]
     gaps: tuple[Gap, ...] = ()
     frames_csv: str | None = None
 
@@ -185,7 +185,7 @@ def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
             return _Times(
                 time_s,
                 (DraftKey("times", name, f"{len(time_s)} of {len(contents.frames)} frames"),),
-                (Finding("times", f"{_span(time_s)}, from {name}"),),
+                (InitFinding("times", f"{_span(time_s)}, from {name}"),),
                 (gap,) if lacking else (),
             )
     if (by_name := times_of_names(contents.frames)) is not None:
@@ -198,7 +198,7 @@ def _times_by_name(time_s: Mapping[str, float]) -> _Times:
     return _Times(
         time_s,
         (DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names"),),
-        (Finding("times", f"{_span(time_s)}, from the frames' names, as {_FRAMES_CSV}"),),
+        (InitFinding("times", f"{_span(time_s)}, from the frames' names, as {_FRAMES_CSV}"),),
         frames_csv="\n".join(["frame,time", *rows]) + "\n",
     )
 
@@ -225,12 +225,12 @@ def _times_by_exif(
         return _Times(
             time_s,
             (key,),
-            (Finding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)"),),
+            (InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)"),),
             (*refused, *((gap,) if is_moving else ())),
         )
     why = "neither a file nor EXIF has the frames' times with their zone"
     if not is_moving:
-        found = Finding("times", f"none: {why}; static targets need none")
+        found = InitFinding("times", f"none: {why}; static targets need none")
         return _Times({}, (key,), (found,), refused)
     remedy = "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time"
     return _Times({}, (replace(key, is_missing=True),), (), (*refused, Gap("times", why, remedy)))
@@ -257,10 +257,10 @@ def _targets_section(
         return Section((DraftText(_EXAMPLE_TARGET),), (), (gap,)), ()
     places, surveyed = _places(contents, targets)
     names = ", ".join(f"{each.name} ({each.ring.outer_diameter_m:g} m)" for each in targets)
-    found = [Finding("targets", f"{names}, from {source}")]
+    found = [InitFinding("targets", f"{names}, from {source}")]
     if places:
         files = ", ".join(contents.relative(points.path) for points in surveyed)
-        found.append(Finding("positions", f"of {', '.join(sorted(places))}, from {files}"))
+        found.append(InitFinding("positions", f"of {', '.join(sorted(places))}, from {files}"))
     is_carried = bool(contents.trajectories)
     lost = [
         each.name
@@ -329,6 +329,6 @@ def _reference_section(contents: FolderContents) -> Section:
     name = contents.relative(contents.references[0])
     return Section(
         (DraftTable("[reference]", (DraftKey("poses", name),)),),
-        (Finding("reference", f"poses of the camera, from {name}"),),
+        (InitFinding("reference", f"poses of the camera, from {name}"),),
         (),
     )

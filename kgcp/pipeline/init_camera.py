@@ -11,7 +11,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey, DraftTable
 from kgcp.io.formats.calibrations import read_calibration
-from kgcp.pipeline.init_records import Finding, Gap, Section
+from kgcp.pipeline.init_records import Gap, InitFinding, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
 _SMALL_FRAME_MM = math.hypot(36.0, 24.0)  # its diagonal, to which CIPA's equivalents refer
@@ -64,7 +64,9 @@ def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
         )
         others = [contents.relative(other) for other in contents.calibrations if other != path]
         beside = f" (not used: {', '.join(others)})" if others else ""
-        return _section(keys, "", (Finding("camera", f"{_shown(camera)}, from {name}{beside}"),))
+        return _section(
+            keys, "", (InitFinding("camera", f"{_shown(camera)}, from {name}{beside}"),)
+        )
     return None
 
 
@@ -100,7 +102,7 @@ def _by_dewarp_data(
         "correct sd_fx and sd_fy in [camera], or use a calibration of this flight",
         is_assumed=True,
     )
-    return _section(keys, note, (Finding("camera", _named(header, found)),), (gap,))
+    return _section(keys, note, (InitFinding("camera", _named(header, found)),), (gap,))
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
@@ -127,7 +129,7 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
     return _section(
         keys,
         f"GUESS from the {source}. A calibration is needed for true distances.",
-        (Finding("camera", _named(header, f"{_shown(camera)}, guessed from the {source}")),),
+        (InitFinding("camera", _named(header, f"{_shown(camera)}, guessed from the {source}")),),
         (
             Gap(
                 "camera",
@@ -172,7 +174,7 @@ def _no_camera(size: tuple[int, int] | None, why: str) -> Section:
         _RESPONSE,
         _SHUTTER,
     )
-    found = (Finding("camera", f"{size[0]} x {size[1]} px"),) if size else ()
+    found = (InitFinding("camera", f"{size[0]} x {size[1]} px"),) if size else ()
     return _section(keys, 'Or: file = "camera.yml"', found, (Gap("camera", why, _REMEDY),))
 
 
@@ -197,7 +199,7 @@ def _parameter_keys(camera: Camera) -> tuple[DraftKey, ...]:
 def _section(
     keys: tuple[DraftKey, ...],
     note: str,
-    findings: tuple[Finding, ...],
+    findings: tuple[InitFinding, ...],
     gaps: tuple[Gap, ...] = (),
 ) -> Section:
     return Section((DraftTable("[camera]", keys, note),), findings, gaps)

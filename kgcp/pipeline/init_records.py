@@ -9,7 +9,7 @@ from kgcp.io.flight.toml_draft import DraftTable, DraftText
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InitFinding:
     """One thing that the folder tells, and where it stands."""
 
     heading: str
@@ -31,7 +31,7 @@ class Section:
     """A part of flight.toml, with the reasons for it."""
 
     blocks: tuple[DraftTable | DraftText, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[InitFinding, ...]
     gaps: tuple[Gap, ...]
 
 

@@ -16,7 +16,7 @@ from kgcp.io.flight.folder import FolderContents
 from kgcp.io.flight.toml_draft import DraftKey, DraftTable
 from kgcp.io.formats.point_table import PointTable
 from kgcp.io.formats.trajectories.first_epoch import FirstEpoch, TrajectoryFile, first_epoch
-from kgcp.pipeline.init_records import Finding, Gap, InitOptions, Section
+from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Section
 from kgcp.quality.checks.frame_header import FrameHeader
 
 _WORDS = {
@@ -66,7 +66,7 @@ def vehicle_section(
     text = f"{name}: {_WORDS[file.format]}{layout_text}{attitude_text}"
     return Section(
         (DraftTable("[vehicle]", keys),),
-        (Finding("trajectory", text), *lever_findings),
+        (InitFinding("trajectory", text), *lever_findings),
         (*_unreadable(name, start), *time_gaps, *lever_gaps),
     )
 
@@ -82,7 +82,7 @@ def crs_key(
     headers: Sequence[FrameHeader],
     surveyed: Sequence[PointTable],
     options: InitOptions,
-) -> tuple[DraftKey, tuple[Finding, ...], tuple[Gap, ...]]:
+) -> tuple[DraftKey, tuple[InitFinding, ...], tuple[Gap, ...]]:
     """Return the flight's crs: as said, or by surveyed points or trajectory, or what it may be.
 
     Parameters
@@ -97,7 +97,7 @@ def crs_key(
     """
     if options.crs is not None:
         parse_crs(options.crs, "crs")
-        return DraftKey("crs", options.crs, "as given"), (Finding("crs", options.crs),), ()
+        return DraftKey("crs", options.crs, "as given"), (InitFinding("crs", options.crs),), ()
     file = contents.trajectories[0] if len(contents.trajectories) == 1 else None
     start = None if file is None else first_epoch(file)
     place = _place(start, headers)
@@ -114,7 +114,7 @@ def crs_key(
     crs = utm_crs(*place)
     return (
         DraftKey("crs", crs, f"UTM zone of {source}; heights are ellipsoidal"),
-        (Finding("crs", f"{crs}, the UTM zone of {source}; any other may be written instead"),),
+        (InitFinding("crs", f"{crs}, the UTM zone of {source}; any other may be written instead"),),
         (),
     )
 
@@ -133,11 +133,11 @@ def _place(start: FirstEpoch | None, headers: Sequence[FrameHeader]) -> tuple[fl
 
 def _crs_by_place(
     source: str, xy: tuple[float, float], place: tuple[float, float] | None
-) -> tuple[DraftKey, tuple[Finding, ...], tuple[Gap, ...]]:
+) -> tuple[DraftKey, tuple[InitFinding, ...], tuple[Gap, ...]]:
     """Return the CRS in which coordinates lie where the flight was."""
     if is_geographic_place(*xy):
         comment = f"longitude, latitude and ellipsoidal height in {source}"
-        found = (Finding("crs", f"{WGS84_3D}: {comment}"),)
+        found = (InitFinding("crs", f"{WGS84_3D}: {comment}"),)
         return DraftKey("crs", WGS84_3D, comment), found, ()
     silent = f"{source} does not say in which CRS its coordinates are"
     if place is None:
@@ -147,14 +147,18 @@ def _crs_by_place(
         return _unknown_crs(f"{silent}, and in none of EPSG's do they lie where the flight was")
     if len(near) == 1:
         text = f"{near[0]}: in it {source} lies where the flight was"
-        return DraftKey("crs", near[0], f"of {source}, by its place"), (Finding("crs", text),), ()
+        return (
+            DraftKey("crs", near[0], f"of {source}, by its place"),
+            (InitFinding("crs", text),),
+            (),
+        )
     shown = " or ".join(near[:_SHOWN_CRS])
     return _unknown_crs(f"{silent}; by the flight's place it may be {shown}", near[0])
 
 
 def _unknown_crs(
     why: str, likely: str = "EPSG:25832"
-) -> tuple[DraftKey, tuple[Finding, ...], tuple[Gap, ...]]:
+) -> tuple[DraftKey, tuple[InitFinding, ...], tuple[Gap, ...]]:
     key = DraftKey(
         "crs", None, "of all coordinates; heights ellipsoidal", f'"{likely}"', is_missing=True
     )
@@ -284,10 +288,10 @@ def _attitude(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
 
 def _lever_arm(
     options: InitOptions,
-) -> tuple[tuple[DraftKey, ...], tuple[Finding, ...], tuple[Gap, ...]]:
+) -> tuple[tuple[DraftKey, ...], tuple[InitFinding, ...], tuple[Gap, ...]]:
     sd_key = DraftKey("sd_lever_arm_m", None, "how well it is known, 1 σ", "[0.005, 0.005, 0.005]")
     if options.lever_arm_m is not None:
-        finding = Finding("lever arm", f"{list(options.lever_arm_m)} m, as given")
+        finding = InitFinding("lever arm", f"{list(options.lever_arm_m)} m, as given")
         return (DraftKey("lever_arm_m", options.lever_arm_m, _LEVER_ARM), sd_key), (finding,), ()
     key = DraftKey("lever_arm_m", None, _LEVER_ARM, "[-0.8, 0.15, -1.95]", is_missing=True)
     gap = Gap(

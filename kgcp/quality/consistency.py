@@ -15,8 +15,8 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition, TargetPositions
 from kgcp.quality.consistency_equations import Meeting, System
-from kgcp.quality.corrections import UNKNOWN_LIMITS, Estimate, estimate
-from kgcp.quality.robust_gls import ErrorModel, find_outliers, weighted_products
+from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimate
+from kgcp.quality.robust_gls import ErrorModel, find_outliers, whitened_products
 from kgcp.settings import VehicleSettings
 
 MIN_POINTS = 10
@@ -45,7 +45,7 @@ class Consistency:
     """How well vehicle and camera agree."""
 
     discrepancies: tuple[Discrepancy, ...]  # ascending in time
-    estimate: Estimate  # corrections that explain them
+    estimate: CorrectionEstimate  # corrections that explain them
     # over which the trajectory's errors seem to fade: the likeliest of a few times [s]
     correlation_s: float
     # how well flight.toml says that unknowns are known, by their names and in their units
@@ -112,7 +112,9 @@ def _stated_sd(settings: VehicleSettings) -> Mapping[str, float]:
     return {"time_offset_s": settings.sd_time_s, **of_arm}
 
 
-def _adjust(time_s: FloatArray, equations: System, kept: BoolArray) -> tuple[Estimate, float]:
+def _adjust(
+    time_s: FloatArray, equations: System, kept: BoolArray
+) -> tuple[CorrectionEstimate, float]:
     """Return the corrections by the points that are kept, and the likeliest correlation time.
 
     A time that is believed but wrong would weigh neighbouring frames against each other as if
@@ -125,7 +127,7 @@ def _adjust(time_s: FloatArray, equations: System, kept: BoolArray) -> tuple[Est
     errors = ErrorModel(equations.white, fading, time_s).kept(kept)
     trials = []
     for correlation_s in _CORRELATIONS_S:
-        products, log_det = weighted_products(columns, errors, correlation_s)
+        products, log_det = whitened_products(columns, errors, correlation_s)
         fitted = estimate(products, 3 * len(columns), has_sds=equations.has_sds)
         misfit = fitted.chi2_after
         if not equations.has_sds:  # the likeliest scale is part of the likelihood
@@ -170,7 +172,7 @@ def _discrepancies(
     meetings: Sequence[Meeting],
     equations: System,
     outlier: BoolArray,
-    fitted: Estimate,
+    fitted: CorrectionEstimate,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
     residual = equations.offset + equations.design @ fitted.values

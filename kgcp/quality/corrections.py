@@ -63,7 +63,7 @@ class Correction:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class CorrectionEstimate:
     """Corrections, and the residuals' size without and with them."""
 
     corrections: tuple[Correction, ...]  # in the order of `UNKNOWNS`
@@ -79,7 +79,7 @@ class Estimate:
         return self.chi2_after / self.degrees_of_freedom
 
 
-def estimate(products: FloatArray, count: int, *, has_sds: bool) -> Estimate:
+def estimate(products: FloatArray, count: int, *, has_sds: bool) -> CorrectionEstimate:
     """Estimate the corrections from weighted products.
 
     Parameters
@@ -111,7 +111,7 @@ def estimate(products: FloatArray, count: int, *, has_sds: bool) -> Estimate:
         _correction(index, float(values[index]), float(sds[index]), freedom, tangles)
         for index in range(len(UNKNOWNS))
     )
-    return Estimate(corrections, values, before, after, freedom)
+    return CorrectionEstimate(corrections, values, before, after, freedom)
 
 
 def _correction(

@@ -145,13 +145,13 @@ def _likeliest(columns: FloatArray, errors: ErrorModel) -> tuple[FloatArray, flo
     """Return the weighted products of columns (m, 1, p + 1), and the correlation time."""
     nothing = np.zeros_like(errors.white)
     white_only = ErrorModel(errors.white, nothing, errors.time_s)
-    trials = [(0.0, *weighted_products(columns, white_only, 0.0))]
+    trials = [(0.0, *whitened_products(columns, white_only, 0.0))]
     if np.all(errors.lasting > 0.0):
-        trials.append((0.0, *weighted_products(columns, errors, 0.0)))
+        trials.append((0.0, *whitened_products(columns, errors, 0.0)))
         for time_s in _CORRELATIONS_S:
             for share in _SHARES:
                 scaled = ErrorModel(errors.white, share * errors.lasting, errors.time_s)
-                trials.append((time_s, *weighted_products(columns, scaled, time_s)))
+                trials.append((time_s, *whitened_products(columns, scaled, time_s)))
     misfits = [_misfit(products, log_det, len(columns)) for _, products, log_det in trials]
     correlation_s, best, _ = trials[int(np.argmin(misfits))]
     is_plain = min(misfits[:2]) - min(misfits) < _CLEARLY
@@ -170,7 +170,7 @@ def _misfit(products: FloatArray, log_det: float, count: int) -> float:
     )
 
 
-def weighted_products(
+def whitened_products(
     columns: FloatArray, errors: ErrorModel, correlation_s: float
 ) -> tuple[FloatArray, float]:
     """Return Cᵀ Σ⁻¹ C (k, k) of columns C (n, d, k), and log det Σ.

@@ -26,7 +26,7 @@ _FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS = 4, 10  # per pixel and axis
 
 
 @dataclass(frozen=True, slots=True)
-class FieldDisc:
+class SimulatedDisc:
     """A disc, or a ring, in the frame of its field.
 
     Attributes
@@ -71,7 +71,7 @@ class FieldScene:
 
     Attributes
     ----------
-    discs : tuple of FieldDisc
+    discs : tuple of SimulatedDisc
     ground, ink : float
         Radiance of the board and of the discs on it at the frame's middle, 0…1; discs may be
         brighter than the ground.
@@ -84,7 +84,7 @@ class FieldScene:
         Radiance beyond the board.
     """
 
-    discs: tuple[FieldDisc, ...]
+    discs: tuple[SimulatedDisc, ...]
     ground: float = 0.8
     ink: float = 0.06
     gradient: tuple[float, float] = (0.0, 0.0)
@@ -141,7 +141,7 @@ def field_irradiance(camera: Camera, pose: Pose, scene: FieldScene, optics: Opti
     return frame
 
 
-def disc_pose(pose: Pose, disc: FieldDisc) -> Pose:
+def disc_pose(pose: Pose, disc: SimulatedDisc) -> Pose:
     """Return the pose of a disc's plane, disc → camera, for that of its field."""
     circle = field_circles(pose, [disc])
     axes = circle.axes[0]
@@ -149,7 +149,7 @@ def disc_pose(pose: Pose, disc: FieldDisc) -> Pose:
     return Pose(rotation, circle.centres_m[0])
 
 
-def field_circles(pose: Pose, discs: Sequence[FieldDisc]) -> Circles3D:
+def field_circles(pose: Pose, discs: Sequence[SimulatedDisc]) -> Circles3D:
     """Return the outer circles of discs in the camera frame, for the field's pose."""
     positions = np.array([disc.position_m for disc in discs], dtype=np.float64)
     normals = np.array([disc.normal for disc in discs], dtype=np.float64)

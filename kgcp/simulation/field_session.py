@@ -11,7 +11,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
-from kgcp.simulation.disc_field import DiscCode, FieldDisc, FieldScene, field_irradiance
+from kgcp.simulation.disc_field import DiscCode, FieldScene, SimulatedDisc, field_irradiance
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.phone import Phone
 from kgcp.targets.fields.layout import Field, FieldPolarity
@@ -107,7 +107,7 @@ def field_photograph(
     return FieldPhotograph(grey, pose)
 
 
-def _discs(field: AnyField, points_m: FloatArray) -> tuple[FieldDisc, ...]:
+def _discs(field: AnyField, points_m: FloatArray) -> tuple[SimulatedDisc, ...]:
     """Return the discs of a field where they are (m, 3)."""
     codes: list[DiscCode | None] = [None] * len(points_m)
     if isinstance(field, PointField) and field.code is not None:
@@ -115,7 +115,7 @@ def _discs(field: AnyField, points_m: FloatArray) -> tuple[FieldDisc, ...]:
     normals = field.normals()
     normals = np.where(normals[:, 2:] < 0.0, -normals, normals)  # into the board: codes turn by it
     return tuple(
-        FieldDisc((x, y, z), 2.0 * outer, 2.0 * hole, (u, v, w), code)
+        SimulatedDisc((x, y, z), 2.0 * outer, 2.0 * hole, (u, v, w), code)
         for (x, y, z), (u, v, w), outer, hole, code in zip(
             points_m.tolist(),
             normals.tolist(),

@@ -23,7 +23,7 @@ from kgcp.io.flight.flight import read_camera_and_targets
 from kgcp.io.formats.camera_writers import CAMERA_FORMATS, CalibratedCamera, camera_file
 from kgcp.measurement.discs.records import Operator
 from kgcp.network.calibration_records import LensModel, PointModel
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.targets.fields.layout import Field, GridKind, Mark
 
@@ -63,7 +63,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
     rng = np.random.default_rng(18)
     discs = tuple(
-        FieldDisc(tuple(point), 2.0 * radius, 2.0 * inner)
+        SimulatedDisc(tuple(point), 2.0 * radius, 2.0 * inner)
         for point, radius, inner in zip(
             FIELD.points_m().tolist(),
             FIELD.radii_m().tolist(),

@@ -21,7 +21,7 @@ from kgcp.io.flight.field_file import field_toml
 from kgcp.io.tables.detections import DETECTION_COLUMNS, read_detections
 from kgcp.io.tables.parquet import write_table
 from kgcp.pipeline.calibration.simulation import FieldSimulation
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.presets import preset
 from kgcp.targets.fields.layout import Field, GridKind, Mark
@@ -179,7 +179,7 @@ def device_flight(folder: Path) -> Path:
     """A device of five dark discs on a bright plate on dark ground, seen once, and its file."""
     camera = Camera(640, 480, 900.0, 900.0, 319.5, 239.5, response=Response.LINEAR)
     pose = Pose(rotation_about(np.array([0.35, -0.2, 0.4])), np.array([-0.12, -0.12, 1.05]))
-    discs = tuple(FieldDisc((x, y, z), 0.03) for x, y, z in DEVICE_M.tolist())
+    discs = tuple(SimulatedDisc((x, y, z), 0.03) for x, y, z in DEVICE_M.tolist())
     scene = FieldScene(
         discs, ground=0.8, ink=0.08, board_m=(-0.06, -0.06, 0.36, 0.28), surround=0.15
     )

@@ -13,7 +13,7 @@ from kgcp.quality.robust_gls import (
     fit,
     separable,
     two_sided,
-    weighted_products,
+    whitened_products,
 )
 from kgcp.quality.statistics import fit_slope
 
@@ -87,12 +87,12 @@ def test_the_weighting_is_that_of_the_full_covariance(dimension: int, tau_s: flo
     cov[np.arange(n), :, np.arange(n)] += white
     cov = cov.reshape(n * dimension, -1)
     flat = columns.reshape(n * dimension, 4)
-    products, log_det = weighted_products(columns, ErrorModel(white, lasting, time_s), tau_s)
+    products, log_det = whitened_products(columns, ErrorModel(white, lasting, time_s), tau_s)
     np.testing.assert_allclose(products, flat.T @ np.linalg.solve(cov, flat), rtol=1e-8, atol=1e-9)
     assert log_det == pytest.approx(np.linalg.slogdet(cov)[1], abs=1e-8)
     if dimension == 1:
         scalars = ErrorModel(white.ravel(), lasting.ravel(), time_s)
-        np.testing.assert_array_equal(weighted_products(columns, scalars, tau_s)[0], products)
+        np.testing.assert_array_equal(whitened_products(columns, scalars, tau_s)[0], products)
 
 
 def test_of_unknowns_that_look_alike_the_last_is_given_up() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.safe_read import likely_encoding, read_bytes
-from kgcp.io.flight.toml_mistakes import explain
+from kgcp.io.flight.toml_mistakes import explain_mistake
 from kgcp.io.flight.toml_table import TomlTable
 
 _MOST_BYTES = 1 << 18
@@ -43,7 +43,7 @@ def read_toml(path: Path, known: Sequence[str], named_by: str) -> tuple[TomlTabl
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        problem, remedy = explain(text, str(error))
+        problem, remedy = explain_mistake(text, str(error))
         raise KgcpError(f"{path}: is not TOML: {problem}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # what tomllib makes of numbers and depth
         raise KgcpError(f"{path}: is not readable TOML ({error}); rewrite it") from error

@@ -42,7 +42,7 @@ _OTHERS: Mapping[str, tuple[str, str]] = {
 }
 
 
-def explain(text: str, message: str) -> tuple[str, str]:
+def explain_mistake(text: str, message: str) -> tuple[str, str]:
     """Return what is wrong with a text that is not TOML, and what to do.
 
     Parameters

@@ -17,7 +17,7 @@ _USUAL_SD_PX = 2.0  # of what is marked by hand
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class HandMark:
     """One target marked in one frame."""
 
     target: str
@@ -26,7 +26,7 @@ class Mark:
 
 def read_marks(
     path: Path, frames: Collection[str], targets: Collection[str], camera: Camera
-) -> Mapping[str, tuple[Mark, ...]]:
+) -> Mapping[str, tuple[HandMark, ...]]:
     """Read marks, CSV with the columns frame, target, x_px, y_px and perhaps sd_px, by frame.
 
     Parameters
@@ -46,7 +46,7 @@ def read_marks(
     table = read_csv_columns(path, _TEXTS, _NUMBERS, (_SD,), "places")
     places = table.block(_NUMBERS).tolist()
     sds = table.block((_SD,))[:, 0].tolist() if _SD in table.names else [_USUAL_SD_PX] * len(places)
-    marks: dict[str, dict[str, Mark]] = {}
+    marks: dict[str, dict[str, HandMark]] = {}
     rows = zip(table.lines, *(table.texts[name] for name in _TEXTS), places, sds, strict=True)
     for line, text, target, (x_px, y_px), sd_px in rows:
         frame, where = text.replace("\\", "/"), f"{path}, line {line}"
@@ -62,7 +62,7 @@ def read_marks(
             raise KgcpError(f"{where}: sd_px is {sd_px:g}; give a standard deviation above 0")
         if target in marks.setdefault(frame, {}):
             raise KgcpError(f"{where}: {target!r} is marked twice in {frame}; keep one of them")
-        marks[frame][target] = Mark(target, MarkedPlace(x_px, y_px, sd_px))
+        marks[frame][target] = HandMark(target, MarkedPlace(x_px, y_px, sd_px))
     for frame, named in marks.items():
         apart = {(mark.place.x_px, mark.place.y_px) for mark in named.values()}
         if len(apart) < max(2, len(named)):

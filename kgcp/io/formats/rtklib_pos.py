@@ -24,7 +24,7 @@ _SEXAGESIMAL = "d'\""  # degrees, minutes, seconds in three cells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class RtklibSolution:
     """The rows of a solution file."""
 
     path: Path
@@ -44,7 +44,7 @@ def looks_like_solution(file: ForeignFile) -> bool:
     return is_header or _DATE.match(text) is not None
 
 
-def read_solution(file: ForeignFile) -> Solution:
+def read_solution(file: ForeignFile) -> RtklibSolution:
     """Read the rows of a solution file by its own header.
 
     Raises
@@ -68,7 +68,7 @@ def read_solution(file: ForeignFile) -> Solution:
     system = TimeSystem.GPS if header[1] == "GPST" else TimeSystem.UTC
     time_s = unix_from_clock(clocks, system) - (_JST_AHEAD_S if header[1] == "JST" else 0.0)
     kind = next((match for _, row in rows if (match := _HEIGHTS.search(row))), None)
-    return Solution(
+    return RtklibSolution(
         file.path,
         tuple(line for line, _ in data),
         time_s,

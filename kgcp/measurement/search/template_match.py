@@ -105,7 +105,7 @@ class TemplateMatch:
         return CodeMatch(ring, outline, self.score, self.lag_deg, self.black, self.white)
 
 
-class Placement(NamedTuple):
+class TemplatePlacement(NamedTuple):
     """The template that fits best, and where: shift in rows, lag in samples."""
 
     score: float
@@ -176,15 +176,15 @@ def match_templates(patch: FloatArray, ring: Ring, radius_px: float) -> Template
     return _matched(patch, ring, part, visible)
 
 
-def best_placement(scores: SingleArray) -> Placement:
+def best_placement(scores: SingleArray) -> TemplatePlacement:
     """Return the largest of the scores (templates, shifts, lags), and where it is."""
     place, lag = divmod(int(scores.argmax()), scores.shape[2])
     template, shift = divmod(place, scores.shape[1])
-    return Placement(float(scores[template, shift, lag]), template, shift, lag)
+    return TemplatePlacement(float(scores[template, shift, lag]), template, shift, lag)
 
 
 def _matched(
-    patch: FloatArray, ring: Ring, place: Placement, visible: BoolArray | None
+    patch: FloatArray, ring: Ring, place: TemplatePlacement, visible: BoolArray | None
 ) -> TemplateMatch:
     templates = templates_of(ring)
     image = templates.images[place.template]
@@ -321,7 +321,9 @@ def _code_circle(ring: Ring) -> Bank:
     return bank_of(along_code[None, None], np.ones(1), FREQUENCIES)
 
 
-def _tells_heading(scores: SingleArray, best: Placement, visible: BoolArray, ring: Ring) -> bool:
+def _tells_heading(
+    scores: SingleArray, best: TemplatePlacement, visible: BoolArray, ring: Ring
+) -> bool:
     """Return whether enough dots are visible, and whether they leave only one heading."""
     lags = np.arange(best.lag + _OTHER_LAG, best.lag + ANGLES - _OTHER_LAG + 1)
     elsewhere = scores.max(axis=(0, 1)).take(lags, mode="wrap").max()

@@ -12,7 +12,7 @@ _UNITS = (("inches", 0.0254), ("feet", 0.3048), ("centimetres", 0.01), ("millime
 _USUAL_M = 0.15, 3.0
 
 
-def check_targets(targets: Sequence[AnyTarget]) -> tuple[Doubt, ...]:
+def check_plates(targets: Sequence[AnyTarget]) -> tuple[Doubt, ...]:
     """Tell diameters that are in other units than metres."""
     doubts = []
     for target in targets:

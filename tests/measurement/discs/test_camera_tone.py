@@ -11,12 +11,12 @@ from kgcp.measurement.discs.adjust_disc import DiscTask
 from kgcp.measurement.discs.camera_tone import learn_tone
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.image_model.photometry import Tone
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 CAMERA = Camera(330, 250, 1000.0, 1000.0, 165.0, 125.0)
 DISCS = tuple(
-    FieldDisc((0.08 * (column - 1.5) + 0.0003 * row, 0.08 * (row - 1.0), 0.0), 0.05)
+    SimulatedDisc((0.08 * (column - 1.5) + 0.0003 * row, 0.08 * (row - 1.0), 0.0), 0.05)
     for column in range(4)
     for row in range(3)
 )

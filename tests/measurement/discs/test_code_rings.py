@@ -10,7 +10,7 @@ from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.discs.code_rings import read_codes
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import DiscOutline
-from kgcp.simulation.disc_field import DiscCode, FieldDisc, FieldScene, photograph
+from kgcp.simulation.disc_field import DiscCode, FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.targets.fields.points import CodeRing
 
@@ -25,7 +25,7 @@ def coded_disc(
     """A photograph of one disc with a code, and the outlines of the disc's size in it."""
     sectors = tuple(digit == "1" for digit in f"{code:012b}") if code is not None else ()
     ring = DiscCode(0.021, 0.031, sectors) if code is not None else None
-    disc = FieldDisc((0.0, 0.0, 0.0), 0.01, code=ring)
+    disc = SimulatedDisc((0.0, 0.0, 0.0), 0.01, code=ring)
     scene = FieldScene((disc,), *((0.06, 0.7) if is_bright else (0.8, 0.06)), (0.003, -0.002))
     rotation = rotation_about(np.array([*tilt, 0.0])) @ rotation_about(np.array([0.0, 0.0, turn]))
     pose = Pose(rotation, np.array([0.0, 0.0, 0.12]))

@@ -24,7 +24,7 @@ from kgcp.measurement.discs.records import (
     ellipse_of_moments,
     moments_of_ellipse,
 )
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 CAMERA = Camera(330, 250, 640.0, 640.0, 165.3, 122.8, -0.12, 0.03)
@@ -35,7 +35,7 @@ POSE = Pose(rotation_about(np.array([0.25, -0.35, 0.2])), np.array([0.0, 0.0, 0.
 class Rendered:
     photo: GreyArray
     moments: FloatArray  # (n, 5): of the outer circles
-    discs: tuple[FieldDisc, ...]
+    discs: tuple[SimulatedDisc, ...]
 
     @property
     def rings(self) -> FloatArray:
@@ -44,7 +44,9 @@ class Rendered:
 
 def render(*, ground: float, ink: float, seed: int = 1) -> Rendered:
     discs = tuple(
-        FieldDisc((0.034 * i, 0.034 * j, 0.0), 0.018, 0.008 if (i, j) in {(0, 0), (1, 0)} else 0.0)
+        SimulatedDisc(
+            (0.034 * i, 0.034 * j, 0.0), 0.018, 0.008 if (i, j) in {(0, 0), (1, 0)} else 0.0
+        )
         for j in range(-2, 3)
         for i in range(-3, 4)
     )
@@ -66,7 +68,7 @@ def bright() -> Rendered:
 def sharpened(light: float, sharpening: float) -> Rendered:
     """Large discs by a camera that sharpens: beside their edges is a fainter one."""
     discs = tuple(
-        FieldDisc((0.07 * i, 0.07 * j, 0.0), 0.045, 0.02 if i == j == 0 else 0.0)
+        SimulatedDisc((0.07 * i, 0.07 * j, 0.0), 0.045, 0.02 if i == j == 0 else 0.0)
         for j in (-1, 0, 1)
         for i in (-1, 0, 1)
     )
@@ -209,7 +211,9 @@ def test_what_cannot_be_measured_says_why(dark: Rendered) -> None:
 def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the ground is burnt, only that keeps its gradient from displacing the centre."""
     discs = tuple(
-        FieldDisc((0.012 * i, 0.012 * j, 0.0), 0.006) for j in range(-2, 3) for i in range(-3, 4)
+        SimulatedDisc((0.012 * i, 0.012 * j, 0.0), 0.006)
+        for j in range(-2, 3)
+        for i in range(-3, 4)
     )
     pose, rng = Pose(np.eye(3), np.array([0.0, 0.0, 0.6])), np.random.default_rng(4)
     photo = photograph(CAMERA, pose, FieldScene(discs, 1.5, 0.15), Optics(0.6), Sensor(), rng)
@@ -234,7 +238,7 @@ def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyA
     `width_px` is that of a logistic step, from a twentieth to nineteen of it.
     """
     pose, camera = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), Camera(480, 110, 1e3, 1e3, 240, 55)
-    discs = tuple(FieldDisc((0.09 * (k - 2), 0.0, 0.0), 0.03) for k in range(5))
+    discs = tuple(SimulatedDisc((0.09 * (k - 2), 0.0, 0.0), 0.03) for k in range(5))
     scene, rng = FieldScene(discs, 0.8, 0.1), np.random.default_rng(3)
     photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
     rows, columns = np.mgrid[: camera.height, : camera.width]

@@ -8,7 +8,7 @@ import pytest
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.calibration import check_camera
 from kgcp.quality.checks.doubt import Cause
-from kgcp.quality.checks.plate import check_targets
+from kgcp.quality.checks.plate import check_plates
 from kgcp.targets.layout import Ring, Target
 
 CAMERA = Camera(1200, 900, 1903.0, 1901.0, 606.2, 446.1)
@@ -51,7 +51,7 @@ def test_an_upright_calibration_is_told() -> None:
 )
 def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
-    (doubt,) = check_targets([Target(ring)])
+    (doubt,) = check_plates([Target(ring)])
     assert doubt.code is Cause.DIAMETERS
     assert words in doubt.sentence
 
@@ -59,4 +59,4 @@ def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
 @pytest.mark.parametrize("diameter", [0.05, 0.3, 0.9, 3.0])
 def test_usual_diameters_raise_no_doubt(diameter: float) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
-    assert check_targets([Target(ring)]) == ()
+    assert check_plates([Target(ring)]) == ()

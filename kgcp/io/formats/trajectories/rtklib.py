@@ -12,7 +12,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import WGS84_3D
 from kgcp.io.files.sniff import ForeignFile
-from kgcp.io.formats.rtklib_pos import Solution, read_solution
+from kgcp.io.formats.rtklib_pos import RtklibSolution, read_solution
 from kgcp.io.formats.trajectories.records import Epochs, TrajectoryFileOptions, check_times
 
 GEOCENTRIC = "EPSG:4978"
@@ -52,7 +52,7 @@ def read(file: ForeignFile, options: TrajectoryFileOptions, _flight_crs: str) ->
     )
 
 
-def _check_heights(solution: Solution) -> None:
+def _check_heights(solution: RtklibSolution) -> None:
     if (solution.datum.upper(), solution.heights) == ("WGS84", "ellipsoidal"):
         return
     found = f"{solution.datum}/{solution.heights}" if solution.datum else "unknown"
@@ -63,7 +63,7 @@ def _check_heights(solution: Solution) -> None:
     )
 
 
-def _block(solution: Solution, names: tuple[str, ...]) -> FloatArray:
+def _block(solution: RtklibSolution, names: tuple[str, ...]) -> FloatArray:
     return np.column_stack([solution.columns[name] for name in names])
 
 
