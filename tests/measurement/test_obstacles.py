@@ -13,7 +13,6 @@ from scipy.special import ndtr
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.frame import measure_match
@@ -25,23 +24,10 @@ from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.plate import PrintedPlate
 from kgcp.simulation.regions import DiscRegion, Region, rectangle
+from tests.measurement.lens import LENS
 
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
-LENS = Camera(
-    width=480,
-    height=340,
-    fx=1310.0,
-    fy=1306.0,
-    cx=121.2,
-    cy=91.7,
-    k1=-0.09,
-    k2=0.06,
-    p1=8e-4,
-    p2=-6e-4,
-    k3=-0.01,
-    response=Response.LINEAR,
-)
 RADIUS_PX = 22.0
 FRAMES = 3
 NO_CODE_THERE_DEG = (130.0, 225.0, 300.0)

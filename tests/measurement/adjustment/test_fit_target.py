@@ -26,23 +26,10 @@ from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Sensor, ToneCurve
 from kgcp.simulation.light_field import Cloud, PlateLight
 from kgcp.simulation.light_settings import Dirt
+from tests.measurement.lens import LENS
 
 Photograph = Callable[..., GreyArray]
 StartNear = Callable[..., InitialPose]
-LENS = Camera(
-    width=480,
-    height=340,
-    fx=1310.0,
-    fy=1306.0,
-    cx=121.2,
-    cy=91.7,
-    k1=-0.09,
-    k2=0.06,
-    p1=8e-4,
-    p2=-6e-4,
-    k3=-0.01,
-    response=Response.LINEAR,
-)
 TARGET = TARGET_PLATE.target
 FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.6, sharpening_px=1.1)
 

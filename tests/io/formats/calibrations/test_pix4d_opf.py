@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,22 +14,20 @@ from pyopf.uid64 import Uid64
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.camera import Camera
 from kgcp.io.formats.calibrations import read_calibration
-
-SILENT = (None, None)
-WIDTH, HEIGHT = 1600, 1100
-K1, K2, K3, P1, P2 = -0.061, 0.043, -0.009, 0.0007, -0.0011
-
-Project = Callable[[FloatArray], FloatArray]
-Check = Callable[[Camera, Project], None]
-Brown = Callable[..., FloatArray]
-
-
-def write(folder: Path, name: str, content: object) -> Path:
-    path = folder / name
-    path.write_text(content if isinstance(content, str) else json.dumps(content), "utf-8")
-    return path
+from tests.io.formats.calibrations.one_camera import (
+    HEIGHT,
+    K1,
+    K2,
+    K3,
+    P1,
+    P2,
+    SILENT,
+    WIDTH,
+    Brown,
+    Check,
+    write,
+)
 
 
 def corner_px(points: FloatArray, brown: Brown) -> FloatArray:
