@@ -179,10 +179,10 @@ def command(
     if log_json:
         log.event("summary", **results.summary)
     elif not is_quiet:
-        _tell(results)
+        _report(results)
 
 
-def _tell(results: CalibrationResults) -> None:
+def _report(results: CalibrationResults) -> None:
     """Report the verdict, the photographs that were not used, and the files."""
     from kgcp.pipeline.calibration.run import REASONS
 

@@ -188,7 +188,7 @@ def command(
     ]
     files.append(write_target_tables(targets, folder))
     sheets_of = {target.name: len(sheets) for target, sheets in zip(targets, layouts, strict=True)}
-    _tell(targets, known, sheets_of, files, as_json=as_json)
+    _report(targets, known, sheets_of, files, as_json=as_json)
 
 
 def _draw_field(
@@ -237,7 +237,7 @@ def _draw_field(
         click.echo(f"wrote {path}", err=True)
 
 
-def _tell(
+def _report(
     targets: Sequence[Target],
     known: Sequence[Target],
     sheets_of: Mapping[str, int],
@@ -254,12 +254,12 @@ def _tell(
 
     apart = least_apart([target.ring for target in dict.fromkeys((*targets, *known))])
     if as_json:
-        told = [
+        described = [
             {"name": t.name, "code_deg": t.ring.code_deg, "sheets": sheets_of[t.name]}
             for t in targets
         ]
         paths = [str(path) for path in files]
-        click.echo(json.dumps({"targets": told, "dots_apart": apart, "files": paths}))
+        click.echo(json.dumps({"targets": described, "dots_apart": apart, "files": paths}))
     for target in targets:
         code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
         count = sheets_of[target.name]

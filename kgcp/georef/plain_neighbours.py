@@ -109,8 +109,8 @@ class PlainTracks:
         if target.normal_enu is None:
             return None
         now, found = self._time_s[row], self._found[target.name]
-        before = max((each for each in found if self._time_s[each] < now), key=self._when)
-        after = min((each for each in found if self._time_s[each] > now), key=self._when)
+        before = max((each for each in found if self._time_s[each] < now), key=self._frame_time_s)
+        after = min((each for each in found if self._time_s[each] > now), key=self._frame_time_s)
         both = found[before], found[after]
         first, second = (place.normal for place in both)
         mean = (first + second) / np.linalg.norm(first + second)
@@ -118,7 +118,7 @@ class PlainTracks:
         sd_deg = max(place.sd_normal_deg for place in both)
         return NormalPrior(mean, math.hypot(sd_deg, apart_deg, _FLOOR_DEG))
 
-    def _when(self, row: int) -> float:
+    def _frame_time_s(self, row: int) -> float:
         return float(self._time_s[row])
 
 

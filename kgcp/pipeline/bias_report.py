@@ -187,7 +187,9 @@ class FlightBias:
         numbers = bias_numbers(self.study)
         shown = [*evenly(numbers.data.distance_m, SPREAD), *numbers.worst]
         again = evenly(numbers.data.distance_m, reexpose)
-        closeups, reexposed = _look(numbers, self.flight, frames, self.settings, shown, again)
+        closeups, reexposed = _closeups_and_reexposures(
+            numbers, self.flight, frames, self.settings, shown, again
+        )
         verdict = assess(numbers, reexposed)
         consistency = self.consistency
         return Content(
@@ -261,19 +263,19 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
     )
 
 
-def _look(
+def _closeups_and_reexposures(
     numbers: BiasNumbers,
     flight: Flight,
     frames: Path | StoredFolder,
     settings: DetectSettings,
-    shown: list[int],
-    again: list[int],
+    closeup_rows: list[int],
+    reexposed_rows: list[int],
 ) -> tuple[dict[int, tuple[bytes, tuple[FloatArray, ...]]], list[Reexposed]]:
     """Draw close-ups of some rows and measure some again, where their frames exist."""
     closeups = {}
     reexposed: list[Reexposed] = []
     targets = {target.name: target for target in flight.all_targets}
-    for row in dict.fromkeys([*shown, *again]):
+    for row in dict.fromkeys([*closeup_rows, *reexposed_rows]):
         sighting = numbers.compared[row].attempt.sighting
         if sighting is None:
             continue
@@ -283,10 +285,10 @@ def _look(
         except (Rejection, KgcpError):
             continue  # the page says of which frames there is no close-up
         target, radius = targets[sighting.target], float(numbers.data.radius_px[row])
-        if row in shown and sighting.pose is not None:
-            view = _view(flight.camera, target, sighting.pose, sighting.centre_px)
+        if row in closeup_rows and sighting.pose is not None:
+            view = _ring_view(flight.camera, target, sighting.pose, sighting.centre_px)
             closeups[row] = draw_closeup(grey, view)
-        if row in again and isinstance(target, Target):
+        if row in reexposed_rows and isinstance(target, Target):
             with defer_interrupts():
                 reexposed += measure_again(
                     grey, flight.camera, target, settings, sighting.centre_px, radius, row
@@ -294,7 +296,7 @@ def _look(
     return closeups, reexposed
 
 
-def _view(camera: Camera, target: AnyTarget, pose: Pose, centre_px: FloatArray) -> RingView:
+def _ring_view(camera: Camera, target: AnyTarget, pose: Pose, centre_px: FloatArray) -> RingView:
     """Return a target with its circles and the centre by its pose."""
     diameters_m = target.diameters_m
     circles = [contour_px(camera, pose, 0.5 * diameter_m) for diameter_m in diameters_m]

@@ -151,7 +151,7 @@ def detect_flight(
         task = _prepared_task(flight, settings, options)
     job = _job_of(task)
     path, is_new = out / ".detections.journal", options.is_restart
-    with Journal(path, _making(job), (FrameResult,), is_new=is_new) as journal:
+    with Journal(path, _dependencies(job), (FrameResult,), is_new=is_new) as journal:
         with (
             _kept_frames(out, settings, options) as kept,
             _open_pool(options, job.frames_folder) as pool,
@@ -381,7 +381,7 @@ def _stages_s(
     return stages_s
 
 
-def _making(job: DetectionJob) -> dict[str, str]:
+def _dependencies(job: DetectionJob) -> dict[str, str]:
     """Return what the results of all frames depend on, so that a change can be named."""
     return {
         "the version of kgcp or of a library": to_text(versions()),

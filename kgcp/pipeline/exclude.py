@@ -62,7 +62,7 @@ def excluded_rows(
             unknown.append(exclusion)
         for name in flights:
             chosen[name].append((exclusion.frame, exclusion.target))
-    _tell(unknown)
+    _warn_of_unknown(unknown)
     return {name: tuple(sorted(set(pairs))) for name, pairs in chosen.items()}
 
 
@@ -72,7 +72,7 @@ def _is_known(exclusion: Exclusion, rows: set[Row]) -> bool:
     return any(frame == exclusion.frame for frame, _ in rows)
 
 
-def _tell(unknown: Sequence[Exclusion]) -> None:
+def _warn_of_unknown(unknown: Sequence[Exclusion]) -> None:
     if unknown:
         shown = "; ".join(map(str, unknown[:_SHOWN]))
         more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""

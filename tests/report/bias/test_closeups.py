@@ -14,7 +14,7 @@ from kgcp.geometry.pose import Pose
 from kgcp.georef.sighting import Sighting
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.io.images.frames import read_grey
-from kgcp.pipeline.bias_report import _view
+from kgcp.pipeline.bias_report import _ring_view
 from kgcp.report.bias.numbers import evenly, largest
 from kgcp.report.bias.reexposure import GAINS, Reexposed, measure_again, reexposed
 from kgcp.report.ring_picture import CLOSEUP_PX, draw_closeup
@@ -40,7 +40,7 @@ def seen_in(flight: Flight, frame: str) -> tuple[GreyArray, Sighting, float]:
 def test_the_fitted_circles_lie_on_the_edges_of_the_picture(flight: Flight) -> None:
     grey, seen, _ = seen_in(flight, "frame_0001.jpg")
     assert seen.pose is not None
-    view = _view(flight.camera, flight.targets[0], seen.pose, seen.centre_px)
+    view = _ring_view(flight.camera, flight.targets[0], seen.pose, seen.centre_px)
     jpeg, curves = draw_closeup(grey, view)
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None
