@@ -21,10 +21,9 @@ from kgcp.targets.layout import Ring, Target
 _CUT = 0.1  # of the outline outside the frame
 _FAINT_DOTS = 0.25  # of the ring's contrast
 _UNSEEN = 0.15  # of the outer edge
-_SEEN, _EDGE_STEP = (
-    0.75,
-    0.4,
-)  # quantile of steps that belongs to the visible part; less is not an edge
+# Quantile of the steps that belongs to the visible part, and the least step of an edge, relative to
+# that.
+_SEEN, _EDGE_STEP = 0.75, 0.4
 _BURNT = 0.9  # of the pixels on disc and plate
 _INK, _PLATE, _HALF_BAND = 0.9, 1.1, 0.04  # circles either side of the outer edge, of its radius
 _DISC = 0.8  # of the inner radius

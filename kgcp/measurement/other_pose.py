@@ -1,4 +1,4 @@
-"""A measurement with its two poses weighed anew, once more is known than the frame itself shows."""
+"""Which of two poses is the likelier one, once more is known than the frame itself shows."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from kgcp.measurement.adjustment.covariance import propagate, spread_over_both
 from kgcp.measurement.records import Alternative, Measurement
 
 
-def weighed_anew(camera: Camera, measurement: Measurement, preference: float) -> Measurement:
-    """Add to the χ² of the other pose, and let the poses change places if it is the better one.
+def with_preference(camera: Camera, measurement: Measurement, preference: float) -> Measurement:
+    """Return a measurement whose χ² of the other pose is raised by a preference.
+
+    The poses change places if the other one is then the better one.
 
     Parameters
     ----------
     preference : float
-        χ² by which the other pose is the worse one, besides its ambiguity.
+        χ² by which the other pose is worse, in addition to its ambiguity.
     """
     other = measurement.alternative
     if other is None:

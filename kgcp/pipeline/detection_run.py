@@ -25,7 +25,7 @@ from kgcp.georef.neighbouring_normals import Place, preferences_of_neighbours
 from kgcp.io.images.remote import stamps_of
 from kgcp.measurement.adjustment.smoothing import with_smoothing
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.other_pose import weighed_anew
+from kgcp.measurement.other_pose import with_preference
 from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.records import (
     FrameResult,
@@ -345,7 +345,7 @@ class DetectionRun:
             learnt = with_smoothing(self._job.camera, learnt, self.learnt.smoothing)
         preference = self._preferences.get((frame, learnt.target, learnt.instance))
         if preference is not None:
-            learnt = weighed_anew(self._job.camera, learnt, preference)
+            learnt = with_preference(self._job.camera, learnt, preference)
         if learnt is measurement or not is_complete:
             return learnt
         return completed(self._job, learnt)

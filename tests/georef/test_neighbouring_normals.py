@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.georef.neighbouring_normals import preferences_of_neighbours
-from kgcp.measurement.other_pose import weighed_anew
+from kgcp.measurement.other_pose import with_preference
 from kgcp.measurement.records import (
     Alternative,
     Appearance,
@@ -66,11 +66,11 @@ def test_the_poses_change_places_with_all_that_follows_from_them() -> None:
     (before,) = plate(3, is_sure=False).outcomes
     assert isinstance(before, Measurement)
     assert before.alternative is not None
-    kept = weighed_anew(CAMERA, before, 4.0)
+    kept = with_preference(CAMERA, before, 4.0)
     assert kept.pose is before.pose
     assert kept.alternative is not None
     assert kept.alternative.ambiguity == pytest.approx(5.2)
-    turned = weighed_anew(CAMERA, before, -8.0)
+    turned = with_preference(CAMERA, before, -8.0)
     assert turned.pose is before.alternative.pose
     assert turned.alternative is not None
     assert turned.alternative.pose is before.pose
@@ -81,7 +81,7 @@ def test_the_poses_change_places_with_all_that_follows_from_them() -> None:
     assert turned.uncertainty is not None
     np.testing.assert_allclose(turned.uncertainty.pose_cov[3:, 3:], OTHER_COV[3:, 3:])
     unknown = replace(before, alternative=replace(before.alternative, pose_cov=None))
-    held = weighed_anew(CAMERA, unknown, -8.0)
+    held = with_preference(CAMERA, unknown, -8.0)
     assert held.pose is before.pose
     assert held.alternative is not None
     assert held.alternative.ambiguity == 0.0
