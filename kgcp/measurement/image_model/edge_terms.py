@@ -68,6 +68,11 @@ def _add_skew(
     members: IndexArray,
     rows: FloatArray,
 ) -> None:
+    """Add −⅙ of the third derivatives of the blurred discs.
+
+    Along normal n and tangent t of its edge, a disc that is blurred to C at the distance ρ from its
+    centre has ∂ₙₙₙC = (1 − z²) φ(z) / σ³ and, since the edge is bent, ∂ₙₜₜC = C″/ρ − C′/ρ².
+    """
     for c in range(len(circles)):
         radius_m, sign = circles[c, 2], circles[c, 3]
         for m in range(starts[c], starts[c + 1]):
@@ -115,7 +120,7 @@ def _add_smoothing(
     members: IndexArray,
     rows: FloatArray,
 ) -> None:
-    """Add the circles' shares.
+    """Add by how much the discs shrink where contours are smoothed.
 
     A pixel's step along the contour in the image is a step t on the plate along the circle, whose
     edge is displaced by t² / 2r there.
@@ -159,6 +164,7 @@ def _add_gradient(
     members: IndexArray,
     rows: FloatArray,
 ) -> None:
+    """Add Σ times the gradients of the blurred discs: −φ(z) / σ along the normals of edges."""
     for c in range(len(circles)):
         radius_m, sign = circles[c, 2], circles[c, 3]
         for m in range(starts[c], starts[c + 1]):
