@@ -46,7 +46,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
-LEARNED_FROM = 5  # photographs, what the camera does to grey values
+LEARNED_FROM = 5  # photographs; they show what the camera does to grey values
 _DIGITS = re.compile(r"(\d+)")
 
 OTHER_SIZE = "other_size"
