@@ -124,15 +124,16 @@ def look(
     tone: ToneCurve | None = None,
     *,
     is_free: bool = False,
+    draw: int = 0,
 ) -> Looks:
     """Render so many targets of one kind and look for them.
 
-    A tone curve is not known; nor is the normal, if it is free.
+    A tone curve is not known; nor is the normal, if it is free. Each draw has other places.
     """
     camera, sensor = _CAMERA, _SENSOR
     if tone is not None:
         camera, sensor = replace(camera, response=Response.UNKNOWN), replace(sensor, tone=tone)
-    rng = np.random.default_rng([int(10 * radius_px), *kind.encode()])
+    rng = np.random.default_rng([int(10 * radius_px), *kind.encode(), *([draw] if draw else [])])
     target, edges = target_of(kind, radius_px, is_free=is_free), _edge_covs(kind, radius_px)
     reasons: Counter[str] = Counter()
     errors, sds, limits, z_distance, along, tilts = [], [], [], [], [], []
@@ -464,6 +465,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--real", type=Path, help="folder of photographs of ground")
     parser.add_argument("--count", type=int, default=40, help="targets per line")
+    parser.add_argument("--draw", type=int, default=0, help="another draw of targets")
     parser.add_argument("--windows", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=11, help="of the windows")
     parser.add_argument(
@@ -486,9 +488,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for radius_px in _RADII_PX:
             if radius_px < smallest_radius_px(target_of(kind, radius_px, is_free=chosen.free)):
                 continue  # it is not looked for
-            print_looks(
-                look(kind, radius_px, chosen.count, grounds, chosen.tone, is_free=chosen.free)
+            looks = look(
+                kind,
+                radius_px,
+                chosen.count,
+                grounds,
+                chosen.tone,
+                is_free=chosen.free,
+                draw=chosen.draw,
             )
+            print_looks(looks)
     if photographs and chosen.windows:
         for radius_px, shares in zip(_RADII_PX, edges_alike(photographs).T, strict=True):
             print(

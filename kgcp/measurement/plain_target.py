@@ -57,7 +57,7 @@ from kgcp.targets.plain import PlainTarget
 _MOST_TRIES = 24  # edges that are measured per target
 # The variances on ground that is not known to be even: its texture displaces edges over longer
 # stretches than the arcs that the covariance is made from.
-_BARE = 3.0
+_BARE = 3.5
 _SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
 # of a normal that is free: least ratio of an edge's axes; what is sought, of the largest image
 _FREE_RATIO, _FREE_SCALE = 0.5, 0.8

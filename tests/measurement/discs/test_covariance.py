@@ -1,0 +1,72 @@
+"""Deviations of a disc alone: few arcs and few pixels, whose chance is not taken for roughness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.discs.covariance import DiscScatter, beyond_chance, inflations
+from kgcp.measurement.discs.measure import measure_disc
+from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.discs.records import Disc
+from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.imaging import Optics, Sensor
+
+ARCS = 10
+
+
+def alone(ratio: float) -> float:
+    scatter = DiscScatter(np.eye(5), np.zeros((5, 5)), ratio, ARCS)
+    return float(inflations([scatter])[0])
+
+
+def test_a_third_is_left_of_what_chance_makes_of_no_excess() -> None:
+    chance = np.random.default_rng(3).normal(0.0, 0.3, 20_000)
+    left = beyond_chance(chance, np.full(len(chance), 0.09))
+    assert left.mean() / 0.3 == pytest.approx(0.13, abs=0.01)
+    assert np.maximum(chance, 0.0).mean() / 0.3 == pytest.approx(0.4, abs=0.01)
+    assert beyond_chance(np.array([3.0]), np.array([0.09])) == pytest.approx([2.97])
+
+
+def test_one_disc_is_inflated_by_what_its_arcs_show_beyond_chance() -> None:
+    rng = np.random.default_rng(4)
+    ratios = rng.chisquare(ARCS, 4000) / ARCS
+    assert 1.01 < np.mean([alone(ratio) for ratio in ratios]) < 1.1
+    # jagged print, compression: nearly all of it is kept
+    assert 2.75 < np.mean([alone(3.0 * ratio) for ratio in ratios]) < 3.0
+    assert alone(0.6) == alone(1.0) == 1.0
+
+
+def test_what_all_discs_of_a_photograph_show_is_no_chance() -> None:
+    ratios = 1.4 * np.random.default_rng(5).chisquare(ARCS, 200) / ARCS
+    scatters = [DiscScatter(np.eye(5), np.zeros((5, 5)), each, ARCS) for each in ratios]
+    assert 1.3 < np.mean(inflations(scatters)) < 1.42
+    assert inflations([]).shape == (0,)
+
+
+def test_the_radius_of_a_disc_alone_is_as_good_as_it_says() -> None:
+    """Chance alone had its deviation stated 8 % too large."""
+    camera = Camera(260, 260, 20_000.0, 20_000.0, 129.5, 129.5)
+    places = [np.array([column, row]) * 42.0 for row in range(-2, 3) for column in range(-2, 3)]
+    rng, z = np.random.default_rng(6), []
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    of_size = np.array((0.0, 0.0, 1.0, 0.0, 1.0))
+    for _ in range(20):
+        discs = tuple(
+            FieldDisc((*((place + rng.uniform(-0.5, 0.5, 2)) / 20_000.0).tolist(), 0.0), 0.0008)
+            for place in places
+        )
+        scene = FieldScene(discs, 0.62, 0.1)
+        photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng)
+        truth = circle_images(camera, field_circles(pose, discs)).moments
+        for outline in find_outlines(photo):
+            disc = measure_disc(photo, outline, response=Response.LINEAR)
+            assert isinstance(disc, Disc)
+            nearest = np.linalg.norm(truth[:, :2] - disc.centre_px, axis=1).argmin()
+            off = float(of_size @ (disc.vector - truth[nearest]))
+            z.append(off / np.sqrt(of_size @ disc.cov @ of_size))
+    assert len(z) == 500
+    assert 0.9 < np.sqrt(np.mean(np.square(z))) < 1.05
