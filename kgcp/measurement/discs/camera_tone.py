@@ -54,6 +54,10 @@ _WORTHY_BENDS = 6.0  # least gain of twice the log-likelihood by three parameter
 # bends gain up to 1200, and what these pretend displaces the discs. Film's curve, with an excess of
 # 1 to 1.5, gains 70 to 800 on nine discs (`benchmarks.calibrate.operator`).
 _BY_EXCESS = 3
+# By a mask that is not quite the camera's, the wrong one of two bent curves may be likelier. So
+# those are compared again by their own masks whose loss is larger by less than this share of what
+# the bends gain. Farther ones would win ties alone, and displace edges by 0.15 px then.
+_NEARLY = 0.2
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
 _MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
@@ -80,12 +84,11 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     if tone is Tone.LINEAR:
         return CameraTone(tone)
     fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
-    best = _likeliest(fits, (tone,) if tone is Tone.SRGB else (Tone.SRGB, Tone.LINEAR))
-    if tone is Tone.UNKNOWN:
-        best = _with_worthy_bends(best, _likeliest(fits, tuple(_BENT.values())))
+    plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
+    bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
+    best = _likeliest([_with_best_mask(joint) for joint in _worthy(plain, bent)])
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
-    best = _with_best_mask(best)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
@@ -145,22 +148,30 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
-def _likeliest(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> JointFit | None:
-    """Return discs adjusted together by the likeliest of some curves; None if by none."""
-    joints = [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
+def _joints(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> list[JointFit]:
+    """Return discs adjusted together by each of some curves, if they can be."""
+    return [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
+
+
+def _likeliest(joints: Sequence[JointFit]) -> JointFit | None:
+    """Return the likeliest; None if there is none."""
     return min(joints, key=lambda joint: joint.loss, default=None)
 
 
-def _with_worthy_bends(plain: JointFit | None, bent: JointFit | None) -> JointFit | None:
-    """Return discs by the bent curve if it is significantly likelier than the plain one.
+def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFit]:
+    """Return discs by the likeliest curve, and by others that are nearly as likely.
 
-    Where discs contradict each other more than their noise lets them, the model lacks something
-    that the bends may stand for.
+    By a bent curve only if it is significantly likelier than a plain one. Where discs contradict
+    each other more than their noise lets them, the model lacks something that the bends may stand
+    for.
     """
-    if plain is None or bent is None:
-        return bent or plain
-    gain = 2.0 * (plain.loss - bent.loss)
-    return bent if gain > _WORTHY_BENDS * _excess(bent) ** _BY_EXCESS else plain
+    known, best = _likeliest(plain), _likeliest(bent)
+    if known is None or best is None:
+        return [joint for joint in (best or known,) if joint]
+    gain = known.loss - best.loss
+    if 2.0 * gain <= _WORTHY_BENDS * _excess(best) ** _BY_EXCESS:
+        return [known]
+    return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
 
 
 def _without_bends(known: CameraPrior) -> CameraPrior:

@@ -8,7 +8,8 @@ import pytest
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask
-from kgcp.measurement.discs.camera_tone import learn_tone
+from kgcp.measurement.discs.camera_tone import _worthy, learn_tone
+from kgcp.measurement.discs.joint_tone import JointFit
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
@@ -20,6 +21,29 @@ DISCS = tuple(
     for column in range(4)
     for row in range(3)
 )
+
+
+def joint(tone: Tone, loss: float) -> JointFit:
+    """Return discs that agree with each other."""
+    return JointFit(tone, 1.0, (), loss, np.eye(4), np.zeros((1, 4)), np.eye(4)[None])
+
+
+@pytest.mark.parametrize(
+    ("of_srgb", "of_line", "worthy"),
+    [
+        (998.0, 999.0, {Tone.SRGB}),  # bends that explain next to nothing
+        (900.0, 700.0, {Tone.UNKNOWN_FROM_LINE}),
+        (750.0, 700.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
+        (700.0, 750.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
+    ],
+)
+def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
+    of_srgb: float, of_line: float, worthy: set[Tone]
+) -> None:
+    plain = [joint(Tone.SRGB, 1000.0), joint(Tone.LINEAR, 1200.0)]
+    bent = [joint(Tone.UNKNOWN, of_srgb), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
+    assert {each.tone for each in _worthy(plain, bent)} == worthy
+    assert {each.tone for each in _worthy(plain, [])} == {Tone.SRGB}
 
 
 @pytest.mark.parametrize(
