@@ -12,7 +12,7 @@ from kgcp.measurement.discs.covariance import DiscScatter, beyond_chance, inflat
 from kgcp.measurement.discs.measure import measure_disc
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc
-from kgcp.simulation.disc_field import FieldDisc, FieldScene, field_circles, photograph
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 
 ARCS = 10
@@ -56,7 +56,7 @@ def test_the_radius_of_a_disc_alone_is_as_good_as_it_says() -> None:
     of_size = np.array((0.0, 0.0, 1.0, 0.0, 1.0))
     for _ in range(20):
         discs = tuple(
-            FieldDisc((*((place + rng.uniform(-0.5, 0.5, 2)) / 20_000.0).tolist(), 0.0), 0.0008)
+            SimulatedDisc((*((place + rng.uniform(-0.5, 0.5, 2)) / 20_000.0).tolist(), 0.0), 0.0008)
             for place in places
         )
         scene = FieldScene(discs, 0.62, 0.1)
