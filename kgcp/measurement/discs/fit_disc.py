@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -368,19 +369,34 @@ def fit_disc(sample: DiscSample, start: DiscState, free: Unknowns) -> DiscFit:
         If the equations cannot be solved.
     """
     state, free = start, free.in_light(sample.radius_px, sample.window.frame_px)
-    sd = noise_at(sample, state).sd
+    linear = _linearised(sample, state)
+    sd = _noise(sample, linear.share, linear.levels).sd
     for _ in range(_NOISE_ROUNDS):
-        fit = _minimise(sample, state, free, sd)
-        state = fit.state
+        fit = _minimise(sample, state, free, sd, linear)
+        state, linear = fit.state, _Linear(fit.share, fit.levels, fit.jacobian)
         before, sd = sd, fit.noise.sd
         if abs(float(sd.sum() / before.sum()) - 1.0) < _SETTLED_NOISE:
             break
     return fit
 
 
-def fit_at(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:
-    """Linearise at a state, with noise (n,) that is known."""
-    share, levels, jacobian = _linearised(sample, state)
+class _Linear(NamedTuple):
+    """The image model about a state."""
+
+    share: FloatArray  # (n,): white share
+    levels: FloatArray  # (n,)
+    jacobian: FloatArray  # (21, n)
+
+
+def fit_at(
+    sample: DiscSample,
+    state: DiscState,
+    free: Unknowns,
+    sd: FloatArray,
+    linear: _Linear | None = None,
+) -> DiscFit:
+    """Linearise at a state, unless that is done, with noise (n,) that is known."""
+    share, levels, jacobian = linear or _linearised(sample, state)
     current = misfit(sample.levels, levels, sd, sample.censoring)
     scaled = scaled_rows(jacobian, free.rows, sd)
     normal = weighted_products(scaled, current.weight, np.zeros(len(free.rows)))
@@ -390,15 +406,13 @@ def fit_at(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray)
 
 def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
     """Return the noise that the residuals of a state show."""
-    share, levels, _ = _linearised(sample, state)
-    return _noise(sample, share, levels)
+    linear = _linearised(sample, state)
+    return _noise(sample, linear.share, linear.levels)
 
 
-def _linearised(sample: DiscSample, state: DiscState) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return white share, grey values (n,) and Jacobian (21, n)."""
+def _linearised(sample: DiscSample, state: DiscState) -> _Linear:
     share = sample.pixels.white_share(state.geometry, state.blur)
-    levels, jacobian = sample.level_model.linearised(share, state.vector)
-    return share.value, levels, jacobian
+    return _Linear(share.value, *sample.level_model.linearised(share, state.vector))
 
 
 def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoise:
@@ -410,9 +424,11 @@ def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoi
     )
 
 
-def _minimise(sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray) -> DiscFit:
-    """Take damped Gauss-Newton steps (Levenberg-Marquardt)."""
-    fit, damping = fit_at(sample, state, free, sd), _DAMPING
+def _minimise(
+    sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray, linear: _Linear
+) -> DiscFit:
+    """Take damped Gauss-Newton steps (Levenberg-Marquardt) from a state that is linearised."""
+    fit, damping = fit_at(sample, state, free, sd, linear), _DAMPING
     total = fit.misfit.total + free.penalty(fit.state.vector)
     for _ in range(_STEPS):
         step, promised = _step(fit, damping)
