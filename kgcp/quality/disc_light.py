@@ -31,10 +31,10 @@ class DiscLight:
     Attributes
     ----------
     dark, bright : float
-        Standard deviation over a photograph of what changes smoothly, median of the photographs; of
-        full scale. Single photographs may be burnt.
+        Standard deviation over a photograph of what changes smoothly, RMS of the photographs; of
+        full scale. Burnt photographs do not count if they are fewer than half.
     clipped : float
-        Median share of clipped pixels; NaN: not known.
+        Median share of clipped pixels in these; NaN: not known.
     """
 
     dark: float
@@ -63,13 +63,16 @@ def light_on_discs(photographs: Iterable[tuple[FloatArray, FloatArray, FloatArra
         Of k discs each, six or more: places [px], levels inside and outside before clipping as
         share of full scale, and share of clipped pixels.
     """
+    all_photographs = list(photographs)
+    unburnt = [each for each in all_photographs if not np.median(each[2]) > _BURNT]
+    considered = unburnt if 2 * len(unburnt) > len(all_photographs) else all_photographs
     changes, clipped = [], []
-    for places_px, levels, share in photographs:
+    for places_px, levels, share in considered:
         terms = _terms(places_px)
         ordered = np.sort(levels, axis=1)
         changes.append([_smooth_change(terms, level) for level in ordered.T])
         clipped.append(share)
-    dark, bright = np.median(changes, axis=0).tolist()
+    dark, bright = np.sqrt(np.mean(np.square(changes), axis=0)).tolist()
     return DiscLight(dark, bright, float(np.median(np.concatenate(clipped))))
 
 

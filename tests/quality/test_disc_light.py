@@ -65,6 +65,16 @@ def test_single_burnt_photographs_are_no_doubt() -> None:
     assert "burnt" in light_on_discs([(PLACES_PX, burnt, clipped + 0.5)] * 2).doubt
 
 
+def test_negatives_are_told_if_the_light_falls_off_over_some_of_them() -> None:
+    def negative(fall: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        levels = np.column_stack((1.0 - 0.8 * light(fall), 1.0 - 0.1 * light(fall)))
+        return PLACES_PX, levels, np.zeros(len(PLACES_PX))
+
+    assert (
+        "negatives" in light_on_discs([negative(0.6), negative(0.6), *[negative(0.05)] * 6]).doubt
+    )
+
+
 def test_even_light_says_nothing() -> None:
     assert of_levels(1.0 - 0.1 * light(0.05), 1.0 - 0.8 * light(0.05)).doubt == ""
 

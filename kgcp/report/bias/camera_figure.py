@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from kgcp.measurement.image_model.srgb import srgb_decoded
+from kgcp.measurement.records import ToneBase
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.quality.number_text import minus
 from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
@@ -54,16 +55,21 @@ def _draw_noise(axes: Axes, learnt: LearntImaging) -> None:
 def learnt_sentence(learnt: LearntImaging) -> str:
     """Say what was learnt, and how much it has changed."""
     low, middle, high = learnt.sharpening.tolist()
-    about = (
-        _NOT_AGREED
-        if learnt.base is None
-        else f"The tone curve departs from {learnt.base.value}, learnt from {learnt.measurements}"
-        f" measurements. Alone, {learnt.overruled} would suggest another base;"
-        f" {learnt.kept_own_base} kept theirs, since it fits far better."
-    )
+    about = _NOT_AGREED if learnt.base is None else _about_tone(learnt, learnt.base)
     smoothing = learnt.smoothing
     return (
         f"{about} Strength of the camera's sharpening: {middle:.2f} ({low:.2f} to {high:.2f})."
         f" Smoothing along contours: {minus(f'{smoothing.mean_px2:.3f}')} px² ±"
         f" {smoothing.sd_mean_px2:.3f}; single measurements scatter by {smoothing.scatter_px2:.3f}."
     )
+
+
+def _about_tone(learnt: LearntImaging, base: ToneBase) -> str:
+    """Say from how many measurements a tone curve was learnt, and which of them disagree."""
+    count = f"{learnt.measurements} measurement{'' if learnt.measurements == 1 else 's'}"
+    parts = [f"The tone curve departs from {base.value}, learnt from {count}"]
+    if learnt.overruled:
+        parts.append(f"{learnt.overruled} alone would suggest another base")
+    if learnt.kept_own_base:
+        parts.append(f"{learnt.kept_own_base} kept another base, which fits far better")
+    return f"{'; '.join(parts)}."

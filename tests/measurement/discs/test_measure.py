@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -101,6 +102,22 @@ def test_what_sharpening_leaves_beside_edges_hides_no_disc(light: float, sharpen
     vectors = np.array([each.vector for each in discs])
     off = vectors - rendered.moments[nearest(vectors[:, :2], rendered.moments)]
     assert np.abs(off[:, :2]).max() < 0.03
+
+
+@pytest.mark.parametrize(("ground", "hole"), [(0.8, 0.2), (0.2, 0.8)])
+def test_narrow_rings_keep_their_fainter_edge(ground: float, hole: float) -> None:
+    """A fifth of the other's contrast is more than sharpening leaves."""
+    places = (np.arange(4 * 120) + 0.5) / 4.0 - 0.5
+    radius_px = np.hypot(places[:, None] - 58.3, places - 61.7)
+    light = np.where(radius_px > 16.0, ground, np.where(radius_px > 12.5, 0.06, hole))
+    sharp = light.reshape(120, 4, 120, 4).mean(axis=(1, 3))
+    outlines = find_outlines(
+        cv2.GaussianBlur(np.round(255.0 * sharp).astype(np.uint8), (7, 7), 0.7)
+    )
+    assert [each.polarity.value for each in outlines] == ["dark", "bright"]
+    radii_px = [each.ellipse.mean_radius for each in outlines]
+    assert radii_px == pytest.approx([16.0, 12.5], abs=0.3)
+    assert [each.is_hole for each in outlines] == [False, True]
 
 
 @pytest.mark.parametrize("field", ["dark", "bright"])
