@@ -26,7 +26,7 @@ from kgcp.measurement.frame import examine
 from kgcp.measurement.records import InitialPose, Measurement, Miss
 from kgcp.settings import DetectSettings
 from kgcp.simulation.flight import TARGET_PLATE
-from kgcp.simulation.imaging import Optics
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.light_field import Cloud, Highlight, PlateLight, Shade
 from kgcp.simulation.light_settings import Dirt
 from kgcp.simulation.plate import PrintedPlate
@@ -87,6 +87,22 @@ def test_distances_in_uneven_light_are_right_and_as_uncertain_as_said(
         sigmas.append(off_m / seen.uncertainty.sd_distance_m)
     assert np.abs(errors).max() < percent
     assert 0.1 < math.sqrt(np.mean(np.square(sigmas))) < 2.0
+
+
+def test_dirt_under_a_film_curve_that_is_not_known_is_no_other_size(
+    photograph: Photograph, start_near: StartNear
+) -> None:
+    """A light that the plain fit curved stayed so beneath varying levels: errors of 2 to 4 σ."""
+    camera, film = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.FILM)
+    sigmas = []
+    for seed in range(5):
+        rng = np.random.default_rng(500 + seed)
+        pose = some_pose(rng)
+        grey = photograph(camera, pose, rng, sensor=film, gain=0.65, field=dirt(rng))
+        start = start_near(camera, pose, rng)
+        seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+        sigmas.append((seen.distance_m - pose.distance_m) / seen.sd_distance_m)
+    assert 0.2 < math.sqrt(np.mean(np.square(sigmas))) < 1.5
 
 
 def test_dirt_on_a_small_ring_is_told_by_its_edges(

@@ -37,6 +37,8 @@ _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, 
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]
 _SHAPED = [Param.CURVATURE, Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING]
+# What levels that vary replace.
+_FINE_LIGHT = [Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE, Param.LINEAR_SHARPENING]
 _OF_TONE = {
     Tone.LINEAR: [],
     Tone.SRGB: [Param.SHARPENING],
@@ -81,10 +83,11 @@ def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
 def without_fine_light(unknowns: Unknowns) -> Unknowns:
     """Return the unknowns of a fit whose levels vary.
 
-    They take what the curvature would, and beside them the two sharpenings are too much: of a
-    highlight on a ring of 107 px they came out with 0.85 and −0.74, and the distance off by 4.6 σ.
+    The levels take what gradient and curvature of the light would. Beside them the two sharpenings
+    are too much: of a highlight on a ring of 107 px they came out with 0.85 and −0.74, and the
+    distance off by 4.6 σ.
     """
-    free = unknowns.free[~np.isin(unknowns.free, [Param.CURVATURE, Param.LINEAR_SHARPENING])]
+    free = unknowns.free[~np.isin(unknowns.free, _FINE_LIGHT)]
     return replace(unknowns, free=free, free_precision=unknowns.precision[free])
 
 

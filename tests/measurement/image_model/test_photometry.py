@@ -39,12 +39,13 @@ from kgcp.measurement.image_model.srgb import (
 WIDTH, HEIGHT, SHARPENING_PX = 31, 22, 1.2
 TONE = Tone.UNKNOWN
 STEP = 1e-6
-LIGHT = Light(0.06, 0.8, 0.04, -0.03, 0.02, 0.35, -0.2, sharpening=0.5, linear_sharpening=0.2)
-LINEAR = replace(LIGHT, tone_1=0.0, tone_2=0.0, sharpening=0.0)
+LIGHT = Light(0.06, 0.8, 0.04, -0.03, 0.02, 0.35, -0.2, 0.1, sharpening=0.5, linear_sharpening=0.2)
+UNSHAPED = replace(LIGHT, tone_1=0.0, tone_2=0.0, tone_3=0.0)
+LINEAR = replace(UNSHAPED, sharpening=0.0)
 CASES = [
     (Tone.LINEAR, 0.0, LINEAR),
-    (Tone.SRGB, 0.0, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
-    (Tone.SRGB, SHARPENING_PX, replace(LIGHT, tone_1=0.0, tone_2=0.0)),
+    (Tone.SRGB, 0.0, UNSHAPED),
+    (Tone.SRGB, SHARPENING_PX, UNSHAPED),
     (Tone.UNKNOWN, 0.0, LIGHT),
     (Tone.UNKNOWN, SHARPENING_PX, LIGHT),
 ]
