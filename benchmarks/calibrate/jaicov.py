@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.network.adjust import PLAIN, adjust
+from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.covariance import precision
 from kgcp.network.records import (
-    CameraPrior,
+    CalibrationPrior,
     Estimate,
     ImageSlopes,
     Network,
@@ -133,7 +133,7 @@ def read_network(folder: Path) -> tuple[Network, Estimate, Published]:
         np.zeros(len(exterior), dtype=np.intp),
         observations,
         PointPrior(nominal, np.zeros((len(nominal), 3, 3)), (scale,)),
-        CameraPrior(values, np.full_like(values, np.inf)),
+        CalibrationPrior(values, np.full_like(values, np.inf)),
     )
     start = Estimate(values, rotations, translations, nominal)
     return network, start, _published(protocol, nominal, known[:, 4:7])
@@ -210,7 +210,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     network, start, published = read_network(parser.parse_args().folder)
-    solution = adjust(network, start, PLAIN)
+    solution = adjust_network(network, start, PLAIN)
     known = precision(network, solution)
     result = compare(solution, known, published)
     discs = len(network.observations.view)

@@ -34,7 +34,7 @@ from kgcp.network.calibration_records import (
     LensModel,
     PointModel,
 )
-from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.covariance import precision
 from kgcp.pipeline.calibration.photographs import Photo
 from kgcp.pipeline.calibration.results import light_of
@@ -253,7 +253,7 @@ def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
     """
     names = whole.network.model.names
     terms = tuple(name for name in names if name[0] in "kp")
-    unknowns = Unknowns(whole.points_used, terms, is_same_aspect="fy" not in names)
+    unknowns = NetworkUnknowns(whole.points_used, terms, is_same_aspect="fy" not in names)
     rng = np.random.default_rng(18)
     ratios: list[FloatArray] = []
     for _ in range(count):
@@ -272,7 +272,7 @@ def halves_z(whole: CameraCalibration, count: int) -> dict[str, float]:
 
 
 def _adjusted_part(
-    whole: CameraCalibration, part: IndexArray, unknowns: Unknowns
+    whole: CameraCalibration, part: IndexArray, unknowns: NetworkUnknowns
 ) -> AdjustedNetwork:
     """Return the adjustment of some of the photographs."""
     views = tuple(whole.views[index] for index in part.tolist())

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from kgcp.pipeline.calibration.results import CalibrationResults
 
 # Named here, not imported, because the modules that know them take numpy; a test compares.
-POINTS = ("fixed", "stiff", "free")
+POINT_MODELS = ("fixed", "stiff", "free")
 LENSES = ("auto", "radial", "brown", "rational")
 OPERATORS = ("model", "gaussian", "centroid")
 RESPONSES = ("linear", "srgb", "unknown")
@@ -51,7 +51,7 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
 )
 @click.option(
     "--points",
-    type=click.Choice(POINTS),
+    type=click.Choice(POINT_MODELS),
     default="stiff",
     show_default=True,
     help="Take the field exactly as stated, let it deviate by what its field.toml allows, or"

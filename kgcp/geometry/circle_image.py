@@ -19,8 +19,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.calibration import image_by_calibration
 from kgcp.geometry.camera import Camera
 
-POINTS = 32  # along an outline
-_ANGLES = 2.0 * np.pi / POINTS * np.arange(POINTS)
+OUTLINE_POINTS = 32  # along an outline
+_ANGLES = 2.0 * np.pi / OUTLINE_POINTS * np.arange(OUTLINE_POINTS)
 _UNIT_CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
 
 
@@ -32,8 +32,8 @@ def _fourier_slopes(count: int) -> FloatArray:
         return np.where(lag == 0, 0.0, sign / np.tan(np.pi * lag / count))
 
 
-_SLOPES = _fourier_slopes(POINTS)
-_STEP = 2.0 * np.pi / POINTS
+_SLOPES = _fourier_slopes(OUTLINE_POINTS)
+_STEP = 2.0 * np.pi / OUTLINE_POINTS
 
 
 def plane_axes(normals: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from pyproj.transformer import TransformerGroup
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 
-FLIGHT_TOML = "flight.toml: crs"
+CRS_KEY = "flight.toml: crs"
 VEHICLE_CRS = "flight.toml: [vehicle] crs"
 WGS84_3D = "EPSG:4979"
 """Longitude, latitude and ellipsoidal height of WGS 84."""
@@ -38,7 +38,7 @@ def crs_of(text: str) -> CRS:
     return CRS.from_user_input(text)
 
 
-def parse_crs(crs: str, where: str = FLIGHT_TOML) -> CRS:
+def parse_crs(crs: str, where: str = CRS_KEY) -> CRS:
     """Return a CRS with heights; ellipsoidal ones, in metres, unless it is compound.
 
     Raises

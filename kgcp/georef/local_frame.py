@@ -19,7 +19,7 @@ from pyproj.exceptions import ProjError
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.georef.crs import (
-    FLIGHT_TOML,
+    CRS_KEY,
     VEHICLE_CRS,
     best_transformer,
     geographic_of,
@@ -46,10 +46,10 @@ class LocalFrame:
     _geodetic_from_map: Transformer
     _ecef_from_geodetic: Transformer
     _radians_per_unit: float
-    _where: str = FLIGHT_TOML
+    _where: str = CRS_KEY
 
     @classmethod
-    def at(cls, crs: str, origin_map: FloatArray, where: str = FLIGHT_TOML) -> Self:
+    def at(cls, crs: str, origin_map: FloatArray, where: str = CRS_KEY) -> Self:
         """Return the frame of `crs` (anything pyproj reads) over the point (3,) `origin_map`.
 
         `where` is what an error names as the place that the CRS was given in.

@@ -66,7 +66,7 @@ PLAIN = Robustness(is_huber=False, rejection=math.inf)
 ROBUST = Robustness()
 
 
-def adjust(network: Network, start: Estimate, robustness: Robustness = ROBUST) -> Solution:
+def adjust_network(network: Network, start: Estimate, robustness: Robustness = ROBUST) -> Solution:
     """Adjust cameras, poses and points to the observed discs.
 
     Gauss-Newton with Levenberg's damping, in rounds of reweighting. The poses are eliminated

@@ -22,7 +22,7 @@ from kgcp.network.camera_network import (
     CENTRE_DETERMINED,
     AdjustedNetwork,
     CalibrationProblem,
-    Unknowns,
+    NetworkUnknowns,
 )
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
@@ -108,7 +108,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     problem = replace(problem, views=tuple(v for v in problem.views if v.photo not in disordered))
     _require_views(problem.views)
     observations = problem.observations()
-    unknowns = Unknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
+    unknowns = NetworkUnknowns(PointModel.FIXED, ("k1", "k2"), is_same_aspect=True)
     if start is None:
         start_from = start_camera_and_poses if field.starts_from_homographies else start_in_space
         camera, estimate = start_from(observations, points, problem.size)

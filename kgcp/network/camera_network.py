@@ -19,12 +19,12 @@ from kgcp.geometry.circle_image import (
     plane_axes,
 )
 from kgcp.geometry.pose import Pose
-from kgcp.network.adjust import ROBUST, adjust
+from kgcp.network.adjust import ROBUST, adjust_network
 from kgcp.network.calibration_records import CalibrationSettings, NamedView, PointModel
 from kgcp.network.covariance import fitting_covariances, precision
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import (
-    CameraPrior,
+    CalibrationPrior,
     Estimate,
     Network,
     Observations,
@@ -53,7 +53,7 @@ _POWER = {"k1": 2, "k2": 4, "k3": 6, "k4": 2, "k5": 4, "k6": 6}
 
 
 @dataclass(frozen=True, slots=True)
-class Unknowns:
+class NetworkUnknowns:
     """What is estimated in an adjustment."""
 
     points: PointModel
@@ -67,7 +67,7 @@ class AdjustedNetwork:
 
     camera: Camera
     estimate: Estimate
-    unknowns: Unknowns
+    unknowns: NetworkUnknowns
     network: Network
     solution: Solution
 
@@ -106,7 +106,7 @@ class CalibrationProblem:
             np.concatenate([view.covs[:, :2, :2] for view in self.views]),
         )
 
-    def with_unknowns(self, state: AdjustedNetwork, unknowns: Unknowns) -> AdjustedNetwork:
+    def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
         """Return the adjustment of other unknowns."""
         return self.adjusted(state.camera, state.estimate, unknowns)
 
@@ -114,7 +114,9 @@ class CalibrationProblem:
         """Return the adjustment from another start."""
         return self.adjusted(state.camera, estimate, state.unknowns)
 
-    def adjusted(self, camera: Camera, estimate: Estimate, unknowns: Unknowns) -> AdjustedNetwork:
+    def adjusted(
+        self, camera: Camera, estimate: Estimate, unknowns: NetworkUnknowns
+    ) -> AdjustedNetwork:
         """Return the adjustment once the eccentricities have settled.
 
         The covariances of the discs are made to fit their residuals, so that priors, which are
@@ -160,7 +162,9 @@ class CalibrationProblem:
         index, last_px = _centre_of(names), np.array(self.size) - 1.0
         is_held, held_px = np.zeros(2, dtype=np.bool_), np.zeros(2)
         for _ in range(_HOLDINGS):
-            solution = adjust(_held_at(network, index[is_held], held_px[is_held]), start, ROBUST)
+            solution = adjust_network(
+                _held_at(network, index[is_held], held_px[is_held]), start, ROBUST
+            )
             start = solution.estimate
             centre_px = start.cameras[0, index]
             nearest_px = np.clip(centre_px, 0.0, last_px)
@@ -225,7 +229,7 @@ class CalibrationProblem:
             sds = np.full_like(sds, 0.1 * self.field.pitch_m)
         return PointPrior(nominal, np.eye(3) * sds[:, None] ** -2.0, bars)
 
-    def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CameraPrior:
+    def camera_prior(self, model: FrameCameraModel, camera: Camera) -> CalibrationPrior:
         """Return what is known of any camera: a principal point in the middle, small distortion."""
         width, height = self.size
         corner = 0.5 * math.hypot(width, height) / camera.mean_focal_px
@@ -234,7 +238,7 @@ class CalibrationProblem:
         for name in model.names:
             values.append(usual.get(name, getattr(camera, name) if name[0] == "f" else 0.0))
             sd.append(self._sd(name, camera, corner))
-        return CameraPrior(np.array([values]), np.array([sd]))
+        return CalibrationPrior(np.array([values]), np.array([sd]))
 
     def _sd(self, name: str, camera: Camera, corner: float) -> float:
         if name in ("fx", "fy"):
@@ -263,7 +267,7 @@ def _held_at(network: Network, index: IndexArray, values: FloatArray) -> Network
     """Return the network with some of the camera's parameters (k,) held at values."""
     known, sd = network.cameras.values.copy(), network.cameras.sd.copy()
     known[0, index], sd[0, index] = values, _HELD_SD
-    return replace(network, cameras=CameraPrior(known, sd))
+    return replace(network, cameras=CalibrationPrior(known, sd))
 
 
 def _determinant(moments: FloatArray) -> FloatArray:

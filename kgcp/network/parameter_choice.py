@@ -9,9 +9,9 @@ import numpy as np
 from scipy import stats
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
-from kgcp.network.adjust import ROBUST, adjust
+from kgcp.network.adjust import ROBUST, adjust_network
 from kgcp.network.calibration_records import LensModel
-from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, Unknowns
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.covariance import precision
 from kgcp.network.records import Estimate, Network, Observations, PointPrior
 from kgcp.network.start import refined_poses
@@ -59,7 +59,7 @@ def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) 
     return kept
 
 
-def _with(unknowns: Unknowns, addition: tuple[str, ...]) -> Unknowns:
+def _with(unknowns: NetworkUnknowns, addition: tuple[str, ...]) -> NetworkUnknowns:
     if addition == _ASPECT:
         return replace(unknowns, is_same_aspect=False)
     return replace(unknowns, terms=(*unknowns.terms, *addition))
@@ -114,7 +114,7 @@ class _CrossValidation:
         for fold in range(min(_FOLDS, len(views))):
             is_left_out = views % _FOLDS == fold
             start = _part_of_estimate(estimate, ~is_left_out)
-            values = adjust(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
+            values = adjust_network(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
             left = _part(judged, is_left_out).observations
             poses = [state.poses[view] for view in np.flatnonzero(is_left_out).tolist()]
             camera = state.model.camera(values)

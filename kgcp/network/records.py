@@ -67,7 +67,7 @@ class PointPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraPrior:
+class CalibrationPrior:
     """What is known beforehand of the parameters of the cameras."""
 
     values: FloatArray  # (c, p)
@@ -98,7 +98,7 @@ class Network:
     view_camera: IndexArray  # (v,): index of each photograph's camera
     observations: Observations
     points: PointPrior
-    cameras: CameraPrior
+    cameras: CalibrationPrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,11 +11,11 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.homography import homography_between, mapped
 from kgcp.geometry.pose import Pose
-from kgcp.network.adjust import PLAIN, adjust
+from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.equations import whitened
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import (
-    CameraPrior,
+    CalibrationPrior,
     Estimate,
     Network,
     Observations,
@@ -113,7 +113,7 @@ def refined_poses(
         np.zeros(len(poses), dtype=np.intp),
         observations,
         PointPrior(points, None),
-        CameraPrior(values, np.full_like(values, _KNOWN)),
+        CalibrationPrior(values, np.full_like(values, _KNOWN)),
     )
     start = Estimate(
         values,
@@ -121,7 +121,7 @@ def refined_poses(
         np.array([pose.translation_m for pose in poses]),
         points,
     )
-    solution = adjust(network, start, PLAIN)
+    solution = adjust_network(network, start, PLAIN)
     weights = np.ones(len(observations.view))
     squares = np.sum(whitened(network, solution.residuals, weights) ** 2, axis=1)
     costs = np.bincount(observations.view, squares, len(poses))

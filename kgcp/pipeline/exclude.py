@@ -10,13 +10,13 @@ from kgcp.errors import KgcpError, KgcpWarning
 from kgcp.io.formats.exclusions import Exclusion
 from kgcp.io.tables.detections import read_detections
 
-Row = tuple[str, str]
+FrameAndTarget = tuple[str, str]
 """Frame and target."""
 
 _SHOWN = 3  # names in a message
 
 
-def rows_of(table: Path) -> set[Row]:
+def rows_of(table: Path) -> set[FrameAndTarget]:
     """Return frame and target of all rows of a table of detections.
 
     Raises
@@ -29,8 +29,8 @@ def rows_of(table: Path) -> set[Row]:
 
 
 def excluded_rows(
-    exclusions: Iterable[Exclusion], rows: Mapping[str, set[Row]]
-) -> dict[str, tuple[Row, ...]]:
+    exclusions: Iterable[Exclusion], rows: Mapping[str, set[FrameAndTarget]]
+) -> dict[str, tuple[FrameAndTarget, ...]]:
     """Return for each flight what `Selection.excluded` is to be.
 
     Lines that mean nothing are told in a `KgcpWarning`: a slip would leave a bad point in.
@@ -45,7 +45,7 @@ def excluded_rows(
     KgcpError
         For a line that names no flight, but a frame that several have.
     """
-    chosen: dict[str, list[Row]] = {name: [] for name in rows}
+    chosen: dict[str, list[FrameAndTarget]] = {name: [] for name in rows}
     unknown = []
     for exclusion in exclusions:
         flights = [
@@ -66,7 +66,7 @@ def excluded_rows(
     return {name: tuple(sorted(set(pairs))) for name, pairs in chosen.items()}
 
 
-def _is_known(exclusion: Exclusion, rows: set[Row]) -> bool:
+def _is_known(exclusion: Exclusion, rows: set[FrameAndTarget]) -> bool:
     if exclusion.target:
         return (exclusion.frame, exclusion.target) in rows
     return any(frame == exclusion.frame for frame, _ in rows)

@@ -29,7 +29,7 @@ _RADIUS_SHARE = 0.03
 _WIDE_DEG = 100.0  # of the field of view, beyond which lenses are fisheyes
 
 
-class Grade(StrEnum):
+class CalibrationGrade(StrEnum):
     """What a calibration may be used for."""
 
     GOOD = "good"
@@ -63,7 +63,7 @@ class CalibrationNumbers:
 class CalibrationVerdict:
     """The grade, its reasons, and what to do."""
 
-    grade: Grade
+    grade: CalibrationGrade
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
 
@@ -144,7 +144,13 @@ def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Calibr
     """Return what a calibration is good for, why, and what would make it better."""
     unusable = _unusable(calibration, numbers)
     doubts = _doubts(calibration, numbers)
-    grade = Grade.UNUSABLE if unusable else Grade.LOOK if doubts else Grade.GOOD
+    grade = (
+        CalibrationGrade.UNUSABLE
+        if unusable
+        else CalibrationGrade.LOOK
+        if doubts
+        else CalibrationGrade.GOOD
+    )
     return CalibrationVerdict(grade, (*unusable, *doubts), _advice(calibration, numbers))
 
 

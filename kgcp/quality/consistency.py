@@ -19,7 +19,7 @@ from kgcp.quality.corrections import UNKNOWN_LIMITS, CorrectionEstimate, estimat
 from kgcp.quality.robust_gls import ErrorModel, find_outliers, whitened_products
 from kgcp.settings import VehicleSettings
 
-MIN_POINTS = 10
+LEAST_MEETINGS = 10
 _CORRELATIONS_S = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _FLOOR_M2 = 1e-12  # keeps a covariance that is zero along an axis invertible
 
@@ -79,7 +79,7 @@ def study_consistency(
         As `TargetPositions.positions`.
     """
     meetings = _meet(sightings, target_positions, poses, camera)
-    if len(meetings) < MIN_POINTS or target_positions.vehicle is None:
+    if len(meetings) < LEAST_MEETINGS or target_positions.vehicle is None:
         return None
     orientations = ExteriorOrientations.of(poses, target_positions.local_frame)
     equations = System.of(
@@ -92,7 +92,7 @@ def study_consistency(
         limits=UNKNOWN_LIMITS,
         least_scale=1.0,
     )
-    if np.count_nonzero(~outlier) < MIN_POINTS:
+    if np.count_nonzero(~outlier) < LEAST_MEETINGS:
         return None
     fitted, correlation_s = _adjust(
         np.array([meeting.time_s for meeting in meetings]), equations, ~outlier

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kgcp.errors import SettingError
 from kgcp.targets.layout import Ring, Target
 from kgcp.targets.rulers import across, down, ruler_mm
-from kgcp.targets.shapes import Artwork, Box, Circle, Layer, Point, Polyline, Shape, Text
+from kgcp.targets.shapes import Artwork, Box, Circle, Layer, Point, Polyline, Primitive, Text
 
 MARGIN = 0.125
 """White around the ring, of its diameter: the search looks at 0.08, blur and tilt take some."""
@@ -65,7 +65,7 @@ def draw_target(target: Target, plate: MountingPlate | None) -> Artwork:
         If the plate or its holes leave too little white.
     """
     radius_mm = margin_radius_mm(target)
-    shapes: list[Shape] = []
+    shapes: list[Primitive] = []
     if plate is None:
         box = Box(0.0, 0.0, 0.0, 0.0).grown(radius_mm)
     else:
@@ -100,7 +100,7 @@ def _check_plate(plate: MountingPlate, radius_mm: float) -> None:
             )
 
 
-def _draw_ring(ring: Ring) -> Iterator[Shape]:
+def _draw_ring(ring: Ring) -> Iterator[Primitive]:
     yield _disc(Layer.INK, (0.0, 0.0), ring.outer_diameter_m)
     yield _disc(Layer.WHITE, (0.0, 0.0), ring.inner_diameter_m)
     for x, y in 1e3 * ring.dot_centres_m():
@@ -111,7 +111,7 @@ def _disc(layer: Layer, centre_mm: Point, diameter_m: float) -> Circle:
     return Circle(layer, centre_mm, 500.0 * diameter_m, is_filled=True)
 
 
-def _draw_plate(plate: MountingPlate) -> Iterator[Shape]:
+def _draw_plate(plate: MountingPlate) -> Iterator[Primitive]:
     if plate.is_round:
         yield Circle(Layer.PLATE, (0.0, 0.0), 0.5 * plate.width_mm)
     else:
@@ -191,7 +191,7 @@ def _arrow(x: float, top: float, height: float) -> Polyline:
 
 def _legend(
     target: Target, box: Box, radius_mm: float, *, is_beside: bool
-) -> tuple[list[Shape], float]:
+) -> tuple[list[Primitive], float]:
     """Return rulers and words below the target, and where they end."""
     unit = _unit(box.width)
     lines = _words(target)

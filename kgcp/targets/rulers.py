@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kgcp.targets.shapes import Box, Layer, Point, Polyline, Shape, Text, filled_rectangle
+from kgcp.targets.shapes import Box, Layer, Point, Polyline, Primitive, Text, filled_rectangle
 
 _LENGTHS_MM = (1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0)
 _PIECES = 10
@@ -18,11 +18,13 @@ def ruler_mm(fits: Callable[[float], bool]) -> float:
     return next((length for length in _LENGTHS_MM if fits(length)), _LENGTHS_MM[-1])
 
 
-def across(corner: Point, length_mm: float, unit: float, *, is_marked: bool = True) -> list[Shape]:
+def across(
+    corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
+) -> list[Primitive]:
     """Return a ruler to the right of a point, which is its lower left corner."""
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - thick, x + length_mm, y)
-    shapes: list[Shape] = [
+    shapes: list[Primitive] = [
         filled_rectangle(Layer.RULER, Box(x + i * step, outline.top, x + (i + 1) * step, y))
         for i in range(0, _PIECES, 2)
     ]
@@ -38,11 +40,13 @@ def across(corner: Point, length_mm: float, unit: float, *, is_marked: bool = Tr
     return shapes
 
 
-def down(corner: Point, length_mm: float, unit: float, *, is_marked: bool = True) -> list[Shape]:
+def down(
+    corner: Point, length_mm: float, unit: float, *, is_marked: bool = True
+) -> list[Primitive]:
     """Return a ruler above a point, which is its lower left corner."""
     (x, y), step, thick = corner, length_mm / _PIECES, THICK_MM * unit
     outline = Box(x, y - length_mm, x + thick, y)
-    shapes: list[Shape] = [
+    shapes: list[Primitive] = [
         filled_rectangle(Layer.RULER, Box(x, y - (i + 1) * step, outline.right, y - i * step))
         for i in range(0, _PIECES, 2)
     ]

@@ -63,7 +63,7 @@ class Text:
     is_bold: bool = False
 
 
-Shape = Circle | Polyline | Text
+Primitive = Circle | Polyline | Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class Box:
         return float((dx * dx + dy * dy) ** 0.5)
 
 
-def _is_seen(shape: Shape, box: Box) -> bool:
+def _is_seen(shape: Primitive, box: Box) -> bool:
     """Whether a box shows some ink of a shape, not counting what lies on top of it."""
     if isinstance(shape, Circle):
         nearest = box.distance_to(*shape.centre_mm)
@@ -143,7 +143,7 @@ def filled_rectangle(layer: Layer, box: Box) -> Polyline:
 class Artwork:
     """All there is to print of one target, about its centre."""
 
-    shapes: tuple[Shape, ...]  # in painting order
+    shapes: tuple[Primitive, ...]  # in painting order
     box: Box  # what has to be on the paper
     white_mm: float = 0.0  # radius about the origin that has to be white paper
 
@@ -165,4 +165,4 @@ class Sheet:
     artwork: Artwork
     centre_mm: Point  # where the artwork's origin is on the sheet
     window: Box  # the part of the sheet that shows the artwork
-    marks: tuple[Shape, ...] = ()  # of the sheet itself
+    marks: tuple[Primitive, ...] = ()  # of the sheet itself

@@ -9,7 +9,7 @@ from enum import StrEnum
 from kgcp.errors import SettingError
 from kgcp.targets.artwork import crop_marks
 from kgcp.targets.rulers import THICK_MM, across, down
-from kgcp.targets.shapes import Artwork, Box, Shape, Sheet, Text
+from kgcp.targets.shapes import Artwork, Box, Primitive, Sheet, Text
 
 _MARGIN_MM = 10.0
 _TILE_MARGIN_MM = 15.0  # printers leave up to five white; the rest is for the marks
@@ -124,7 +124,7 @@ def _tiles(
             )
 
 
-def _tile_marks(cut: Box, words: str) -> Iterator[Shape]:
+def _tile_marks(cut: Box, words: str) -> Iterator[Primitive]:
     """Yield the marks around a tile: where to cut, which it is, and rulers."""
     yield from crop_marks(cut, _MARK_GAP_MM, _MARK_MM)
     foot = cut.bottom + _MARK_GAP_MM + THICK_MM

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from PIL import ExifTags, Image
 
 from kgcp.cli import main
-from kgcp.cli.calibrate import FORMATS, LENSES, OPERATORS, POINTS, RESPONSES
+from kgcp.cli.calibrate import FORMATS, LENSES, OPERATORS, POINT_MODELS, RESPONSES
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
@@ -302,7 +302,7 @@ def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 
 
 def test_the_choices_are_those_of_the_library() -> None:
-    assert list(PointModel) == list(POINTS)
+    assert list(PointModel) == list(POINT_MODELS)
     assert list(LensModel) == list(LENSES)
     assert list(Operator) == list(OPERATORS)
     assert list(Response) == list(RESPONSES)

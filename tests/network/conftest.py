@@ -12,7 +12,7 @@ from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.network.equations import computed
 from kgcp.network.frame_camera import FrameCameraModel
-from kgcp.network.records import CameraPrior, Estimate, Network, Observations, PointPrior
+from kgcp.network.records import CalibrationPrior, Estimate, Network, Observations, PointPrior
 
 SD_PX = 0.02
 CAMERA = Camera(1600, 1200, 1510.0, 1510.0, 811.0, 583.0, -0.11, 0.06)
@@ -74,7 +74,7 @@ def simulated(
         np.zeros(views, dtype=np.intp),
         observations,
         points or PointPrior(nominal, None),
-        CameraPrior(values, np.full_like(values, np.inf)),
+        CalibrationPrior(values, np.full_like(values, np.inf)),
     )
     truth = Estimate(values, np.array(rotations), np.array(translations), true_points)
     exact = SimulatedNetwork(network, truth)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.calibrate.jaicov import compare, read_network
-from kgcp.network.adjust import PLAIN, adjust
+from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.covariance import (
     fitting_covariances,
     observation_factor,
@@ -57,7 +57,7 @@ def test_slopes_are_those_of_the_projection(rng: np.random.Generator) -> None:
 
 def test_exact_discs_give_the_exact_camera(rng: np.random.Generator) -> None:
     made = simulated()
-    solution = adjust(made.network, made.start(rng))
+    solution = adjust_network(made.network, made.start(rng))
     assert np.allclose(solution.estimate.cameras, made.truth.cameras, rtol=1e-7, atol=1e-7)
     assert np.allclose(solution.estimate.translations, made.truth.translations, atol=1e-9)
 
@@ -67,7 +67,7 @@ def test_deviations_are_those_of_the_errors(rng: np.random.Generator) -> None:
     formal, clustered, pose, factors = [], [], [], []
     for _ in range(40):
         noisy = made.observed(rng)
-        solution = adjust(noisy.network, made.truth, PLAIN)
+        solution = adjust_network(noisy.network, made.truth, PLAIN)
         known = precision(noisy.network, solution)
         error = (solution.estimate.cameras - made.truth.cameras)[0]
         formal.append(error / np.sqrt(known.inverse.diagonal()))
@@ -90,7 +90,7 @@ def test_wrong_discs_are_rejected_whole(rng: np.random.Generator) -> None:
     places[wrong, 0] += 3.0
     observations = replace(noisy.network.observations, places=places)
     network = replace(noisy.network, observations=observations)
-    solution = adjust(network, noisy.start(rng))
+    solution = adjust_network(network, noisy.start(rng))
     assert not solution.is_used[wrong].any()
     assert solution.is_used.sum() >= len(places) - 17
     assert solution.estimate.cameras[0, 0] == pytest.approx(1510.0, abs=0.5)
@@ -102,7 +102,7 @@ def test_a_free_field_finds_its_own_shape(rng: np.random.Generator) -> None:
     bend[:, 2] = 0.0005 * rng.standard_normal(35)
     nominal = simulated().network.points.nominal
     exact = simulated(points=PointPrior(nominal, np.zeros((35, 3, 3))), displaced_m=bend)
-    solution = adjust(exact.network, replace(exact.start(rng), points=nominal))
+    solution = adjust_network(exact.network, replace(exact.start(rng), points=nominal))
     assert np.abs(solution.residuals).max() < 1e-5
     change = solution.estimate.points - nominal
     basis = inner_constraints(exact.network, nominal)
@@ -116,7 +116,7 @@ def test_a_bar_gives_a_free_field_its_scale(rng: np.random.Generator) -> None:
     bar = ScaleBar(0, 34, 1.02 * float(np.linalg.norm(nominal[34] - nominal[0])), 1e-6)
     prior = PointPrior(nominal, np.zeros((35, 3, 3)), (bar,))
     exact = simulated(points=prior)
-    solution = adjust(exact.network, exact.start(rng))
+    solution = adjust_network(exact.network, exact.start(rng))
     size = np.linalg.norm(solution.estimate.points[34] - solution.estimate.points[0])
     assert size == pytest.approx(bar.length, rel=1e-5)
 
@@ -126,8 +126,8 @@ def test_a_stiff_field_bends_no_further_than_its_prior_allows(rng: np.random.Gen
     nominal = simulated().network.points.nominal
     information = np.broadcast_to(np.eye(3) / 0.0002**2, (35, 3, 3))
     made = simulated(points=PointPrior(nominal, information), displaced_m=bend).observed(rng)
-    stiff = adjust(made.network, made.start(rng))
-    fixed = adjust(replace(made.network, points=PointPrior(nominal, None)), made.start(rng))
+    stiff = adjust_network(made.network, made.start(rng))
+    fixed = adjust_network(replace(made.network, points=PointPrior(nominal, None)), made.start(rng))
     assert np.sqrt(np.mean(stiff.residuals**2)) < 1.1 * SD_PX
     assert np.sqrt(np.mean(fixed.residuals**2)) > 10 * SD_PX
     assert observation_factor(made.network, stiff) == pytest.approx(1.0, abs=0.3)
@@ -147,7 +147,7 @@ def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
         own = [811.0, 583.0] + (places - [811.0, 583.0]) * stretch[view]
         observations = replace(noisy.network.observations, places=own)
         network = replace(noisy.network, observations=observations)
-        solution = adjust(network, made.truth)
+        solution = adjust_network(network, made.truth)
         known = precision(network, solution)
         formal = np.sqrt(known.variance_factor * known.inverse.diagonal())
         error = (solution.estimate.cameras - made.truth.cameras)[0]
@@ -162,7 +162,7 @@ def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
 def test_covariances_are_made_to_fit_the_residuals(rng: np.random.Generator) -> None:
     """Residuals that are too small scale them; what is too much is the same for all discs."""
     noisy = simulated().observed(rng)
-    solution = adjust(noisy.network, noisy.truth)
+    solution = adjust_network(noisy.network, noisy.truth)
     own = noisy.network.observations.cov
     assert fitting_covariances(noisy.network, solution, 9.0 * own) == pytest.approx(own, rel=0.1)
     stated = own * rng.uniform(0.01, 0.1, len(own))[:, None, None]
@@ -179,7 +179,7 @@ def test_groups_have_their_own_variance(rng: np.random.Generator) -> None:
     exact = computed(noisy.network, noisy.truth)
     places[half == 1] += (places - exact)[half == 1]
     network = replace(noisy.network, observations=replace(observations, places=places))
-    solution = adjust(network, noisy.truth, PLAIN)
+    solution = adjust_network(network, noisy.truth, PLAIN)
     redundancy = precision(network, solution).redundancy
     first, second = variance_components(network, solution, redundancy, half)
     assert 0.9 < first < 1.5  # the bad half has a say in the common solution
@@ -201,7 +201,7 @@ def test_a_published_adjustment_is_reproduced() -> None:
     disturbed = Estimate(
         start.cameras + 30.0 * published.sd, start.rotations, start.translations, start.points
     )
-    solution = adjust(network, disturbed, PLAIN)
+    solution = adjust_network(network, disturbed, PLAIN)
     result = compare(solution, precision(network, solution), published)
     assert len(network.observations.view) == 9972
     assert np.abs(result.values_in_sd).max() < 0.05

@@ -22,9 +22,9 @@ from kgcp.network.calibration_records import (
 )
 from kgcp.network.camera_network import CalibrationProblem
 from kgcp.network.frame_camera import FrameCameraModel
-from kgcp.network.records import CameraPrior
+from kgcp.network.records import CalibrationPrior
 from kgcp.quality.calibration_verdict import (
-    Grade,
+    CalibrationGrade,
     calibration_numbers,
     change_if_neglected,
     judge,
@@ -77,7 +77,7 @@ def test_a_good_calibration_is_called_good() -> None:
     result = calibrated(views(), lens=LensModel.AUTO)
     numbers = calibration_numbers(result)
     verdict = judge(result, numbers)
-    assert verdict.grade is Grade.GOOD, verdict.sentence
+    assert verdict.grade is CalibrationGrade.GOOD, verdict.sentence
     errors = [result.camera.fx - 1500.0, result.camera.cx - 811.0, result.camera.cy - 583.0]
     sd = numbers.sd[[0, 2, 3]]
     assert np.all(np.abs(errors) < 4.0 * sd)
@@ -110,7 +110,7 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
     result = calibrated(views(bend_m=bend_m), PointModel.FREE)
     numbers = calibration_numbers(result)
     verdict = judge(result, numbers)
-    assert verdict.grade is Grade.LOOK
+    assert verdict.grade is CalibrationGrade.LOOK
     assert "the field is not what it is said to be" in verdict.sentence
     assert 0.005 < numbers.rms_px < 0.03
     assert 0.1 < numbers.rms_fixed_px < 3.0
@@ -121,7 +121,7 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
 def test_frontal_photographs_determine_little_and_say_so() -> None:
     result = calibrated(views(tilt=0.005))
     verdict = judge(result, calibration_numbers(result))
-    assert verdict.grade is Grade.UNUSABLE
+    assert verdict.grade is CalibrationGrade.UNUSABLE
     assert any("Tilt the field" in sentence for sentence in verdict.advice)
     assert 0.0 < result.camera.cx < 1600.0
     assert 0.0 < result.camera.cy < 1200.0
@@ -143,17 +143,17 @@ def test_a_principal_point_that_runs_away_is_held_at_the_border_and_not_claimed(
     result = calibrated(made)
     assert result.camera.cx == border
     assert "cx" in result.undetermined
-    assert judge(result, calibration_numbers(result)).grade is Grade.UNUSABLE
+    assert judge(result, calibration_numbers(result)).grade is CalibrationGrade.UNUSABLE
     known_prior = CalibrationProblem.camera_prior
 
     def prior_at_border(
         problem: CalibrationProblem, model: FrameCameraModel, camera: Camera
-    ) -> CameraPrior:
+    ) -> CalibrationPrior:
         prior = known_prior(problem, model, camera)
         at = model.names.index("cx")
         values, sd = prior.values.copy(), prior.sd.copy()
         values[0, at], sd[0, at] = border, 1e-3
-        return CameraPrior(values, sd)
+        return CalibrationPrior(values, sd)
 
     monkeypatch.setattr(CalibrationProblem, "camera_prior", prior_at_border)
     fixed = calibrated(made).camera
@@ -202,7 +202,7 @@ def test_more_than_a_tenth_of_wrong_discs_make_it_unusable() -> None:
         made.append(replace(view, vectors=vectors))
     result = calibrated(made)
     verdict = judge(result, calibration_numbers(result))
-    assert verdict.grade is Grade.UNUSABLE
+    assert verdict.grade is CalibrationGrade.UNUSABLE
     assert "% of the discs do not fit" in verdict.sentence
 
 
@@ -218,14 +218,14 @@ def test_a_fisheye_is_told() -> None:
         made.append(replace(view, vectors=vectors))
     result = calibrated(made, lens=LensModel.RADIAL)
     verdict = judge(result, calibration_numbers(result))
-    assert verdict.grade is Grade.UNUSABLE
+    assert verdict.grade is CalibrationGrade.UNUSABLE
     assert "fisheye" in verdict.sentence
 
 
 def test_negatives_are_to_be_looked_at() -> None:
     result = calibrated(views(), lens=LensModel.AUTO)
     verdict = judge(result, calibration_numbers(result, DiscLight(0.07, 0.01, 0.0)))
-    assert verdict.grade is Grade.LOOK
+    assert verdict.grade is CalibrationGrade.LOOK
     assert "they look like negatives" in verdict.sentence
     assert any("no negatives" in text for text in verdict.advice)
 

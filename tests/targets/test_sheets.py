@@ -12,18 +12,20 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.targets.artwork import MountingPlate, draw_target, margin_radius_mm
 from kgcp.targets.code_design import chosen_targets, new_targets
 from kgcp.targets.layout import Ring, Target
-from kgcp.targets.shapes import Circle, Layer, Polyline, Shape, Text
+from kgcp.targets.shapes import Circle, Layer, Polyline, Primitive, Text
 from kgcp.targets.sheets import Paper, lay_out
 
 LARGE = TARGET_PLATE.target
 SMALL = Target(Ring("Südtor", 0.15, 0.075, 0.107, 0.021, (0.0, 40.0, 90.0, 255.0)))
 
 
-def discs_of(shapes: Sequence[Shape]) -> list[Circle]:
+def discs_of(shapes: Sequence[Primitive]) -> list[Circle]:
     return [shape for shape in shapes if isinstance(shape, Circle) and shape.is_filled]
 
 
-def lines_of(shapes: Sequence[Shape], layer: Layer, *, is_filled: bool = False) -> list[Polyline]:
+def lines_of(
+    shapes: Sequence[Primitive], layer: Layer, *, is_filled: bool = False
+) -> list[Polyline]:
     return [
         shape
         for shape in shapes
@@ -31,7 +33,7 @@ def lines_of(shapes: Sequence[Shape], layer: Layer, *, is_filled: bool = False) 
     ]
 
 
-def points(shape: Shape) -> list[tuple[float, float]]:
+def points(shape: Primitive) -> list[tuple[float, float]]:
     """Points of a shape's outline; of a text, the corners of what it may take at most."""
     if isinstance(shape, Circle):
         (x, y), r = shape.centre_mm, shape.radius_mm

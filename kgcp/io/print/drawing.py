@@ -23,7 +23,7 @@ from PIL import Image
 
 from kgcp.errors import SettingError
 from kgcp.io.print.typeface import fit_text, font
-from kgcp.targets.shapes import LINE_MM, Circle, Shape, Sheet, Text
+from kgcp.targets.shapes import LINE_MM, Circle, Primitive, Sheet, Text
 
 _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
@@ -110,7 +110,7 @@ def _figure(sheet: Sheet, dpi: int | None = None) -> Figure:
     return figure
 
 
-def _artist(figure: Figure, shape: Shape, transform: Transform) -> Artist:
+def _artist(figure: Figure, shape: Primitive, transform: Transform) -> Artist:
     """Add a shape to a figure."""
     if isinstance(shape, Text):
         words, size_mm = fit_text(shape)

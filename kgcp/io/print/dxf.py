@@ -9,7 +9,7 @@ from ezdxf import units
 from ezdxf.layouts import Modelspace
 
 from kgcp.io.print.typeface import CAP_HEIGHT, fit_text
-from kgcp.targets.shapes import Artwork, Circle, Layer, Shape, Text
+from kgcp.targets.shapes import Artwork, Circle, Layer, Primitive, Text
 
 _STYLE = "SANS"
 _COLOURS = {Layer.PLATE: 3, Layer.HOLES: 5, Layer.CROP: 8, Layer.WHITE: 1}  # AutoCAD's indices
@@ -35,7 +35,7 @@ def dxf_of(artwork: Artwork) -> bytes:
     return stream.getvalue().encode(drawing.output_encoding)
 
 
-def _add(space: Modelspace, shape: Shape) -> None:
+def _add(space: Modelspace, shape: Primitive) -> None:
     if isinstance(shape, Text):
         words, size_mm = fit_text(shape)
         place = shape.start_mm[0], -shape.start_mm[1]

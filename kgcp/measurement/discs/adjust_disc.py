@@ -17,7 +17,7 @@ from kgcp.measurement.discs.fit_disc import (
     DiscFit,
     DiscSample,
     DiscState,
-    Unknowns,
+    DiscUnknowns,
     fit_disc,
 )
 from kgcp.measurement.discs.pixel_choice import (
@@ -91,7 +91,7 @@ def outline_geometry(outline: DiscOutline) -> Geometry:
     return geometry_of(moments_of_ellipse(outline.ellipse))
 
 
-def adjust_disc_in_any_light(task: DiscTask, free: Unknowns, blur_px: float = 0.0) -> DiscFit:
+def adjust_disc_in_any_light(task: DiscTask, free: DiscUnknowns, blur_px: float = 0.0) -> DiscFit:
     """Adjust a disc, by light of second order where the edge of a shadow or of a spot crosses it.
 
     Raises
@@ -116,7 +116,7 @@ def is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
 
 
 def adjust_disc(
-    task: DiscTask, free: Unknowns, start: DiscState | None = None, blur_px: float = 0.0
+    task: DiscTask, free: DiscUnknowns, start: DiscState | None = None, blur_px: float = 0.0
 ) -> DiscFit:
     """Adjust a disc from its outline and a first blur, or from an earlier state.
 
@@ -159,7 +159,7 @@ def _adjust_on(
     limits: Censoring,
     index: IndexArray,
     state: DiscState,
-    free: Unknowns,
+    free: DiscUnknowns,
 ) -> DiscFit:
     sample = DiscSample.of(
         window,
@@ -180,7 +180,7 @@ def _start(
     index: IndexArray,
     geometry: Geometry,
     blur: Blur,
-    free: Unknowns,
+    free: DiscUnknowns,
 ) -> DiscState:
     """Return levels from the middle of the disc and the ground around it.
 
@@ -241,7 +241,7 @@ def _foreign(fit: DiscFit, window: DiscWindow, index: IndexArray) -> BoolArray |
     return np.asarray(grown.ravel() > 0)
 
 
-def check_fit(fit: DiscFit, outline: DiscOutline) -> None:
+def check_disc_fit(fit: DiscFit, outline: DiscOutline) -> None:
     """Refuse a fit that is not that of the outlined disc.
 
     Raises

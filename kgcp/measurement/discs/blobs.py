@@ -48,7 +48,7 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
     polarities : list of Polarity
     """
     octave = 0
-    image = eight_bit(grey) if min(grey.shape) >= _SMALLEST_FRAME else grey
+    image = stretched_to_bytes(grey) if min(grey.shape) >= _SMALLEST_FRAME else grey
     blobs: list[tuple[float, ...]] = []
     polarities: list[Polarity] = []
     while min(image.shape) >= (_SMALLEST_SIDE if octave else _SMALLEST_FRAME):
@@ -65,7 +65,7 @@ def find_blobs(grey: GreyArray) -> tuple[FloatArray, list[Polarity]]:
     return np.array(blobs, dtype=np.float64).reshape(-1, 5), polarities
 
 
-def eight_bit(grey: GreyArray) -> GreyArray:
+def stretched_to_bytes(grey: GreyArray) -> GreyArray:
     """Return an image as 0…255, stretched to all but the brightest thousandth if it is deeper."""
     if grey.dtype == np.uint8:
         return grey

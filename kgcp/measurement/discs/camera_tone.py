@@ -18,18 +18,18 @@ from kgcp.measurement.discs.adjust_disc import (
     DiscRejection,
     DiscTask,
     adjust_disc,
-    check_fit,
+    check_disc_fit,
     is_in_curved_light,
 )
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
     SHARPENING_PX,
-    CameraPrior,
     DiscFit,
     DiscState,
+    DiscUnknowns,
     NoFit,
-    Unknowns,
+    ProcessingPrior,
 )
 from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.discs.tone_curve import WAVES
@@ -68,7 +68,7 @@ class CameraTone:
 
     tone: Tone
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
-    known: CameraPrior | None = None
+    known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
 
 
@@ -97,9 +97,9 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     return CameraTone(best.tone, best.sharpening_px, known, blur_px)
 
 
-def unknowns_of(task: DiscTask, camera: CameraTone) -> Unknowns:
+def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
     """Return what is estimated of a disc."""
-    return Unknowns.of(
+    return DiscUnknowns.of(
         camera.tone,
         camera.known,
         sharpening_px=camera.sharpening_px,
@@ -139,8 +139,8 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     fits, clean = [], []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
-            fit = adjust_disc(task, Unknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
-            check_fit(fit, task.outline)
+            fit = adjust_disc(task, DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
+            check_disc_fit(fit, task.outline)
             fits.append(fit)
             is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
             if not is_burnt and not is_in_curved_light(fit, task):
@@ -174,12 +174,12 @@ def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFi
     return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
 
 
-def _without_bends(known: CameraPrior) -> CameraPrior:
+def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
     """Return what is known of the camera with bends that are hardly there."""
     precision = known.precision.copy()
     waves = np.arange(WAVES)
     precision[waves, waves] = _LITTLE_BENT**-2
-    return CameraPrior(known.mean, precision)
+    return ProcessingPrior(known.mean, precision)
 
 
 def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
@@ -249,14 +249,14 @@ def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
     return DiscState(vector)
 
 
-def _known_by(joint: JointFit) -> CameraPrior:
+def _known_by(joint: JointFit) -> ProcessingPrior:
     """Return what discs adjusted together say of the camera, as it may be off.
 
     Where they contradict each other more than their noise lets them, it is known so much worse.
     """
     cov = np.linalg.inv(joint.precision) * _excess(joint)
     cov += _LEAST_SD**2 * np.eye(len(cov))
-    return CameraPrior(joint.shared, np.asarray(np.linalg.inv(cov)))
+    return ProcessingPrior(joint.shared, np.asarray(np.linalg.inv(cov)))
 
 
 def _excess(joint: JointFit) -> float:

@@ -39,7 +39,7 @@ _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 _PRIOR_SD = {
     Row.BLUR_DIFFERENCE: 0.3,  # px²
     Row.BLUR_XY: 0.3,
-    Row.SLOPE_X: 0.1,  # at most: see `Unknowns.in_light`
+    Row.SLOPE_X: 0.1,  # at most: see `DiscUnknowns.in_light`
     Row.SLOPE_Y: 0.1,
     Row.WAVE_1: 0.3,
     Row.WAVE_2: 0.4,
@@ -72,21 +72,21 @@ class NoFit(Exception):  # noqa: N818 - the outcome of one disc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraPrior:
+class ProcessingPrior:
     """What is known of the camera beforehand, in the order of `CAMERA_ROWS`."""
 
     mean: FloatArray  # (4,)
     precision: FloatArray  # (4, 4)
 
     @classmethod
-    def usual(cls) -> CameraPrior:
+    def usual(cls) -> ProcessingPrior:
         """Return what is known of any camera."""
         sd = np.array([_PRIOR_SD[row] for row in CAMERA_ROWS])
         return cls(np.zeros(len(sd)), np.diag(sd**-2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unknowns:
+class DiscUnknowns:
     """What is estimated of a disc, and what is known beforehand."""
 
     tone: Tone
@@ -99,16 +99,16 @@ class Unknowns:
     def of(
         cls,
         tone: Tone,
-        camera: CameraPrior | None = None,
+        camera: ProcessingPrior | None = None,
         *,
         sharpening_px: float = 0.0,
         has_ink_slope: bool = False,
-    ) -> Unknowns:
+    ) -> DiscUnknowns:
         """Return the unknowns of a disc.
 
         Parameters
         ----------
-        camera : CameraPrior
+        camera : ProcessingPrior
             What other discs show of tone and sharpening; None: what is known of any camera.
         sharpening_px : float
             σ of the camera's unsharp mask [px]; 0: it does not sharpen.
@@ -120,7 +120,7 @@ class Unknowns:
         rows += (Row.SHARPENING,) if sharpening_px else ()
         rows += _INK_SLOPES if has_ink_slope else ()
         free = np.array(sorted(map(int, rows)))
-        known = camera or CameraPrior.usual()
+        known = camera or ProcessingPrior.usual()
         mean, precision = np.zeros(COUNT), np.zeros((COUNT, COUNT))
         for row, sd in _PRIOR_SD.items():
             precision[row, row] = sd**-2
@@ -132,7 +132,7 @@ class Unknowns:
         precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
         return cls(tone, sharpening_px, free, mean, precision)
 
-    def without_ink_slope(self) -> Unknowns:
+    def without_ink_slope(self) -> DiscUnknowns:
         """Return the unknowns without a gradient of the darker level's own."""
         return replace(self, rows=np.setdiff1d(self.rows, np.array(_INK_SLOPES)))
 
@@ -141,7 +141,7 @@ class Unknowns:
         """Whether the light is of second order."""
         return bool(self.rows[-1] == Row.CURVE_YY)
 
-    def with_curved_light(self) -> Unknowns:
+    def with_curved_light(self) -> DiscUnknowns:
         """Return the unknowns of a disc at the edge of a shadow: light of second order.
 
         The darker level gets a gradient of its own, whatever the disc's size: a step through the
@@ -151,7 +151,7 @@ class Unknowns:
         precision[_UNEVEN, _UNEVEN] = _UNEVEN_PRECISIONS
         return replace(self, rows=np.union1d(self.rows, _UNEVEN), precision=precision)
 
-    def in_light(self, radius_px: float, frame_px: int) -> Unknowns:
+    def in_light(self, radius_px: float, frame_px: int) -> DiscUnknowns:
         """Return the unknowns of a disc of some size in a photograph of some size.
 
         Light falls off over a photograph, and so by little over a small disc. Where the ground is
@@ -265,7 +265,7 @@ class DiscSample:
         index: IndexArray,
         state: DiscState,
         limits: Censoring,
-        free: Unknowns,
+        free: DiscUnknowns,
         *,
         is_dark: bool,
         radius_px: float,
@@ -319,7 +319,7 @@ class DiscFit:
     """The state of an adjustment."""
 
     sample: DiscSample
-    free: Unknowns
+    free: DiscUnknowns
     state: DiscState
     share: FloatArray  # (n,): white share
     levels: FloatArray  # (n,): modelled, before clipping
@@ -360,7 +360,7 @@ class DiscFit:
         return _noise(self.sample, self.share, self.levels)
 
 
-def fit_disc(sample: DiscSample, start: DiscState, free: Unknowns) -> DiscFit:
+def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFit:
     """Minimise the negative log-likelihood, until the noise is the one that residuals show.
 
     Raises
@@ -388,10 +388,10 @@ class _Linear(NamedTuple):
     jacobian: FloatArray  # (21, n)
 
 
-def fit_at(
+def disc_fit_at(
     sample: DiscSample,
     state: DiscState,
-    free: Unknowns,
+    free: DiscUnknowns,
     sd: FloatArray,
     linear: _Linear | None = None,
 ) -> DiscFit:
@@ -425,16 +425,16 @@ def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoi
 
 
 def _minimise(
-    sample: DiscSample, state: DiscState, free: Unknowns, sd: FloatArray, linear: _Linear
+    sample: DiscSample, state: DiscState, free: DiscUnknowns, sd: FloatArray, linear: _Linear
 ) -> DiscFit:
     """Take damped Gauss-Newton steps (Levenberg-Marquardt) from a state that is linearised."""
-    fit, damping = fit_at(sample, state, free, sd, linear), _DAMPING
+    fit, damping = disc_fit_at(sample, state, free, sd, linear), _DAMPING
     total = fit.misfit.total + free.penalty(fit.state.vector)
     for _ in range(_STEPS):
         step, promised = _step(fit, damping)
         if promised < _ENOUGH:
             break
-        trial = fit_at(sample, fit.state.moved(step, free.tone), free, sd)
+        trial = disc_fit_at(sample, fit.state.moved(step, free.tone), free, sd)
         trial_total = trial.misfit.total + free.penalty(trial.state.vector)
         if trial_total <= total:
             fit, total, damping = trial, trial_total, max(0.1 * damping, _DAMPING)

@@ -15,13 +15,13 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.discs.disc_levels import COUNT
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
-    CameraPrior,
     DiscFit,
     DiscSample,
     DiscState,
+    DiscUnknowns,
     NoFit,
-    Unknowns,
-    fit_at,
+    ProcessingPrior,
+    disc_fit_at,
     noise_at,
 )
 from kgcp.measurement.image_model.photometry import Tone
@@ -72,8 +72,8 @@ def adjust_together(
     NoFit
         If the equations cannot be solved.
     """
-    usual = CameraPrior.usual()
-    free = Unknowns.of(
+    usual = ProcessingPrior.usual()
+    free = DiscUnknowns.of(
         tone,
         replace(usual, precision=np.zeros_like(usual.precision)),
         sharpening_px=sharpening_px,
@@ -96,8 +96,8 @@ def adjust_together(
 def _minimised(
     samples: Sequence[DiscSample],
     states: Sequence[DiscState],
-    free: Unknowns,
-    usual: CameraPrior,
+    free: DiscUnknowns,
+    usual: ProcessingPrior,
     sds: Sequence[FloatArray],
 ) -> list[DiscFit]:
     """Take damped Gauss-Newton steps of all discs together.
@@ -108,7 +108,7 @@ def _minimised(
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
         return [
-            fit_at(sample, state, free.in_light(sample.radius_px, sample.window.frame_px), sd)
+            disc_fit_at(sample, state, free.in_light(sample.radius_px, sample.window.frame_px), sd)
             for sample, state, sd in zip(samples, places, sds, strict=True)
         ]
 
@@ -138,7 +138,7 @@ def _own_total(fit: DiscFit) -> float:
     return fit.misfit.total + fit.free.penalty(fit.state.vector)
 
 
-def _total(fits: Sequence[DiscFit], usual: CameraPrior) -> float:
+def _total(fits: Sequence[DiscFit], usual: ProcessingPrior) -> float:
     off = fits[0].state.vector[_SHARED] - usual.mean
     return sum(_own_total(fit) for fit in fits) + 0.5 * float(off @ usual.precision @ off)
 
@@ -168,7 +168,7 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
 
 
 def _steps(
-    fits: Sequence[DiscFit], usual: CameraPrior, damping: float
+    fits: Sequence[DiscFit], usual: ProcessingPrior, damping: float
 ) -> tuple[list[FloatArray], float]:
     """Return a step (21,) of every disc, and the gain that they promise together."""
     free = fits[0].free

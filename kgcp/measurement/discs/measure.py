@@ -15,12 +15,17 @@ from kgcp.measurement.discs.adjust_disc import (
     DiscRejection,
     DiscTask,
     adjust_disc_in_any_light,
-    check_fit,
+    check_disc_fit,
     geometry_of,
     outline_geometry,
 )
 from kgcp.measurement.discs.affine_model import NO_INNER, Geometry
-from kgcp.measurement.discs.camera_tone import CameraTone, first_blur_px, learn_tone, unknowns_of
+from kgcp.measurement.discs.camera_tone import (
+    CameraTone,
+    first_blur_px,
+    learn_tone,
+    unknowns_of_disc,
+)
 from kgcp.measurement.discs.comparison import measure_by_centroid, measure_by_gaussian
 from kgcp.measurement.discs.covariance import (
     DiscScatter,
@@ -147,8 +152,10 @@ def _measured(
 
 def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] | DiscMiss:
     try:
-        fit = adjust_disc_in_any_light(task, unknowns_of(task, camera), first_blur_px(task, camera))
-        check_fit(fit, task.outline)
+        fit = adjust_disc_in_any_light(
+            task, unknowns_of_disc(task, camera), first_blur_px(task, camera)
+        )
+        check_disc_fit(fit, task.outline)
         return (fit, scatter_of(fit)) if not len(task.inner) else _with_ring_unknowns(fit)
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)

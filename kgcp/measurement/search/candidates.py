@@ -12,7 +12,7 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.measurement.search.code_signal import CodeMatch
-from kgcp.measurement.search.outlines import Seeds, find_outlines, find_seeds
+from kgcp.measurement.search.outlines import Seeds, find_seeds, track_outlines
 from kgcp.measurement.search.pyramid import build_pyramid
 from kgcp.measurement.search.sampling import sample_ellipses
 from kgcp.measurement.search.template_match import match_templates
@@ -54,7 +54,7 @@ class Refusal:
 def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
     """Return the outlines of all dark rings in a frame that may be a target's."""
     pyramid = build_pyramid(grey)
-    return find_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
+    return track_outlines(pyramid, find_seeds(pyramid, settings.min_radius_px))
 
 
 def find_rings_at(
@@ -73,7 +73,7 @@ def find_rings_at(
     seeds = Seeds(centres_px - low, radii_px, np.ones(len(radii_px)))
     return tuple(
         replace(outline, x=outline.x + float(low[0]), y=outline.y + float(low[1]))
-        for outline in find_outlines(build_pyramid(window), seeds)
+        for outline in track_outlines(build_pyramid(window), seeds)
     )
 
 

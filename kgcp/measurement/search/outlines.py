@@ -112,7 +112,7 @@ def find_seeds(pyramid: Pyramid, min_radius_px: float) -> Seeds:
     return Seeds(centres, radii, contrasts).chosen(kept)
 
 
-def find_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
+def track_outlines(pyramid: Pyramid, seeds: Seeds) -> tuple[Ellipse, ...]:
     """Track the outer edge of every seed's ring and fit an ellipse to it.
 
     Twice: the centre of a large ring is known to some pixels at first.

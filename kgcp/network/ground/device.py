@@ -24,10 +24,10 @@ from kgcp.network.ground.pose_adjustment import adjusted_pose
 from kgcp.network.ground.pose_hypotheses import three_point_poses
 from kgcp.network.ground.resection import NoPoseError
 
-MIN_MARGIN = 3.0
+DEVICE_MARGIN = 3.0
 """RMS of the next best permutation over that of the best, from which on the best counts."""
 
-MIN_POINTS, MOST_POINTS = 4, 8
+LEAST_POINTS, MOST_POINTS = 4, 8
 _FARTHEST_M = 1000.0
 _ALIKE = 0.03  # of the device's size: distances that differ by less are the same
 _FOCALS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts, in standard deviations of the logarithm
@@ -75,8 +75,8 @@ def require_distinct(points_m: FloatArray) -> None:
         all points to places of others.
     """
     count = len(points_m)
-    if not MIN_POINTS <= count <= MOST_POINTS:
-        raise SettingError("device", f"has {count} points", f"give {MIN_POINTS} to {MOST_POINTS}")
+    if not LEAST_POINTS <= count <= MOST_POINTS:
+        raise SettingError("device", f"has {count} points", f"give {LEAST_POINTS} to {MOST_POINTS}")
     if not np.abs(points_m).max() <= _FARTHEST_M:
         raise SettingError(
             "device", f"has a point farther than {_FARTHEST_M:g} m", "give positions in metres"
@@ -141,7 +141,7 @@ def orient_by_device(
     rms, names, pose, cov = fits[0]
     floor = math.sqrt(float(np.mean(np.trace(pixel_cov, axis1=1, axis2=2))) / 2.0)
     margin = fits[1][0] / max(rms, floor) if len(fits) > 1 else math.inf
-    if margin < MIN_MARGIN:
+    if margin < DEVICE_MARGIN:
         raise NoPoseError(
             f"two permutations of the device's points fit alike (margin {margin:.1f})"
         )

@@ -34,7 +34,7 @@ from kgcp.network.ground.space_circle import (
     outline_noise,
 )
 
-MIN_FRAMES = 2
+LEAST_FRAMES = 2
 """Frames with fewer than which a circle has no place: the rays of one do not meet."""
 
 _MOST_STEPS = 60
@@ -105,7 +105,7 @@ def place_circle(
     camera : Camera
         Its lens acts on every point of the outline.
     views : CircleViews
-        Of at least `MIN_FRAMES` frames from different places.
+        Of at least `LEAST_FRAMES` frames from different places.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def place_circle(
     if other is not None and other.cost < best.cost:
         best, other = other, best
         mirrored = best.circle.mirrored(views.camera_m[best.is_used])
-    if np.count_nonzero(best.is_used) < max(MIN_FRAMES, _LEAST_KEPT * len(views)):
+    if np.count_nonzero(best.is_used) < max(LEAST_FRAMES, _LEAST_KEPT * len(views)):
         used = int(np.count_nonzero(best.is_used))
         raise NoCircleError(f"only {used} of {len(views)} frames agree with each other")
     if other is None or _is_same(best.circle, other.circle):
@@ -272,7 +272,7 @@ def _without_outliers(
     for _ in range(_ROBUST_ROUNDS):
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
         kept = chi2 <= _REJECTED_CHI2 * scale
-        if np.array_equal(kept, used) or np.count_nonzero(kept) < MIN_FRAMES:
+        if np.array_equal(kept, used) or np.count_nonzero(kept) < LEAST_FRAMES:
             break
         used = kept
         moved = _minimised(camera, views, circle, covs, used.astype(np.float64))

@@ -21,8 +21,8 @@ from kgcp.report.bias.wording import (
 )
 
 
-class Grade(IntEnum):
-    """Grade of a flight; the worst of all findings counts."""
+class FlightGrade(IntEnum):
+    """FlightGrade of a flight; the worst of all findings counts."""
 
     GOOD = 0
     LOOK = 1
@@ -59,7 +59,7 @@ LIMITS = Limits()
 class Finding:
     """One sentence of the verdict."""
 
-    grade: Grade  # what it makes of the flight; `GOOD` where it only informs
+    grade: FlightGrade  # what it makes of the flight; `GOOD` where it only informs
     text: str
     section: str  # where the page shows it: the id of a section
 
@@ -71,7 +71,7 @@ class Verdict:
     findings: tuple[Finding, ...]
 
     @property
-    def grade(self) -> Grade:
+    def grade(self) -> FlightGrade:
         """The worst grade of the findings."""
         return max(finding.grade for finding in self.findings)
 
@@ -103,16 +103,16 @@ def _accuracy(numbers: BiasNumbers) -> Finding:
     text = f"Distance error (RMS) over {count} {frames}: {'; '.join(parts)}."
     if numbers.total.percent.rms > LIMITS.unusable_rms_percent:
         return Finding(
-            Grade.UNUSABLE,
+            FlightGrade.UNUSABLE,
             f"{text} That is above {LIMITS.unusable_rms_percent:g} %: something is wrong with"
             " target, camera, times, reference or exposure.",
             "error",
         )
     if count < LIMITS.min_frames:
         return Finding(
-            Grade.LOOK, f"{text} Fewer than {LIMITS.min_frames} frames say little.", "error"
+            FlightGrade.LOOK, f"{text} Fewer than {LIMITS.min_frames} frames say little.", "error"
         )
-    return Finding(Grade.GOOD, text, "error")
+    return Finding(FlightGrade.GOOD, text, "error")
 
 
 def _rms(row: RangeRow) -> str:
@@ -121,17 +121,17 @@ def _rms(row: RangeRow) -> str:
 
 def _bias(numbers: BiasNumbers) -> Finding:
     if numbers.total.percent.count == 1:
-        return Finding(Grade.LOOK, "One frame says nothing about bias.", "error")
+        return Finding(FlightGrade.LOOK, "One frame says nothing about bias.", "error")
     if not numbers.biased:
         is_stated = numbers.total.sd_reference_percent is not None
         beyond = "noise and the reference's own errors" if is_stated else "noise"
         text = f"No bias beyond {beyond}: the mean error is {_mean(numbers.total)}."
-        return Finding(Grade.GOOD, text, "error")
+        return Finding(FlightGrade.GOOD, text, "error")
     sides = [(row, "long" if row.percent.mean > 0.0 else "short") for row in numbers.biased]
     parts = [f"too {side} {row.label}, on average by {_mean(row)}" for row, side in sides]
     material = any(abs(row.percent.mean) >= LIMITS.mean_percent for row in numbers.biased)
     text = f"Biased: distances are measured {'; '.join(parts)}."
-    return Finding(Grade.LOOK if material else Grade.GOOD, text, "error")
+    return Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "error")
 
 
 def _mean(row: RangeRow) -> str:
@@ -146,14 +146,14 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
     regression = numbers.regression
     if regression is None:
         text = "Scale and offset cannot be told apart: too few frames, or distances too alike."
-        yield Finding(Grade.LOOK, text, "causes")
+        yield Finding(FlightGrade.LOOK, text, "causes")
         return
     basic = [term for term in regression.terms if term.name in {"scale", "offset_m"}]
     if not any(term.is_significant for term in basic):
         values = " and ".join(
             f"{LABELS[term.name]} {value_of(term)}{_allowed(term, numbers)}" for term in basic
         )
-        yield Finding(Grade.GOOD, f"Neither is significant: {values}.", "causes")
+        yield Finding(FlightGrade.GOOD, f"Neither is significant: {values}.", "causes")
     large = {"scale": 0.01 * LIMITS.scale_percent, "offset_m": LIMITS.offset_m}
     for term in regression.terms:
         if term.name in large and term.is_significant:
@@ -162,13 +162,17 @@ def _causes(numbers: BiasNumbers) -> Iterator[Finding]:
             allowed = reference_allows(term, numbers)
             if allowed is not None:
                 text += f" Errors of the reference allow {allowed}."
-            yield Finding(Grade.LOOK if material else Grade.GOOD, text, "causes")
+            yield Finding(FlightGrade.LOOK if material else FlightGrade.GOOD, text, "causes")
         elif term.name == "edge_curvature_px2":
-            yield Finding(Grade.LOOK, meaning_of(term), "causes")
+            yield Finding(FlightGrade.LOOK, meaning_of(term), "causes")
     material = (
         regression.is_exposure_significant and regression.exposure_share >= LIMITS.exposure_share
     )
-    yield Finding(Grade.LOOK if material else Grade.GOOD, exposure_sentence(regression), "exposure")
+    yield Finding(
+        FlightGrade.LOOK if material else FlightGrade.GOOD,
+        exposure_sentence(regression),
+        "exposure",
+    )
 
 
 def _allowed(term: Term, numbers: BiasNumbers) -> str:
@@ -186,7 +190,7 @@ def _reexposure(reexposed: Sequence[Reexposed]) -> Iterator[Finding]:
         f"Measured again with grey values × {' and × '.join(f'{gain:g}' for gain in GAINS)},"
         f" distances change by {rms:.3f} % (RMS of {len(changes)}; {lost} lost)."
     )
-    grade = Grade.LOOK if rms > LIMITS.reexposure_percent else Grade.GOOD
+    grade = FlightGrade.LOOK if rms > LIMITS.reexposure_percent else FlightGrade.GOOD
     yield Finding(grade, text, "reexposure")
 
 
@@ -198,14 +202,14 @@ def _scatter(numbers: BiasNumbers) -> Iterator[Finding]:
     spread = regression.scatter
     if spread > LIMITS.standardised_high:
         yield Finding(
-            Grade.LOOK,
+            FlightGrade.LOOK,
             f"Residuals scatter {spread:.1f} times as much as their reported standard deviations"
             " say: those of trajectory and reference poses may be too small.",
             "standardised",
         )
     elif spread < LIMITS.standardised_low:
         yield Finding(
-            Grade.GOOD,
+            FlightGrade.GOOD,
             f"Residuals scatter only {spread:.2f} times as much as their reported standard"
             " deviations say: those of trajectory and reference poses may be too large.",
             "standardised",
@@ -219,11 +223,11 @@ def _losses(numbers: BiasNumbers) -> Iterator[Finding]:
     if not outliers + misplaced:
         return
     share = (outliers + misplaced) / (numbers.total.percent.count + misplaced)
-    grade = Grade.GOOD
+    grade = FlightGrade.GOOD
     if share > LIMITS.unusable_lost_share:
-        grade = Grade.UNUSABLE
+        grade = FlightGrade.UNUSABLE
     elif share > LIMITS.lost_share:
-        grade = Grade.LOOK
+        grade = FlightGrade.LOOK
     parts = []
     if misplaced:
         parts.append(
@@ -248,7 +252,7 @@ def _detection(numbers: BiasNumbers) -> Iterator[Finding]:
     share = numbers.detected / numbers.expected_visible
     kind = "the target fully in view" if numbers.attitudes_agree else "a reference pose"
     yield Finding(
-        Grade.GOOD if share >= LIMITS.detection_rate else Grade.LOOK,
+        FlightGrade.GOOD if share >= LIMITS.detection_rate else FlightGrade.LOOK,
         f"Detected in {numbers.detected} of {numbers.expected_visible} frames with {kind}"
         f" ({100.0 * share:.1f} %).",
         "rate",
@@ -267,10 +271,10 @@ def _reservations(numbers: BiasNumbers) -> Iterator[Finding]:
         stated_m = [sd_m for sd_m in sds_m if sd_m is not None]
         if stated_m:
             text += f", measured ones to {1000.0 * median(stated_m):.2g} mm"
-        yield Finding(Grade.GOOD, f"{text} (median standard deviations).", "error")
+        yield Finding(FlightGrade.GOOD, f"{text} (median standard deviations).", "error")
     if not numbers.attitudes_agree:
         yield Finding(
-            Grade.LOOK,
+            FlightGrade.LOOK,
             "The reference attitudes do not lead to the measured points: check omega, phi, kappa;"
             " distances do not depend on them.",
             "left-out",

@@ -13,9 +13,9 @@ from kgcp.geometry.circle_image import Circles3D
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.quality.calibration_verdict import (
+    CalibrationGrade,
     CalibrationNumbers,
     CalibrationVerdict,
-    Grade,
     change_if_neglected,
 )
 from kgcp.quality.eccentricity import EccentricitySummary, summarise_eccentricity
@@ -24,7 +24,11 @@ from kgcp.quality.number_text import minus
 from kgcp.report.html_page import embedded_pictures, page_template
 
 _PIXELS = 4  # the first parameters are lengths in pixels
-_CLASSES = {Grade.GOOD: "good", Grade.LOOK: "look", Grade.UNUSABLE: "unusable"}
+_CLASSES = {
+    CalibrationGrade.GOOD: "good",
+    CalibrationGrade.LOOK: "look",
+    CalibrationGrade.UNUSABLE: "unusable",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

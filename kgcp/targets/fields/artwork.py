@@ -18,7 +18,7 @@ from kgcp.targets.shapes import (
     Circle,
     Layer,
     Polyline,
-    Shape,
+    Primitive,
     Text,
     filled_rectangle,
 )
@@ -51,7 +51,7 @@ def draw_field(field: AnyField) -> Artwork:
     (left, top), (right, bottom) = (points.min(axis=0) - middle), (points.max(axis=0) - middle)
     board = Box(float(left), float(top), float(right), float(bottom)).grown(_reach_mm(field))
     disc, ground = Layer.INK, Layer.WHITE
-    shapes: list[Shape] = []
+    shapes: list[Primitive] = []
     if field.polarity is FieldPolarity.BRIGHT:
         disc, ground = Layer.WHITE, Layer.INK
         shapes.append(filled_rectangle(Layer.INK, board))
@@ -98,7 +98,7 @@ def _described(field: AnyField) -> str:
     return f"{field.name}: {len(field.points)} discs{coded}"
 
 
-def _codes(field: PointField, layer: Layer, centres_mm: FloatArray) -> Iterator[Shape]:
+def _codes(field: PointField, layer: Layer, centres_mm: FloatArray) -> Iterator[Primitive]:
     """Yield the sectors of all codes that have the discs' brightness, neighbours as one."""
     for point, centre_mm in zip(field.points, centres_mm, strict=True):
         if field.code is None or point.code is None:

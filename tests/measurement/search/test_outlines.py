@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import GreyArray
-from kgcp.measurement.search.outlines import find_outlines, find_seeds, non_max_suppression
+from kgcp.measurement.search.outlines import find_seeds, non_max_suppression, track_outlines
 from kgcp.measurement.search.pyramid import build_pyramid, factor_of
 
 SUPER = 8  # factor by which the drawing is larger
@@ -56,7 +56,7 @@ def test_a_ring_of_any_size_is_seeded_and_followed(radius: float) -> None:
     apart = np.hypot(*(seeds.centres_px - centre).T)
     assert np.any((apart < 0.3 * radius) & (np.abs(seeds.radii_px / radius - 1.0) < 0.3))
     outlines = [
-        outline for outline in find_outlines(pyramid, seeds) if outline.mean_radius > 0.7 * radius
+        outline for outline in track_outlines(pyramid, seeds) if outline.mean_radius > 0.7 * radius
     ]
     assert len(outlines) == 1
     assert math.hypot(outlines[0].x - centre[0], outlines[0].y - centre[1]) < 0.3
@@ -68,7 +68,7 @@ def test_an_oblique_ring_with_a_hidden_quarter_keeps_its_axes(angle_deg: float) 
     frame = ring_frame((120.6, 99.2), (52.0, 39.0), angle_deg)
     cv2.ellipse(frame, (121, 99), (75, 75), 0.0, 20.0, 100.0, 115.0, -1)
     pyramid = build_pyramid(frame)
-    largest = max(find_outlines(pyramid, find_seeds(pyramid, 6.0)), key=lambda outline: outline.a)
+    largest = max(track_outlines(pyramid, find_seeds(pyramid, 6.0)), key=lambda outline: outline.a)
     assert (largest.x, largest.y) == pytest.approx((120.6, 99.2), abs=1.5)
     assert (largest.a, largest.b) == pytest.approx((52.0, 39.0), rel=0.05)
     assert math.cos(largest.angle_rad - math.radians(angle_deg)) ** 2 > 0.98

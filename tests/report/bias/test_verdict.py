@@ -11,7 +11,7 @@ from kgcp.quality.bias_causes import Term
 from kgcp.quality.bias_study import BiasStudy, Comparison, ReferenceSds
 from kgcp.report.bias.numbers import BiasNumbers, bias_numbers
 from kgcp.report.bias.reexposure import Reexposed
-from kgcp.report.bias.verdict import Grade, assess
+from kgcp.report.bias.verdict import FlightGrade, assess
 from kgcp.report.bias.wording import meaning_of, signed_amount
 
 Compare = Callable[..., Comparison]
@@ -50,7 +50,7 @@ def fly(compare: Compare, study: Study) -> Fly:
     return flown
 
 
-def texts(numbers: BiasNumbers, grade: Grade | None = None) -> str:
+def texts(numbers: BiasNumbers, grade: FlightGrade | None = None) -> str:
     findings = assess(numbers).findings
     return "\n".join(finding.text for finding in findings if grade in {None, finding.grade})
 
@@ -84,7 +84,7 @@ def test_numbers_are_those_of_the_study(compare: Compare, study: Study) -> None:
 
 def test_a_flight_that_is_as_reported_is_good(fly: Fly) -> None:
     numbers = fly()
-    assert assess(numbers).grade is Grade.GOOD
+    assert assess(numbers).grade is FlightGrade.GOOD
     assert assess(numbers).sentences[0] == "Good."
     assert numbers.standardised is not None
     assert numbers.standardised.sd == pytest.approx(1.0, abs=0.25)
@@ -93,10 +93,10 @@ def test_a_flight_that_is_as_reported_is_good(fly: Fly) -> None:
 
 
 def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
-    by_scale = texts(fly(lambda d: 0.004 * d), Grade.LOOK)
+    by_scale = texts(fly(lambda d: 0.004 * d), FlightGrade.LOOK)
     assert "focal length" in by_scale
     assert "lever arm" not in by_scale
-    by_offset = texts(fly(lambda d: np.full_like(d, -0.08)), Grade.LOOK)
+    by_offset = texts(fly(lambda d: np.full_like(d, -0.08)), FlightGrade.LOOK)
     assert "lever arm" in by_offset
     assert "focal length" not in by_offset
     assert "too short" in by_offset
@@ -104,23 +104,23 @@ def test_focal_length_and_lever_arm_are_named(fly: Fly) -> None:
 
 def test_what_is_significant_but_small_does_not_spoil_a_flight(fly: Fly) -> None:
     numbers = fly(lambda d: np.full_like(d, 0.004), sd_m=0.001, noise_m=0.001)
-    assert "lever arm" in texts(numbers, Grade.GOOD)
-    assert assess(numbers).grade is Grade.GOOD
+    assert "lever arm" in texts(numbers, FlightGrade.GOOD)
+    assert assess(numbers).grade is FlightGrade.GOOD
 
 
 def test_a_flight_of_rubbish_is_not_usable(fly: Fly) -> None:
     numbers = fly(lambda d: 0.03 * d * np.sin(d))
-    assert assess(numbers).grade is Grade.UNUSABLE
-    assert assess(numbers).findings[0].grade is Grade.UNUSABLE
+    assert assess(numbers).grade is FlightGrade.UNUSABLE
+    assert assess(numbers).findings[0].grade is FlightGrade.UNUSABLE
 
 
 def test_standard_deviations_that_are_too_small_are_found(fly: Fly) -> None:
     assert "times as much as their reported standard deviations" in texts(
-        fly(sd_m=0.005), Grade.LOOK
+        fly(sd_m=0.005), FlightGrade.LOOK
     )
     too_large = fly(sd_m=0.1)
     assert "may be too large" in texts(too_large)
-    assert assess(too_large).grade is Grade.GOOD
+    assert assess(too_large).grade is FlightGrade.GOOD
 
 
 def test_distances_that_follow_the_grey_values_are_found(fly: Fly) -> None:
@@ -129,9 +129,9 @@ def test_distances_that_follow_the_grey_values_are_found(fly: Fly) -> None:
 
     numbers = fly()
     steady = assess(numbers, again(0.01, -0.02, None))
-    assert steady.grade is Grade.GOOD
+    assert steady.grade is FlightGrade.GOOD
     assert "change by 0.016 % (RMS of 2; 1 lost)" in "\n".join(steady.sentences)
-    assert assess(numbers, again(0.5, 0.01)).grade is Grade.LOOK
+    assert assess(numbers, again(0.5, 0.01)).grade is FlightGrade.LOOK
 
 
 def test_outliers_and_misses_are_counted(fly: Fly) -> None:
@@ -141,7 +141,7 @@ def test_outliers_and_misses_are_counted(fly: Fly) -> None:
     assert numbers.regression is not None
     assert np.flatnonzero(numbers.regression.outlier).tolist() == [0, 1, 2, 3, 4, 5]
     assert "6 outliers" in texts(numbers)
-    assert "Detected in 50 of 80" in texts(fly(found=50), Grade.LOOK)
+    assert "Detected in 50 of 80" in texts(fly(found=50), FlightGrade.LOOK)
 
 
 def test_a_constant_offset_is_called_a_bias_and_noise_is_not(
@@ -189,7 +189,7 @@ def test_an_influence_of_exposure_is_named(compare: Compare, study: Study) -> No
     slope = numbers.influences[0].residual
     assert slope is not None
     assert slope.probability < 1e-6
-    assert "follows the exposure (level of white)" in texts(numbers, Grade.LOOK)
+    assert "follows the exposure (level of white)" in texts(numbers, FlightGrade.LOOK)
 
 
 def test_rounding_is_not_an_exposure_that_varies(compare: Compare, study: Study) -> None:
@@ -199,7 +199,7 @@ def test_rounding_is_not_an_exposure_that_varies(compare: Compare, study: Study)
 
 def test_reservations_are_spoken(compare: Compare, study: Study) -> None:
     numbers = bias_numbers(study(compare(30.0, 0.1), attitudes_agree=False))
-    assert "check omega, phi, kappa" in texts(numbers, Grade.LOOK)
+    assert "check omega, phi, kappa" in texts(numbers, FlightGrade.LOOK)
     assert "One frame says nothing about bias." in texts(numbers)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
-from kgcp.georef.crs import FARTHEST, FLIGHT_TOML, geographic_of, parse_crs
+from kgcp.georef.crs import CRS_KEY, FARTHEST, geographic_of, parse_crs
 from kgcp.georef.local_frame import CrsTransform, LocalFrame
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations.records import (
@@ -149,7 +149,7 @@ def _moved(
             "has coordinates of its own CRS, but flight.toml has none",
             'name the flight\'s, for example crs = "EPSG:25831"',
         )
-    transform = CrsTransform.to(crs, local_frame, source.position[0], FLIGHT_TOML)
+    transform = CrsTransform.to(crs, local_frame, source.position[0], CRS_KEY)
     turn = np.array([transform.axes(point) for point in source.position])
     sd = source.sd_position_m
     if sd is not None:  # the axes turn; what correlates then is left out
