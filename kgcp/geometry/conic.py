@@ -72,11 +72,6 @@ class Ellipse:
         unit[..., 0], unit[..., 1] = np.cos(angles_rad), np.sin(angles_rad)
         return factor * unit @ self.stretch + self.centre
 
-    def angles_rad(self, points: FloatArray) -> FloatArray:
-        """Return the angles (n,) of `points` for points (n, 2), wherever they lie radially."""
-        unit = (points - self.centre) @ np.linalg.inv(self.stretch)
-        return np.arctan2(unit[:, 1], unit[:, 0])
-
     def scaled(self, factor: float) -> Ellipse:
         """Return the ellipse with both axes times `factor` about the same centre."""
         return Ellipse(self.x, self.y, factor * self.a, factor * self.b, self.angle_rad)

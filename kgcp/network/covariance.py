@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import linalg, optimize
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray
 from kgcp.network.equations import (
     ReducedSystem,
     ViewRows,
@@ -61,12 +61,6 @@ def precision(network: Network, solution: Solution) -> Precision:
         _redundancy_numbers(equations, system, inverse, len(solution.weights)),
         _camera_covariance(network, equations, inverse, factor),
     )
-
-
-def observation_factor(network: Network, solution: Solution) -> float:
-    """Return the variance factor of the observations alone, whatever priors there are."""
-    squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
-    return squares / _observation_freedom(network, solution)
 
 
 def fitting_covariances(network: Network, solution: Solution, stated: FloatArray) -> FloatArray:
@@ -253,21 +247,3 @@ def tangled(names: Sequence[str], cov: FloatArray, most_inflation: float) -> tup
     return tuple(
         name for name, part in zip(names, weakest, strict=True) if part > 0.3 * weakest.max()
     )
-
-
-def variance_components(
-    network: Network, solution: Solution, redundancy: FloatArray, group: IndexArray
-) -> FloatArray:
-    """Return s₀² (g,) of every group of observations, by residuals over redundancy.
-
-    Parameters
-    ----------
-    redundancy : (n,) array
-        As `Precision.redundancy`.
-    group : (n,) array
-        Index of the group of each disc: its photograph, its kind of mark.
-    """
-    squares = np.sum(whitened(network, solution.residuals, solution.weights) ** 2, axis=1)
-    count = int(group.max()) + 1
-    total = np.bincount(group, redundancy, count)
-    return np.asarray(np.bincount(group, squares, count) / np.maximum(total, 1e-9))
