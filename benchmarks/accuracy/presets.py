@@ -20,10 +20,7 @@ import pandas as pd
 from benchmarks.accuracy.bands import BOUND_COLUMNS, join_truth, read_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from benchmarks.accuracy.evaluate import detect
-from benchmarks.accuracy.timing import time_measurement, timing_line
 from benchmarks.pool import ordered_map
-from kgcp.io.flight.flight import read_flight
-from kgcp.io.images.frames import list_frames
 from kgcp.pipeline.execution.resilient_map import usable_cores
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.pipeline.simulate import write_simulated_flight
@@ -35,7 +32,6 @@ from kgcp.simulation.presets import PRESETS, SimulationSettings, preset
 PRESET_NAMES = ("clean", "exposure_sweep", "consumer", "blurred", "oblique", "far")
 _FRAMES = 36
 _QUICK_FRAMES = 12
-_TIMED_FRAMES = 12
 
 
 def plan_preset(name: str, frames: int, seed: int) -> FlightPlan:
@@ -117,7 +113,6 @@ def main(
     """Print the tables."""
     settings = DetectSettings(method=Method(method))
     count, jobs = frames or (_QUICK_FRAMES if quick else _FRAMES), jobs or usable_cores()
-    times_ms = []
     with _folder_or_temporary(keep) as root:
         for name in names or PRESET_NAMES:
             plan = plan_preset(name, count, seed)
@@ -125,9 +120,6 @@ def main(
             table = compare(plan, folder, settings, jobs)
             print(f"{name}  {count} frames  method {method}  wrong {int(table['is_wrong'].sum())}")
             print("\n".join(table_lines(summarise(table))), flush=True)
-            flight = read_flight(folder)
-            times_ms += time_measurement(flight, list_frames(flight.frames_folder)[:_TIMED_FRAMES])
-    print(timing_line(times_ms))
 
 
 if __name__ == "__main__":

@@ -10,12 +10,11 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import evaluate, presets, reexpose
+from benchmarks.accuracy import evaluate, presets
 from benchmarks.accuracy.bands import join_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
-from kgcp.report.bias.reexposure import reexposed
 from kgcp.settings import DetectSettings
 from kgcp.simulation.crlb import censored_information, pose_bound
 from kgcp.simulation.flight import TARGET_PLATE, FramePlan, plan_flight
@@ -198,12 +197,6 @@ def test_methods_without_sigmas_leave_dashes() -> None:
     assert all("–" in line for line in list(table_lines(results))[1:])
 
 
-def test_reexposed_frames_clip_and_round() -> None:
-    grey = np.array([[0, 7, 100, 160, 255]], dtype=np.uint8)
-    np.testing.assert_array_equal(reexposed(grey, 1.6), [[0, 11, 160, 255, 255]])
-    np.testing.assert_array_equal(reexposed(grey, 0.6), [[0, 4, 60, 96, 153]])
-
-
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
     settings = replace(
@@ -226,13 +219,9 @@ def test_clean_frames_are_measured_near_the_bound(flight: tuple[Path, pd.DataFra
     assert 1.0 < band.mahalanobis2 < 14.0
 
 
-def test_the_commands_print_their_tables(flight: tuple[Path, pd.DataFrame]) -> None:
+def test_the_command_prints_its_table(flight: tuple[Path, pd.DataFrame]) -> None:
     folder, _ = flight
     arguments = [str(folder), str(folder / "truth.csv"), "--method", "paper", "--jobs", "1"]
     evaluated = CliRunner().invoke(evaluate.main, arguments, catch_exceptions=False)
     assert "found/present" in evaluated.stdout
     assert "wrong 0" in evaluated.stdout
-    moved = CliRunner().invoke(reexpose.main, arguments, catch_exceptions=False)
-    assert "× 0.6" in moved.stdout
-    assert "× 1.6" in moved.stdout
-    assert "CPU time" in moved.stdout
