@@ -30,7 +30,6 @@ from kgcp.pipeline.simulate import write_simulated_flight
 from kgcp.simulation.flight import plan_flight
 from kgcp.simulation.presets import preset
 
-_RENDERED = 100  # frames; further ones are links to them, later by a multiple of a break
 _BREAK_S = 1000.0
 _EARLY_S = 2.0  # in which a run starts
 _PAUSE_S = 0.3  # at most, between a frame and a kill
@@ -52,13 +51,18 @@ class Toll:
         return self.parents + self.workers
 
 
-def make_flight(folder: Path, frames: int, jobs: int, *, absent_share: float = 0.1) -> None:
-    """Write a flight of small frames, some of which need a second look."""
+def make_flight(
+    folder: Path, frames: int, jobs: int, *, absent_share: float = 0.1, rendered: int = 100
+) -> None:
+    """Write a flight of small frames, some of which need a second look.
+
+    Frames after the first `rendered` ones are links to these, later by a multiple of a break.
+    """
     far = preset("far")
     settings = replace(
         far,
         camera=replace(far.camera, width=400, height=300, cx=203.2, cy=147.1),
-        frames=min(frames, _RENDERED),
+        frames=min(frames, rendered),
         distance_m=(60.0, 215.0),
         absent_share=absent_share,
         decoy_share=0.1,

@@ -59,21 +59,52 @@ def _compiled_functions(path: Path) -> dict[str, ast.FunctionDef]:
     return {
         node.name: node
         for node in tree.body
-        if isinstance(node, ast.FunctionDef)
-        and any(isinstance(by, ast.Name) and by.id in _DECORATORS for by in node.decorator_list)
+        if isinstance(node, ast.FunctionDef) and _has(node, *_DECORATORS)
     }
 
 
-def test_compiled_functions_call_compiled_ones_of_their_own_file_only() -> None:
+def _called(function: ast.FunctionDef) -> set[str]:
+    return {
+        node.func.id
+        for node in ast.walk(function)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+
+
+def _has(function: ast.FunctionDef, *decorators: str) -> bool:
+    return any(isinstance(by, ast.Name) and by.id in decorators for by in function.decorator_list)
+
+
+@pytest.fixture(scope="module")
+def by_file() -> dict[Path, dict[str, ast.FunctionDef]]:
+    """Return the compiled functions of every file."""
+    return {path: _compiled_functions(path) for path in sorted(_KGCP.rglob("*.py"))}
+
+
+def test_compiled_functions_call_compiled_ones_of_their_own_file_only(
+    by_file: dict[Path, dict[str, ast.FunctionDef]],
+) -> None:
     """Of another file they would go on calling an old version that they were compiled with."""
-    by_file = {path: _compiled_functions(path) for path in sorted(_KGCP.rglob("*.py"))}
     names = {name for functions in by_file.values() for name in functions}
     assert len(names) > 50
     for path, functions in by_file.items():
         for name, function in functions.items():
-            called = {
-                node.func.id
-                for node in ast.walk(function)
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-            }
-            assert called & names <= functions.keys(), f"{path}: {name}"
+            assert _called(function) & names <= functions.keys(), f"{path}: {name}"
+
+
+def test_only_python_calls_what_adds_in_an_order_of_the_compilers(
+    by_file: dict[Path, dict[str, ast.FunctionDef]],
+) -> None:
+    """Else there could be two versions, and a process would get the one that it compiled itself."""
+    entries = set()
+    for path, functions in by_file.items():
+        loose = {name for name, each in functions.items() if _has(each, "fused", "summed")}
+        entry = {
+            name
+            for name, each in functions.items()
+            if _has(each, "summed") or (_called(each) & loose and not _has(each, "fused"))
+        }
+        callers = [name for name, each in functions.items() if _called(each) & entry]
+        assert not callers, f"{path}: {callers} call {entry}"
+        entries |= entry
+    assert entries == {"render", "weighted_products"}

@@ -5,11 +5,7 @@ Neither shares any code with it.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -313,39 +309,6 @@ def test_a_smeared_edge_is_the_mean_of_shifted_ones(length: float) -> None:
     mean = [sharp.level(at + length * shifts, np.zeros(2000)).mean() for at in rho.tolist()]
     smeared = replace(sharp, streak_x=length).level(rho, np.zeros(33))
     np.testing.assert_allclose(smeared, mean, rtol=0.0, atol=2e-5)
-
-
-RENDERED = """
-import hashlib
-import numpy as np
-from kgcp.measurement.image_model.blurred_discs import render
-views = np.random.default_rng(3).normal(size=(15, 400))
-circles = np.array([[0.1, -0.2, 0.3 + 0.2 * rule, 1.0, rule] for rule in range(7)])
-out = np.zeros((9, 400))
-render(
-    *(views, np.array([0.7, 0.5, 0.1, 1.5, -2.0]), circles),
-    *(400 * np.arange(8), np.tile(np.arange(400), 7), out),
-)
-print(hashlib.sha256(out.tobytes()).hexdigest())
-"""
-
-
-def test_who_compiles_gets_what_those_get_who_find_it_compiled(tmp_path: Path) -> None:
-    """To the last bit, though products may be fused with sums."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    hashes = [
-        subprocess.run(
-            [sys.executable, "-c", RENDERED],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for _ in range(2)
-    ]
-    assert list(tmp_path.iterdir()), "nothing was kept"
-    assert len(hashes[0]) > 60
-    assert hashes[0] == hashes[1]
 
 
 def test_every_pixel_is_served_once() -> None:
