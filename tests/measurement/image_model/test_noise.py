@@ -118,6 +118,19 @@ def test_bands_of_many_pixels_have_their_own_noise_and_others_follow_the_line() 
     assert noise.sd[1500:] == pytest.approx(noise.plateau_sd[1500:], rel=0.05)
 
 
+@pytest.mark.parametrize("pixels", [10, 40])
+def test_a_band_counts_by_its_pixels_against_ten_of_the_line(pixels: int) -> None:
+    """Residuals of one size, whose trimmed variance is exactly that of their standard deviation."""
+    count = [400, 400, 400, pixels]
+    share = np.repeat([0.0, 1.0, 0.5, 0.25], count)
+    variance = np.repeat([0.01**2, 0.02**2, 0.5 * (0.01**2 + 0.02**2), 0.05**2], count)
+    residuals = np.sqrt(0.6230 * variance)
+    noise = estimate_noise(residuals, share, np.ones(len(share), bool), COUNT, in_bands=True)
+    line = 0.01**2 + 0.25 * (0.02**2 - 0.01**2)
+    expected = (pixels * 0.05**2 + 10.0 * line) / (pixels + 10.0)
+    assert noise.sd[-1] ** 2 == pytest.approx(expected, rel=1e-6)
+
+
 @pytest.mark.parametrize("is_ink_seen", [False, True])
 def test_edges_tell_the_noise_of_what_is_nowhere_seen(is_ink_seen: bool) -> None:  # noqa: FBT001 - a case
     """Of a narrow ring no pixel is wholly ink: it has not the noise of the plate."""

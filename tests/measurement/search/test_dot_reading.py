@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -86,6 +87,23 @@ def test_dots_are_read_where_they_leave_little_ink_between_them(
     dots = read_dots(frame, Ellipse(x, y, radius_px, radius_px, 0.0), RING)
     assert len(dots) == len(many)
     np.testing.assert_allclose(np.diff(dots), 360.0 / 11.0, atol=1.5)
+
+
+def test_dirt_darker_than_the_ink_does_not_hide_the_dots(
+    camera: Camera, place_plate: PlacePlate, draw_frame: DrawFrame
+) -> None:
+    """In haze, where the grey of ink is nearer to that of dots than to black."""
+    radius_px = 50.0
+    pose = place_plate((240.0, 180.0), radius_px)
+    frame = (150.0 + draw_frame((coded(RING.code_deg), pose)) * (70.0 / 255.0)).astype(np.uint8)
+    x, y = camera.project(pose.translation_m)
+    ellipse = Ellipse(x, y, radius_px, radius_px, 0.0)
+    clean = read_dots(frame, ellipse, RING)
+    assert len(clean) == len(RING.code_deg)
+    between = 0.5 * (clean[0] + clean[1]) if clean[1] - clean[0] > 40.0 else clean[1] + 20.0
+    dirt = ellipse.points(np.radians([between]), RING.code_diameter_m / RING.outer_diameter_m)[0]
+    cv2.circle(frame, np.rint(dirt).astype(int).tolist(), 4, 0, -1)
+    np.testing.assert_allclose(read_dots(frame, ellipse, RING), clean, atol=1.0)
 
 
 def test_the_ring_that_has_failed_is_shown_and_not_its_replica(
