@@ -142,7 +142,7 @@ def main() -> None:
     The usual sequence for a flight folder:
 
     \b
-      kgcp init FLIGHT           write its flight.toml from what lies there
+      kgcp init FLIGHT           write flight.toml from the files in the folder
       kgcp check FLIGHT          report what is in a flight folder, and what does not fit
       kgcp detect FLIGHT         find and measure the target in every frame
       kgcp export-gcp FLIGHT     compute and export kinematic ground control points

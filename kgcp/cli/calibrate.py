@@ -129,13 +129,13 @@ def command(
     log_json: bool,
     as_json: bool,
 ) -> None:
-    """Calibrate a camera by photographs of a field of discs.
+    """Calibrate a camera from photographs of a field of discs.
 
-    PHOTOS are images or folders of images. Twelve or more are good: the whole field in each, tilted
-    by 25 to 40 degrees in all directions, two with the camera turned by 90 degrees.
+    PHOTOS are images or folders of images. Take twelve or more: the whole field in each, tilted by
+    25 to 40 degrees in all directions, two with the camera turned by 90 degrees.
 
-    Writes camera.toml, with the full covariance, which [camera] file in flight.toml reads; tables
-    of all discs, of the field and of the photographs; and calibration.html.
+    Writes camera.toml, with the full covariance, to be named as [camera] file in flight.toml;
+    tables of all discs, of the field and of the photographs; and calibration.html.
 
     If a run is interrupted, repeat the command to resume it.
 

@@ -87,13 +87,13 @@ _DEFAULTS = DetectSettings()
     "is_learning",
     default=_DEFAULTS.is_learning,
     show_default=True,
-    help="Learn from all frames together which known curve an unknown tone curve is near.",
+    help="If the tone curve is unknown, learn from all frames which known curve it resembles.",
 )
 @click.option(
     "--places",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Look for plain discs and rings where they are marked by hand, in frames without a pose:"
+    help="Places marked by hand, by which plain discs and rings are found in frames without a pose:"
     " CSV with frame,target,x_px,y_px and at least two static targets per frame.",
 )
 @click.option(

@@ -98,8 +98,8 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 @click.option(
     "--flight-ids",
     is_flag=True,
-    help="Begin the points' ids with the flight's name, for a project that takes several exports;"
-    " always so if several flights are exported at once.",
+    help="Begin the points' ids with the flight's name, so that a project can take several exports;"
+    " always done if several flights are exported at once.",
 )
 @selection_options
 @detections_option

@@ -59,7 +59,7 @@ def command(
     *,
     as_json: bool,
 ) -> None:
-    """Write a flight.toml for FLIGHT from what lies there.
+    """Write a flight.toml from the files in the folder FLIGHT.
 
     Takes the camera from a calibration file, from DJI's DewarpData or, marked as a guess, from the
     focal length in EXIF; times from Timestamp.MRK, frames.csv, the frames' names or EXIF; the

@@ -54,15 +54,15 @@ _FEW_FRAMES = 3  # that are named
     metavar="FILE",
     type=click.Path(path_type=Path),
     default=None,
-    help="Orient frames by an EO device in them instead, in its own frame: device.toml has its"
+    help="Orient frames by an EO device that they show, relative to it; FILE, device.toml, has its"
     " points.",
 )
 @click.option(
     "--field",
     "field_text",
     metavar="FIELD",
-    help="Orient frames by a field of discs in them instead, in its own frame: a field.toml,"
-    " another program's board file, or a shorthand, as for 'kgcp calibrate'.",
+    help="Orient frames by a field of discs that they show, relative to it: a field.toml, another"
+    " program's board file, or a shorthand, as for 'kgcp calibrate'.",
 )
 @unit_option
 @detections_option

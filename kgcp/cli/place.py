@@ -44,7 +44,7 @@ def _names(
     type=click.Choice(["sd", "fixed"]),
     default="sd",
     show_default=True,
-    help="Whether the standard deviations of the poses count, or the poses are exact.",
+    help="Use the standard deviations of the poses, or take the poses as exact.",
 )
 @click.option(
     "--min-frames",
@@ -59,8 +59,8 @@ def _names(
     "formats",
     type=click.Choice([*FORMATS]),
     multiple=True,
-    help="Write the placed targets for another program, too, into the folder places; may be"
-    " repeated. Formats are those of 'kgcp export-gcp'.",
+    help="Also write the placed targets for another program, to the folder places; may be"
+    " repeated. The formats are those of 'kgcp export-gcp'.",
 )
 @detections_option
 @json_option

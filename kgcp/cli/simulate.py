@@ -137,8 +137,8 @@ def command(
     above it. Writes frames, flight.toml, frames.csv, vehicle.csv, reference.csv and truth.csv.
     Options from --shadow to --motion add an effect to the preset, or change the preset's own.
 
-    With --field, writes photographs of a field of discs, taken by the preset's camera, field.toml
-    and the truth, which kgcp calibrate is to find.
+    With --field, writes photographs of a field of discs by the preset's camera, with field.toml
+    and the truth, to test 'kgcp calibrate'.
 
     \b
     Examples:

@@ -71,7 +71,7 @@ class _Compilable:
                 made = numba.njit(cache=True, error_model="numpy", **self._options)(function)
             except RuntimeError as error:  # numba's own, where no folder is left
                 raise KgcpError(
-                    f"compiled code can be kept in no folder ({error}); set the environment"
+                    f"compiled code cannot be stored in any folder ({error}); set the environment"
                     " variable NUMBA_CACHE_DIR to a folder that can be written"
                 ) from error
             function.__globals__[function.__name__] = self._dispatcher = made

@@ -69,7 +69,7 @@ class LocalFrame:
             )
         ellipsoid = geodetic.ellipsoid
         if ellipsoid is None:
-            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give one that has")
+            raise KgcpError(f"{where} {crs!r} has no ellipsoid; give a CRS that has one")
         geodetic_from_map = best_transformer(
             horizontal,
             geodetic.to_3d(),

@@ -93,8 +93,8 @@ def calibrate_camera(
         return _calibrated(CalibrationProblem(tuple(views), field, size, settings), start)
     except np.linalg.LinAlgError as error:
         raise KgcpError(
-            "the photographs determine no camera, however its parameters are limited; take some"
-            " from other sides, or correct what describes the field"
+            "the photographs do not determine a camera, however its parameters are limited; take"
+            " some from other sides, or correct the description of the field"
         ) from error
 
 
@@ -148,7 +148,7 @@ def _require_views(views: Sequence[NamedView]) -> None:
     if len(views) < LEAST_VIEWS:
         raise KgcpError(
             f"{len(views)} of the photographs show the field, and {LEAST_VIEWS} are needed; take"
-            " more, or correct what describes the field"
+            " more, or correct the description of the field"
         )
 
 

@@ -381,7 +381,8 @@ class DetectionRun:
             return
         if any(map(is_unreadable, result.outcomes)) and not os.path.lexists(path):
             raise KgcpError(
-                f"{path}: has vanished; when the frames are back, repeat the command, which resumes"
+                f"{path}: has disappeared; once the frames are back, repeat the command, which"
+                " resumes"
             )
 
     def _tell_what_is_kept(self) -> None:

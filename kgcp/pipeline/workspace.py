@@ -34,7 +34,7 @@ def results_folder(flight: Path) -> Path:
     folder = flight / RESULTS_NAME
     if folder.is_symlink():
         raise KgcpError(
-            f"{folder}: is a link; delete it, or name where it leads as the results folder",
+            f"{folder}: is a link; delete it, or use its destination as the results folder",
             option="out",
         )
     for parent, folders, _ in os.walk(folder):

@@ -288,7 +288,7 @@ def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> Non
     out = tmp_path / "out"
     result = run(photos, "--field", board, "--out", out, *QUIET)
     assert result.exit_code == 1
-    assert "does not say its unit" in result.stderr
+    assert "does not state its unit" in result.stderr
     assert "(--unit)" in result.stderr
     files = (photos / "photo1.png", photos / "photo2.png")
     result = run(*files, "--field", board, "--unit", "cm", "--out", out, *QUIET)

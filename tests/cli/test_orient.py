@@ -172,7 +172,7 @@ def test_nothing_to_orient_by_is_one_line(tmp_path: Path) -> None:
     toml.write_text("\n".join(kept), encoding="utf-8")
     result = run("orient", folder)
     assert result.exit_code == 1
-    assert "no target stands still" in result.stderr
+    assert "no target is static" in result.stderr
 
 
 def device_flight(folder: Path) -> Path:

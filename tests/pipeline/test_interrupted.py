@@ -268,7 +268,7 @@ def test_frames_that_vanish_stop_the_run_and_are_no_rows(
             if done == 4:
                 frames.rename(elsewhere)
 
-    with pytest.raises(KgcpError, match=r"f_\d\.png: has vanished; when the frames are back"):
+    with pytest.raises(KgcpError, match=r"f_\d\.png: has disappeared; once the frames are back"):
         detect(flight, Unmount())
     elsewhere.rename(frames)
     detect(flight)

@@ -233,7 +233,7 @@ def test_negatives_are_to_be_looked_at() -> None:
 def test_one_photograph_three_times_is_no_traceback() -> None:
     once = views()[0]
     copies = [replace(once, photo=f"copy{index}") for index in range(3)]
-    with pytest.raises(KgcpError, match="the photographs determine no camera"):
+    with pytest.raises(KgcpError, match="the photographs do not determine a camera"):
         calibrated(copies, PointModel.STIFF)
 
 

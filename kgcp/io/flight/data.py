@@ -104,7 +104,7 @@ class FlightData:
         Raises
         ------
         KgcpError
-            If flight.toml has no crs, its crs is unusable, or no target stands still.
+            If flight.toml has no crs, its crs is unusable, or no target is static.
         """
         return TargetPositions.of(self._crs, self._flight.all_targets, None, VehicleSettings())
 

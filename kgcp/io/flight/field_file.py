@@ -93,7 +93,7 @@ def _length_m(text: str, length: str) -> float:
     match = _LENGTH.fullmatch(length.strip())
     if match is None:
         raise KgcpError(
-            f"{text}: {length!r} is no length with a unit; write it like {_EXAMPLE}",
+            f"{text}: {length!r} is not a length with a unit; write it like {_EXAMPLE}",
             option="field",
         )
     return float(match[1]) * _METRES[match[2]]

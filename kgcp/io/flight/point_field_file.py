@@ -127,7 +127,7 @@ def _from_row(columns: CsvColumns, row: int, diameter_m: float, inner_m: float) 
 
     where, name = f"{columns.path}, line {columns.lines[row]}", columns.texts["name"][row]
     if not name or not name.isprintable():
-        raise KgcpError(f"{where}: {name!r} is no name; give one without control characters")
+        raise KgcpError(f"{where}: {name!r} is not a name; give one without control characters")
     code = cell("code", -1.0)  # below 0: this disc has none
     if code != int(code):
         raise KgcpError(f"{where}: code {code:g} is not a whole number; correct it")

@@ -55,7 +55,7 @@ def read_marks(
             raise KgcpError(f"{where}: {problem}")
         if target not in targets:
             listed = ", ".join(sorted(targets))
-            raise KgcpError(f"{where}: {target!r} stands still nowhere; name one of {listed}")
+            raise KgcpError(f"{where}: {target!r} is not a static target; name one of {listed}")
         if not (0.0 <= x_px <= camera.width - 1.0 and 0.0 <= y_px <= camera.height - 1.0):
             raise KgcpError(f"{where}: ({x_px:g}, {y_px:g}) is outside the frame; correct it")
         if not sd_px > 0.0:

@@ -198,7 +198,7 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
         ((_, learned),) = outcomes
     if isinstance(learned, TaskFailure):
         warnings.warn(
-            "the tone curve is learned in every photograph by itself, since the process that"
+            "the tone curve is learned separately in every photograph, because the process that"
             " learned it from five of them has ended or taken too long; results differ slightly",
             KgcpWarning,
             stacklevel=2,
@@ -272,7 +272,7 @@ def _of_one_camera(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[PhotoDiscs
         (first, first_count), (second, second_count) = lenses.most_common(2)
         raise KgcpError(
             f"the photographs are by several cameras or focal lengths: {first_count} by {first},"
-            f" {second_count} by {second}; calibrate them apart"
+            f" {second_count} by {second}; calibrate them separately"
         )
     sizes = Counter((result.width, result.height) for result in found)
     if not sizes:
@@ -316,8 +316,8 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
         raise KgcpError(
             f"the field is found in {len(found)} of {len(results)} photographs"
-            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; correct what describes"
-            " the field, or take more photographs"
+            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; correct the"
+            " description of the field, or take more photographs"
         )
     return [
         NamedView(

@@ -302,7 +302,7 @@ def _locked(path: Path) -> FileIO:
                     return file
     except BlockingIOError as error:
         raise KgcpError(
-            f"{path.parent}: another kgcp is writing here; wait for its end, or choose another"
+            f"{path.parent}: another kgcp is writing here; wait until it ends, or choose another"
             " results folder",
             option="out",
         ) from error

@@ -136,8 +136,8 @@ def orient_flight(
     table = results_folder(flight.folder) / DETECTIONS if detections is None else Path(detections)
     if not any(target.position_m is not None for target in flight.all_targets):
         raise KgcpError(
-            f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"
-            " that frames are to be oriented by"
+            f"{flight.folder / 'flight.toml'}: no target is static; give position_m to the"
+            " targets by which frames are to be oriented"
         )
     attempts = read_attempts(table, flight)
     frames = sorted({attempt.frame for attempt in attempts})

@@ -265,8 +265,8 @@ def _targets(flight: Flight, names: Sequence[str]) -> list[AnyTarget]:
     static = [target for target in flight.all_targets if target.position_m is not None]
     if not static:
         raise KgcpError(
-            f"{flight.folder / 'flight.toml'}: no target stands still; give position_m to those"
-            " that do, roughly is enough, or name the targets to place",
+            f"{flight.folder / 'flight.toml'}: no target is static; give position_m to those"
+            " that are (a rough one is enough), or name the targets to place",
             option="targets",
         )
     return static

@@ -74,10 +74,12 @@ def _require_sheet(field: PointField) -> None:
     is_flat = np.ptp(field.points_m()[:, 2]) <= _FLAT_M
     if not is_flat or np.abs(field.normals()[:, :2]).max() > _FLAT_M:
         raise SettingError(
-            "points", "do not lie in one plane of equal z, as on a sheet", "print their parts apart"
+            "points",
+            "do not lie in one plane of equal z, as on a sheet",
+            "print their parts separately",
         )
     if not field.is_diameter_stated:
-        raise SettingError("diameter_m", "is missing", "say how large the discs are")
+        raise SettingError("diameter_m", "is missing", "state how large the discs are")
 
 
 def _reach_mm(field: AnyField) -> float:

@@ -127,7 +127,7 @@ class Field:
         if not LEAST_POINTS <= self.columns * self.rows <= 2 * MOST_POINTS:
             raise SettingError(
                 "columns",
-                f"{self.columns} x {self.rows} is no field of {LEAST_POINTS} to {MOST_POINTS}"
+                f"{self.columns} x {self.rows} is not a field of {LEAST_POINTS} to {MOST_POINTS}"
                 " discs",
                 "correct columns and rows",
             )
@@ -152,7 +152,7 @@ class Field:
             if (mark.column, mark.row) not in discs:
                 raise SettingError(
                     "at",
-                    f"[{mark.column}, {mark.row}] is no disc of the grid",
+                    f"[{mark.column}, {mark.row}] is not a disc of the grid",
                     "count column and row from 0",
                 )
             if not mark.is_missing:
@@ -289,7 +289,7 @@ def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...]) -> None:
             if name not in names:
                 raise SettingError(
                     key,
-                    f"{name!r} is no disc of the field",
+                    f"{name!r} is not a disc of the field",
                     f"give the name of one, as {names[0]}",
                 )
         if bar.first == bar.second:

@@ -134,7 +134,7 @@ class PointField:
         if not LEAST_POINTS <= len(self.points) <= MOST_DISCS:
             raise SettingError(
                 "points",
-                f"{len(self.points)} is no field of {LEAST_POINTS} to {MOST_DISCS} discs",
+                f"{len(self.points)} is not a field of {LEAST_POINTS} to {MOST_DISCS} discs",
                 "list all discs",
             )
         for sd in self.flat_sd_m:
@@ -163,7 +163,7 @@ class PointField:
             raise SettingError(
                 "code",
                 f"{len(codes)} of the discs have one, and names need {LEAST_POINTS}",
-                "say the codes of the others, or delete [code] and all codes",
+                "give the codes of the others, or delete [code] and all codes",
             )
         _require_once("code", [str(self.code.canonical(code)) for code in codes])
 
@@ -179,7 +179,7 @@ class PointField:
         widths = np.linalg.svd(centres - centres.mean(axis=0))[1]
         if widths[1] < _LEAST_WIDTH * widths[0]:
             raise SettingError(
-                "points", "lie in one row, which determines no camera", "add some beside it"
+                "points", "lie in one row, which does not determine a camera", "add some beside it"
             )
 
     def _reaches_m(self) -> FloatArray:

@@ -85,7 +85,7 @@ def test_results_go_through_no_link(tmp_path: Path, leads_to: str) -> None:
         results_folder(tmp_path)
     (tmp_path / "flight").mkdir()
     (tmp_path / "flight" / "kgcp").symlink_to(leads_to)
-    with pytest.raises(KgcpError, match="kgcp: is a link; delete it, or name where it leads"):
+    with pytest.raises(KgcpError, match="kgcp: is a link; delete it, or use its destination"):
         results_folder(tmp_path / "flight")
 
 

@@ -108,7 +108,7 @@ def test_shorthands() -> None:
 
 def test_boofcv_does_not_say_its_unit(tmp_path: Path) -> None:
     path = write(tmp_path, "calibration_target.yaml", BOOFCV)
-    with pytest.raises(KgcpError, match="does not say its unit") as caught:
+    with pytest.raises(KgcpError, match="does not state its unit") as caught:
         read_field(path)
     assert caught.value.option == "unit"
     field = read_grid(path, "cm")
@@ -206,7 +206,7 @@ def test_wrong_rings_end_in_one_line(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("grid:10x8:25:15mm", "'25' is no length with a unit"),
+        ("grid:10x8:25:15mm", "'25' is not a length with a unit"),
         ("grid:10x8:25mm:30mm", "discs of 30 mm overlap"),
         ("grid:1x8:25mm:5mm", "columns: 1 is"),
         ("nothing.toml", "is neither a field's file nor a shorthand"),
@@ -224,7 +224,7 @@ def test_wrong_shorthands(text: str, message: str) -> None:
         ("pitch_m = 0.025", "pitch = 0.025", "nearest known key is 'pitch_m'"),
         ("pitch_m = 0.025", "pitch_m = 0.01", "overlap"),
         ("at = [2, 2]", "at = [2.5, 2]", "is not column and row"),
-        ("at = [2, 2]", "at = [20, 2]", "is no disc of the grid"),
+        ("at = [2, 2]", "at = [20, 2]", "is not a disc of the grid"),
         ("diameter_m = 0.015\n", "", "diameter_m: is missing"),
         ("[grid]", "[code]\nbits = 14\n[grid]", "code: is given beside a grid"),
     ],
@@ -315,7 +315,7 @@ def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
         (("field.csv", "no.csv"), ("", ""), "'no.csv' does not exist"),
         (("", ""), ("sd_z,", "sd_w,"), "lacks sd_z; give all of sd_x, sd_y, sd_z"),
         (("", ""), ("A,0,0,0", "A,0,0,much"), "line 2: z is 'much'"),
-        (("", ""), ("A,0", ",0"), "line 2: '' is no name"),
+        (("", ""), ("A,0", ",0"), "line 2: '' is not a name"),
         (("", ""), ("1,3\n", "1,3.5\n"), "line 2: code 3.5 is not a whole number"),
         (("", ""), ("B,0.1", "A,0.1"), "A stands 2 times"),
         (("", ""), ("0,1,5\n", "0,1,3\n"), "code: 3 stands 2 times"),
@@ -358,7 +358,7 @@ NXYZ = """\
 @pytest.mark.parametrize("head", ["", "Name X Y Z\n"])
 def test_lists_of_points_do_not_say_their_unit(tmp_path: Path, head: str) -> None:
     path = write(tmp_path, "points.txt", head + NXYZ)
-    with pytest.raises(KgcpError, match="does not say its unit") as caught:
+    with pytest.raises(KgcpError, match="does not state its unit") as caught:
         read_field(path)
     assert caught.value.option == "unit"
     field = read_field(path, "mm")

@@ -55,7 +55,7 @@ def test_codes_may_come_closer_across_an_edge() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"points": POINTS[:5]}, "5 is no field of 6 to 2000 discs"),
+        ({"points": POINTS[:5]}, "5 is not a field of 6 to 2000 discs"),
         ({"points": (*POINTS, POINTS[0])}, "p0 stands 2 times"),
         ({"points": changed(diameter_m=0.09)}, "p0 and p3 overlap"),
         (  # which are not the nearest two
@@ -84,7 +84,7 @@ def test_codes_may_come_closer_across_an_edge() -> None:
             },
             "lie in one row",
         ),
-        ({"bars": (FieldBar("p0", "p9", 0.1, 1e-5),)}, "'p9' is no disc"),
+        ({"bars": (FieldBar("p0", "p9", 0.1, 1e-5),)}, "'p9' is not a disc"),
         ({"flat_sd_m": (0.0, 1e-4, 1e-4)}, "flat_sd_m"),
     ],
 )

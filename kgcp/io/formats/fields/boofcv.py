@@ -39,7 +39,7 @@ def field(file: ForeignFile, unit_m: float | None) -> Field:
         raise file.error("has sizes that are not finite numbers")
     if unit_m is None:
         raise KgcpError(
-            f"{file.path}: does not say its unit; say what shapeSize {size:g} is in",
+            f"{file.path}: does not state its unit; state what shapeSize {size:g} is in",
             option="unit",
         )
     return Field(

@@ -44,7 +44,8 @@ def field(file: ForeignFile, unit_m: float | None) -> PointField:
             raise file.error_at(f"line {line}", "is not name, x, y, z", "repair or delete it")
     if unit_m is None:
         raise KgcpError(
-            f"{file.path}: does not say its unit; say what its coordinates are in", option="unit"
+            f"{file.path}: does not state its unit; state what its coordinates are in",
+            option="unit",
         )
     if not rows:
         raise file.error("has no points", "name a list of name, x, y, z")
