@@ -7,7 +7,7 @@ import numpy as np
 from kgcp.geometry.arrays import BoolArray, FloatArray
 
 _SIDE = 4  # neighbours in time on either side, at most
-_LEAST_ON_A_SIDE = 2  # a parabola does not foresee, it interpolates
+_LEAST_ON_A_SIDE = 2  # a parabola interpolates well, and extrapolates badly
 _REACH_INTERVALS = 6.0  # neighbours within this many usual intervals
 _LIMIT = 5.0
 _UNREST_FACTOR = 2.0  # gusts are not normally distributed
@@ -19,12 +19,12 @@ _MAX_ROUNDS = 1000
 def find_jumps(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> BoolArray:
     """Return which of n values do not continue the parabola through their neighbours.
 
-    A value is compared with the least-squares parabola through up to four neighbours on either
-    side, itself left out. It jumps if it is off by more than five standard deviations. These
-    combine the deviations of the values with twice the flight's unrest, the excess of the scatter
-    about parabolas, of all values or of these neighbours. The worst of a neighbourhood is taken
-    out, and the others are compared again; two wrong values in one neighbourhood can hide each
-    other.
+    Each value is compared with the least-squares parabola through up to four neighbours on either
+    side, without the value itself. It jumps if it is off by more than five standard deviations.
+    These combine the standard deviations of the values with twice the flight's unrest: the excess
+    of the scatter about parabolas, of all values or of these neighbours. The worst value of a
+    neighbourhood is removed, and the others are compared again. Two wrong values in one
+    neighbourhood can hide each other.
 
     Parameters
     ----------
@@ -82,9 +82,9 @@ def _departures(time_s: FloatArray, value: FloatArray, sd: FloatArray) -> FloatA
 
 
 def _local_unrest(misfit: FloatArray, near: BoolArray) -> FloatArray:
-    """Return how far neighbours themselves are off their parabola (n,), by the median.
+    """Return the median deviation of neighbours from their own parabola (n,).
 
-    Where a climb turns into a descent nothing is a parabola, and nothing is wrong.
+    Where a climb turns into a descent, nothing follows a parabola although nothing is wrong.
     """
     count = near.sum(axis=1)
     typical = np.median(np.where(near, misfit, 0.0), axis=1)

@@ -1,7 +1,7 @@
 """Which of a plate's two normals the frames before and after make the likelier one.
 
-A camera that looks down at a plate on a roof sees its normal change little from frame to frame. How
-little, the frames tell in which the image alone is sure.
+For a camera that looks down at a plate on a roof, the normal changes little from frame to frame.
+The frames whose image alone decides between the two show how little.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult, Measurement
 
-_SURE = 10.0  # Δχ² of the image from which on one frame may speak for another
-_FEWEST = 4  # pairs of neighbours that tell how far normals differ
-_FARTHEST = 3.0  # times as long ago as neighbours usually are
+_SURE = 10.0  # Δχ² of the image above which one frame may decide for another
+_FEWEST = 4  # pairs of neighbours from which the difference of normals is estimated
+_FARTHEST = 3.0  # times the usual interval between neighbours
 _MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
 _LEAST_SD_DEG = 1.0
 

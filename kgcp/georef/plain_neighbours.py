@@ -18,8 +18,8 @@ from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import FrameResult, Measurement
 from kgcp.targets.plain import PlainTarget
 
-# Image places are interpolated over gaps as long as those that tell how a target moves, or little
-# longer: the camera may turn round meanwhile.
+# Image places are interpolated only over gaps not much longer than those from which the motion is
+# known: the camera may turn round meanwhile.
 _LONGEST_GAP = 4.0
 _FLOOR_PX, _FLOOR_DEG = 1.0, 2.0  # least standard deviations, whatever neighbours agree on
 
@@ -53,7 +53,7 @@ class PlainTracks:
     def __init__(self, targets: Sequence[PlainTarget], time_s: FloatArray) -> None:
         self._targets = targets
         self._found: dict[str, dict[int, _Place]] = {target.name: {} for target in targets}
-        # frames without any times are at least in order, and how evenly, the targets tell
+        # without any times, the order of the frames replaces them
         in_order = np.arange(len(time_s), dtype=np.float64)
         self._time_s = time_s if np.isfinite(time_s).any() else in_order
 
@@ -66,7 +66,7 @@ class PlainTracks:
     def predictions(
         self, camera: Camera, wanted: Mapping[int, Collection[str]]
     ) -> Mapping[int, Predictions]:
-        """Return by row where targets must be, as far as neighbours tell, of those wanted in it."""
+        """Return by row where the targets wanted in it must be, as far as neighbours show it."""
         made: dict[int, dict[str, PlainPrediction]] = {}
         for target in self._targets:
             found = self._found[target.name]
@@ -102,9 +102,9 @@ class PlainTracks:
         )
 
     def _normal(self, target: PlainTarget, row: int) -> NormalPrior | None:
-        """Return the mean of the normals before and after, as uncertain as they are and differ.
+        """Return the mean of the normals before and after, uncertain by their difference as well.
 
-        None: of a target whose normal is free they may be either of two.
+        None if the target's normal is free: each of the two may be the mirrored one.
         """
         if target.normal_enu is None:
             return None

@@ -48,8 +48,8 @@ def normal_priors(
 ) -> list[NormalPrior | None]:
     """Return for each frame where the normal of the vehicle's plate should point.
 
-    The vehicle's attitude says it where the frame's time is within its trajectory. Elsewhere a
-    plate counts as level, if `level_sd_deg` says how level it is.
+    Within the trajectory it follows from the vehicle's attitude. Elsewhere the plate is taken as
+    level, if `level_sd_deg` is given.
 
     Parameters
     ----------

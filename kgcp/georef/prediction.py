@@ -20,11 +20,11 @@ from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import Measurement
 from kgcp.targets.plain import AnyTarget
 
-_MIN_FOUND = 4  # frames that the reference is compared with, at least
+_MIN_FOUND = 4  # least number of frames with which the reference is compared
 _MEDIAN_OF_2D = 1.1774  # of the distance from the centre of a normal distribution, in σ
 _MEDIAN_OF_1D = 0.6745  # of the absolute value
 _FLOOR_PX, _FLOOR_LOG = 0.5, 0.02  # least standard deviations of a prediction
-_TRIPLES = 8  # of neighbours, nearest in time, that tell how the target moves
+_TRIPLES = 8  # of neighbours, nearest in time, from which the motion is estimated
 _MIN_TRIPLES = 3
 NEIGHBOURS = "its neighbours"
 """What a prediction by interpolation was made from."""
@@ -51,10 +51,10 @@ def state_of(observation: Measurement) -> FloatArray:
 
 
 def predict_position(track: Track, by_reference: FloatArray | None) -> list[Prediction | None]:
-    """Return what is expected of the n frames in which a target was not found.
+    """Return where a target must be in the n frames in which it was not found.
 
-    It is the surer one of the two sources, of which `by_reference` (n, 3) is that of
-    `reference_states`; None where neither tells, and where the target was found.
+    The sources are the neighbouring frames and `by_reference` (n, 3), from `reference_states`; the
+    more precise one counts. None where neither gives a prediction, and where the target was found.
     """
     sources = [predict_between(track)]
     if by_reference is not None:
@@ -72,9 +72,9 @@ def predict_position(track: Track, by_reference: FloatArray | None) -> list[Pred
 def predict_by_reference(track: Track, predicted: FloatArray) -> list[Prediction | None]:
     """Turn states (n, 3) by the reference into predictions.
 
-    Their deviations are those of the frames in which the target was found, by medians, so that a
-    wrong frame does no harm; a bias counts as deviation. Nothing is expected where fewer than four
-    frames tell, or where most are off by more than a radius.
+    Their standard deviations are medians over the frames in which the target was found, so that a
+    wrong frame does no harm; a bias counts as deviation. There is no prediction if fewer than four
+    frames can be compared, or if most are off by more than a radius.
     """
     error = (track.state - predicted)[np.isfinite(track.state + predicted).all(axis=1)]
     if len(error) < _MIN_FOUND:
@@ -115,13 +115,14 @@ def predict_between(track: Track) -> list[Prediction | None]:
 
 
 def interpolate(track: Track, longest_gap: float = np.inf) -> list[Interpolation | None]:
-    """Interpolate between the found frames before and after.
+    """Interpolate between the frames before and after in which the target was found.
 
-    These are at most `longest_gap` times as far apart as found frames nearby usually are.
+    Gaps of more than `longest_gap` times the usual interval between such frames nearby are left
+    open.
 
-    The target moves on a straight line with an unknown acceleration α, so that at a time τ between
-    a and b the line is off by ½ α (τ − a)(b − τ). The mean square of α comes from the nearest
-    triples of found frames, of which each predicts its middle one.
+    The target is taken to move on a straight line. An unknown acceleration α displaces it from that
+    line by ½ α (τ − a)(b − τ) at a time τ between a and b. The mean square of α comes from the
+    nearest triples of found frames: the outer two of each predict the middle one.
     """
     states: list[Interpolation | None] = [None] * len(track.time_s)
     found = np.flatnonzero(track.is_found & np.isfinite(track.time_s))
@@ -157,7 +158,7 @@ def interpolate(track: Track, longest_gap: float = np.inf) -> list[Interpolation
 def _between(
     now: FloatArray, before: FloatArray, after: FloatArray, start: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states (m, 3) on the line between two, and what an acceleration is to be times."""
+    """Return states (m, 3) on the line between two, and the factor (m,) of an acceleration."""
     share = (now - before) / (after - before)
     return start + share[:, None] * (end - start), 0.5 * (now - before) * (after - now)
 
@@ -170,7 +171,7 @@ def reference_states(
     target_positions: TargetPositions,
     camera: Camera,
 ) -> FloatArray:
-    """Return the states (n, 3) that reference poses give a target; NaN where it cannot be said.
+    """Return the states (n, 3) of a target by reference poses; NaN where they are not known.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """How fast a target goes by while a rolling shutter reads a frame, from the frames around it.
 
 Reference poses and the target's positions give the direction of the target in the camera frame at
-the times of the frames; differences over time give its rotation at each. How much these are worth
-shows in how well differences over twice the time agree.
+the times of the frames; differences over time give its rotation at each. Their uncertainty follows
+from the comparison with differences over twice the time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.plate_prior import SceneRotation
 
-_NEAREST = 8  # frames that tell together how well a rotation is known
+_NEAREST = 8  # frames from which the uncertainty of a rotation is estimated
 _FEWEST = 4
 _UNSEEN_SHARE = 0.2  # of the a-priori deviation: vibration that is too fast for frames to show
 
@@ -50,8 +50,8 @@ def rotations_between_frames(
     Returns
     -------
     list of SceneRotation
-        That of frames without neighbours on both sides, or of a flight in which too few tell how
-        well neighbours foretell each other, is the a-priori one.
+        For frames without neighbours on both sides, and in flights with too few frames to compare,
+        it is the a-priori one.
     """
     count = len(time_s)
     near, is_near = _differences(time_s, sight_m, camera_from_plate, 1)

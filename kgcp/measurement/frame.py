@@ -26,9 +26,9 @@ from kgcp.measurement.search.template_match import match_templates_at
 from kgcp.settings import DetectSettings, Method
 from kgcp.targets.layout import Ring, Target
 
-_MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be held against it
+_MIN_VISIBLE = 0.3  # of the main ring's code circle, for a replica to be compared with it
 _MIN_MAIN_SCORE = 0.75
-_MOST_TURNED_DEG = 8.0  # the main ring's heading against the replica's
+_MOST_TURNED_DEG = 8.0  # of the main ring's heading from the replica's
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +194,7 @@ def _check_plate(
 ) -> BoolArray | None:
     """Refuse a plate that does not look like the target; return where it is visible.
 
-    None stands for all of it.
+    None means that all of it is.
 
     Raises
     ------

@@ -33,9 +33,9 @@ class NormalPrior:
     def chi2(self, pose: Pose, rotation_cov: FloatArray) -> float:
         """Return how far the normal of a measured pose is from the expected one, as χ² (2 dof).
 
-        dᵀ (S + sd² I)⁻¹ d with the turn d from one to the other and the covariance S of the
-        measured normal: what the least χ² of both observations together is. Without S, far targets
-        would be judged by the noise of their normals.
+        dᵀ (S + sd² I)⁻¹ d, with the rotation d from one to the other and the covariance S of the
+        measured normal: the least χ² of both observations together. Without S, the noise of their
+        normals would decide about far targets.
 
         Parameters
         ----------
@@ -52,9 +52,9 @@ class NormalPrior:
         return float(turn @ np.linalg.solve(cov, turn))
 
     def preference(self, pose: Pose, other: Pose, rotation_cov: FloatArray) -> float:
-        """Return by how much more χ² the other pose has, each counting to 5 σ at most.
+        """Return the χ² of the other pose minus that of this one, each limited to 5 σ.
 
-        Of two poses that are both farther off, neither is preferred: attitudes may be wrong.
+        If both are farther off, neither is preferred: attitudes may be wrong.
         """
         own, others = (min(self.chi2(each, rotation_cov), _BELIEVED_CHI2) for each in (pose, other))
         return others - own
@@ -64,9 +64,9 @@ class NormalPrior:
 class SceneRotation:
     """How the scene turns about the camera while a rolling shutter reads it."""
 
-    # Ω about the camera's axes x right, y down, z forward: a point X moves by Ω × X. It is the
-    # camera's own rotation, turned round, and for the part of a moving plate or of a camera that
-    # flies by, the turn of the line of sight.
+    # Ω about the camera's axes x right, y down, z forward: a point X moves by Ω × X. It combines
+    # the inverse of the camera's own rotation with the rotation of the line of sight to a moving
+    # plate, or from a moving camera.
     velocity_rad_s: tuple[float, float, float]
     sd_rad_s: float  # standard deviation of each of the three
 

@@ -1,7 +1,7 @@
 """Errors that all frames share: the camera's calibration and the size of the print.
 
 Averaging over frames does not reduce them. They are therefore not part of an observation's own
-covariance, and are reported apart.
+covariance, and are reported separately.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def pose_by_calibration(camera: Camera, radius_m: float, pose: Pose) -> FloatArr
 def _edge_weights(along: FloatArray) -> FloatArray:
     """Return the matrices (n, 2, 2) from displacements of an edge [px] to weighted residuals.
 
-    An edge only shows how far it is displaced across its direction `along` (n, 2); along it the
-    dots say a little, which decides about the heading and hardly counts elsewhere.
+    An edge only shows how far it is displaced across its direction `along` (n, 2). Along it the
+    dots give a little information, which determines the heading and hardly counts elsewhere.
     """
     x, y = (along / np.linalg.norm(along, axis=1, keepdims=True)).T
     rows = np.stack((-y, x), -1), _ALONG_EDGE * np.stack((x, y), -1)

@@ -32,7 +32,7 @@ _FIRST_DAMPING = 1e-4
 _MOST_DAMPING = 1e12
 _CONVERGED = 1e-8  # relative decrease of the cost
 _MOST_STEPS = 100
-_ROUND_STEPS = 2  # between two reweightings, of what changes anyway
+_ROUND_STEPS = 2  # between two reweightings, which change the minimum anyway
 _SETTLED_WEIGHT = 0.05  # change of a weight between two rounds
 _HUBER = 2.0  # in units of the robust deviation of a disc's residual
 _MEDIAN_OF_TWO = math.sqrt(2.0 * math.log(2.0))  # of the norm of two standard normal numbers
@@ -166,7 +166,7 @@ def _reweighted(
     observations = network.observations
     residuals = observations.places - computed(network, estimate)
     sizes = np.linalg.norm(whitened(network, residuals, np.ones(len(residuals))), axis=1)
-    # photographs fit differently well; the discs of one are compared with each other, too
+    # photographs fit differently well, so that discs are also compared within each of them
     overall = max(float(np.median(sizes)) / _MEDIAN_OF_TWO, _LEAST_DEVIATION)
     own = [
         float(np.median(sizes[observations.view == view])) / _MEDIAN_OF_TWO

@@ -225,7 +225,7 @@ class CalibrationProblem:
         )
         sds = self.field.point_sds_m()
         if points is PointModel.FREE:
-            # a deviation of a tenth of the pitch holds what the photographs hardly see
+            # a tenth of the pitch limits what the photographs hardly determine
             sds = np.full_like(sds, 0.1 * self.field.pitch_m)
         return PointPrior(nominal, np.eye(3) * sds[:, None] ** -2.0, bars)
 

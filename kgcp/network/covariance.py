@@ -1,13 +1,13 @@
-"""How well a network determines its unknowns: formal, by photograph, and what it cannot tell apart.
+"""Formal and clustered covariances of a network, and which parameters it cannot tell apart.
 
-The formal covariance s₀² N⁻¹ takes all discs for independent. They are not: what bends a photograph
-(a shutter, the light, a model that does not fit) bends all discs of it. Halves of the same sets of
-photographs differ by 2 to 7 formal standard deviations. So the covariance is estimated from the
-scatter between photographs, whose residuals are enlarged by a power of what the adjustment leaves
-of them. CR2 of Bell & McCaffrey (2002), the power 1/2, still takes the discs of a photograph for
-independent; halves differ by 1.0 to 2.1 of its deviations. CR3, the power 1, is the jackknife; with
-three to five photographs, one of which decides much alone, halves differ by 0.3 to 0.5 of its
-deviations. The power is between the two.
+The formal covariance s₀² N⁻¹ assumes that all discs are independent. They are not: whatever
+distorts a photograph (a shutter, the light, a model that does not fit) displaces all its discs.
+Halves of the same sets of photographs differ by 2 to 7 formal standard deviations. The covariance
+is therefore estimated from the scatter between photographs, whose residuals are divided by a power
+of their redundancy. CR2 of Bell & McCaffrey (2002), with the power 1/2, still assumes that the
+discs of a photograph are independent; halves differ by 1.0 to 2.1 of its standard deviations. CR3,
+with the power 1, is the jackknife; with three to five photographs, one of which dominates, halves
+differ by 0.3 to 0.5 of its standard deviations. The power used here is between the two.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from kgcp.network.point_elimination import (
 from kgcp.network.records import Network, Precision, Solution
 
 _POWER = 0.75
-_LEAST_FACTOR = 1e-4  # of the stated variances: residuals that vanish check nothing
-_LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, a photograph decides it alone
+_LEAST_FACTOR = 1e-4  # of the stated variances: residuals of zero prove nothing
+_LEAST_REDUNDANCY = 1e-6  # of a direction of the observations: below, nothing else checks it
 
 
 def precision(network: Network, solution: Solution) -> Precision:
@@ -64,11 +64,11 @@ def precision(network: Network, solution: Solution) -> Precision:
 
 
 def fitting_covariances(network: Network, solution: Solution, stated: FloatArray) -> FloatArray:
-    """Return covariances (n, 2, 2) of the discs to which their residuals fit.
+    """Return covariances (n, 2, 2) of the discs that agree with their residuals.
 
-    Where residuals are smaller than `stated`, all are scaled. Where they are larger, the same
-    variance is added to all: what bends a photograph or a field, and is not in the model, knows
-    nothing of how well a disc was measured.
+    If the residuals are smaller than `stated`, all covariances are scaled. If they are larger, the
+    same variance is added to all discs: an effect that the model lacks does not depend on how well
+    a disc was measured.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def _unknowns(network: Network) -> int:
 
 
 def _determined_by_priors(network: Network, solution: Solution) -> float:
-    """Return how many unknowns priors and inner constraints determine, as a sum of shares."""
+    """Return the number of unknowns that priors and inner constraints determine, in shares."""
     equations = view_rows(network, solution.estimate, solution.weights)
     if can_eliminate_points(network):
         return determined_by_priors(network, reduce_points(network, solution.estimate, equations))
@@ -145,7 +145,7 @@ def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
 
 
 def _pose_inverses(system: ReducedSystem, inverse: FloatArray) -> FloatArray:
-    """Return the cofactors (v, 6, 6) of the poses, cameras and points being unknown too."""
+    """Return the cofactors (v, 6, 6) of the poses, with cameras and points unknown as well."""
     cofactors = []
     for normal, coupling, columns in zip(
         system.pose_normals, system.couplings, system.columns, strict=True
@@ -175,7 +175,7 @@ def _camera_covariance(
 ) -> FloatArray:
     """Return the covariance (c p, c p) of the camera parameters, clustered by photograph.
 
-    In no direction is it below the formal one, which few photographs may seem to allow.
+    It is raised to the formal one where it is smaller, as it can be by chance of few photographs.
     """
     cameras = network.cameras.values.size
     reach = inverse[:cameras]
@@ -208,7 +208,7 @@ def _score(view: ViewRows, inverse: FloatArray) -> FloatArray:
 
 
 def _enlarged(along: FloatArray, redundancy: FloatArray) -> FloatArray:
-    """Return components over a power of their redundancy, 0 where a photograph decides alone."""
+    """Return components over a power of their redundancy; 0 where nothing else checks them."""
     is_checked = redundancy > _LEAST_REDUNDANCY
     return np.where(is_checked, along / np.where(is_checked, redundancy, 1.0) ** _POWER, 0.0)
 
@@ -221,7 +221,7 @@ def _without_pose(view: ViewRows) -> tuple[FloatArray, FloatArray]:
 
 
 def never_below(cov: FloatArray, floor: FloatArray) -> FloatArray:
-    """Return a covariance that is `floor` in the directions in which `cov` is smaller."""
+    """Return `cov`, raised to `floor` in the directions in which it is smaller."""
     scale = np.sqrt(floor.diagonal())
     root = np.linalg.cholesky(floor / np.outer(scale, scale)) * scale[:, None]
     relative = np.linalg.solve(root, np.linalg.solve(root, cov).T)

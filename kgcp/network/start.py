@@ -24,7 +24,7 @@ from kgcp.network.records import (
 
 FOCALS = (0.5, 0.8, 1.2, 2.0, 3.2, 5.0, 8.0, 12.0)
 """To try to begin with: multiples of the longer side of the frame."""
-_KNOWN = 1e-9  # standard deviation of what is not to change
+_KNOWN = 1e-9  # standard deviation of parameters that are not to change
 
 
 def start_camera_and_poses(
