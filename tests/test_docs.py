@@ -35,6 +35,20 @@ DESIGN = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 
+def test_named_benchmarks_exist() -> None:
+    code = [*(ROOT / "kgcp").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]
+    named = {
+        (path, module)
+        for path in (*PAGES, *code, ROOT / "benchmarks" / "README.md", ROOT / "Makefile")
+        for module in re.findall(r"benchmarks(?:\.[a-z_]+)+", path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 50
+    for path, module in named:
+        place = ROOT.joinpath(*module.split("."))
+        found = (place.with_suffix(".py"), place, place.parent.with_suffix(".py"))
+        assert any(each.exists() for each in found), f"{path}: {module}"
+
+
 def section(heading: str, page: str = TABLES) -> str:
     """The text below a heading of a page, up to the next one of any level."""
     match = re.search(rf"^#+ {re.escape(heading)}$(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)

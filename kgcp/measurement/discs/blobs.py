@@ -19,7 +19,8 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.measurement.discs.records import Polarity
 
-# Tuning. `benchmarks.calibrate.finder` counts what is found in rendered fields and in photographs.
+# Tuning. `benchmarks.calibrate.sets` counts the discs found in photographs of fields, and
+# `benchmarks.ground.plain_targets` those found in rendered frames.
 _WINDOW = 11  # pixels: sees both sides of an edge blurred by σ = 2 px
 _LEAST_RANGE = 12  # grey values of 255: fainter edges are not followed
 _RANGE_SIGMAS = 12.0  # of the noise: a window of 121 even pixels has a range of 5 σ
