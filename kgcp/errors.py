@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Self
 
-_LONGEST_LINE = 1500  # characters: what is wrong stands at the beginning, the remedy at the end
+_LONGEST_LINE = 1500  # characters: the problem is at the beginning, the remedy at the end
 
 
 def one_line(text: str) -> str:

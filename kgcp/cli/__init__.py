@@ -19,7 +19,7 @@ from kgcp import __version__
 from kgcp.errors import KgcpError, KgcpWarning, SettingError
 from kgcp.pipeline.execution.threads import use_one_thread_each
 
-_OBJECTS = 50_000  # between two searches for garbage, of which libraries that are loaded leave none
+_OBJECTS = 50_000  # between two searches for garbage; loading libraries leaves none
 
 STARTED_S = time.perf_counter()
 """When the program began to run: after some 20 ms of Python's own."""

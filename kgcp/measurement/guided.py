@@ -22,10 +22,10 @@ from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 
 # Tuning of the second look; its benchmark is the table in docs/method.md, "The second pass": four
-# simulated flights, with what the second look adds to them.
+# simulated flights, with the targets that the second look adds.
 _SIGMAS = 4.0  # of the prediction, in place and radius
 _SMALLEST_PX = 3.0  # radius of a ring that is looked for
-_FARTHEST = 8.0  # radii that a target may be off: beyond, the expectation is of little use
+_FARTHEST = 8.0  # largest uncertainty of the place, in radii: beyond, a prediction is of little use
 _LARGEST_RATIO = 2.0  # of the radius to the expected one
 _SPACING, _RATIO = 0.35, 1.25  # of the places and radii that rings are tracked from
 _LOWER_SCORE = 0.06

@@ -26,7 +26,7 @@ _SETTLED = 1e-9  # of the distance, and radians
 _LARGEST_TURN_RAD = 0.3  # of a step
 _TURN = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)
 _LEAST_TILT_RAD = 0.05
-_ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an angle of which nothing is known
+_ANY_HEADING_RAD2 = math.pi**2 / 3.0  # variance of an unknown angle
 
 
 @dataclass(frozen=True, slots=True, eq=False)

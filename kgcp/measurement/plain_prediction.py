@@ -21,7 +21,7 @@ Below, pebbles and clods are as round. On ground that is not known to be even, o
 measured at a wrong place at 2.5 px. Where any ellipse would do, three or more of 2000 places
 without a target were taken for one between 2.5 and 4 px (`benchmarks.ground.plain_targets`).
 """
-_FARTHEST = 16.0  # radii that a target may be off: beyond, too much else would be looked at
+_FARTHEST = 16.0  # largest uncertainty of the place, in radii: beyond, too much would be searched
 _FREE_SD_DEG = 60.0
 _LEAST_COSINE = 0.17  # of the angle between normal and ray: 80°
 

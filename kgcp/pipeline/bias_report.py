@@ -283,7 +283,7 @@ def _closeups_and_reexposures(
             with at_hand(frames, sighting.frame) as path:
                 grey = read_grey(path, flight.camera)
         except (Rejection, KgcpError):
-            continue  # the page says of which frames there is no close-up
+            continue  # the page names the frames without a close-up
         target, radius = targets[sighting.target], float(numbers.data.radius_px[row])
         if row in closeup_rows and sighting.pose is not None:
             view = _ring_view(flight.camera, target, sighting.pose, sighting.centre_px)

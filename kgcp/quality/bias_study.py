@@ -119,7 +119,7 @@ class BiasStudy:
     # called misplaced, and every frame with a pose counts as one that shows it.
     attitudes_agree: bool
     frames_without_pose: tuple[str, ...]  # frames that the reference does not name
-    absences: tuple[NoPosition, ...]  # of the frames whose target cannot be placed
+    absences: tuple[NoPosition, ...]  # of the frames in which the position of the target is unknown
 
     def trusts(self, pair: Comparison) -> bool:
         """Whether a comparison holds a measurement, and one of this target."""

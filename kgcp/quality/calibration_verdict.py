@@ -217,7 +217,7 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
     if numbers.normals_deg < 2.0 * _NORMALS_DEG or np.median(numbers.tilts_deg) < _NORMALS_DEG:
         advice.append("Tilt the field by 25° to 40° about both axes, in all four directions.")
     turns = np.radians(numbers.turns_deg)
-    # how much of the directions lies along one axis: 1 where all photographs are held alike
+    # share of the directions along one axis: 1 if all photographs are held in the same way
     alike = float(np.abs(np.mean(np.exp(2j * turns))))
     if alike > 0.9:
         advice.append("Turn the camera by 90° in at least two photographs.")

@@ -97,7 +97,9 @@ class Slope:
     sd_height: float
     sd_value: float
     probability: float  # of as large a slope by chance
-    share: float  # of the variance of y what the line explains, corrected for its one parameter
+    share: (
+        float  # share of the variance of y that the line explains, corrected for its one parameter
+    )
 
     def line(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the line at x (n,) and its standard deviation."""

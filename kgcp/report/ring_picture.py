@@ -42,7 +42,7 @@ class RingView:
     centre_px: FloatArray  # (2,): its centre in the raw frame [px]
     radius_px: float  # of its outer edge [px]
     curves: Sequence[FloatArray]  # contours, fitted or of the outline that was dropped [px]
-    residual_image: ResidualImage | None = None  # what the fit leaves; None: there is no fit
+    residual_image: ResidualImage | None = None  # residuals of the fit; None: there is no fit
     expected: Sequence[FloatArray] = ()  # dots that a dropped ring should have [px]
 
 

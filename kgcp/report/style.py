@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
-# Okabe and Ito's palette, told apart by colour-blind readers and in grey print
+# Okabe and Ito's palette, which colour-blind readers and grey prints can tell apart
 BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 MARK_STEPS = 10_000  # of a picture's width and height
 _DPI = 180

@@ -13,7 +13,7 @@ from kgcp.simulation.plane_raster import PlaneRaster
 _TILE = 1024  # texels per side of the periodic noise
 _SPECTRUM_EXPONENT = 1.2  # amplitude ~ 1/frequency^e: between pink noise and natural images
 _LEVELS = 8
-_LOWEST_FREQUENCY = 4.0 / _TILE  # what is larger would betray the tile's repetition
+_LOWEST_FREQUENCY = 4.0 / _TILE  # larger structures would show that the tile repeats
 _STEP = 2  # texture is looked up at every second sub-pixel and interpolated: a quarter of the time
 _ROAD_HALF_WIDTH_M = 3.6
 _MARKING_M = 0.12

@@ -125,7 +125,7 @@ class Outlook:
     footprint_m: tuple[float, float]  # of the image on the ground: its width and height
     # in which the main ring is whole while the camera passes along the image's height
     frames_per_pass: float
-    # what the centre of the ring's ellipse is off by, in the image's middle and at `OBLIQUE_DEG`
+    # offset of the centre of the ring's ellipse, in the middle of the image and at `OBLIQUE_DEG`
     eccentricity_px: float
 
 

@@ -94,7 +94,7 @@ class PlateImage:
     """Light of a plate in the pixels of a window."""
 
     window: PixelWindow
-    opacity: FloatArray  # (height, width): how much of what lies behind the plate is hidden, 0…1
+    opacity: FloatArray  # (height, width): share of the background that the plate hides, 0…1
     irradiance: FloatArray  # (height, width): light that comes from the plate
 
     def paste(self, frame: FloatArray) -> None:

@@ -41,7 +41,7 @@ class RowMotion:
     """Motion of the image of one frame from row to row."""
 
     px_per_row: tuple[float, float]  # x and y [px]
-    still_row: float  # the row to whose moment all poses belong
+    still_row: float  # row whose moment of exposure all poses refer to
     rows: int  # of the frame
 
     @property

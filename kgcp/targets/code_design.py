@@ -22,7 +22,7 @@ _Kind = TypeVar("_Kind", bound=AnyTarget)
 
 LEAST_DISTANCE = 2.0
 """Dots by which new codes must differ: less than one dot elsewhere is dirt or a shadow."""
-DOTS = (3, 6)  # fewer identify too little; of more, too many overlap in any arrangement
+DOTS = (3, 6)  # fewer dots distinguish too few codes; more dots overlap in any arrangement
 _GRID_DEG, _STARTS = 5.0, 6
 # Many codes that do not fit on that grid may fit on a coarser one. Codes are told apart by a dot
 # that is off by more than a dot's width: two steps of a grid just coarser than half of it. On the

@@ -13,7 +13,7 @@ from kgcp.targets.shapes import Artwork, Box, Primitive, Sheet, Text
 
 _MARGIN_MM = 10.0
 _TILE_MARGIN_MM = 15.0  # printers leave up to five white; the rest is for the marks
-_BLEED_MM = 3.0  # beyond the cut, so that no white line is left
+_BLEED_MM = 3.0  # beyond the cut, so that no white line remains
 _MARK_GAP_MM, _MARK_MM = 5.0, 5.0
 _RULER_MM = 100.0
 _LARGEST_MM = 5000.0  # of a PDF page: 14400 pt

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 class Format:
     """One format of the command line."""
 
-    # what it writes, below the results' folder; in brackets: only where there is something
+    # what it writes, below the results' folder; in brackets: only if there is something to write
     files: tuple[str, ...]
     description: str
 

@@ -36,7 +36,7 @@ class CsvLayout:
 
     separator: str = ","
     decimal: str = "."
-    # name in docs/foreign_files.md → name in the file's first line; the others are alike in both
+    # name in docs/foreign_files.md → name in the file's first line; the others are the same in both
     columns: Mapping[str, str] = field(default_factory=dict)
 
 

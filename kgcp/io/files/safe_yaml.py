@@ -8,7 +8,7 @@ from itertools import islice
 import yaml
 
 _MOST_CHARACTERS = 1 << 22
-_MOST_OPENED = 5000  # collections, all of which may be in each other: a parser recurses
+_MOST_OPENED = 5000  # collections, which may all be nested: a parser recurses
 _OPENING = re.compile(r"[\[{]|[-?:]\s")
 _MATRIX = "tag:yaml.org,2002:opencv-matrix"
 _SAFE: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # twenty times faster

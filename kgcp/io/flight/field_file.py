@@ -32,7 +32,7 @@ _SHORTHAND = re.compile(
 )
 _LENGTH = re.compile(r"(\d+(?:\.\d+)?|\.\d+)\s*(mm|cm|m|in)")
 _METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
-_USUAL_SHARE = 0.5  # of the pitch: what a diameter is taken for until it is measured
+_USUAL_SHARE = 0.5  # of the pitch: assumed diameter until it is measured
 _EXAMPLE = "grid:10x8:25mm:15mm"
 
 

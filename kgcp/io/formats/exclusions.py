@@ -11,7 +11,7 @@ from kgcp.errors import KgcpError
 from kgcp.io.files.safe_read import is_file, read_lines
 
 _COLUMNS = ("flight", "frame", "target")
-_UNNAMED = ("frame", "target")  # of a file whose first line names no columns
+_UNNAMED = ("frame", "target")  # of a file without a header
 
 
 @dataclass(frozen=True, slots=True)

@@ -201,6 +201,6 @@ FORMATS: Registry[Callable[[ForeignFile, Sequence[str]], FrameTimes]] = Registry
     {
         "mrk": (looks_like_marks, _read_marks),
         "rtklib": (looks_like_solution, _read_events),
-        "csv": (lambda _: True, _read_csv),  # whose reader says what is wrong with the file
+        "csv": (lambda _: True, _read_csv),  # its reader reports what is wrong with the file
     },
 )

@@ -129,7 +129,7 @@ class StoredFolder:
             pa.memory_map(str(source)) as content,
             system.open_output_stream(path) as stream,
         ):
-            # In one piece, since the end of the stream would make an object of half a file, too.
+            # In one piece: a stream that ends early would leave an object with half of the file.
             stream.write(content.read_buffer())
 
     def require_writable(self) -> None:

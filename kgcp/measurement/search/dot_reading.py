@@ -68,7 +68,7 @@ def _centres_of_runs(is_bright: BoolArray, dot_deg: float) -> FloatArray:
     centres = []
     for start in starts:
         length = int((ends - start).min(where=ends >= start, initial=count))
-        if length == count:  # the run goes over the end of the circle
+        if length == count:  # the run crosses the end of the circle
             length = int(ends[0]) + count - int(start)
         width_deg = (length + 1) * step_deg
         if width_deg < _NARROWEST * dot_deg:

@@ -22,7 +22,7 @@ _REACH = 8  # samples that it reaches to either side
 _KERNEL = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SMOOTHED) ** 2)
 _KERNEL /= _KERNEL.sum()
 _UNEVEN = 0.15  # of the contrast: below, one pair of levels does
-_LEAST_CONTRAST = 0.2  # of the typical one: what is fainter is something else
+_LEAST_CONTRAST = 0.2  # of the typical one: anything fainter is something else
 
 
 def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None:

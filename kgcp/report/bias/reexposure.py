@@ -16,7 +16,7 @@ from kgcp.targets.layout import Target
 
 GAINS = (0.6, 1.6)
 _SD_PX, _SD_LOG_RADIUS = 0.5, 0.02  # how sure it is that the target is where it was
-_REACH = 4.0  # of the ring's radius: what is changed of the frame around it
+_REACH = 4.0  # of the ring's radius: size of the part of the frame that is changed
 _LEAST_REACH_PX = 60.0
 
 
@@ -25,7 +25,7 @@ class Reexposed:
     """One target measured again."""
 
     row: int  # of the measurement, by its place in time
-    gain: float  # what the grey values were multiplied by
+    gain: float  # factor of the grey values
     radius_px: float  # of the ring
     change_percent: float | None  # of the distance; None: the target was not measured again
     sd_percent: float | None  # standard deviation of the new distance

@@ -59,7 +59,7 @@ LIMITS = Limits()
 class Finding:
     """One sentence of the verdict."""
 
-    grade: FlightGrade  # what it makes of the flight; `GOOD` where it only informs
+    grade: FlightGrade  # grade that it gives the flight; `GOOD` if it only informs
     text: str
     section: str  # where the page shows it: the id of a section
 

@@ -20,7 +20,7 @@ from kgcp.targets.fields.points import MOST_DISCS, FieldPoint, PointField, gaps_
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 _COMMENTS = ("#", "!", "%", "//")
-_DISC = 0.3  # of the distance of neighbours: what a diameter is taken for until it is measured
+_DISC = 0.3  # of the distance of neighbours: assumed diameter until it is measured
 _LARGEST_DISC = 0.5  # of the least distance
 _HEAD = 4096  # characters that tell the format
 _COUNTS = (4, 7)  # cells in a row: without and with deviations
