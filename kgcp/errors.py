@@ -109,7 +109,7 @@ class Reason(StrEnum):
     NO_CANDIDATE = (
         "no_candidate",
         Status.NOT_FOUND,
-        "nothing like the target, other targets' rings apart",
+        "nothing like the target, apart from rings of other targets",
         "none needed if the target is not in the frame; else see the contact sheet",
     )
     CODE_MISMATCH = (
@@ -127,19 +127,19 @@ class Reason(StrEnum):
     NO_PREDICTION = (
         "no_prediction",
         Status.NOT_FOUND,
-        "where a plain target must be is not known of this frame, or not well enough",
+        "nothing predicts where a plain target is in this frame, or not well enough",
         "give [reference] poses of the frames (see kgcp orient), marks or more static targets",
     )
     UNLIKE_PREDICTION = (
         "unlike_prediction",
         Status.NOT_FOUND,
-        "what is where a plain target must be has another place, size or shape",
+        "the edge where a plain target must be has another place, size or shape",
         "none needed if it is hidden; else correct its diameter, position or normal",
     )
     AMBIGUOUS_PLACE = (
         "ambiguous_place",
         Status.REJECTED,
-        "two things like a plain target are where it must be",
+        "two things that look like a plain target are where it must be",
         "give better poses, or keep the ground clear",
     )
     CROWDED = (
@@ -241,7 +241,7 @@ class Reason(StrEnum):
     TIMED_OUT = (
         "timed_out",
         Status.UNREADABLE,
-        "the frame took longer than it may, also alone",
+        "the frame took longer than allowed, also when it was examined alone",
         "look at the file, or allow more time",
     )
 
