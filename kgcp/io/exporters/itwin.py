@@ -14,10 +14,6 @@ from collections.abc import Mapping
 from importlib.resources import files as resources
 from xml.etree import ElementTree as ET
 
-from pyproj.enums import WktVersion
-from pyproj.exceptions import CRSError
-
-from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import (
@@ -30,7 +26,7 @@ from kgcp.io.exporters.points import (
     largest_sd,
     pixel,
 )
-from kgcp.io.exporters.shared import add_text, xml_text
+from kgcp.io.exporters.shared import add_text, well_known_text, xml_text
 
 _FOLDER = "itwin"
 _SENSOR_MM = 36.0  # of the longer side; the focal length is in the same proportion
@@ -147,12 +143,4 @@ def _definition(points: MapPoints) -> str:
     """Return the code, or well-known text 1."""
     if _CODE.fullmatch(points.crs):
         return points.crs
-    crs = points.parsed_crs
-    whole = crs if crs.is_compound else crs.to_2d()
-    try:
-        return whole.to_wkt(WktVersion.WKT1_GDAL)
-    except CRSError:
-        raise KgcpError(
-            f"{_FOLDER}: crs {points.crs!r} has no form that iTwin Capture reads; export in another"
-            " CRS or leave this format out"
-        ) from None
+    return well_known_text(points, _FOLDER, "iTwin Capture")

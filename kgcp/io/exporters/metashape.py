@@ -12,10 +12,6 @@ from importlib.resources import files as resources
 from pathlib import PurePosixPath
 from xml.etree import ElementTree as ET
 
-from pyproj.enums import WktVersion
-from pyproj.exceptions import CRSError
-
-from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior, opk_covs, opk_deg
@@ -31,7 +27,7 @@ from kgcp.io.exporters.points import (
     labels,
     pixel,
 )
-from kgcp.io.exporters.shared import focal_length_note, marks_note, xml_text
+from kgcp.io.exporters.shared import focal_length_note, marks_note, well_known_text, xml_text
 
 _FOLDER = "metashape"
 _HOWTO = """\
@@ -132,17 +128,8 @@ def _script(points: MapPoints, mark_px: str) -> str:
 def _definition(points: MapPoints) -> str:
     """Return a CRS as Metashape's CoordinateSystem takes it: a code, or well-known text 1."""
     crs = points.parsed_crs
-    whole = crs if crs.is_compound else crs.to_2d()
-    code = None if crs.is_compound else whole.to_epsg()
-    if code is not None:
-        return f"EPSG::{code}"
-    try:
-        return whole.to_wkt(WktVersion.WKT1_GDAL)
-    except CRSError:
-        raise KgcpError(
-            f"{_FOLDER}: crs {points.crs!r} has no form that Metashape reads; export in another CRS"
-            " or leave this format out"
-        ) from None
+    code = None if crs.is_compound else crs.to_2d().to_epsg()
+    return well_known_text(points, _FOLDER, "Metashape") if code is None else f"EPSG::{code}"
 
 
 def _markers(points: MapPoints, label: Mapping[str, str]) -> str:

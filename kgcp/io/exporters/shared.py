@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
+from pyproj.enums import WktVersion
+from pyproj.exceptions import CRSError
+
+from kgcp.errors import KgcpError
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import MapPoints
 from kgcp.io.exporters.weights import ASSUMED_SHARE, distance_share
@@ -61,6 +65,24 @@ def marks_note(points: MapPoints) -> str:
         " everywhere, and with thousandths of\na pixel each would weigh as much as thousands of"
         " tie points."
     )
+
+
+def well_known_text(points: MapPoints, where: str, program: str) -> str:
+    """Return the points' CRS as well-known text 1, without heights unless it is compound.
+
+    Raises
+    ------
+    KgcpError
+        If the CRS has no such form.
+    """
+    crs = points.parsed_crs
+    try:
+        return (crs if crs.is_compound else crs.to_2d()).to_wkt(WktVersion.WKT1_GDAL)
+    except CRSError:
+        raise KgcpError(
+            f"{where}: crs {points.crs!r} has no form that {program} reads; export in another CRS"
+            " or leave this format out"
+        ) from None
 
 
 def xml_text(root: ET.Element) -> str:

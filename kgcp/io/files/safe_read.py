@@ -38,6 +38,14 @@ def is_sound(value: float) -> bool:
     return abs(value) < LARGEST
 
 
+def is_number(text: str) -> bool:
+    """Return whether this is the text of a sound number."""
+    try:
+        return is_sound(float(text))
+    except ValueError:
+        return False
+
+
 def require_file(path: Path, toml_key: str) -> None:
     """Refuse what is not a regular file.
 

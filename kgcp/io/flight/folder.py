@@ -9,7 +9,7 @@ from pathlib import Path
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.csv_sniff import sniff_table
-from kgcp.io.files.safe_read import is_file, is_folder
+from kgcp.io.files.safe_read import is_file, is_folder, is_number
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.calibrations import FORMATS as CALIBRATION_FORMATS
 from kgcp.io.formats.frame_times import looks_like_marks
@@ -180,7 +180,7 @@ def _kinds_of_adjustment(file: ForeignFile) -> _Kinds:
     """Return what programs that calibrate and adjust have written, and TUM, which has no mark."""
     if b"\0" in file.head or not file.head.strip():
         return ()
-    if tum.matches(file) and all(map(_is_number, file.first_line.split())):
+    if tum.matches(file) and all(map(is_number, file.first_line.split())):
         return (("trajectory", TrajectoryFile(file.path, "tum")),)
     is_poses = any(
         matches(file) for name, (matches, _) in POSE_FORMATS.formats.items() if name != "csv"
@@ -199,11 +199,3 @@ def _is_calibration(file: ForeignFile) -> bool:
         return bool(CALIBRATION_FORMATS.reader(file)(file))
     except KgcpError:
         return False
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

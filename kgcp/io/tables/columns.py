@@ -5,6 +5,7 @@ What each column means is said once, in docs/tables.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -59,6 +60,11 @@ def time_cell(time_s: float | None) -> datetime | None:
 def matrix_cell(matrix: FloatArray | None) -> list[float] | None:
     """Return the elements of a matrix, row by row."""
     return None if matrix is None else matrix.ravel().tolist()
+
+
+def finite_cell(value: float) -> float | None:
+    """Return a number as a table cell: null where it is not finite."""
+    return value if math.isfinite(value) else None
 
 
 def sd_cell(cov: FloatArray | None, axis: int) -> float | None:

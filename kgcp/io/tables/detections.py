@@ -30,6 +30,7 @@ from kgcp.io.tables.columns import (
     TIME,
     Column,
     Row,
+    finite_cell,
     matrix_cell,
     row_of,
     sd_cell,
@@ -105,10 +106,6 @@ def _alternative(get: Callable[[Alternative], object]) -> _Get:
     return _part(lambda seen: seen.alternative, get)
 
 
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def _eccentricity(seen: Measurement) -> FloatArray | None:
     return seen.eccentricity_px
 
@@ -169,7 +166,9 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("ecc_y_px", NUMBER, _part(_eccentricity, lambda off: float(off[1]))),
     Column("moments", NUMBERS, _part(_image, lambda image: matrix_cell(image.moments))),
     Column("moments_cov", NUMBERS, _part(_image, lambda image: matrix_cell(image.cov))),
-    Column("score", NUMBER, _outcome(lambda seen: _finite(seen.score), lambda miss: miss.score)),
+    Column(
+        "score", NUMBER, _outcome(lambda seen: finite_cell(seen.score), lambda miss: miss.score)
+    ),
     Column("radius_px", NUMBER, _measured(lambda seen: seen.appearance.radius_px)),
     Column("blur_px", NUMBER, _measured(lambda seen: seen.appearance.blur_px)),
     Column("edge_shift_px", NUMBER, _measured(lambda seen: seen.appearance.edge_shift_px)),

@@ -14,7 +14,16 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
-from kgcp.io.tables.columns import BOOLEAN, INTEGER, NUMBER, NUMBERS, TEXT, Column, matrix_cell
+from kgcp.io.tables.columns import (
+    BOOLEAN,
+    INTEGER,
+    NUMBER,
+    NUMBERS,
+    TEXT,
+    Column,
+    finite_cell,
+    matrix_cell,
+)
 from kgcp.network.ground.frame_poses import FramePose
 from kgcp.network.ground.point_images import CameraPose
 
@@ -128,17 +137,13 @@ def _distance_percent(row: PoseResidual) -> float | None:
     return 100.0 * math.expm1(log) if math.isfinite(log) else None
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 POSE_RESIDUAL_COLUMNS: tuple[Column[PoseResidual], ...] = (
     Column("frame", TEXT, lambda row: row.frame),
     Column("target", TEXT, lambda row: row.target),
     Column("used", BOOLEAN, lambda row: row.is_used),
-    Column("chi2", NUMBER, lambda row: _finite(row.chi2)),
-    Column("residual_x_px", NUMBER, lambda row: _finite(float(row.residual[0]))),
-    Column("residual_y_px", NUMBER, lambda row: _finite(float(row.residual[1]))),
+    Column("chi2", NUMBER, lambda row: finite_cell(row.chi2)),
+    Column("residual_x_px", NUMBER, lambda row: finite_cell(float(row.residual[0]))),
+    Column("residual_y_px", NUMBER, lambda row: finite_cell(float(row.residual[1]))),
     Column("residual_distance_percent", NUMBER, _distance_percent),
 )
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from kgcp.errors import KgcpError
-from kgcp.io.files.safe_read import is_sound
+from kgcp.io.files.safe_read import is_number
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.targets.fields.layout import LEAST_POINTS
 from kgcp.targets.fields.points import MOST_DISCS, FieldPoint, PointField, gaps_between
@@ -75,22 +75,10 @@ def _cells(lines: enumerate[str]) -> Iterator[tuple[int, list[str]]]:
 
 def _below_heading(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     """Return the rows without names of columns: a first row in which no cell is a number."""
-    has_heading = bool(rows) and not any(map(_is_number, rows[0][1]))
+    has_heading = bool(rows) and not any(map(is_number, rows[0][1]))
     return rows[1:] if has_heading else rows
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _is_point(cells: list[str]) -> bool:
     is_named = cells[0] != "" and cells[0].isprintable()
-    return is_named and len(cells) in _COUNTS and _are_numbers(cells[1:])
-
-
-def _are_numbers(cells: list[str]) -> bool:
-    return all(_is_number(cell) and is_sound(float(cell)) for cell in cells)
+    return is_named and len(cells) in _COUNTS and all(map(is_number, cells[1:]))

@@ -12,6 +12,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses, opk_from_rotation
 from kgcp.georef.crs import CRS_KEY, FARTHEST, geographic_of, parse_crs
 from kgcp.georef.local_frame import CrsTransform, LocalFrame
+from kgcp.io.files.safe_read import is_number
 from kgcp.io.files.sniff import ForeignFile
 from kgcp.io.formats.orientations.records import (
     OrientationFileOptions,
@@ -93,16 +94,9 @@ def read_offset(path: Path) -> FloatArray:
     file = ForeignFile(path, "[reference] offset")
     for _, row in file.rows:
         words = row.replace(",", " ").split()
-        if len(words) in (2, 3) and all(map(_is_number, words)):
+        if len(words) in (2, 3) and all(map(is_number, words)):
             return np.array([*map(float, words), 0.0][:3])
     raise file.error("has no line of two or three numbers", "give the project's offset file")
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
 
 
 def _placed(file: ForeignFile, source: SourcePoses, stated: str | None) -> SourcePoses:

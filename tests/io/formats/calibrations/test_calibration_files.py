@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -13,16 +12,7 @@ from hypothesis import strategies as st
 from kgcp.errors import KgcpError
 from kgcp.io.flight.flight import read_flight
 from kgcp.io.formats.calibrations import FORMATS, read_calibration
-
-SILENT = (None, None)
-WIDTH, HEIGHT = 1600, 1100
-
-
-def write(folder: Path, name: str, content: object) -> Path:
-    path = folder / name
-    path.write_text(content if isinstance(content, str) else json.dumps(content), "utf-8")
-    return path
-
+from tests.io.formats.calibrations.one_camera import HEIGHT, SILENT, WIDTH, write
 
 BROWN = {"projection_type": "brown", "focal_x": 1.069, "focal_y": 1.063, "c_x": 0.008, "c_y": 0.0}
 PERSPECTIVE = {
