@@ -131,8 +131,7 @@ def test_dirt_spots_cost_little(measure: Callable[..., list[Outcome]]) -> None:
     check(outcomes, sigmas=5.0, percent=0.1)
 
 
-@pytest.mark.parametrize("depth", [0.4, 0.75])
-@pytest.mark.parametrize("width_radii", [0.06, 0.15])
+@pytest.mark.parametrize(("depth", "width_radii"), [(0.4, 0.06), (0.75, 0.15)])
 def test_the_shadow_of_a_mast_costs_little(
     measure: Callable[..., list[Outcome]], depth: float, width_radii: float
 ) -> None:
