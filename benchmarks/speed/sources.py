@@ -97,9 +97,7 @@ def photographs_of(folder: Path | None, like: Source) -> list[Source]:
         return []
     by_size: dict[tuple[int, int], list[str]] = {}
     for name in list_frames(folder):
-        picture = cv2.imread(
-            str(folder / name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        )
+        picture = cv2.imread(str(folder / name), _AS_IT_IS)
         if picture is not None:
             by_size.setdefault(picture.shape[:2], []).append(name)
     return [

@@ -221,10 +221,13 @@ def test_in_even_light_nothing_changes(
 def test_uneven_light_is_measured_the_same_every_time(
     photograph: Photograph, start_near: StartNear
 ) -> None:
-    first, second = (
-        measured(photograph, start_near, 1, shadow_edge)[1].pose.matrix for _ in range(2)
-    )
-    assert first.tobytes() == second.tobytes()
+    rng = np.random.default_rng(301)
+    pose = some_pose(rng)
+    pose = Pose(pose.rotation, 2.0 * pose.translation_m)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=shadow_edge(rng))
+    start = start_near(LENS, pose, rng)
+    first, second = (measure_by_model(grey, LENS, TARGET_PLATE.target, start) for _ in range(2))
+    assert first.pose.matrix.tobytes() == second.pose.matrix.tobytes()
 
 
 def other_code(code_deg: tuple[float, ...]) -> PrintedPlate:

@@ -28,7 +28,6 @@ from kgcp.measurement.image_model.quadrature import (
 )
 from kgcp.measurement.image_model.ray_plate import PLATE_ROWS, VIEW_ROWS
 
-CHORDS = [rule for rule in Quadrature if rule is not Quadrature.EDGE]
 BY_PLATE_X, BY_PLATE_Y, BY_DEPTH, BY_XX, BY_XY, BY_YY, BY_STREAK_X, BY_STREAK_Y = range(1, 9)
 
 
