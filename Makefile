@@ -21,10 +21,8 @@ demo: $(VENV)/.runs ## detect, export-gcp and bias-report on sample_flight/
 	@ls -1 sample_flight/kgcp | sed 's/^/  /'
 	@echo "Open sample_flight/kgcp/bias_report.html in a browser."
 
-# the tests start hundreds of processes: each would compile all modules anew; and threads of BLAS
-# in several workers wait for each other
+# the tests start hundreds of processes: each would compile all modules anew
 test: export PYTHONDONTWRITEBYTECODE :=
-test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/.develops ## run the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal
 

@@ -8,6 +8,10 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import settings
 
+from kgcp.pipeline.execution.threads import use_one_thread_each
+
+use_one_thread_each()  # before numpy is loaded: threads of several workers wait for each other
+
 # A busy machine is no failure, and the same tests try the same examples on every machine.
 settings.register_profile("kgcp", deadline=None, derandomize=True)
 settings.load_profile("kgcp")
