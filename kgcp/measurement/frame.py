@@ -195,10 +195,6 @@ def _check_plate(
     """Refuse a plate that does not look like the target; return where it is visible.
 
     None means that all of it is.
-
-    Raises
-    ------
-    Rejection
     """
     template_match = match_templates_at(grey, camera, pose, ring)
     template_match.check(settings.min_score)

@@ -60,12 +60,7 @@ def check_edge(disc: Disc) -> None:
 
 
 def _check_size(target: PlainTarget, prediction: PlainPrediction, pose: Pose) -> None:
-    """Refuse a distance that is not the predicted one.
-
-    Raises
-    ------
-    Rejection
-    """
+    """Refuse a distance that is not the predicted one."""
     expected_m = float(np.linalg.norm(prediction.position_m))
     off = math.log(pose.distance_m / expected_m)
     sd = math.hypot(

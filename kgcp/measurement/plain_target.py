@@ -182,12 +182,7 @@ def _try_edge(
     prediction: PlainPrediction,
     edge: DiscOutline,
 ) -> _Candidate:
-    """Measure a target from the edge of its outer circle, and check everything.
-
-    Raises
-    ------
-    Rejection
-    """
+    """Measure a target from the edge of its outer circle, and check everything."""
     start = _start(camera, target, prediction, edge.ellipse)
     circles = _measured_circles(grey, camera, target, prediction, start, edge)
     check_edge(circles.discs[0])
@@ -247,12 +242,7 @@ def _expected_ellipse(camera: Camera, target: PlainTarget, prediction: PlainPred
 def _start(
     camera: Camera, target: PlainTarget, prediction: PlainPrediction, ellipse: Ellipse
 ) -> Pose:
-    """Return the pose that an outline of the outer circle has, if its plane is as expected.
-
-    Raises
-    ------
-    Rejection
-    """
+    """Return the pose that an outline of the outer circle has, if its plane is as expected."""
     if prediction.normal is None:
         return pose_of_ellipse(camera, ellipse, target.radii_m[0])
     x, y = camera.undistort(ellipse.centre[None])[0].tolist()
@@ -273,12 +263,7 @@ def _measured_circles(
     start: Pose,
     edge: DiscOutline,
 ) -> _Circles:
-    """Measure the outer circle and those within it.
-
-    Raises
-    ------
-    Rejection
-    """
+    """Measure the outer circle and those within it."""
     ellipses = _ellipses_of(camera, target, start)
     if _is_narrow(ellipses):
         whole = _measured_whole(grey, camera, target, start, edge)
@@ -331,12 +316,7 @@ def _measured_whole(
     start: Pose,
     edge: DiscOutline,
 ) -> _Circles:
-    """Measure the outer circle of a ring whose others move and grow with it.
-
-    Raises
-    ------
-    Rejection
-    """
+    """Measure the outer circle of a ring whose others move and grow with it."""
     ellipses = _ellipses_of(camera, target, start)
     to_unit = np.linalg.inv(ellipses[0].stretch)
     inner = [
