@@ -214,7 +214,7 @@ def main() -> None:
     known = precision(network, solution)
     result = compare(solution, known, published)
     discs = len(network.observations.view)
-    print(f"{discs} discs, {len(network.view_camera)} photographs, {solution.iterations} steps")
+    print(f"{discs} discs, {len(network.view_camera)} photographs")
     print(f"s0 {1e3 * result.s0_mm:.4f} µm, published {1e3 * published.s0_mm:.3f} µm")
     for name, difference, ratio in zip(
         network.model.names, result.values_in_sd, result.sd_ratio, strict=True

@@ -84,11 +84,10 @@ def adjust_network(network: Network, start: Estimate, robustness: Robustness = R
     """
     count = len(network.observations.view)
     weights, is_used = np.ones(count), np.ones(count, dtype=np.bool_)
-    estimate, iterations = start, 0
+    estimate = start
     if robustness != PLAIN:
         for _ in range(_ROUNDS):
-            estimate, steps = _minimise(network, estimate, weights, _ROUND_STEPS)
-            iterations += steps
+            estimate = _minimise(network, estimate, weights, _ROUND_STEPS)
             next_weights, next_used = _reweighted(network, estimate, robustness)
             is_stable = np.array_equal(next_used, is_used) and np.allclose(
                 next_weights, weights, atol=_SETTLED_WEIGHT
@@ -96,19 +95,18 @@ def adjust_network(network: Network, start: Estimate, robustness: Robustness = R
             weights, is_used = next_weights, next_used
             if is_stable:
                 break
-    estimate, steps = _minimise(network, estimate, weights, _MOST_STEPS)
-    iterations += steps
+    estimate = _minimise(network, estimate, weights, _MOST_STEPS)
     residuals = network.observations.places - computed(network, estimate)
-    return Solution(estimate, residuals, is_used, weights, iterations)
+    return Solution(estimate, residuals, is_used, weights)
 
 
 def _minimise(
     network: Network, estimate: Estimate, weights: FloatArray, most_steps: int
-) -> tuple[Estimate, int]:
-    """Return the estimate with the least weighted sum of squares, and the steps taken."""
+) -> Estimate:
+    """Return the estimate with the least weighted sum of squares."""
     damping = _FIRST_DAMPING
     cost = _cost(network, estimate, weights)
-    for step in range(most_steps):
+    for _ in range(most_steps):
         equations = view_rows(network, estimate, weights)
         while True:
             trial = _stepped(network, estimate, equations, damping)
@@ -117,13 +115,13 @@ def _minimise(
                 break
             damping *= 10.0
         if trial_cost > cost:
-            return estimate, step
+            break
         is_done = cost - trial_cost <= _CONVERGED * cost
         estimate, cost = trial, trial_cost
         damping = max(damping / 10.0, 1e-15)
         if is_done:
-            return estimate, step + 1
-    return estimate, most_steps
+            break
+    return estimate
 
 
 def _stepped(

@@ -119,7 +119,6 @@ class Solution:
     residuals: FloatArray  # (n, 2): observed minus computed
     is_used: BoolArray  # (n,): whether a disc was kept
     weights: FloatArray  # (n,): robust weights in 0…1; 0 where a disc was rejected
-    iterations: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
