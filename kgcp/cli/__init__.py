@@ -82,7 +82,7 @@ class Program(click.Group):
     """The `kgcp` command: imports a command when it is called, prints known errors as one line."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 - click's signature
-        """Run the program; its help, too, has characters that not every stream prints."""
+        """Run the program; even its help has characters that not every stream can print."""
         _print_anything()
         gc.set_threshold(_OBJECTS)
         atexit.register(gc.freeze)  # 0.2 s of searching what ends with the process anyway

@@ -101,7 +101,7 @@ def camera_priors(
     target_positions: TargetPositions,
     local_frame: LocalFrame,
 ) -> tuple[CameraPrior, ...]:
-    """Orient the camera in every frame where the plate on the vehicle tells its attitude.
+    """Orient the camera in every frame where the plate on the vehicle determines its attitude.
 
     Left out are static targets, whose attitude is unknown, measurements without a pose, and
     those whose two poses cannot be told apart: the wrong one moves the camera by metres.

@@ -199,7 +199,7 @@ def _gcp(
 
 
 def flight_prefix(name: str) -> str:
-    """Return a flight's name as it stands in ids and paths: letters, digits, point and hyphen."""
+    """Return a flight's name as used in ids and paths: letters, digits, point and hyphen."""
     return re.sub(r"[^\w.-]+", "_", name).strip("_.") or "flight"
 
 

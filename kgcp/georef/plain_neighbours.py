@@ -87,7 +87,7 @@ class PlainTracks:
     def _prediction(
         self, target: PlainTarget, row: int, between: Interpolation, camera: Camera
     ) -> PlainPrediction:
-        """Return the prediction for a place between, whose size is the distance."""
+        """Return the prediction for an interpolated place; its size is the distance."""
         distance_m = between.size
         sight = np.append(camera.undistort(between.centre_px[None])[0], 1.0)
         position_m = distance_m / float(np.linalg.norm(sight)) * sight

@@ -174,7 +174,7 @@ def _height(sighting: Sighting, up_m: float) -> tuple[float, float]:
 def pass_gates(
     gcps: Sequence[Gcp], gates: Selection
 ) -> tuple[tuple[Gcp, ...], tuple[SkippedSighting, ...]]:
-    """Return the points that are good enough, and the others with what they failed on.
+    """Return the points that are good enough, and the others with the reason for each.
 
     A value that is not known does not pass the gate that asks for it.
     """

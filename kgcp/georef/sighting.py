@@ -1,4 +1,4 @@
-"""One measured target, as far as its place on the ground needs it."""
+"""One measured target: the part of the measurement that its place on the ground needs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Sighting:
 
 
 def sighting_of(frame: str, number: int, time_s: float | None, seen: Measurement) -> Sighting:
-    """Return what was measured, as its place on the ground needs it.
+    """Return the part of a measurement that its place on the ground needs.
 
     Parameters
     ----------

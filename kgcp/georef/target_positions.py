@@ -249,7 +249,7 @@ def _static_positions(
 def static_position(
     position_map: tuple[float, float, float], target: AnyTarget, local_frame: LocalFrame
 ) -> TargetPosition:
-    """Return the place of the centre of a target's face, from the position that is stated of it."""
+    """Return the place of the centre of a target's face, from its stated position."""
     position = local_frame.enu_from_map(np.array([position_map]))[0]
     axes = local_frame.grid_rotation(position)
     cov = covariance_along(axes, np.array(target.sd_position_m))

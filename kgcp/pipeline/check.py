@@ -46,7 +46,7 @@ class FlightCheck:
 
 @single_threaded()
 def check_flight(flight: Flight, *, stored_frames: StoredFolder | None = None) -> FlightCheck:
-    """Read everything but the pixels of a flight, and tell what does not fit.
+    """Read everything but the pixels of a flight, and report what does not fit.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ _Input = TypeVar("_Input")
 
 @contextmanager
 def naming_causes(doubts: Sequence[Doubt]) -> Iterator[None]:
-    """Let an error about places or times in the block say what caused it, if a grave doubt does.
+    """Let an error about places or times name its cause, if a grave doubt explains it.
 
     Raises
     ------

@@ -86,7 +86,7 @@ def _with_rates(
     frames: Sequence[str],
     by_frames_around: Mapping[int, SceneRotation],
 ) -> dict[int, SceneRotation]:
-    """Add what the times file says of the camera's rates to what the frames around say."""
+    """Combine the camera's rates of the times file with those from the frames around."""
     rotations = dict(by_frames_around)
     if flight.camera.readout_s:
         unknown = SceneRotation.unknown(flight.camera)

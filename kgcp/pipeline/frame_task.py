@@ -156,7 +156,7 @@ def _look_for_plain(
 
 @single_threaded()
 def examine_frame_again(job: DetectionJob, guided_input: GuidedInput) -> FrameResult:
-    """Look once more for what was not found in a frame, where it must be."""
+    """Search again for missing targets of a frame at their predicted places."""
     grey = _read_again(job, guided_input.input.frame)
     measured = {
         outcome.target: outcome
@@ -268,7 +268,7 @@ def _coded_outcomes(
     measured: Mapping[str, Measurement],
     considered: Sequence[Considered],
 ) -> tuple[Outcome, ...]:
-    """Replace misses by what is measured now, and the reasons of the others by what is known now.
+    """Replace misses by new measurements, and update the reasons of the remaining ones.
 
     Parameters
     ----------

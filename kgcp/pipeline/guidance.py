@@ -112,7 +112,7 @@ def predict_missing(
 def plain_by_reference(
     flight: Flight, data: FlightData, frames: Sequence[str]
 ) -> list[Predictions]:
-    """Return for each frame where its plain targets must be, as reference poses say it.
+    """Return for each frame where its plain targets must be, by the reference poses.
 
     Raises
     ------

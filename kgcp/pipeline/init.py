@@ -294,7 +294,7 @@ def _block(
 
 
 def _targets(contents: FolderContents, options: InitOptions) -> tuple[tuple[Target, ...], str]:
-    """Return the flight's targets, and who says so."""
+    """Return the flight's targets, and their source."""
     if options.targets_file is not None:
         return read_target_tables(options.targets_file), str(options.targets_file.name)
     if options.codes or options.diameter_m is not None:

@@ -106,7 +106,7 @@ def _by_dewarp_data(
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
-    """Return a guess from EXIF, with what it may be wrong by."""
+    """Return a guess from EXIF, with its possible error."""
     guesses = (_guessed_px(header) for header in headers if header.size_px == size)
     guess = next((guess for guess in guesses if guess is not None), None)
     if guess is None:
@@ -143,7 +143,7 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
 
 
 def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
-    """Return a focal length by EXIF [px], and in words where it is from."""
+    """Return a focal length by EXIF [px], and its source in words."""
     if header.size_px is None:
         return None
     where = f"EXIF of {header.frame}"

@@ -184,7 +184,7 @@ def _no_trajectory(contents: FolderContents) -> Section:
 
 
 def _layout(file: TrajectoryFile) -> tuple[tuple[DraftKey, ...], str]:
-    """Return how the table of a CSV file is written, as far as it is not kgcp's own way."""
+    """Return the layout of a CSV file where it differs from kgcp's own."""
     if file.table is None:
         return (), ""
     table = file.table.table
@@ -216,7 +216,7 @@ def _file_crs(start: FirstEpoch | None, form: str) -> tuple[DraftKey, ...]:
 def _time_keys(
     file: TrajectoryFile, start: FirstEpoch | None, times_s: Mapping[str, float]
 ) -> tuple[tuple[DraftKey, ...], tuple[Gap, ...]]:
-    """Return whose clock the file's times are of, and the day of seconds of a week."""
+    """Return the time system of the file, and the day if its times are seconds of a week."""
     if start is None or not start.time:
         return (), ()
     named = None if file.table is None else file.table.time_system

@@ -128,7 +128,7 @@ def sketch_frame(job: DetectionJob, result: FrameResult) -> list[Sketch]:
 
 
 def _rings(result: FrameResult) -> list[Outcome | Considered]:
-    """Return what has a card: all outcomes, and dropped rings that are not the best of a miss."""
+    """Return the contents of the cards: all outcomes, and rejected rings but the best of a miss."""
     outcomes = sorted(
         result.outcomes,
         key=lambda outcome: (outcome.target, 0 if isinstance(outcome, Miss) else outcome.instance),

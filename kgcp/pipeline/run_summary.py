@@ -230,7 +230,7 @@ class SummaryBuilder:
 
 
 def _without_place(detail: str) -> str:
-    """Return what a detail says that may be the same in other frames."""
+    """Return the part of a detail that may be the same in other frames."""
     text = _PLACE.sub("", _PREDICTION.sub("", detail))
     return _NUMBERS_OF_TEST.sub("", text)
 

@@ -141,7 +141,7 @@ def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
 
 
 def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> CalibrationVerdict:
-    """Return what a calibration is good for, why, and what would make it better."""
+    """Return the grade of a calibration, the reasons, and advice for a better one."""
     unusable = _unusable(calibration, numbers)
     doubts = _doubts(calibration, numbers)
     grade = (

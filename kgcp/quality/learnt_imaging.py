@@ -190,7 +190,7 @@ def _over_both_bases(result: FrameResult) -> list[Measurement]:
 
 
 def _agreed(advantages: Mapping[ToneBase, float]) -> ToneBase | None:
-    """Return the base with most of the likelihood; None if much of it speaks against it."""
+    """Return the base with the larger likelihood; None if much of the evidence contradicts it."""
     base = max(advantages, key=lambda each: advantages[each])
     is_agreed = sum(advantages.values()) <= (1.0 + _MAX_SHARE_AGAINST) * advantages[base]
     return base if is_agreed else None

@@ -6,7 +6,7 @@ import math
 
 
 def minus(number: str) -> str:
-    """Return a number with a true minus, and no sign where it is zero."""
+    """Return a number with a typographic minus, and without a sign if it is zero."""
     return number.replace("-", "−") if float(number) else number.lstrip("+-")
 
 

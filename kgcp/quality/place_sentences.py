@@ -83,7 +83,7 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
 
 
 def noise_sentence(placement: Placement) -> str:
-    """Return what the residuals have beyond the stated deviations; empty if next to nothing."""
+    """Return by how much the residuals exceed the stated deviations; empty if hardly."""
     noise = placement.noise
     parts = [
         f"{value:.3f} px in {what}"

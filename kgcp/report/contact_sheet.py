@@ -78,7 +78,7 @@ class ContactSheet:
             raise self._unwritable(error) from error
 
     def clear(self) -> None:
-        """Delete the page of another run: what follows is not what it shows."""
+        """Delete the page of another run, which does not show the cards that follow."""
         try:
             self.page.unlink(missing_ok=True)
         except OSError as error:

@@ -54,7 +54,7 @@ class Effects:
 
 
 def with_effects(settings: SimulationSettings, wanted: Effects) -> SimulationSettings:
-    """Return a flight's settings with other figures of some effects.
+    """Return a flight's settings with other strengths of some effects.
 
     Everything else about an effect stays as it is in the settings or, where they do not have the
     effect, as it is by default.

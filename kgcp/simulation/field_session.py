@@ -135,7 +135,7 @@ def _code(point: FieldPoint, ring: CodeRing) -> DiscCode | None:
 
 
 def _corners(field: AnyField, board_m: tuple[float, float, float, float]) -> FloatArray:
-    """Return the corners (n, 3) of what a photograph is to show, in the field's frame [m]."""
+    """Return the corners (n, 3) that a photograph must show, in the field's frame [m]."""
     left, top, right, bottom = board_m
     flat = [(left, top), (right, top), (right, bottom), (left, bottom)]
     depths = {0.0} if isinstance(field, Field) else {*field.points_m()[:, 2].tolist()}

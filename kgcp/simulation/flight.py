@@ -92,7 +92,7 @@ def frame_name(settings: SimulationSettings, index: int) -> str:
 
 
 def plan_flight(settings: SimulationSettings, seed: int) -> FlightPlan:
-    """Decide where everything is, and what the surveyor's instruments say about it.
+    """Decide where everything is, and what the surveyor's instruments report.
 
     The same settings and seed give the same plan. Random numbers come from one stream per
     purpose and frame, so that a frame does not depend on the others.

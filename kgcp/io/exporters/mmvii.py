@@ -89,7 +89,7 @@ def _document(root: ET.Element) -> str:
 
 
 def _system(points: MapPoints) -> str:
-    """Return what the frame is; the order of a PROJ string's axes is unambiguous."""
+    """Return the definition of the frame; a PROJ string's order of axes is unambiguous."""
     origin = origin_of(points)
     place = f"{origin.longitude}*{origin.latitude}*{origin.height}"
     root = ET.Element("SysCoData")

@@ -232,7 +232,7 @@ def largest_sd(cov: FloatArray) -> float:
 
 
 def upper(cov: FloatArray, above: int = 0) -> FloatArray:
-    """Return what a covariance has on its diagonal and above, row by row; `above` 1: without it."""
+    """Return a covariance's diagonal and the elements above, row by row; `above` 1: without it."""
     return cov[_upper_indices(len(cov), above)]
 
 

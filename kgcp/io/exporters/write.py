@@ -75,7 +75,7 @@ def export(points: MapPoints, name: str, folder: Path) -> list[Path]:
 
 
 def _remove_stale(folder: Path, patterns: tuple[str, ...], written: set[Path]) -> None:
-    """Remove what the format wrote earlier and does not now: packages read whole folders."""
+    """Remove files of an earlier export that are not written now: packages read whole folders."""
     for pattern in patterns:
         for path in folder.glob(pattern.strip("[]")):
             if path not in written:

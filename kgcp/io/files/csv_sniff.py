@@ -31,7 +31,7 @@ _SAMPLE = 20  # rows by which the decimal mark is told
 
 @dataclass(frozen=True, slots=True)
 class SniffedTable:
-    """The table of a file, as far as its first lines tell."""
+    """The table of a file, as its first lines show it."""
 
     layout: CsvLayout  # which translates every known column whose name differs
     cells: Mapping[str, str]  # of the first row, by the names of docs/foreign_files.md

@@ -105,7 +105,7 @@ def read_lines(path: Path, toml_key: str) -> Iterator[str]:
 
 
 def likely_encoding(content: bytes) -> str:
-    """Return in words what a content that is not UTF-8 probably is."""
+    """Return in words the probable kind of a content that is not UTF-8."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "UTF-16"
     if content.startswith(b"PK\x03\x04"):

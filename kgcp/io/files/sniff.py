@@ -26,7 +26,7 @@ _HEAD = 4096
 
 @dataclass(frozen=True, eq=False)
 class ForeignFile:
-    """A file whose format its content tells; each part is read when it is first asked for."""
+    """A file whose format follows from its content; each part is read when first needed."""
 
     path: Path
     toml_key: str  # where flight.toml names it, for messages

@@ -46,7 +46,7 @@ class FlightData:
         return vehicle is not None and vehicle.trajectory_file.exists()
 
     def has_position_of(self, target: AnyTarget) -> bool:
-        """Tell whether there is what a target's position is made from."""
+        """Tell whether a target has a position, or the files that its position is computed from."""
         is_placed = target.position_m is not None or self.has_trajectory
         return self._flight.crs is not None and is_placed
 
@@ -99,7 +99,7 @@ class FlightData:
 
     @cached_property
     def static_positions(self) -> TargetPositions:
-        """Where the targets are that stand still. The trajectory is not read.
+        """Positions of the static targets. The trajectory is not read.
 
         Raises
         ------

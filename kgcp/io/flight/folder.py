@@ -60,7 +60,7 @@ class FolderContents:
 
 
 def survey_folder(folder: Path) -> FolderContents:
-    """Tell what the files of a flight's folder are, by their content.
+    """Recognise the files of a flight's folder by their content.
 
     Hidden folders, the results of kgcp and sheets of targets are passed over.
 
@@ -148,7 +148,7 @@ def _kinds_by_content(file: ForeignFile) -> _Kinds:
 
 
 def _kinds_of_log(file: ForeignFile) -> _Kinds:
-    """Return what a receiver or its program has written."""
+    """Recognise files of a receiver or its program."""
     path, name = file.path, file.path.name.lower()
     if looks_like_marks(file):
         return (("marks", None),)

@@ -84,7 +84,7 @@ class TomlTable:
         return value
 
     def name(self, key: str) -> str:
-        """Return what something is called: one line that may stand in any table or page."""
+        """Return a name: one line that can be shown in any table or page."""
         value = self.text(key)
         if len(value) > _LONGEST_NAME or any(map(_is_control, value)):
             problem = f"{value[:20]!r} is not a name"

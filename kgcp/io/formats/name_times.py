@@ -1,4 +1,4 @@
-"""Frame times that stand in the frames' names, as machine-vision recorders write them.
+"""Frame times in the frames' names, as machine-vision recorders write them.
 
 Names of drones and phones hold local time in whole seconds: too coarse for a moving target.
 """

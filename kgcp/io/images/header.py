@@ -150,7 +150,7 @@ def _tiff_size(stream: BinaryIO, layout: _Layout) -> tuple[int, int] | None:
 
 
 def _entries(stream: BinaryIO, layout: _Layout, first: int | None = None) -> Iterator[_Entry]:
-    """Yield the tags of a directory, by default the first image's, as far as they are there."""
+    """Yield the tags of a directory, by default the first image's, up to the end of the file."""
     stream.seek(0)
     try:
         if first is None:

@@ -215,7 +215,7 @@ def frames_below(folder: Path | StoredFolder) -> list[str]:
 def stamps_of(
     folder: Path | StoredFolder, names: Sequence[str]
 ) -> Iterator[tuple[int, int] | None]:
-    """Yield size and time of change [ns] of files, by which a changed one is told; None: missing.
+    """Yield size and time of change [ns] of files, which show whether one changed; None: missing.
 
     Raises
     ------

@@ -24,7 +24,7 @@ def font(*, is_bold: bool) -> FontProperties:
 
 @cache
 def fit_text(text: Text) -> tuple[str, float]:
-    """Return what is printed of a text, and the type's size [mm] at which it fits into its room.
+    """Return the printable part of a text, and the type's size [mm] at which it fits.
 
     Characters that the typeface lacks become question marks.
     """

@@ -322,7 +322,7 @@ def read_settings(path: Path) -> DetectSettings:
 
 
 def read_learnt_imaging(path: Path) -> LearntImaging | None:
-    """Read what a flight has taught of its camera; None if nothing, or in another version's words.
+    """Read what was learnt about a flight's camera; None if nothing, or by another version.
 
     It is shown only, and changes no result.
     """
@@ -410,7 +410,7 @@ def _number(row: _Cells, name: str) -> float | None:
 
 
 def _told(value: object) -> str:
-    """Describe what stands in place of a number."""
+    """Describe a cell that is not a number."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "empty"
     return f"{value!r}" if isinstance(value, float) else "no number"

@@ -210,7 +210,7 @@ def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnFramePose:
-    """A frame's pose in the frame of what it shows, and what else its row tells."""
+    """A frame's pose relative to the device or field that it shows, and the rest of its row."""
 
     frame: str
     pose: CameraPose

@@ -209,7 +209,7 @@ def _target_table(target: Target, ring: Ring) -> dict[str, object]:
 def digested_times(
     flight: Flight, frames: Iterable[str], times: FrameTimes
 ) -> list[tuple[object, ...]]:
-    """Return what is known of each frame's time before it is read: microseconds, or who tells.
+    """Return each frame's time as known before the frame is read: microseconds, or the source.
 
     With a rolling shutter, how fast the camera turns at that time is known, too.
     """

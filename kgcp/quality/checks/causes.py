@@ -120,7 +120,7 @@ def _pairs(singles: Sequence[_Trial]) -> list[_Trial]:
 
 
 def _fitted(encounters: Encounters) -> list[_Trial]:
-    """Try what has an amount that the offsets themselves tell, the likelier first."""
+    """Try slips whose amount follows from the offsets themselves, the likelier first."""
     return [
         _heights(encounters),
         *_clock(encounters),

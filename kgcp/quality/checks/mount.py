@@ -44,7 +44,7 @@ def check_mount(encounters: Encounters) -> tuple[Doubt, ...]:
 
 
 def _plate_turns_deg(encounters: Encounters, mount_deg: float) -> FloatArray:
-    """Return by how much the plate is turned about its normal from what is said (n,) [deg]."""
+    """Return the rotation of the plate about its normal from its stated mount (n,) [deg]."""
     by_image = encounters.enu_from_camera @ encounters.camera_from_plate
     by_vehicle = encounters.frame_from_body @ body_from_plate(mount_deg)
     turn = np.swapaxes(by_vehicle, 1, 2) @ by_image

@@ -84,7 +84,7 @@ def _compare(
 def _reexposed_around(
     grey: GreyArray, gain: float, centre_px: FloatArray, radius_px: float
 ) -> GreyArray:
-    """Return a frame that is changed as far as the measurement looks."""
+    """Return a frame with other grey values where the measurement uses it."""
     reach = max(_LEAST_REACH_PX, _REACH * radius_px)
     left, top = np.maximum(np.floor(centre_px - reach), 0).astype(int)
     right, bottom = np.ceil(centre_px + reach).astype(int)

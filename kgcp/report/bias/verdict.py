@@ -135,7 +135,7 @@ def _bias(numbers: BiasNumbers) -> Finding:
 
 
 def _mean(row: RangeRow) -> str:
-    """Return a mean error with its own noise, and what the reference may be wrong by."""
+    """Return a mean error with its noise and the possible error of the reference."""
     text = signed_amount(row.percent.mean, row.percent.sd_mean, "%")
     if row.sd_reference_percent is None:
         return text

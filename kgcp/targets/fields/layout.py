@@ -1,4 +1,4 @@
-"""A field of targets: discs or rings on a lattice, some of them marks that tell its ends apart.
+"""A field of targets: discs or rings on a lattice; some may be marks that show its orientation.
 
 The field's frame is that of kgcp's targets: seen from the front, x right, y down, z into the board;
 the origin is the first disc of the first row.

@@ -58,7 +58,7 @@ def _size(camera: NamedValues) -> tuple[int, int] | None:
 
 
 def _camera(camera: NamedValues, width: int, height: int) -> Camera:
-    """Return the camera for a frame, of whose longer side its lengths are shares."""
+    """Return the camera for a frame; its lengths are shares of the frame's longer side."""
     model = camera.text("projection_type")
     if model not in _TERMS:
         raise unsupported(camera.file, f"the projection_type {model!r}", camera.where)

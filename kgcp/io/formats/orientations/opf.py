@@ -54,7 +54,7 @@ def poses(file: ForeignFile) -> SourcePoses:
 
 
 def _kind(file: ForeignFile) -> str:
-    """Return what an OPF file says that it is; nothing for other files."""
+    """Return the kind that an OPF file states; empty for other files."""
     said = file.document.get("format") if isinstance(file.document, dict) else None
     word = said if isinstance(said, str) else ""
     return word.removeprefix("application/opf-").removesuffix("+json")
