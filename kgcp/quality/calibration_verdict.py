@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import rotation_onto
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.records import PointPrior
@@ -22,7 +23,7 @@ _LEAST_DISCS = 6  # per photograph
 _MOST_REJECTED = 0.1
 _FOCAL_SHARE = 0.01
 _OPERATOR_RATIO = 3.0
-_FIELD_RATIO = 3.0
+_FIELD_RATIO = 2.0
 _COVERAGE = 0.7
 _NORMALS_DEG = 15.0
 _RADIUS_SHARE = 0.03
@@ -35,6 +36,37 @@ class CalibrationGrade(StrEnum):
     GOOD = "good"
     LOOK = "to be looked at"
     UNUSABLE = "unusable"
+
+
+@dataclass(frozen=True, slots=True)
+class FieldDeviation:
+    """How far discs are from where they are meant to be, shift, turn and scale taken out.
+
+    Attributes
+    ----------
+    in_plane_m, height_m : float
+        RMS along the field's axes x and y, and along z.
+    in_plane_ratio, height_ratio : float
+        RMS over what is stated to be possible.
+    """
+
+    in_plane_m: float
+    height_m: float
+    in_plane_ratio: float
+    height_ratio: float
+
+    @property
+    def doubt(self) -> str:
+        """What the field is not; empty: it is as stated."""
+        found = [
+            f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times more than stated"
+            for off_m, ratio, where in (
+                (self.in_plane_m, self.in_plane_ratio, "in its plane"),
+                (self.height_m, self.height_ratio, "in height"),
+            )
+            if ratio > _FIELD_RATIO
+        ]
+        return f"discs are off by {' and by '.join(found)}" if found else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +88,7 @@ class CalibrationNumbers:
     # (h, w): standard deviation of a pixel's ray, with turns of the camera taken out [px]
     ray_sd_px: FloatArray
     flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
+    field: FieldDeviation | None  # None: it was taken as stated
     light: DiscLight | None  # None: levels are not known
 
 
@@ -110,8 +143,29 @@ def calibration_numbers(
         None
         if calibration.points_used is PointModel.FIXED
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
+        _field_deviation(calibration),
         light,
     )
+
+
+def _field_deviation(calibration: CameraCalibration) -> FieldDeviation | None:
+    """Return how far the discs that were seen are from where they are meant to be."""
+    if calibration.points_used is PointModel.FIXED:
+        return None
+    field = calibration.field
+    seen = np.unique(np.concatenate([view.point for view in calibration.views]))
+    meant, found = field.points_m()[seen], calibration.solution.estimate.points[seen]
+    found = (found - found.mean(axis=0)) @ rotation_onto(found, meant).T
+    meant = meant - meant.mean(axis=0)
+    # without a measured distance, photographs do not tell how large the field is
+    scale = 1.0 if field.bars else float(np.sum(meant * found) / np.sum(found**2))
+    off = scale * found - meant
+    ratio = off / field.point_sds_m()[seen]
+    return FieldDeviation(_rms(off[:, :2]), _rms(off[:, 2]), _rms(ratio[:, :2]), _rms(ratio[:, 2]))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
@@ -184,11 +238,10 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
         doubts.append(
             f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
         )
-    is_estimated = calibration.points_used is not PointModel.FIXED
-    if is_estimated and numbers.rms_fixed_px > _FIELD_RATIO * numbers.rms_px:
+    if numbers.field is not None and numbers.field.doubt:
         doubts.append(
-            f"the field is not what it is said to be: {numbers.rms_fixed_px:.2f} px as stated,"
-            f" {numbers.rms_px:.3f} px in its own shape"
+            f"the field is not what it is said to be: {numbers.field.doubt}"
+            f" ({numbers.rms_fixed_px:.2f} px as stated, {numbers.rms_px:.3f} px in its own shape)"
         )
     if numbers.coverage < _COVERAGE:
         doubts.append(f"discs cover {100.0 * numbers.coverage:.0f} % of the frame")

@@ -30,7 +30,7 @@ from kgcp.quality.calibration_verdict import (
     judge,
 )
 from kgcp.quality.disc_light import DiscLight
-from kgcp.targets.fields.layout import Field, GridKind, Mark
+from kgcp.targets.fields.layout import Field, FieldBar, GridKind, Mark
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
 FIELD = Field("f", GridKind.SQUARE, 6, 5, 0.04, 0.024, marks=(Mark(1, 1, 0.024, 0.01),))
@@ -111,11 +111,65 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
     numbers = calibration_numbers(result)
     verdict = judge(result, numbers)
     assert verdict.grade is CalibrationGrade.LOOK
-    assert "the field is not what it is said to be" in verdict.sentence
+    assert "the field is not what it is said to be: discs are off by 0.1" in verdict.sentence
+    assert "mm in its plane" in verdict.sentence
+    assert numbers.field is not None
+    drawn_m = np.sqrt(np.mean((bend_m - bend_m.mean(axis=0))[:, :2] ** 2))
+    assert numbers.field.in_plane_m == pytest.approx(drawn_m, rel=0.1)
+    assert "in height" not in verdict.sentence  # 0.3 mm are stated
     assert 0.005 < numbers.rms_px < 0.03
     assert 0.1 < numbers.rms_fixed_px < 3.0
     assert numbers.flatness_m == pytest.approx(0.0002, rel=0.4)
     assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0]
+
+
+def test_a_field_as_flat_as_it_is_stated_is_good() -> None:
+    rng = np.random.default_rng(8)
+    bend_m = FIELD.point_sds_m() * rng.standard_normal((len(FIELD.names()), 3))
+    result = calibrated(views(bend_m=bend_m), PointModel.STIFF, LensModel.AUTO)
+    numbers = calibration_numbers(result)
+    assert judge(result, numbers).sentence == "The calibration is good."
+    assert numbers.rms_fixed_px > 10.0 * numbers.rms_px  # its shape is seen, and is as stated
+    assert numbers.field is not None
+    assert 0.7 < numbers.field.in_plane_ratio < 1.3
+    assert 0.7 < numbers.field.height_ratio < 1.3
+
+
+@pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
+@pytest.mark.parametrize(("grow", "ratio"), [(1.01, 0.0), (1.0, 5.0)])
+def test_a_bowed_sheet_is_told_by_its_heights_and_a_larger_one_is_not(
+    points: PointModel, grow: float, ratio: float
+) -> None:
+    """Photographs do not tell how large a field is."""
+    nominal = FIELD.points_m()
+    x = (nominal[:, 0] - nominal[:, 0].mean()) / np.ptp(nominal[:, 0])
+    bow = x**2 - np.mean(x**2)
+    bend_m = (grow - 1.0) * nominal
+    bend_m[:, 2] = ratio * 0.0003 * bow / np.sqrt(np.mean(bow**2))
+    result = calibrated(views(bend_m=bend_m), points)
+    field = calibration_numbers(result).field
+    assert field is not None
+    assert field.in_plane_ratio < 1.0
+    assert field.height_ratio == pytest.approx(ratio, abs=0.3)
+    assert ("in height" in field.doubt) == (ratio > 0.0)
+
+
+def test_a_larger_field_is_told_if_a_distance_was_measured() -> None:
+    larger = 0.01 * FIELD.points_m()
+    names = FIELD.names()
+    bar = FieldBar(names[0], names[-1], 1.01 * float(np.hypot(0.2, 0.16)), 0.00002)
+    made = views(bend_m=larger)
+    settings = CalibrationSettings(PointModel.FREE, LensModel.RADIAL)
+    result = calibrate_camera(made, replace(FIELD, bars=(bar,)), (1600, 1200), settings)
+    field = calibration_numbers(result).field
+    assert field is not None
+    assert field.in_plane_m == pytest.approx(0.01 * np.sqrt(np.mean(_about_middle() ** 2)), rel=0.1)
+    assert "in its plane" in field.doubt
+
+
+def _about_middle() -> FloatArray:
+    flat = FIELD.points_m()[:, :2]
+    return np.asarray(flat - flat.mean(axis=0))
 
 
 def test_frontal_photographs_determine_little_and_say_so() -> None:
