@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from kgcp.network.camera_network import (
 from kgcp.network.covariance import precision, tangled
 from kgcp.network.field_turns import with_turns
 from kgcp.network.parameter_choice import DETERMINED, with_chosen_parameters
+from kgcp.network.photographs_apart import photographs_apart, without
 from kgcp.network.space_start import start_in_space
 from kgcp.network.start import better_poses, homography_misfits, start_camera_and_poses
 from kgcp.targets.fields.points import AnyField
@@ -36,6 +37,17 @@ _INFLATION = 100.0  # of a variance by other parameters: a deviation ten times l
 _LEAST_SHARE = 0.6  # of a photograph's discs that must fit
 _MARGIN_PX = 2.0  # within the frame, where a disc is to be found
 _MOST_MISFIT = 0.1  # of a photograph's homography, over the spread of its discs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chosen:
+    """The adjustment of what is worth estimating."""
+
+    problem: CalibrationProblem  # with the discs of turned photographs named accordingly
+    state: AdjustedNetwork
+    fixed: AdjustedNetwork  # the field as it is stated
+    points: PointModel
+    is_turn_unclear: bool
 
 
 def missing_discs(calibration: CameraCalibration) -> dict[str, tuple[IndexArray, FloatArray]]:
@@ -99,7 +111,7 @@ def calibrate_camera(
 
 
 def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) -> CameraCalibration:
-    field, settings = problem.field, problem.settings
+    field = problem.field
     if start is not None:
         problem = replace(problem, field=start.field)
     points = field.points_m()
@@ -127,21 +139,29 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
         state = problem.with_estimate(state, state.estimate)
     problem, state, misfits = _without_misfits(problem, state)
     dropped = (*disordered, *(() if start is None else start.dropped), *misfits)
-    dropped = tuple(dict.fromkeys(dropped))
     _require_views(problem.views)
+    chosen = _chosen(problem, state)
+    apart = photographs_apart(chosen.problem, chosen.state)
+    if apart:
+        is_apart = np.array([view.photo in apart for view in problem.views])
+        chosen = _chosen(*without(problem, state, is_apart))
+    return _result(chosen, tuple(dict.fromkeys((*dropped, *apart))))
+
+
+def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
+    """Return the adjustment of what is worth estimating, from one of the field as it is stated."""
     fixed = with_chosen_parameters(problem, state)
-    points_used, is_turn_unclear = settings.points, False
-    state = fixed
-    if settings.points is not PointModel.FIXED:
-        own_shape = replace(fixed.unknowns, points=settings.points)
-        state = problem.adjusted(fixed.camera, fixed.estimate, own_shape)
-        if any(view.is_symmetric for view in problem.views):
-            problem, state, is_turn_unclear = with_turns(problem, state)
-        if is_turn_unclear:
-            state, points_used = fixed, PointModel.FIXED
-        else:
-            state = with_chosen_parameters(problem, state)
-    return _result(problem, state, fixed, dropped, points_used, is_turn_unclear=is_turn_unclear)
+    points = problem.settings.points
+    if points is PointModel.FIXED:
+        return _Chosen(problem, fixed, fixed, points, is_turn_unclear=False)
+    state = problem.adjusted(fixed.camera, fixed.estimate, replace(fixed.unknowns, points=points))
+    is_turn_unclear = False
+    if any(view.is_symmetric for view in problem.views):
+        problem, state, is_turn_unclear = with_turns(problem, state)
+    if is_turn_unclear:
+        return _Chosen(problem, fixed, fixed, PointModel.FIXED, is_turn_unclear=True)
+    state = with_chosen_parameters(problem, state)
+    return _Chosen(problem, state, fixed, points, is_turn_unclear=False)
 
 
 def _require_views(views: Sequence[NamedView]) -> None:
@@ -189,26 +209,12 @@ def _without_misfits(
             return problem, state, dropped
         worst = int(share.argmin())
         dropped = (*dropped, problem.views[worst].photo)
-        stays = np.arange(count) != worst
-        problem = replace(problem, views=tuple(np.array(problem.views, dtype=object)[stays]))
-        estimate = replace(
-            state.estimate,
-            rotations=state.estimate.rotations[stays],
-            translations=state.estimate.translations[stays],
-        )
-        state = problem.with_estimate(state, estimate)
+        problem, state = without(problem, state, np.arange(count) == worst)
 
 
-def _result(
-    problem: CalibrationProblem,
-    state: AdjustedNetwork,
-    fixed: AdjustedNetwork,
-    dropped: tuple[str, ...],
-    points_used: PointModel,
-    *,
-    is_turn_unclear: bool,
-) -> CameraCalibration:
+def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
     """Return the camera with its covariance and what it does not determine."""
+    problem, state = chosen.problem, chosen.state
     model = state.model
     known = precision(state.network, state.solution)
     cov = known.camera_cov
@@ -229,12 +235,12 @@ def _result(
         state.solution,
         known,
         problem.eccentricity(state.camera, state.estimate, observed),
-        points_used,
-        rms_px(fixed.solution),
+        chosen.points,
+        rms_px(chosen.fixed.solution),
         problem.radius_scale(state),
         tuple(names[weak].tolist()),
         tangled(model.names, _with_focal_difference(model.names, cov), _INFLATION),
-        is_turn_unclear,
+        chosen.is_turn_unclear,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -63,7 +64,7 @@ class CameraCalibration:
     field: AnyField  # with the diameters that were used
     settings: CalibrationSettings
     views: tuple[NamedView, ...]  # those that took part
-    dropped: tuple[str, ...]  # photographs whose discs do not lie like the field's
+    dropped: tuple[str, ...]  # photographs that do not fit the field or the others
     network: Network
     solution: Solution
     precision: Precision
@@ -83,8 +84,13 @@ class CameraCalibration:
     @property
     def operator_sd_px(self) -> float:
         """Median of the discs' own deviations per point, as the operator states them [px]."""
-        covs = np.concatenate([view.covs[:, :2, :2] for view in self.views])
-        return float(np.median(np.sqrt(np.trace(covs, axis1=1, axis2=2))))
+        return operator_sd_px(self.views)
+
+
+def operator_sd_px(views: Sequence[NamedView]) -> float:
+    """Return the median of the discs' deviations per point, as the operator states them [px]."""
+    covs = np.concatenate([view.covs[:, :2, :2] for view in views])
+    return float(np.median(np.sqrt(np.trace(covs, axis1=1, axis2=2))))
 
 
 def rms_px(solution: Solution) -> float:

@@ -233,7 +233,7 @@ def _far_off(numbers: CalibrationNumbers) -> float:
 
 def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
     doubts = []
-    if numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px:
+    if _fits_badly(numbers):
         ratio = numbers.rms_px / numbers.operator_sd_px
         doubts.append(
             f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
@@ -255,10 +255,19 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
             "the field looks the same when it is turned, so that its own errors cannot be estimated"
         )
     if calibration.dropped:
-        doubts.append(f"{len(calibration.dropped)} photographs do not fit the others")
+        count = len(calibration.dropped)
+        doubts.append(
+            "1 photograph does not fit the others"
+            if count == 1
+            else f"{count} photographs do not fit the others"
+        )
     if numbers.light is not None and numbers.light.doubt:
         doubts.append(numbers.light.doubt)
     return doubts
+
+
+def _fits_badly(numbers: CalibrationNumbers) -> bool:
+    return numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _larger(off: float) -> str:
@@ -276,6 +285,11 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
         advice.append("Turn the camera by 90° in at least two photographs.")
     if numbers.coverage < _COVERAGE:
         advice.append("Bring the field into the corners of the frame.")
+    if calibration.dropped or _fits_badly(numbers):
+        advice.append(
+            "Keep zoom, focus and crop the same in all photographs, none turned afterwards, and the"
+            " field rigid."
+        )
     if numbers.views < 12:
         advice.append("Take 12 photographs or more.")
     if calibration.undetermined:

@@ -34,6 +34,7 @@ from kgcp.targets.fields.layout import Field, FieldBar, GridKind, Mark
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 811.0, 583.0, -0.11)
 FIELD = Field("f", GridKind.SQUARE, 6, 5, 0.04, 0.024, marks=(Mark(1, 1, 0.024, 0.01),))
+OTHER_ZOOM = replace(CAMERA, fx=1545.0, fy=1545.0)
 SD_PX = 0.01
 TURNS = (0.0, 1.6, 0.2, 3.0, 1.5, 0.1)
 
@@ -78,6 +79,7 @@ def test_a_good_calibration_is_called_good() -> None:
     numbers = calibration_numbers(result)
     verdict = judge(result, numbers)
     assert verdict.grade is CalibrationGrade.GOOD, verdict.sentence
+    assert result.dropped == ()
     errors = [result.camera.fx - 1500.0, result.camera.cx - 811.0, result.camera.cy - 583.0]
     sd = numbers.sd[[0, 2, 3]]
     assert np.all(np.abs(errors) < 4.0 * sd)
@@ -170,6 +172,59 @@ def test_a_larger_field_is_told_if_a_distance_was_measured() -> None:
 def _about_middle() -> FloatArray:
     flat = FIELD.points_m()[:, :2]
     return np.asarray(flat - flat.mean(axis=0))
+
+
+def twelve_views() -> list[NamedView]:
+    farther = [replace(view, photo=f"{view.photo}b") for view in views(distance_m=0.4)]
+    return views() + farther
+
+
+def upside_down(view: NamedView) -> NamedView:
+    """Return a photograph whose file was turned by half a turn."""
+    vectors = view.vectors.copy()
+    vectors[:, :2] = np.array([CAMERA.width, CAMERA.height]) - 1.0 - vectors[:, :2]
+    return replace(view, vectors=vectors)
+
+
+@pytest.mark.parametrize("zoom", [1.05, 1.01])
+def test_a_photograph_of_another_zoom_takes_no_part(zoom: float) -> None:
+    """Its pose takes up most of the zoom: all of its discs fit to less than a pixel."""
+    made = views()
+    focal_px = 1500.0 * zoom
+    made[3] = views(camera=replace(CAMERA, fx=focal_px, fy=focal_px))[3]
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert result.dropped == ("p3",)
+    numbers = calibration_numbers(result)
+    assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0] < 1.0
+    verdict = judge(result, numbers)
+    assert "1 photograph does not fit the others" in verdict.sentence
+    assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
+
+
+def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> None:
+    made = twelve_views()
+    made[2], made[7] = upside_down(made[2]), upside_down(made[7])
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert set(result.dropped) == {"p2", "p1b"}
+    errors = [result.camera.cx - 811.0, result.camera.cy - 583.0]
+    assert np.all(np.abs(errors) < 4.0 * calibration_numbers(result).sd[2:4])
+    assert result.rms_px < 2.0 * result.operator_sd_px
+
+
+def test_of_two_halves_by_two_zooms_none_is_left_out() -> None:
+    other = [replace(view, photo=f"{view.photo}b") for view in views(camera=OTHER_ZOOM)]
+    result = calibrated(views() + other, PointModel.STIFF)
+    assert result.dropped == ()
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is not CalibrationGrade.GOOD
+    assert "worse" in verdict.sentence
+    assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
+
+
+def test_a_photograph_of_four_is_not_outvoted() -> None:
+    made = views()[:4]
+    made[3] = views(camera=OTHER_ZOOM)[3]
+    assert calibrated(made, PointModel.STIFF).dropped == ()
 
 
 def test_frontal_photographs_determine_little_and_say_so() -> None:

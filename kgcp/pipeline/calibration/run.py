@@ -62,7 +62,8 @@ REASONS: Mapping[str, str] = {
     "ambiguous": "a part of the field that could be another part; show all of it, or a mark",
     OTHER_SIZE: "the photograph has another size than most",
     DUPLICATE: "the same as another photograph, which says nothing new",
-    UNLIKE_FIELD: "most discs do not fit the camera and the field of the other photographs",
+    UNLIKE_FIELD: "it does not fit the camera and the field of the other photographs: other zoom,"
+    " focus or crop, a field bent otherwise, or discs with wrong names",
 }
 """Why a photograph is not used: the words of the `reason` column."""
 

@@ -1,0 +1,70 @@
+"""Photographs that stand apart: by another zoom, focus or crop, or of a field bent otherwise.
+
+One of them displaces the camera of all, and rejecting discs one by one does not tell them: its pose
+takes up most of what is wrong, and what is left is spread over all photographs. But without it, the
+others fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.network.calibration_records import operator_sd_px, rms_px
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
+
+_FITTING = 1.5  # RMS over the discs' own deviation, that leaves nothing to explain
+_MOST_APART = 0.25  # of the photographs
+_LEAST_LEFT = 4
+_LEAST_GAIN = 2.0  # by how much the others must fit better
+_NEARLY = 1.5  # RMS over the least one: fewer photographs are left out then
+_USUAL_TERMS = ("k1", "k2")  # which photographs that stand apart may have made insignificant
+
+
+def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tuple[str, ...]:
+    """Return the photographs without which the others fit at least twice as well.
+
+    Those with the largest residuals are left out one after another, a quarter of them at most. What
+    all photographs contradict is no reason to leave out any: a lens that is none of kgcp's, or a
+    field that is not stated right.
+    """
+    limit_px = _FITTING * operator_sd_px(problem.views)
+    most = min(int(_MOST_APART * len(problem.views)), len(problem.views) - _LEAST_LEFT)
+    first_px = rms_px(state.solution)
+    if most < 1 or first_px <= limit_px:
+        return ()
+    terms = (*_USUAL_TERMS, *(t for t in state.unknowns.terms if t not in _USUAL_TERMS))
+    state = problem.with_unknowns(state, replace(state.unknowns, terms=terms))
+    left_out: list[str] = []
+    misfits_px = [first_px]
+    while len(left_out) < most and misfits_px[-1] > limit_px:
+        worst = int(_own_rms_px(state).argmax())
+        left_out.append(problem.views[worst].photo)
+        problem, state = without(problem, state, np.arange(len(problem.views)) == worst)
+        misfits_px.append(rms_px(state.solution))
+    count = int(np.argmax(np.array(misfits_px) <= _NEARLY * min(misfits_px)))
+    return tuple(left_out[:count]) if _LEAST_GAIN * misfits_px[count] <= first_px else ()
+
+
+def without(
+    problem: CalibrationProblem, state: AdjustedNetwork, is_left_out: BoolArray
+) -> tuple[CalibrationProblem, AdjustedNetwork]:
+    """Return problem and adjustment without some photographs (v,)."""
+    stays = ~is_left_out
+    views = tuple(view for view, is_in in zip(problem.views, stays, strict=True) if is_in)
+    problem = replace(problem, views=views)
+    estimate = replace(
+        state.estimate,
+        rotations=state.estimate.rotations[stays],
+        translations=state.estimate.translations[stays],
+    )
+    return problem, problem.with_estimate(state, estimate)
+
+
+def _own_rms_px(state: AdjustedNetwork) -> FloatArray:
+    """Return the RMS of every photograph's residuals (v,), of the discs that were kept."""
+    view = state.network.observations.view[state.solution.is_used]
+    squares = np.sum(state.solution.residuals[state.solution.is_used] ** 2, axis=1)
+    return np.asarray(np.sqrt(np.bincount(view, squares) / np.bincount(view)))
