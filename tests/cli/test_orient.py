@@ -62,13 +62,64 @@ def test_frames_are_oriented_and_their_poses_place_targets(tmp_path: Path) -> No
     assert sds[4].max() > 1.2 * np.delete(sds, 4, axis=0).max()
     # the places of the targets are exact here: their deviations are not used up
     assert 0.05 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.3
-    assert np.abs(np.delete(off, 4, axis=0)).max() < 0.02
+    assert np.abs(np.delete(off, 4, axis=0)).max() < 0.03
     placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
     assert placed.exit_code == 0, placed.stderr
     for target in json.loads(placed.stdout)["targets"]:
         assert np.abs(target["residual_m"]).max() < 0.02
         assert (np.abs(target["residual_m"]) < 3.0 * np.array(target["sd_residual_m"])).all()
         assert abs(target["diameter_residual_permille"]) < 1.0
+
+
+def poses_of(folder: Path, flight: GroundFlight) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and standard deviations (n, 3) of the frames' places [m]."""
+    poses = pd.read_parquet(folder / "kgcp" / "poses.parquet")
+    off = poses[["x", "y", "z"]].to_numpy() - flight.local_frame.map_from_enu(flight.centres)
+    return off, poses[["sd_x", "sd_y", "sd_z"]].to_numpy()
+
+
+@pytest.mark.parametrize(
+    ("stated_m", "words"), [(0.9, ""), (0.899, "1.1 ‰"), (0.897, "3.3 ‰"), (0.906, "6.7 ‰")]
+)
+def test_diameters_that_are_all_wrong_displace_no_pose(
+    tmp_path: Path, stated_m: float, words: str
+) -> None:
+    """Nobody states how well these rings are printed: 'place' measures it by such poses."""
+    flight = GroundFlight(stated_diameter_m=stated_m)
+    folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
+    result = run("orient", folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    off, sds = poses_of(folder, flight)
+    assert 0.3 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.2
+    assert np.abs(off[:, 2]).max() < 0.015
+    doubts = json.loads(result.stdout)["doubts"]
+    assert len(doubts) == bool(words)
+    assert (f"the distances are {words}" in result.stderr) == bool(words)
+    placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
+    for target in json.loads(placed.stdout)["targets"]:
+        assert abs(target["diameter_m"] - 0.9) < 3.0 * target["sd_diameter_m"] < 0.003
+
+
+def test_diameters_that_are_vouched_for_tell_how_far_away_a_frame_is(tmp_path: Path) -> None:
+    flight, found = GroundFlight(), []
+    for name, words in (("open", ""), ("stated", "sd_outer_diameter_m = 0.0001\n")):
+        folder = flight.write(tmp_path / name, sd_position_m=0.002)
+        toml = folder / "flight.toml"
+        text = toml.read_text(encoding="utf-8").replace("\nposition_m", f"\n{words}position_m")
+        toml.write_text(text, encoding="utf-8")
+        assert run("orient", folder).exit_code == 0
+        found.append(float(np.median(poses_of(folder, flight)[1][:, 2])))
+    assert found[1] < 0.7 * found[0]
+
+
+def test_radii_in_the_place_of_diameters_are_told(tmp_path: Path) -> None:
+    folder = GroundFlight(stated_diameter_m=0.45, frames=3).write(tmp_path / "flight")
+    result = run("orient", folder)
+    assert result.exit_code == 1
+    assert "the distances are 50 % shorter than the positions say; look at the targets'" in (
+        result.stderr
+    )
+    assert result.stderr.count("\n") == 1
 
 
 def test_a_wrong_name_is_left_out(tmp_path: Path) -> None:

@@ -77,6 +77,25 @@ def test_four_points_alone_must_fit_well() -> None:
         orient(CAMERA, images_of(points[:4], seen[:4]))
 
 
+def test_what_all_distances_are_off_by_is_found_beside_a_wrong_name() -> None:
+    points = np.random.default_rng(6).uniform(-6.0, 6.0, (6, 3)) * [1.0, 1.0, 0.2]
+    seen = points.copy()
+    seen[[1, 4]] = seen[[4, 1]]
+    images = images_of(points, seen)
+    distances_m = 1.004 * np.linalg.norm(POSE.in_camera(seen), axis=1)
+    images = replace(images, distances_m=distances_m, sd_distances_m=5e-5 * distances_m)
+    found = orient(CAMERA, replace(images, sd_scale=0.005))
+    assert np.flatnonzero(~found.is_used).tolist() == [1, 4]
+    assert found.distance_scale == pytest.approx(np.log(1.004), abs=2e-4)
+    off = found.pose.centre_m - POSE.centre_m
+    z = off / np.sqrt(found.cov.diagonal()[:3])
+    assert np.abs(z).max() < 0.5  # what is allowed for draws it a little towards none
+    known = orient(CAMERA, replace(images, distances_m=distances_m / 1.004))
+    assert np.linalg.norm(known.pose.centre_m - POSE.centre_m) < 1e-6
+    assert known.distance_scale == 0.0
+    assert known.cov[2, 2] < 0.5 * found.cov[2, 2]
+
+
 ROUGH = np.array(
     [[-5.0, -4.0, 0.0], [5.0, -4.0, 0.8], [5.0, 4.0, 0.0], [-5.0, 4.0, 3.0], [1.0, 0.5, 0.4]]
 )

@@ -7,9 +7,10 @@ alone, so that such a pose is much weaker, and none if the circle's two poses ca
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,6 +22,7 @@ from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.network.ground.point_images import CameraPose, PointImages
 from kgcp.network.ground.resection import MIN_MARGIN, MIN_POINTS, NoPoseError, Resection, orient
+from kgcp.targets.plain import AnyTarget
 
 FOCAL_SCALES = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0)
 """Starts for an unknown focal length, as multiples of the camera's."""
@@ -30,6 +32,10 @@ SD_FOCAL = 0.7
 FOCAL_DETERMINED = 0.05
 """Relative standard deviation of a focal length that is determined, at most."""
 
+UNSTATED_SCALE_SD = 0.005
+"""Of the logarithm of all distances together, where nobody says how well targets are printed."""
+
+_MOST_SCALE_SD = 4.0  # standard deviations that all distances may be off by, alike
 _LEAST_PLATE_FRAMES = 3  # that tell how a plate lies
 _AGREEING_CHI2 = 25.0  # of three coordinates, at most
 
@@ -64,6 +70,10 @@ class FramePose:
         where they are not known; None: not by three targets.
     chi2 : (n,) array or None
         Their squares over their covariances.
+    distance_scale : float or None
+        Logarithm of what all distances are too long by, alike; None: as `residuals`.
+    sd_distance_scale : float or None
+        Its standard deviation.
     """
 
     frame: str
@@ -78,6 +88,8 @@ class FramePose:
     sd_focal_scale: float | None = None
     residuals: FloatArray | None = None
     chi2: FloatArray | None = None
+    distance_scale: float | None = None
+    sd_distance_scale: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +100,16 @@ class PlateAttitude:
     cov: FloatArray  # (3, 3): of a left rotation vector, ENU axes [rad²]
 
 
+def unstated_scale_sd(targets: Iterable[AnyTarget]) -> float:
+    """Return `sd_scale` of `orient_frames`: 0 if it is stated how well static targets are printed.
+
+    Then sightings state what the print contributes.
+    """
+    static = [target for target in targets if target.position_m is not None]
+    is_stated = all(target.sd_outer_diameter_m > 0.0 for target in static)
+    return 0.0 if is_stated else UNSTATED_SCALE_SD
+
+
 def orient_frames(
     frames: Sequence[str],
     sightings: Sequence[Sighting],
@@ -96,6 +118,7 @@ def orient_frames(
     *,
     min_points: int = MIN_POINTS,
     has_free_focal: bool = False,
+    sd_scale: float = UNSTATED_SCALE_SD,
 ) -> list[FramePose]:
     """Orient frames by their static targets.
 
@@ -111,20 +134,25 @@ def orient_frames(
         Targets that must agree where their distances are not known; three that are.
     has_free_focal : bool
         Whether the focal length is unknown, to a factor of two.
+    sd_scale : float
+        Of the logarithm of what all distances may be off by, alike, besides the common share that
+        the sightings state: of targets whose print nobody vouches for.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
     for each in sightings:
         if each.frame in by_frame and each.target in positions and not each.instance:
             by_frame[each.frame].append(each)
     poses = [
-        _by_points(frame, mine, positions, camera, min_points, has_free_focal=has_free_focal)
+        _by_points(
+            frame, mine, positions, camera, min_points, sd_scale, has_free_focal=has_free_focal
+        )
         for frame, mine in by_frame.items()
     ]
     if has_free_focal:
         return poses
     plates = _plate_attitudes(poses, by_frame)
     return [
-        _by_ring(pose, by_frame[pose.frame], positions, plates)
+        _by_ring(pose, by_frame[pose.frame], positions, plates, sd_scale)
         if pose.pose is None and pose.targets
         else pose
         for pose in poses
@@ -132,18 +160,14 @@ def orient_frames(
 
 
 def point_images(
-    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition]
+    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], sd_scale: float
 ) -> PointImages:
-    """Return measured targets as points of known position."""
+    """Return measured targets as points of known position; `sd_scale` as for `orient_frames`."""
     no_cov = np.zeros((3, 3))
     places = [positions[each.target] for each in sightings]
-    sds = [
-        math.nan
-        if each.sd_distance_m is None
-        else math.hypot(each.sd_distance_m, each.sd_common_distance_m or 0.0)
-        for each in sightings
-    ]
+    sds = [math.nan if each.sd_distance_m is None else each.sd_distance_m for each in sightings]
     known = np.isfinite(sds)
+    common = [(each.sd_common_distance_m or 0.0) / each.distance_m for each in sightings]
     return PointImages(
         np.array([place.position_m for place in places]),
         np.array([no_cov if place.cov_m2 is None else place.cov_m2 for place in places]),
@@ -151,6 +175,7 @@ def point_images(
         np.array([each.centre_cov_px2 for each in sightings]),
         np.where(known, [each.distance_m for each in sightings], np.nan),
         np.array(sds),
+        math.hypot(sd_scale, float(np.median(common))),
     )
 
 
@@ -160,6 +185,7 @@ def _by_points(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
     min_points: int,
+    sd_scale: float,
     *,
     has_free_focal: bool,
 ) -> FramePose:
@@ -167,26 +193,61 @@ def _by_points(
     names = tuple(each.target for each in usable)
     if len(usable) < 3:
         return FramePose(frame, names, None, None, (), _count_words(len(usable)))
-    try:
-        found = orient(
-            camera,
-            point_images(usable, positions),
-            min_points=min_points,
-            focals=FOCAL_SCALES if has_free_focal else (1.0,),
-            sd_focal=SD_FOCAL if has_free_focal else 0.0,
+    images = point_images(usable, positions, sd_scale)
+    focals, sd_focal_before = (FOCAL_SCALES, SD_FOCAL) if has_free_focal else ((1.0,), 0.0)
+
+    def resected(points: PointImages) -> Resection:
+        return orient(
+            camera, points, min_points=min_points, focals=focals, sd_focal=sd_focal_before
         )
+
+    try:
+        found = resected(images)
     except NoPoseError as error:
-        return FramePose(frame, names, None, None, (), str(error))
+        reason = "" if has_free_focal else _scale_reason(images, resected)
+        return FramePose(frame, names, None, None, (), reason or str(error))
+    if abs(found.distance_scale) > _MOST_SCALE_SD * images.sd_scale:
+        return FramePose(frame, names, None, None, (), _scale_words(found.distance_scale))
     sd_focal = math.sqrt(found.cov[6, 6]) if has_free_focal else None
     if sd_focal is not None and sd_focal > FOCAL_DETERMINED:
         reason = f"the focal length is not determined (± {100.0 * sd_focal:.0f} %)"
         return FramePose(frame, names, None, None, (), reason)
-    return _of_resection(frame, names, found, sd_focal)
+    return _of_resection(frame, names, found, sd_focal, images)
+
+
+def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resection]) -> str:
+    """Return that all distances are wrong alike, if points fit well without them; else nothing."""
+    unknown = np.full(len(images), np.nan)
+    with contextlib.suppress(NoPoseError):
+        pose = resected(replace(images, distances_m=unknown, sd_distances_m=unknown)).pose
+        true_m = np.linalg.norm(pose.in_camera(images.positions_m), axis=1)
+        logs = np.log(images.distances_m / true_m)
+        scale, limit = float(np.nanmedian(logs)), _MOST_SCALE_SD * images.sd_scale
+        if abs(scale) > limit > np.nanmedian(np.abs(logs - scale)):
+            return _scale_words(scale)
+    return ""
+
+
+def _scale_words(scale: float) -> str:
+    """Return the reason by which all distances are wrong, in whole per cent to group frames."""
+    share = math.exp(scale) - 1.0
+    is_long = "longer" if share > 0.0 else "shorter"
+    return (
+        f"the distances are {100.0 * abs(share):.0f} % {is_long} than the positions say; look at"
+        " the targets' diameters and at the focal length"
+    )
 
 
 def _of_resection(
-    frame: str, names: tuple[str, ...], found: Resection, sd_focal: float | None
+    frame: str,
+    names: tuple[str, ...],
+    found: Resection,
+    sd_focal: float | None,
+    images: PointImages,
 ) -> FramePose:
+    # where all distances are off alike, images and positions alone tell how far away they are
+    sight = images.positions_m[found.is_used].mean(axis=0) - found.pose.centre_m
+    sd_scale = math.sqrt(float(sight @ found.cov[:3, :3] @ sight)) / float(sight @ sight)
     return FramePose(
         frame=frame,
         targets=names,
@@ -199,6 +260,8 @@ def _of_resection(
         sd_focal_scale=sd_focal,
         residuals=found.residuals,
         chi2=found.chi2,
+        distance_scale=found.distance_scale,
+        sd_distance_scale=sd_scale,
     )
 
 
@@ -249,6 +312,7 @@ def _by_ring(
     sightings: Sequence[Sighting],
     positions: Mapping[str, TargetPosition],
     plates: Mapping[str, PlateAttitude],
+    sd_scale: float,
 ) -> FramePose:
     """Return the pose by the best of a frame's rings; the frame as it was, if there is none.
 
@@ -258,7 +322,7 @@ def _by_ring(
     for each in sightings:
         if each.target not in plates or not _is_told_apart(each):
             continue
-        made = _pose_by_ring(each, positions[each.target], plates[each.target])
+        made = _pose_by_ring(each, positions[each.target], plates[each.target], sd_scale)
         if made is None:
             continue
         pose, cov = made
@@ -304,7 +368,7 @@ def _agrees(
 
 
 def _pose_by_ring(
-    ring: Sighting, place: TargetPosition, plate: PlateAttitude
+    ring: Sighting, place: TargetPosition, plate: PlateAttitude, sd_scale: float
 ) -> tuple[CameraPose, FloatArray] | None:
     """Return the camera's pose and covariance by one ring, to first order; None: without its own.
 
@@ -326,6 +390,7 @@ def _pose_by_ring(
     )
     from_plate = np.vstack((cross_matrix(sight), np.eye(3)))
     cov = from_pose @ pose_cov @ from_pose.T + from_plate @ plate.cov @ from_plate.T
+    cov[:3, :3] += sd_scale**2 * np.outer(sight, sight)
     if place.cov_m2 is not None:
         cov[:3, :3] += place.cov_m2
     return CameraPose(place.position_m - sight, rotation), np.asarray(cov)

@@ -21,6 +21,8 @@ class PointImages:
     pixel_cov: FloatArray  # (n, 2, 2)
     distances_m: FloatArray  # (n,): camera to point, as the image's size says; NaN: not known
     sd_distances_m: FloatArray  # (n,)
+    # of the logarithm of what all distances are off by alike: prints, focal length; 0: nothing
+    sd_scale: float = 0.0
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -34,6 +36,7 @@ class PointImages:
             self.pixel_cov[which],
             self.distances_m[which],
             self.sd_distances_m[which],
+            self.sd_scale,
         )
 
     @property

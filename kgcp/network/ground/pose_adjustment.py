@@ -124,7 +124,9 @@ def squared_residuals(
         _, by_point = _design(camera, kept, pose)
         cov = _covariances(kept, by_point)
         cov[:, :2, :2] += slack_px**2 * np.eye(2)
-        chi2[ahead] = _chi2(residuals[ahead], cov)
+        off = residuals[ahead]
+        off[:, 2] -= _scale(kept, off, cov)
+        chi2[ahead] = _chi2(off, cov)
     return chi2
 
 
@@ -199,12 +201,40 @@ def _normal_equations(
     normal = np.einsum("nmp,nmq->pq", design, weighted[..., :-1])
     right = np.einsum("nmp,nm->p", design, weighted[..., -1])
     cost = float(np.einsum("nm,nm->", known, weighted[..., -1]))
+    if images.sd_scale:
+        # what all distances are off by alike, as an unknown that is eliminated
+        row = weighted[:, 2]
+        coupling = row[:, :-1].sum(axis=0)
+        pull = float(row[:, -1].sum())
+        own = float(weights @ np.linalg.inv(cov)[:, 2, 2]) + images.sd_scale**-2.0
+        normal -= np.outer(coupling, coupling) / own
+        right -= coupling * pull / own
+        cost -= pull**2 / own
     if sd_focal:
         off = math.log(pose.focal_scale)
         normal[6, 6] += 1.0 / sd_focal**2
         right[6] -= off / sd_focal**2
         cost += (off / sd_focal) ** 2
     return normal, right, cost
+
+
+def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:
+    """Return the logarithm of what all distances are too long by, alike; 0: they are not."""
+    if not images.sd_scale:
+        return 0.0
+    _, by_point = _design(camera, images, pose)
+    return _scale(images, _residuals(camera, images, pose), _covariances(images, by_point))
+
+
+def _scale(images: PointImages, residuals: FloatArray, cov: FloatArray) -> float:
+    """Return it by the residuals (n, 3) near their median: points with wrong names have no part."""
+    known = images.has_distance & np.isfinite(residuals).all(axis=1)
+    if not images.sd_scale or not known.any():
+        return 0.0
+    logs, variances = residuals[known, 2], cov[known, 2, 2]
+    off = (logs - np.median(logs)) ** 2 / variances
+    weights = 1.0 / (variances * (1.0 + off / 9.0))
+    return float(weights @ logs / (weights.sum() + images.sd_scale**-2.0))
 
 
 def covariance_and_residuals(

@@ -24,6 +24,7 @@ from kgcp.network.ground.pose_adjustment import (
     bend_cov,
     covariance_and_residuals,
     minimised,
+    scale_at,
     squared_residuals,
 )
 from kgcp.network.ground.pose_hypotheses import hypotheses
@@ -68,6 +69,8 @@ class Resection:
         Δχ² by which the next best pose fits worse; every point counts up to a limit.
     other : CameraPose or None
         That pose; None: no other explains any three points.
+    distance_scale : float
+        Logarithm of what all distances are too long by, alike; 0 where they are taken as right.
     """
 
     pose: CameraPose
@@ -77,6 +80,7 @@ class Resection:
     is_used: BoolArray
     margin: float
     other: CameraPose | None
+    distance_scale: float
 
     @property
     def observations(self) -> int:
@@ -152,7 +156,8 @@ def orient(
     if margin < MIN_MARGIN:
         raise NoPoseError(f"two poses fit alike (Δχ² {margin:.1f})")
     cov, residuals, chi2 = _determined(camera, images, pose, used, sd_focal)
-    oriented = Resection(pose, cov, residuals, chi2, used, margin, other)
+    scale = scale_at(camera, images.chosen(used), pose)
+    oriented = Resection(pose, cov, residuals, chi2, used, margin, other, scale)
     _require_fit(oriented)
     return oriented
 
@@ -216,7 +221,7 @@ def _hypothesis_costs(
     )
     chi2 = off2 / variance
     share = np.log(images.distances_m * focals[:, None] / distance)
-    sd2 = _START_SHARE**2 + (images.sd_distances_m / images.distances_m) ** 2
+    sd2 = _START_SHARE**2 + images.sd_scale**2 + (images.sd_distances_m / images.distances_m) ** 2
     chi2 += np.nan_to_num(share**2 / sd2)
     return np.asarray(np.sum(np.minimum(np.nan_to_num(chi2, nan=np.inf), _REJECTED_CHI2), axis=1))
 
@@ -286,6 +291,8 @@ def _robust_fit(
         pose = moved
     chi2 = squared_residuals(camera, images, pose, 0.0)
     prior = (math.log(pose.focal_scale) / sd_focal) ** 2 if sd_focal else 0.0
+    if images.sd_scale:
+        prior += (scale_at(camera, images.chosen(used), pose) / images.sd_scale) ** 2
     return float(np.sum(np.minimum(chi2, _REJECTED_CHI2))) + prior, pose, used
 
 

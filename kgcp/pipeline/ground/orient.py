@@ -28,10 +28,12 @@ from kgcp.io.tables.poses import (
     poses_csv,
 )
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.network.ground.frame_poses import FramePose, orient_frames
+from kgcp.network.ground.frame_poses import FramePose, orient_frames, unstated_scale_sd
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
+
+_SIGNIFICANT = 3.0  # standard deviations of what all distances are off by
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +97,39 @@ class FlightPoses:
         focal = self.flight.camera.mean_focal_px * math.exp(mean)
         return focal, focal * sd
 
+    @property
+    def distance_scale(self) -> tuple[float, float] | None:
+        """What all distances are too long by, alike, as a share, and its standard deviation.
+
+        The median of the frames. None: no frame tells.
+        """
+        pairs = [
+            (each.distance_scale, each.sd_distance_scale)
+            for each in self.oriented
+            if each.distance_scale and each.sd_distance_scale is not None
+        ]
+        if not pairs:
+            return None
+        logs, sds = np.median(pairs, axis=0).tolist()
+        return math.expm1(logs), sds
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with the distances of all targets; empty: nothing is seen."""
+        if self.distance_scale is None:
+            return ""
+        share, sd = self.distance_scale
+        if abs(share) <= _SIGNIFICANT * sd:
+            return ""
+        return (
+            f"the distances are {1000.0 * abs(share):.1f} ‰ (± {1000.0 * sd:.1f})"
+            f" {'longer' if share > 0.0 else 'shorter'} than the positions say; look at the"
+            " targets' diameters and at the focal length"
+        )
+
     def summary(self) -> dict[str, object]:
         """Return all numbers for machines."""
+        scale = self.distance_scale
         reasons = Counter(each.reason for each in self.poses if each.pose is None)
         focal = self.focal_px
         return {
@@ -109,6 +142,8 @@ class FlightPoses:
                 if len(each.used) < len(each.targets) and not each.is_by_one_ring
             },
             "reasons": dict(sorted(reasons.items())),
+            "distance_scale": None if scale is None else {"value": scale[0], "sd": scale[1]},
+            "doubts": [self.doubt] if self.doubt else [],
             "focal_px": None if focal is None else {"value": focal[0], "sd": focal[1]},
         }
 
@@ -154,6 +189,7 @@ def orient_flight(
             flight.camera,
             min_points=options.min_points,
             has_free_focal=options.has_free_focal,
+            sd_scale=unstated_scale_sd(flight.all_targets),
         )
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
