@@ -74,6 +74,12 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
             f"{placed.target}: {frames} not fit the others and took no part;"
             f" the worst is {placed.worst_frame}"
         )
+    if placed.own_noise_px is not None:
+        doubts.append(
+            f"{placed.target}: its images contradict each other by {placed.own_noise_px:.3g} px,"
+            " those of other targets do not: it was moved, or something else was taken for it;"
+            " this is allowed for"
+        )
     if placed.ambiguity < MIN_AMBIGUITY:
         doubts.append(
             f"{placed.target}: its mirrored normal fits nearly as well"

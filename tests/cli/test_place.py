@@ -62,6 +62,52 @@ def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
     assert abs(worst["residual_x_px"]) + abs(worst["residual_y_px"]) > 5.0
 
 
+def moved(frames: int, off_m: float) -> GroundFlight:
+    """A flight in whose first frames B lies elsewhere, to the east."""
+    rotations = GroundFlight().rotations
+    east = np.array([off_m, 0.0, 0.0])
+    return GroundFlight(wrong={(frame, "B"): rotations[frame].T @ east for frame in range(frames)})
+
+
+def places_of(folder: Path) -> dict[str, np.ndarray]:
+    """Places, their deviations, diameters and their deviations by target: x y z, and so on."""
+    table = pd.read_parquet(folder / "kgcp" / "places.parquet")
+    columns = ["x", "y", "z", "sd_x", "sd_y", "sd_z", "diameter_m", "sd_diameter_m"]
+    return dict(zip(table["target"].tolist(), table[columns].to_numpy(), strict=True))
+
+
+@pytest.mark.parametrize(("frames", "off_m"), [(6, 0.05), (6, 1.0), (4, 1.0), (4, 6.0)])
+def test_a_target_that_was_moved_makes_no_other_less_sure(
+    tmp_path: Path, frames: int, off_m: float
+) -> None:
+    flight = moved(frames, off_m)
+    undisturbed = GroundFlight().write(tmp_path / "undisturbed")
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == run(undisturbed).exit_code == 0, result.stderr
+    found, expected = places_of(folder), places_of(undisturbed)
+    for name in ("A", "C", "D"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6)
+    assert "mostly of the reference poses" not in result.stderr
+    sd_x = found["B"][3]
+    if frames == 4:  # most frames agree
+        assert "B: 4 of 12 frames do not fit the others and took no part" in result.stderr
+        assert np.abs(found["B"][:3] - flight.positions_map[1]).max() < 0.001
+        assert sd_x < 2.0 * expected["B"][3]
+    else:
+        assert "B: its images contradict each other by" in result.stderr
+        assert "it was moved" in result.stderr
+        assert sd_x > 0.1 * off_m / np.sqrt(12.0)
+
+
+def test_a_target_at_two_distant_places_is_not_placed(tmp_path: Path) -> None:
+    folder = moved(6, 6.0).write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == 0
+    assert "B: its images contradict each other by 100 px or more" in result.stderr
+    assert list(places_of(folder)) == ["A", "C", "D"]
+
+
 def test_deviations_of_poses_count(tmp_path: Path) -> None:
     folder = GroundFlight().write(tmp_path / "flight")
     path = folder / "reference.csv"

@@ -25,7 +25,12 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
-from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circles
+from kgcp.network.ground.target_plane import (
+    MOST_EXTRA_PX,
+    PlacedCircle,
+    common_covariance,
+    place_circles,
+)
 from kgcp.targets.plain import AnyTarget, Shape, shape_of
 
 _FLOOR_PX = 0.0005  # of the outline: no print is better, and a frontal view has no singular pose
@@ -66,6 +71,9 @@ class PlacedTarget:
         frames, `common_cov` what all frames share.
     variance_factor : float
         Squares of the residuals over what was expected.
+    own_noise_px : float or None
+        How far its images deviate beyond what is stated [px], if by far more than those of most
+        targets; None: they do not.
     check : PlaceCheck
         Against flight.toml.
     """
@@ -84,6 +92,7 @@ class PlacedTarget:
     cov: FloatArray
     common_cov: FloatArray
     variance_factor: float
+    own_noise_px: float | None
     check: PlaceCheck
 
     @property
@@ -151,7 +160,8 @@ class Placement:
     skipped : mapping of str to str
         Why a target was not placed, by its name.
     noise : ExtraNoise
-        Deviations beyond the stated ones that the residuals of all targets show.
+        Deviations beyond the stated ones that the residuals of all targets show, but of those that
+        have their own.
     """
 
     targets: tuple[PlacedTarget, ...]
@@ -215,15 +225,22 @@ def place_targets(
         if isinstance(outcome, NoCircleError):
             skipped[target.name] = str(outcome)
             continue
+        own_px = outcome.noise.centre_px if outcome.is_apart else None
+        if own_px is not None and own_px >= MOST_EXTRA_PX:
+            skipped[target.name] = (
+                f"its images contradict each other by {MOST_EXTRA_PX:.0f} px or more, those of"
+                " other targets do not"
+            )
+            continue
         common = common_covariance(
             camera,
             views,
             outcome.fit,
-            noise,
+            outcome.noise,
             None if calibration is None else calibration.cov,
             _CODED_EDGE_SD_PX,
         )
-        placed.append(_on_the_map(target, frames, outcome, common, local_frame))
+        placed.append(_on_the_map(target, frames, outcome, own_px, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
 
 
@@ -320,6 +337,7 @@ def _on_the_map(
     target: AnyTarget,
     frames: tuple[str, ...],
     placed: PlacedCircle,
+    own_noise_px: float | None,
     common_cov: FloatArray,
     local_frame: LocalFrame,
 ) -> PlacedTarget:
@@ -348,6 +366,7 @@ def _on_the_map(
         cov=cov,
         common_cov=common_cov,
         variance_factor=fit.variance_factor,
+        own_noise_px=own_noise_px,
         check=_check(target, circle, cov + common_cov, enu_from_map, local_frame),
     )
 
