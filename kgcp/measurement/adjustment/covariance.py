@@ -34,6 +34,7 @@ from kgcp.measurement.image_model.photometry import (
 )
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.records import Uncertainty
+from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _ARC_PX = 6.0
 _UNEVEN_ARC_PX = 12.0  # where levels vary: stains leave residuals that go together over their knots
@@ -53,7 +54,9 @@ _EDGE_FLOOR_PX = {
     Tone.OF_BINS: 0.004,
 }
 # The variance where levels vary without a shadow's edge, by what residuals show of it: dirt and
-# highlights on 100 simulated plates (R 13-110 px). With an edge residuals show it all.
+# highlights on 100 simulated plates (R 13-110 px). With an edge residuals show it all. Rings too
+# small for levels to vary have it, too: with dirt on 40 plates of R 9-13 px, simulated like the
+# preset `clean`, the RMS of standardised errors is 1.42 without it.
 _UNDER_UNEVEN_LIGHT = 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
@@ -117,7 +120,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     in_common_px = common_displacement_px(fit, min(max(mean - 1.0, 0.0) / _ALL_ALONG_ARCS, 1.0))
     shifts = inverse[:6] @ _edge_pull(fit, scaled, circle) * in_common_px
     pose_cov = half @ half.T + shifts @ shifts.T
-    pose_cov *= unevenness_factor(fit)
+    pose_cov *= unevenness_factor(fit, mean)
     if fit.parameters.has_skew:
         depth_m = fit.parameters.matrix[2, 3]
         across_px = _skew_displacement_px(fit, mean * np.diag(inverse))
@@ -131,10 +134,17 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
     return PoseCovariance(pose_cov, max(1.0, mean))
 
 
-def unevenness_factor(fit: TargetFit) -> float:
-    """Return how many times the variances that residuals show are too small in uneven light."""
-    field = fit.parameters.field
-    return 1.0 if field is None or len(field.edges) else _UNDER_UNEVEN_LIGHT
+def unevenness_factor(fit: TargetFit, inflation: float) -> float:
+    """Return how many times the variances that residuals show are too small in uneven light.
+
+    Of rings too small for levels to vary, an `inflation` beyond 1 tells that it is uneven.
+    """
+    field, problem = fit.parameters.field, fit.sample.problem
+    if field is not None:
+        return 1.0 if len(field.edges) else _UNDER_UNEVEN_LIGHT
+    if problem.outer_radius_px >= SMALLEST_UNEVEN_PX:
+        return 1.0
+    return float(_UNDER_UNEVEN_LIGHT ** min(max(inflation - 1.0, 0.0), 1.0))
 
 
 def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:

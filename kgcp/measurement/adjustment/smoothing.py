@@ -57,7 +57,7 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
     precision = own + float(mixed @ moves)
     return ContourSmoothing(
         seen_px2=score / precision,
-        sd_seen_px2=math.sqrt(inflation * unevenness_factor(fit) / precision),
+        sd_seen_px2=math.sqrt(inflation * unevenness_factor(fit, inflation) / precision),
         pose_by_smoothing=moves[:6],
     )
 
