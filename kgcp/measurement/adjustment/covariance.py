@@ -53,11 +53,11 @@ _EDGE_FLOOR_PX = {
     Tone.UNKNOWN_FROM_LINE: 0.002,
     Tone.OF_BINS: 0.004,
 }
-# The variance where levels vary without a shadow's edge, by what residuals show of it: dirt and
-# highlights on 100 simulated plates (R 13-110 px). With an edge residuals show it all. Rings too
-# small for levels to vary have it, too: with dirt on 40 plates of R 9-13 px, simulated like the
-# preset `clean`, the RMS of standardised errors is 1.42 without it.
-_UNDER_UNEVEN_LIGHT = 1.4
+# The variance where levels vary without a shadow's edge, by what residuals show of it: dirt,
+# highlights and both with other effects on 254 simulated plates (R 13-130 px). With an edge
+# residuals show it all. And that of rings too small for levels to vary: dirt on 40 plates of R
+# 9-13 px, simulated like the preset `clean`, without which standardised errors have an RMS of 1.42.
+_UNDER_UNEVEN_LIGHT, _ON_SMALL_RINGS = 1.2, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.25, 0.5
@@ -144,7 +144,7 @@ def unevenness_factor(fit: TargetFit, inflation: float) -> float:
         return 1.0 if len(field.edges) else _UNDER_UNEVEN_LIGHT
     if problem.outer_radius_px >= SMALLEST_UNEVEN_PX:
         return 1.0
-    return float(_UNDER_UNEVEN_LIGHT ** min(max(inflation - 1.0, 0.0), 1.0))
+    return float(_ON_SMALL_RINGS ** min(max(inflation - 1.0, 0.0), 1.0))
 
 
 def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
