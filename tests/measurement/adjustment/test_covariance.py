@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from kgcp.measurement.adjustment.covariance import (
     common_displacement_px,
     pose_covariance,
     propagate,
+    unevenness_factor,
 )
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.problem import FitProblem
@@ -37,6 +40,28 @@ def some_covariance(seed: int) -> FloatArray:
     scale = np.array([0.002, 0.003, 0.02, 0.004, 0.003, 0.002])
     scaled = scale[:, None] * root
     return np.asarray(scaled @ scaled.T)
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "inflation", "edges", "expected"),
+    [
+        (11.0, 1.0, None, 1.0),  # even light
+        (11.0, 1.5, None, math.sqrt(1.4)),
+        (11.0, 6.0, None, 1.4),  # dirt on a ring too small for levels to vary
+        (13.0, 6.0, None, 1.0),  # levels could have varied, and did not need to
+        (30.0, 1.0, 0, 1.2),  # levels that vary …
+        (30.0, 1.0, 1, 1.0),  # … with a shadow's edge
+    ],
+)
+def test_uneven_light_makes_variances_larger_than_residuals_show(
+    radius_px: float, inflation: float, edges: int | None, expected: float
+) -> None:
+    field = None if edges is None else SimpleNamespace(edges=[0.0] * edges)
+    fit: Any = SimpleNamespace(
+        parameters=SimpleNamespace(field=field),
+        sample=SimpleNamespace(problem=SimpleNamespace(outer_radius_px=radius_px)),
+    )
+    assert unevenness_factor(fit, inflation) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("turn_deg", [31.0, 179.9])
