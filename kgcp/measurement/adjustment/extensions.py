@@ -234,12 +234,7 @@ def _of_levels(light: Light, black: float, white: float) -> Light:
 
 
 def _in_even_light(light: Light) -> Light:
-    """Return the levels and the tone curve without what `without_fine_light` leaves out.
-
-    Gradient and curvature act on what the tone curve has made of the light, so that levels, which
-    act on the light itself, could not undo them: of 22 plates with dirt under a film curve (R
-    60–130 px) they left an RMS error of 0.016 % and 2.2 σ, now 0.006 % and 0.9 σ.
-    """
+    """Return the levels and the tone curve without what `without_fine_light` leaves out."""
     return replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0, linear_sharpening=0.0)
 
 

@@ -1,9 +1,10 @@
 """From white share to grey value: levels, tone, light that is not quite even, sharpening.
 
-grey = sharpen(sRGB(sharpen((black + (white − black) · tone(share)) · light))), where the light is
-1 + slope · offset + curvature · (offset² − ⅝): an unknown response departs from sRGB's curve, which
-nearly all cameras follow, by a function of the share between ink and plate that has three
-parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve as in cameras.
+grey = sharpen(sRGB(sharpen(black + (white − black) · tone(x)))), where x is the light between that of
+ink, 0, and of plate, 1: x = light · share + (light − 1) · black / (white − black), with the light
+1 + slope · offset + curvature · (offset² − ⅝). An unknown response departs from sRGB's curve, which
+nearly all cameras follow, by a function of x that has three parameters; sharpening is an unsharp
+mask on the pixel grid, after the tone curve as in cameras.
 Demosaicing sharpens, too, and before the tone curve: behind it, that shows most on the dark side of
 edges. Local tone mapping curves the light over the plate. Together they are what displaces apparent
 edges: δ is a consequence here, not a parameter.
@@ -199,12 +200,10 @@ class PhotometricModel:
         """
         value, values = np.empty(len(share)), light.values
         _expose(share, self.offsets, values, self._added(added), value)
-        if added is None:
-            gains = _tone_slopes(share, values)
-        else:
-            between = 1.0 + added[1] - added[0]
-            gains = between * _tone_slopes(added[0] + between * share, values)
-        carried: FloatArray = gains * _light_at(self.offsets, values) * rows
+        lit = _light_at(self.offsets, values)
+        ink, between = (0.0, 1.0) if added is None else (added[0], 1.0 + added[1] - added[0])
+        x = lit * (ink + between * share) + (lit - 1.0) * light.black / (light.white - light.black)
+        carried: FloatArray = lit * between * _tone_slopes(x, values) * rows
         mask = self._mask_in_light(added)
         if mask is not None and light.linear_sharpening:
             value += light.linear_sharpening * mask.detail(value, light.black, light.white)
@@ -438,14 +437,15 @@ def _expose(
     added: FloatArray,
     value: FloatArray,
 ) -> None:
-    """Fill in black + (white − black) · tone(share), times the light."""
+    """Fill in black + (white − black) · tone(x), with x as in the module's description."""
     black, white, _, _, _, tone_1, tone_2, tone_3, _, _ = light
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
-        tone, _, _, _ = _toned(ink + (plate - ink) * share[i], tone_1, tone_2, tone_3)
         lit, _ = _lit(offsets[0, i], offsets[1, i], light)
-        value[i] = (black + (white - black) * tone) * lit
+        x = lit * (ink + (plate - ink) * share[i]) + (lit - 1.0) * black / (white - black)
+        tone, _, _, _ = _toned(x, tone_1, tone_2, tone_3)
+        value[i] = black + (white - black) * tone
 
 
 @compiled
@@ -469,18 +469,21 @@ def _expose_with_slopes(
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
-        x = ink + (plate - ink) * share[i]
-        tone, slope, arch, lean = _toned(x, tone_1, tone_2, tone_3)
         lit, bulge = _lit(offsets[0, i], offsets[1, i], light)
-        core = black + contrast * tone
-        value[i] = core * lit
+        x = ink + (plate - ink) * share[i]
+        tone, slope, arch, lean = _toned(
+            lit * x + (lit - 1.0) * black / contrast, tone_1, tone_2, tone_3
+        )
+        value[i] = black + contrast * tone
         gain = contrast * lit
         gains[i] = gain * slope * (plate - ink)
-        jacobian[11, i] = lit * (1.0 - tone)
-        jacobian[12, i] = lit * tone
-        jacobian[13, i], jacobian[14, i] = core * offsets[0, i], core * offsets[1, i]
-        bend = gain * arch if has_tone else 0.0
-        jacobian[15, i] = core * bulge
+        added_to_ink = slope * (lit - 1.0) / contrast
+        jacobian[11, i] = 1.0 - tone + added_to_ink * white
+        jacobian[12, i] = tone - added_to_ink * black
+        by_light = slope * (black + contrast * x)
+        jacobian[13, i], jacobian[14, i] = by_light * offsets[0, i], by_light * offsets[1, i]
+        bend = contrast * arch if has_tone else 0.0
+        jacobian[15, i] = by_light * bulge
         jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend, bend * lean, bend * lean * lean
         jacobian[19, i] = jacobian[20, i] = 0.0
         if each:
