@@ -123,6 +123,19 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, rtol=1e-6, atol=2e-7)
 
 
+@pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+def test_the_light_varies_before_the_tone_curve(tone: Tone) -> None:
+    """Ink without light stays black; other pixels look as if they were whiter in even light."""
+    photometry, light = make_imager(tone, 0.0), replace(LIGHT, black=0.0)
+    share = make_share(photometry).value
+    even = replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0)
+    x, y = photometry.offsets
+    lit = 1.0 + light.slope_x * x + light.slope_y * y + light.curvature * (x * x + y * y - 0.625)
+    np.testing.assert_allclose(
+        photometry.levels(share, light), photometry.levels(lit * share, even), atol=1e-14
+    )
+
+
 @pytest.mark.parametrize("modelled", [0.05, 0.5, 1.0])
 def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> None:
     """The same as OpenCV's blur of the plain image, in which other pixels are ink or plate."""
