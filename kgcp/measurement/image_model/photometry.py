@@ -1,13 +1,13 @@
 """From white share to grey value: levels, tone, light that is not quite even, sharpening.
 
-grey = sharpen(sRGB(sharpen(black + (white − black) · tone(x)))), where x is the light between that of
-ink, 0, and of plate, 1: x = light · share + (light − 1) · black / (white − black), with the light
-1 + slope · offset + curvature · (offset² − ⅝). An unknown response departs from sRGB's curve, which
-nearly all cameras follow, by a function of x that has three parameters; sharpening is an unsharp
-mask on the pixel grid, after the tone curve as in cameras.
-Demosaicing sharpens, too, and before the tone curve: behind it, that shows most on the dark side of
-edges. Local tone mapping curves the light over the plate. Together they are what displaces apparent
-edges: δ is a consequence here, not a parameter.
+grey = sharpen(sRGB(sharpen((black + (white − black) · tone(x)) · curved))), where x is the light
+between that of ink, 0, and of plate, 1: x = lit · share + (lit − 1) · black / (white − black). Its
+gradient is lit = 1 + slope · offset; local tone mapping leaves curved = 1 + curvature · (offset² −
+⅝). An unknown response departs from sRGB's curve, which nearly all cameras follow, by a function of
+x that has three parameters; sharpening is an unsharp mask on the pixel grid, after the tone curve
+as in cameras. Demosaicing sharpens, too, and before the tone curve: behind it, that shows most on
+the dark side of edges. Together they are what displaces apparent edges: δ is a consequence here,
+not a parameter.
 """
 
 from __future__ import annotations
@@ -200,10 +200,10 @@ class PhotometricModel:
         """
         value, values = np.empty(len(share)), light.values
         _expose(share, self.offsets, values, self._added(added), value)
-        lit = _light_at(self.offsets, values)
+        lit, curved = _light_at(self.offsets, values)
         ink, between = (0.0, 1.0) if added is None else (added[0], 1.0 + added[1] - added[0])
         x = lit * (ink + between * share) + (lit - 1.0) * light.black / (light.white - light.black)
-        carried: FloatArray = lit * between * _tone_slopes(x, values) * rows
+        carried: FloatArray = curved * lit * between * _tone_slopes(x, values) * rows
         mask = self._mask_in_light(added)
         if mask is not None and light.linear_sharpening:
             value += light.linear_sharpening * mask.detail(value, light.black, light.white)
@@ -410,22 +410,22 @@ def _tone_slopes(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
 
 
 @inlined
-def _lit(x: float, y: float, light: tuple[float, ...]) -> tuple[float, float]:
-    """Return the light at a place in ring radii, and by how much its curvature raises it there.
+def _lit(x: float, y: float, light: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return the light at a place in ring radii, the factor that curves the level, and its bulge.
 
     The curvature leaves the mean of both edges as it is: of (1² + ½²)/2 for a ring half as wide
     inside, so that it is not mistaken for the level of white.
     """
     bulge = x * x + y * y - _MEAN_SQUARE
-    return 1.0 + light[2] * x + light[3] * y + light[4] * bulge, bulge
+    return 1.0 + light[2] * x + light[3] * y, 1.0 + light[4] * bulge, bulge
 
 
 @compiled
 def _light_at(offsets: FloatArray, light: tuple[float, ...]) -> FloatArray:
-    """Return the light (n,) at all places."""
-    lit = np.empty(offsets.shape[1])
-    for i in range(len(lit)):
-        lit[i], _ = _lit(offsets[0, i], offsets[1, i], light)
+    """Return the light, and what curves the level, (2, n) at all places."""
+    lit = np.empty((2, offsets.shape[1]))
+    for i in range(lit.shape[1]):
+        lit[0, i], lit[1, i], _ = _lit(offsets[0, i], offsets[1, i], light)
     return lit
 
 
@@ -442,10 +442,10 @@ def _expose(
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
-        lit, _ = _lit(offsets[0, i], offsets[1, i], light)
+        lit, curved, _ = _lit(offsets[0, i], offsets[1, i], light)
         x = lit * (ink + (plate - ink) * share[i]) + (lit - 1.0) * black / (white - black)
         tone, _, _, _ = _toned(x, tone_1, tone_2, tone_3)
-        value[i] = black + (white - black) * tone
+        value[i] = curved * (black + (white - black) * tone)
 
 
 @compiled
@@ -469,21 +469,22 @@ def _expose_with_slopes(
     each = 1 if added.shape[1] > 1 else 0
     for i in range(len(share)):
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
-        lit, bulge = _lit(offsets[0, i], offsets[1, i], light)
+        lit, curved, bulge = _lit(offsets[0, i], offsets[1, i], light)
         x = ink + (plate - ink) * share[i]
         tone, slope, arch, lean = _toned(
             lit * x + (lit - 1.0) * black / contrast, tone_1, tone_2, tone_3
         )
-        value[i] = black + contrast * tone
-        gain = contrast * lit
+        core = black + contrast * tone
+        value[i] = curved * core
+        gain = curved * contrast * lit
         gains[i] = gain * slope * (plate - ink)
         added_to_ink = slope * (lit - 1.0) / contrast
-        jacobian[11, i] = 1.0 - tone + added_to_ink * white
-        jacobian[12, i] = tone - added_to_ink * black
-        by_light = slope * (black + contrast * x)
+        jacobian[11, i] = curved * (1.0 - tone + added_to_ink * white)
+        jacobian[12, i] = curved * (tone - added_to_ink * black)
+        by_light = curved * slope * (black + contrast * x)
         jacobian[13, i], jacobian[14, i] = by_light * offsets[0, i], by_light * offsets[1, i]
-        bend = contrast * arch if has_tone else 0.0
-        jacobian[15, i] = by_light * bulge
+        bend = curved * contrast * arch if has_tone else 0.0
+        jacobian[15, i] = core * bulge
         jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend, bend * lean, bend * lean * lean
         jacobian[19, i] = jacobian[20, i] = 0.0
         if each:

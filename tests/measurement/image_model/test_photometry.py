@@ -128,9 +128,9 @@ def test_the_light_varies_before_the_tone_curve(tone: Tone) -> None:
     """Ink without light stays black; other pixels look as if they were whiter in even light."""
     photometry, light = make_imager(tone, 0.0), replace(LIGHT, black=0.0)
     share = make_share(photometry).value
-    even = replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0)
+    even = replace(light, slope_x=0.0, slope_y=0.0)
     x, y = photometry.offsets
-    lit = 1.0 + light.slope_x * x + light.slope_y * y + light.curvature * (x * x + y * y - 0.625)
+    lit = 1.0 + light.slope_x * x + light.slope_y * y
     np.testing.assert_allclose(
         photometry.levels(share, light), photometry.levels(lit * share, even), atol=1e-14
     )
