@@ -71,7 +71,7 @@ _PLATEAU_PIXELS = 1200
 _LEAST_CONTRAST = 0.05
 # Mean square of the residuals' sums over cells, relative to that of independent residuals. Above
 # this, the levels vary; frames in even light have about 1.
-_UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 2.5
+_UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
 # In small rings, cells say less than edges do. An excess that leaves a doubt is enough if residuals
 # that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
 # an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
