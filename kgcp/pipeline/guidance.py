@@ -27,7 +27,7 @@ from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
-from kgcp.network.ground.frame_poses import orient_frames, unstated_scale_sd
+from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
 from kgcp.targets.plain import AnyTarget
 
 # What a ring that is not the target's may be dropped for.
@@ -202,7 +202,7 @@ def _by_own_targets(
 ) -> dict[str, Predictions]:
     """Return by frame where plain targets must be, as other static targets orient it."""
     made: dict[str, Predictions] = {}
-    scale_sd = unstated_scale_sd(flight.all_targets)
+    scale_sd = print_scale_sd(flight.all_targets)
     for oriented in orient_frames(
         frames, sightings, positions.static, flight.camera, sd_scale=scale_sd
     ):

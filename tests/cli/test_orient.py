@@ -100,13 +100,37 @@ def test_diameters_that_are_all_wrong_displace_no_pose(
         assert abs(target["diameter_m"] - 0.9) < 3.0 * target["sd_diameter_m"] < 0.003
 
 
+def vouch(folder: Path, sd_diameter_m: float) -> None:
+    """State how well all rings are printed, after they were measured."""
+    toml = folder / "flight.toml"
+    words = f"\nsd_outer_diameter_m = {sd_diameter_m}\nposition_m"
+    toml.write_text(toml.read_text("utf-8").replace("\nposition_m", words), encoding="utf-8")
+
+
+def test_a_print_that_is_stated_after_detection_is_not_exact(tmp_path: Path) -> None:
+    flight = GroundFlight(stated_diameter_m=0.897)
+    folder = flight.write(tmp_path / "flight")
+    vouch(folder, 0.003)
+    assert run("orient", folder).exit_code == 0
+    off, sds = poses_of(folder, flight)
+    assert 0.2 < float(np.sqrt(np.mean((off[:, 2] / sds[:, 2]) ** 2))) < 1.5
+
+
+def test_diameters_that_contradict_what_is_vouched_for_are_told_in_permille(tmp_path: Path) -> None:
+    flight = GroundFlight(stated_diameter_m=0.897, frames=3)
+    folder = flight.write(tmp_path / "flight", sd_position_m=0.002)
+    vouch(folder, 0.0001)
+    result = run("orient", folder)
+    assert result.exit_code == 1
+    assert "the distances are 3 ‰ shorter than the positions say" in result.stderr
+
+
 def test_diameters_that_are_vouched_for_tell_how_far_away_a_frame_is(tmp_path: Path) -> None:
     flight, found = GroundFlight(), []
-    for name, words in (("open", ""), ("stated", "sd_outer_diameter_m = 0.0001\n")):
+    for name in ("open", "stated"):
         folder = flight.write(tmp_path / name, sd_position_m=0.002)
-        toml = folder / "flight.toml"
-        text = toml.read_text(encoding="utf-8").replace("\nposition_m", f"\n{words}position_m")
-        toml.write_text(text, encoding="utf-8")
+        if name == "stated":
+            vouch(folder, 0.0001)
         assert run("orient", folder).exit_code == 0
         found.append(float(np.median(poses_of(folder, flight)[1][:, 2])))
     assert found[1] < 0.7 * found[0]

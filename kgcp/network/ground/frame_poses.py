@@ -100,14 +100,15 @@ class PlateAttitude:
     cov: FloatArray  # (3, 3): of a left rotation vector, ENU axes [rad²]
 
 
-def unstated_scale_sd(targets: Iterable[AnyTarget]) -> float:
-    """Return `sd_scale` of `orient_frames`: 0 if it is stated how well static targets are printed.
+def print_scale_sd(targets: Iterable[AnyTarget]) -> float:
+    """Return `sd_scale` of `orient_frames`: how well the static targets are printed, as stated.
 
-    Then sightings state what the print contributes.
+    That of the least well known one, as a share of its diameter. Sightings may state it as well,
+    but need not: it may have been stated after they were measured.
     """
     static = [target for target in targets if target.position_m is not None]
-    is_stated = all(target.sd_outer_diameter_m > 0.0 for target in static)
-    return 0.0 if is_stated else UNSTATED_SCALE_SD
+    shares = [target.sd_outer_diameter_m / target.outer_diameter_m for target in static]
+    return max(shares, default=0.0) if all(shares) else UNSTATED_SCALE_SD
 
 
 def orient_frames(
@@ -136,7 +137,7 @@ def orient_frames(
         Whether the focal length is unknown, to a factor of two.
     sd_scale : float
         Of the logarithm of what all distances may be off by, alike, besides the common share that
-        the sightings state: of targets whose print nobody vouches for.
+        the sightings state: see `print_scale_sd`.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
     for each in sightings:
@@ -165,7 +166,13 @@ def point_images(
     """Return measured targets as points of known position; `sd_scale` as for `orient_frames`."""
     no_cov = np.zeros((3, 3))
     places = [positions[each.target] for each in sightings]
-    sds = [math.nan if each.sd_distance_m is None else each.sd_distance_m for each in sightings]
+    # a print may be wrong by itself, or as those of all targets are: both are allowed for
+    sds = [
+        math.nan
+        if each.sd_distance_m is None
+        else math.hypot(each.sd_distance_m, each.sd_common_distance_m or 0.0)
+        for each in sightings
+    ]
     known = np.isfinite(sds)
     common = [(each.sd_common_distance_m or 0.0) / each.distance_m for each in sightings]
     return PointImages(
@@ -229,12 +236,13 @@ def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resecti
 
 
 def _scale_words(scale: float) -> str:
-    """Return the reason by which all distances are wrong, in whole per cent to group frames."""
+    """Return the reason by which all distances are wrong, in whole numbers to group frames."""
     share = math.exp(scale) - 1.0
-    is_long = "longer" if share > 0.0 else "shorter"
+    size = abs(share)
+    words = f"{100.0 * size:.0f} %" if size >= 0.01 else f"{1000.0 * size:.0f} ‰"
     return (
-        f"the distances are {100.0 * abs(share):.0f} % {is_long} than the positions say; look at"
-        " the targets' diameters and at the focal length"
+        f"the distances are {words} {'longer' if share > 0.0 else 'shorter'} than the positions"
+        " say; look at the targets' diameters and at the focal length"
     )
 
 

@@ -28,7 +28,7 @@ from kgcp.io.tables.poses import (
     poses_csv,
 )
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.network.ground.frame_poses import FramePose, orient_frames, unstated_scale_sd
+from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -189,7 +189,7 @@ def orient_flight(
             flight.camera,
             min_points=options.min_points,
             has_free_focal=options.has_free_focal,
-            sd_scale=unstated_scale_sd(flight.all_targets),
+            sd_scale=print_scale_sd(flight.all_targets),
         )
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
