@@ -115,7 +115,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     if start is not None:
         problem = replace(problem, field=start.field)
     points = field.points_m()
-    # only the terms dropped by the earlier calibration are dropped now
+    # only the photographs dropped by the earlier calibration are dropped now
     disordered = () if start is not None else _disordered(problem)
     problem = replace(problem, views=tuple(v for v in problem.views if v.photo not in disordered))
     _require_views(problem.views)

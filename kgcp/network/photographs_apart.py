@@ -18,6 +18,7 @@ from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 _FITTING = 1.5  # RMS over the discs' own deviation, that leaves nothing to explain
 _MOST_APART = 0.25  # of the photographs
 _LEAST_LEFT = 4
+_TRIED = 4  # with the largest residuals, each round
 _LEAST_GAIN = 2.0  # by how much the others must fit better
 _NEARLY = 1.5  # RMS over the least one: fewer photographs are left out then
 _USUAL_TERMS = ("k1", "k2")  # which photographs that stand apart may have made insignificant
@@ -26,9 +27,10 @@ _USUAL_TERMS = ("k1", "k2")  # which photographs that stand apart may have made 
 def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tuple[str, ...]:
     """Return the photographs without which the others fit at least twice as well.
 
-    Those with the largest residuals are left out one after another, a quarter of them at most. What
-    all photographs contradict is no reason to leave out any: a lens that is none of kgcp's, or a
-    field that is not stated right.
+    One after another is left out: of those with the largest residuals, the one without which the
+    others fit best. If they do not fit without a quarter of them, all stay. What all photographs
+    contradict is no reason to leave out any: a lens that is none of kgcp's, or a field that is not
+    stated right.
     """
     limit_px = _FITTING * operator_sd_px(problem.views)
     most = min(int(_MOST_APART * len(problem.views)), len(problem.views) - _LEAST_LEFT)
@@ -40,12 +42,19 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     left_out: list[str] = []
     misfits_px = [first_px]
     while len(left_out) < most and misfits_px[-1] > limit_px:
-        worst = int(_own_rms_px(state).argmax())
-        left_out.append(problem.views[worst].photo)
-        problem, state = without(problem, state, np.arange(len(problem.views)) == worst)
-        misfits_px.append(rms_px(state.solution))
+        # the one that displaces the camera need not be the one that fits worst in it
+        index = np.arange(len(problem.views))
+        tried = np.argsort(-_own_rms_px(state))[:_TRIED].tolist()
+        trials = [without(problem, state, index == each) for each in tried]
+        misfits = [rms_px(trial.solution) for _, trial in trials]
+        best = int(np.argmin(misfits))
+        left_out.append(problem.views[tried[best]].photo)
+        problem, state = trials[best]
+        misfits_px.append(misfits[best])
     count = int(np.argmax(np.array(misfits_px) <= _NEARLY * min(misfits_px)))
-    return tuple(left_out[:count]) if _LEAST_GAIN * misfits_px[count] <= first_px else ()
+    is_cleared = count < most or misfits_px[count] <= limit_px  # else some are still among them
+    is_gain = _LEAST_GAIN * misfits_px[count] <= first_px
+    return tuple(left_out[:count]) if is_cleared and is_gain else ()
 
 
 def without(
@@ -64,7 +73,10 @@ def without(
 
 
 def _own_rms_px(state: AdjustedNetwork) -> FloatArray:
-    """Return the RMS of every photograph's residuals (v,), of the discs that were kept."""
+    """Return the RMS of every photograph's residuals (v,), of kept discs; infinite: it has none."""
+    count = len(state.estimate.rotations)
     view = state.network.observations.view[state.solution.is_used]
     squares = np.sum(state.solution.residuals[state.solution.is_used] ** 2, axis=1)
-    return np.asarray(np.sqrt(np.bincount(view, squares) / np.bincount(view)))
+    discs = np.bincount(view, minlength=count)
+    mean = np.bincount(view, squares, count) / np.maximum(discs, 1)
+    return np.asarray(np.sqrt(np.where(discs > 0, mean, np.inf)))

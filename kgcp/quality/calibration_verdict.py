@@ -288,7 +288,8 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
     if calibration.dropped or _fits_badly(numbers):
         advice.append(
             "Keep zoom, focus and crop the same in all photographs, none turned afterwards, and the"
-            " field rigid."
+            " field rigid. If those that do not fit are the only ones to reach the corners, it may"
+            " be a lens that no model here describes."
         )
     if numbers.views < 12:
         advice.append("Take 12 photographs or more.")

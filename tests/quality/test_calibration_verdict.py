@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -20,8 +22,9 @@ from kgcp.network.calibration_records import (
     NamedView,
     PointModel,
 )
-from kgcp.network.camera_network import CalibrationProblem
+from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.frame_camera import FrameCameraModel
+from kgcp.network.photographs_apart import _own_rms_px
 from kgcp.network.records import CalibrationPrior
 from kgcp.quality.calibration_verdict import (
     CalibrationGrade,
@@ -199,6 +202,43 @@ def test_a_photograph_of_another_zoom_takes_no_part(zoom: float) -> None:
     verdict = judge(result, numbers)
     assert "1 photograph does not fit the others" in verdict.sentence
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
+
+
+def test_a_photograph_of_another_zoom_is_told_where_another_one_fits_worst() -> None:
+    """Its pose and the camera take up so much that a right one has the largest residuals."""
+    made = views(distance_m=0.45)
+    made[4] = views(camera=replace(CAMERA, fx=1515.0, fy=1515.0), distance_m=0.45)[4]
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert result.dropped == ("p4",)
+    assert abs(result.camera.fx - 1500.0) < 3.0 * calibration_numbers(result).sd[0] < 1.0
+
+
+def test_more_than_a_quarter_by_another_zoom_is_not_left_out_in_part() -> None:
+    """Without three of these four, the others would fit well enough not to look bad."""
+    other, made = replace(CAMERA, fx=1515.0, fy=1515.0), []
+    for distance_m, wrong in ((0.45, (0, 1, 2)), (0.4, (2,))):
+        right = views(distance_m=distance_m)
+        for index in wrong:
+            right[index] = views(camera=other, distance_m=distance_m)[index]
+        made += [replace(view, photo=f"{view.photo} {distance_m}") for view in right]
+    result = calibrated(made, PointModel.STIFF, LensModel.AUTO)
+    assert result.dropped == ()
+    verdict = judge(result, calibration_numbers(result))
+    assert "times worse" in verdict.sentence
+    assert any("no model here describes" in sentence for sentence in verdict.advice)
+
+
+def test_a_photograph_without_any_kept_disc_is_the_worst() -> None:
+    result = calibrated(views())
+    used = result.solution.is_used & (result.network.observations.view < 5)
+    state = SimpleNamespace(
+        network=result.network,
+        solution=replace(result.solution, is_used=used),
+        estimate=result.solution.estimate,
+    )
+    rms_px = _own_rms_px(cast("AdjustedNetwork", state))
+    assert np.argmax(rms_px) == 5
+    assert np.all((rms_px[:5] > 0.003) & (rms_px[:5] < 0.03))
 
 
 def test_photographs_whose_files_are_turned_by_half_a_turn_take_no_part() -> None:
