@@ -100,6 +100,27 @@ def test_a_target_that_was_moved_makes_no_other_less_sure(
         assert sd_x > 0.1 * off_m / np.sqrt(12.0)
 
 
+def test_of_two_targets_the_one_that_was_moved_is_placed_by_most_frames(tmp_path: Path) -> None:
+    """Of two, none stands apart; but its residuals are far beyond what both have alike."""
+    rotations, east = GroundFlight().rotations, np.array([1.0, 0.0, 0.0])
+    offsets_m = GroundFlight().offsets_m[:2]
+    wrong = {(frame, "B"): rotations[frame].T @ east for frame in range(4)}
+    flight = GroundFlight(names=("A", "B"), offsets_m=offsets_m, wrong=wrong)
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == 0, result.stderr
+    assert "B: 4 of 12 frames do not fit the others and took no part" in result.stderr
+    found = places_of(folder)
+    z = np.array(
+        [
+            (found[n][:3] - p) / found[n][3:6]
+            for n, p in zip("AB", flight.positions_map, strict=True)
+        ]
+    )
+    assert 0.2 < float(np.sqrt(np.mean(z**2))) < 1.8
+    assert abs(found["B"][6] - 0.9) < 3.0 * found["B"][7] < 0.001
+
+
 def test_a_target_at_two_distant_places_is_not_placed(tmp_path: Path) -> None:
     folder = moved(6, 6.0).write(tmp_path / "flight")
     result = run(folder)

@@ -51,6 +51,7 @@ _SETTLED_NOISE = 0.1  # change of a deviation between two rounds
 # A circle whose images are off by so many times as much as the median circle's was moved, or others
 # were taken for it. What poses lack, all circles have about alike.
 _APART, _LEAST_CIRCLES = 4.0, 3
+_MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
 _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
 MOST_EXTRA_PX = 100.0
 """Largest deviation that is estimated [px]; where it is reached, nothing fits."""
@@ -178,7 +179,8 @@ def place_circles(
     """Place several circles, with the deviations that their residuals show together.
 
     A circle that stands apart by its residuals has deviations of its own, and no part in those of
-    the others.
+    the others. One that its residuals contradict though none stands apart, as of two circles, is
+    placed by most of its frames, or with deviations of its own.
 
     Returns
     -------
@@ -200,12 +202,26 @@ def place_circles(
                 settled = False
         if settled:
             break
-    for index in own:
-        outcome = outcomes[index]
-        if isinstance(outcome, PlacedCircle):
-            by_most = _by_most_frames(camera, many[index], noise)
-            outcomes[index] = by_most or replace(outcome, is_apart=True)
+    for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
+        if not isinstance(outcome, PlacedCircle):
+            continue
+        if index in own or outcome.fit.variance_factor > _MOST_FACTOR:
+            outcomes[index] = _by_most_frames(camera, views, noise) or _by_own_noise(
+                camera, views, outcome
+            )
     return outcomes, noise
+
+
+def _by_own_noise(
+    camera: Camera, views: CircleViews, outcome: PlacedCircle
+) -> PlacedCircle | NoCircleError:
+    """Place a circle by all frames, with the deviations that its own residuals show."""
+    if outcome.fit.variance_factor > _MOST_FACTOR:
+        again = _attempt(camera, views, extra_noise(camera, [(views, outcome.fit)]))
+        if isinstance(again, NoCircleError):
+            return again
+        outcome = again
+    return replace(outcome, is_apart=True)
 
 
 def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | None:
