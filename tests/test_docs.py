@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,14 @@ def test_named_benchmarks_exist() -> None:
         place = ROOT.joinpath(*module.split("."))
         found = (place.with_suffix(".py"), place, place.parent.with_suffix(".py"))
         assert any(each.exists() for each in found), f"{path}: {module}"
+
+
+def test_no_file_has_marks_of_a_merge() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a clone")
+    command = ["git", "grep", "-nIE", "^(<<<<<<<|>>>>>>>) "]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stdout, found.stderr) == (1, "", "")
 
 
 def section(heading: str, page: str = TABLES) -> str:

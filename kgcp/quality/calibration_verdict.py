@@ -59,7 +59,7 @@ class FieldDeviation:
     def doubt(self) -> str:
         """What the field is not; empty: it is as stated."""
         found = [
-            f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times more than stated"
+            f"{1000.0 * off_m:.2f} mm {where}, {ratio:.1f} times as much as stated"
             for off_m, ratio, where in (
                 (self.in_plane_m, self.in_plane_ratio, "in its plane"),
                 (self.height_m, self.height_ratio, "in height"),

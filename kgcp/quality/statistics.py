@@ -97,9 +97,8 @@ class Slope:
     sd_height: float
     sd_value: float
     probability: float  # of as large a slope by chance
-    share: (
-        float  # share of the variance of y that the line explains, corrected for its one parameter
-    )
+    # of the variance of y that the line explains, corrected for its one parameter
+    share: float
 
     def line(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the line at x (n,) and its standard deviation."""

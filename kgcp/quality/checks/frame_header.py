@@ -13,9 +13,8 @@ from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 _SMALL_FRAME_MM = 36.0, math.hypot(36.0, 24.0)  # width and diagonal that equivalents refer to
-_FOCAL_TOLERANCE = (
-    1.25  # equivalents are rounded, refer to width or diagonal, and may be those of cropped video
-)
+# equivalents are rounded, refer to width or diagonal, and may be those of cropped video
+_FOCAL_TOLERANCE = 1.25
 _SIZE_TOLERANCE = 1.1
 _FOCUSED = 1.03  # what focusing makes of a focal length in EXIF
 

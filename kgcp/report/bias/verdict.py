@@ -22,7 +22,7 @@ from kgcp.report.bias.wording import (
 
 
 class FlightGrade(IntEnum):
-    """FlightGrade of a flight; the worst of all findings counts."""
+    """Grade of a flight; the worst of all findings counts."""
 
     GOOD = 0
     LOOK = 1
