@@ -78,7 +78,7 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
         doubts.append(
             f"{placed.target}: its images contradict each other by {placed.own_noise_px:.3g} px,"
             " those of other targets do not: it was moved, or something else was taken for it;"
-            " this is allowed for"
+            " its place lies between, and may be off by more than is stated"
         )
     if placed.ambiguity < MIN_AMBIGUITY:
         doubts.append(
