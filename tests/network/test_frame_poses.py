@@ -36,7 +36,14 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
         distances_m = distances_m * (1.0 + sd_alike * rng.standard_normal())
         sightings = [
             Sighting(
-                *("f", 1, name, 0, None, pixel, SD_PX**2 * np.eye(2), distance_m),
+                frame="f",
+                number=1,
+                target=name,
+                instance=0,
+                time_s=None,
+                centre_px=pixel,
+                centre_cov_px2=SD_PX**2 * np.eye(2),
+                distance_m=distance_m,
                 sd_distance_m=SD_DISTANCE * distance_m,
                 sd_common_distance_m=max(sd_own, sd_alike) * distance_m,
             )

@@ -53,10 +53,10 @@ _EDGE_FLOOR_PX = {
     Tone.UNKNOWN_FROM_LINE: 0.002,
     Tone.OF_BINS: 0.004,
 }
-# The variance where levels vary without a shadow's edge, by what residuals show of it: dirt,
-# highlights and both with other effects on 254 simulated plates (R 13-130 px). With an edge
-# residuals show it all. And that of rings too small for levels to vary: dirt on 40 plates of R
-# 9-13 px, simulated like the preset `clean`, without which standardised errors have an RMS of 1.42.
+# Variance in uneven light, relative to what residuals show of it. Where levels vary: from dirt,
+# highlights and both with other effects on 254 simulated plates (R 13-130 px); with a shadow's edge
+# residuals show it all. On rings too small for levels to vary: without it, standardised errors of
+# 40 plates with dirt (R 9-13 px, simulated like the preset `clean`) have an RMS of 1.42.
 _UNDER_UNEVEN_LIGHT, _ON_SMALL_RINGS = 1.2, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
@@ -137,7 +137,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
 def unevenness_factor(fit: TargetFit, inflation: float) -> float:
     """Return how many times the variances that residuals show are too small in uneven light.
 
-    Of rings too small for levels to vary, an `inflation` beyond 1 tells that it is uneven.
+    On rings too small for levels to vary, an `inflation` beyond 1 shows that the light is uneven.
     """
     field, problem = fit.parameters.field, fit.sample.problem
     if field is not None:

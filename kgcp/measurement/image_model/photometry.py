@@ -478,9 +478,9 @@ def _expose_with_slopes(
         value[i] = curved * core
         gain = curved * contrast * lit
         gains[i] = gain * slope * (plate - ink)
-        added_to_ink = slope * (lit - 1.0) / contrast
-        jacobian[11, i] = curved * (1.0 - tone + added_to_ink * white)
-        jacobian[12, i] = curved * (tone - added_to_ink * black)
+        of_ink_light = slope * (lit - 1.0) / contrast  # by black / contrast, which is part of x
+        jacobian[11, i] = curved * (1.0 - tone + of_ink_light * white)
+        jacobian[12, i] = curved * (tone - of_ink_light * black)
         by_light = curved * slope * (black + contrast * x)
         jacobian[13, i], jacobian[14, i] = by_light * offsets[0, i], by_light * offsets[1, i]
         bend = curved * contrast * arch if has_tone else 0.0

@@ -227,7 +227,10 @@ def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:
 
 
 def _scale(images: PointImages, residuals: FloatArray, cov: FloatArray) -> float:
-    """Return it by the residuals (n, 3) near their median: points with wrong names have no part."""
+    """Return the logarithm by which all distances are too long, from residuals (n, 3).
+
+    Points with wrong names hardly count: residuals far from the median have little weight.
+    """
     known = images.has_distance & np.isfinite(residuals).all(axis=1)
     if not images.sd_scale or not known.any():
         return 0.0

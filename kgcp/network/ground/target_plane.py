@@ -136,14 +136,21 @@ def place_circle(
     other = _fit(camera, views, mirrored, noise)
     if other is not None and other.cost < best.cost:
         best, other = other, best
-        mirrored = best.circle.mirrored(views.camera_m[best.is_used])
     if np.count_nonzero(best.is_used) < max(LEAST_FRAMES, _LEAST_KEPT * len(views)):
         used = int(np.count_nonzero(best.is_used))
         raise NoCircleError(f"only {used} of {len(views)} frames agree with each other")
     if other is None or _is_same(best.circle, other.circle):
-        worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
-        return PlacedCircle(best, None, max(0.0, worse - best.cost), noise)
+        return _without_other(camera, views, best, noise)
     return PlacedCircle(best, other, other.cost - best.cost, noise)
+
+
+def _without_other(
+    camera: Camera, views: CircleViews, best: CircleFit, noise: ExtraNoise
+) -> PlacedCircle:
+    """Return a circle whose mirrored normal leads to no other place."""
+    mirrored = best.circle.mirrored(views.camera_m[best.is_used])
+    worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
+    return PlacedCircle(best, None, max(0.0, worse - best.cost), noise)
 
 
 def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]]) -> ExtraNoise:
@@ -243,9 +250,7 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
             best = fit
     if best is None or not 2 * np.count_nonzero(best.chi2 <= _REJECTED_CHI2) > len(views):
         return None
-    mirrored = best.circle.mirrored(views.camera_m[best.is_used])
-    worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
-    return PlacedCircle(best, None, max(0.0, worse - best.cost), noise)
+    return _without_other(camera, views, best, noise)
 
 
 def _noise_of_all(
