@@ -12,9 +12,22 @@ from kgcp.pipeline.execution.threads import use_one_thread_each
 
 use_one_thread_each()  # before numpy is loaded: threads of several workers wait for each other
 
+_LIMIT_S = 60.0  # of a call that does nothing, after all is compiled
+
 # A busy machine is no failure, and the same tests try the same examples on every machine.
 settings.register_profile("kgcp", deadline=None, derandomize=True)
 settings.load_profile("kgcp")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what most tests use before several processes run them: each would compile it."""
+    jobs = getattr(session.config.option, "numprocesses", None)
+    if jobs:
+        from kgcp.pipeline.execution.compiled_code import compilation
+        from kgcp.pipeline.execution.local_processes import SupervisedProcessPool
+
+        with SupervisedProcessPool(jobs, _LIMIT_S, compilation()) as pool:
+            list(pool.map(abs, range(jobs)))
 
 
 @pytest.fixture

@@ -22,11 +22,10 @@ from kgcp.measurement.guided import Prediction
 from kgcp.measurement.records import FrameResult
 from kgcp.network.ground.exchanged_marks import exchanged_marks
 from kgcp.pipeline.detection_run import DetectionRun, ProgressListener
-from kgcp.pipeline.execution.compiled_code import compile_code, load_compiled_code
+from kgcp.pipeline.execution.compiled_code import compilation
 from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.kept_frames import KeptFrames, kept_frames, remove_kept_frames
-from kgcp.pipeline.execution.local_processes import Preparation
 from kgcp.pipeline.execution.profiling import OTHER
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.frame_priors import priors_of_frames
@@ -243,7 +242,7 @@ def _open_pool(
         options.scheduler,
         frames_folder,
         _STAGE_CALLERS if options.is_profiled else (),
-        Preparation(load_compiled_code, compile_code),
+        compilation(),
     )
 
 

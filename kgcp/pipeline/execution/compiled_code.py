@@ -2,8 +2,8 @@
 
 A process takes half a second to load it. Under Linux, the server of new processes does so once,
 while the program loads what else it needs, and its children have it from the start. What is not
-compiled yet takes a minute: one worker compiles, and the others wait for what it leaves on the disk
-(`kgcp.pipeline.execution.local_processes`).
+compiled yet takes a minute: one worker compiles the search while another one compiles the
+adjustment, and all load what these leave on the disk (`kgcp.pipeline.execution.local_processes`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,14 @@ import numpy as np
 
 from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.frame import examine
+from kgcp.measurement.records import InitialPose
+from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
+from kgcp.measurement.search.initial_pose import initial_pose
+from kgcp.measurement.search.template_match import match_templates_at
+from kgcp.pipeline.execution.local_processes import Preparation
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Ring, Target
@@ -22,6 +29,7 @@ from kgcp.targets.layout import Ring, Target
 _SIDE_PX, _RADIUS_PX = 100, 20.0
 _FINE = 4  # points per pixel and axis
 _BLACK, _WHITE, _NOISE = 40.0, 200.0, 1.5  # grey values
+_TILT_RAD, _BLUR_PX = 0.1, 0.5  # that an adjustment may start from
 _CAMERA = Camera(_SIDE_PX, _SIDE_PX, 1000.0, 1000.0, 49.5, 49.5)
 _RING = Ring("A", 1.0, 0.5, 0.75, 0.15, (0.0, 80.0, 130.0, 250.0))
 
@@ -59,6 +67,28 @@ def load_compiled_code() -> bool:
 
 
 @single_threaded()
+def compile_search() -> bool:
+    """Compile what is missing of the search: by looking for the drawn plate."""
+    grey, target = _drawn_plate(), Target(_RING)
+    candidates = find_dotted(grey, find_rings(grey, DetectSettings()), [_RING])
+    (match,), _ = find_code(candidates[_RING], _RING, DetectSettings())
+    start = initial_pose(grey, _CAMERA, target, match)
+    match_templates_at(grey, _CAMERA, start.pose, _RING)
+    return True
+
+
+@single_threaded()
+def compile_adjustment() -> bool:
+    """Compile what is missing of the adjustment: by measuring the drawn plate where it is."""
+    grey, distance_m = _drawn_plate(), _CAMERA.fx * 0.5 * _RING.outer_diameter_m / _RADIUS_PX
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, distance_m])).tilted(_TILT_RAD)
+    start = InitialPose(_RING.name, 1.0, pose, _RADIUS_PX, edge_shift_px=0.0, blur_px=_BLUR_PX)
+    for response in _RESPONSES:
+        measure_by_model(grey, replace(_CAMERA, response=response), Target(_RING), start)
+    return True
+
+
+@single_threaded()
 def compile_code() -> bool:
     """Load what most frames need, and compile what is missing: by measuring a drawn plate."""
     grey = _drawn_plate()
@@ -68,6 +98,11 @@ def compile_code() -> bool:
             examine(grey, camera, (Target(_RING),), DetectSettings())
             _loaded.add(response)
     return True
+
+
+def compilation() -> Preparation:
+    """Return what new processes do before their first frame."""
+    return Preparation(load_compiled_code, compile_code, (compile_adjustment, compile_search))
 
 
 def _drawn_plate() -> GreyArray:

@@ -18,8 +18,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any
@@ -60,11 +61,38 @@ class Preparation:
         Returns whether that was enough.
     slow : callable
         What else it takes. One process at a time does it, and leaves what the others need.
+    parts : sequence of callable, optional
+        Of what is slow, each done once, and at the same time as the others.
     """
 
-    def __init__(self, quick: Callable[[], bool], slow: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        quick: Callable[[], bool],
+        slow: Callable[[], bool],
+        parts: Sequence[Callable[[], bool]] = (),
+    ) -> None:
         self.quick, self.slow = quick, slow
         self.lock = threading.Lock()  # of `slow`
+        self._parts_left, self._parts_begun = list(parts), 0
+        self._part_ended = threading.Condition()
+
+    def share_parts(self, do: Callable[[Callable[[], bool]], bool]) -> None:
+        """Do the parts that no other process has begun, and wait for the end of all others.
+
+        One that fails is not begun again: then `slow` does it.
+        """
+        with self._part_ended:
+            while self._parts_left:
+                part = self._parts_left.pop(0)
+                self._parts_begun += 1
+                self._part_ended.release()
+                try:
+                    do(part)
+                finally:
+                    self._part_ended.acquire()
+                    self._parts_begun -= 1
+                    self._part_ended.notify_all()
+            self._part_ended.wait_for(lambda: not self._parts_begun)
 
 
 class WorkerProcess:
@@ -115,6 +143,7 @@ class WorkerProcess:
         """Let a new process get ready, however long it takes: not counted as work."""
         if self._prepared_by(connection, preparation.quick):
             return
+        preparation.share_parts(partial(self._prepared_by, connection))
         with preparation.lock:  # meanwhile another process may have done what is slow
             if self._prepared_by(connection, preparation.quick):
                 return

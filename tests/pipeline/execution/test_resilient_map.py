@@ -143,6 +143,38 @@ def test_one_process_prepares_what_all_of_them_need(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "begin ready "
 
 
+def meet(folder: Path, own: str, other: str) -> bool:
+    """Wait until another process does the other part, which proves that neither waits."""
+    with (folder / own).open("a", encoding="utf-8") as file:
+        file.write("begun ")
+    deadline = time.monotonic() + 20.0
+    while not (folder / other).exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    (folder / f"{own} ended").touch()
+    return True
+
+
+def both_ended(folder: Path) -> bool:
+    return (folder / "a ended").exists() and (folder / "b ended").exists()
+
+
+def test_processes_prepare_parts_at_the_same_time_and_each_once(tmp_path: Path) -> None:
+    parts = (partial(meet, tmp_path, "a", "b"), partial(meet, tmp_path, "b", "a"))
+    preparation = Preparation(partial(both_ended, tmp_path), refuse, parts)
+    with SupervisedProcessPool(3, LIMIT_S, preparation) as executor:
+        assert dict(resilient_map(abs, range(6), executor, 3)) == {i: i for i in range(6)}
+    for name in ("a", "b"):
+        assert (tmp_path / name).read_text(encoding="utf-8") == "begun "
+
+
+def test_a_part_whose_process_ends_is_left_to_the_slow_way(tmp_path: Path) -> None:
+    path = tmp_path / "steps"
+    preparation = Preparation(partial(is_prepared, path), partial(prepare, path), (end,))
+    with SupervisedProcessPool(2, LIMIT_S, preparation) as executor:
+        assert dict(resilient_map(abs, range(6), executor, 2)) == {i: i for i in range(6)}
+    assert path.read_text(encoding="utf-8") == "begin ready "
+
+
 def refuse() -> bool:
     raise LookupError("no folder")
 
