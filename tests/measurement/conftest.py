@@ -130,6 +130,7 @@ def imaging_of() -> Callable[..., FitProblem]:
         circles = circles_of(target.rings)
         return FitProblem(
             window=window,
+            ring=target.ring,
             circles=circles,
             measured_count=len(circles.radii_m),
             outer_radius_m=radius_m,

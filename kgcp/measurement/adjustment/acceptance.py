@@ -70,7 +70,7 @@ def check_precision(observation: Measurement) -> None:
         raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
 
 
-def check_code(fit: TargetFit, ring: Ring) -> None:
+def check_code(fit: TargetFit) -> None:
     """Refuse a ring that shows a dot where this code has none, or lacks more than a dirty one.
 
     The residuals of the fit are averaged over discs of a dot's size all around the code circle.
@@ -80,6 +80,7 @@ def check_code(fit: TargetFit, ring: Ring) -> None:
     Rejection
         `OTHER_CODE`.
     """
+    ring = fit.sample.problem.ring
     excess = _light_around_code_circle(fit, ring)
     at_dot, between, sides = _places_of_code(ring)
     extra = float(excess[between].max(initial=0.0))

@@ -15,6 +15,7 @@ import numpy as np
 
 from kgcp.errors import Rejection
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.adjustment.acceptance import check_code
 from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
 from kgcp.measurement.adjustment.covariance import pose_covariance
 from kgcp.measurement.adjustment.likelihood import advantage_over
@@ -133,8 +134,9 @@ def _fit_in_any_light(
     Raises
     ------
     Rejection
-        As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; `POOR_FIT` if varying levels do
-        not explain the image either.
+        As `kgcp.measurement.adjustment.two_poses.fit_both_poses`; `OTHER_CODE` if the code is not
+        seen where the levels are even; `POOR_FIT` if varying levels do not explain the image
+        either.
     """
     is_small = problem.outer_radius_px < SMALLEST_UNEVEN_PX
     try:
@@ -180,7 +182,7 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
     for poses_skewed in skewed[1:]:
         if advantage_over(likelier.best, poses_skewed.best) > 0.0:
             likelier = poses_skewed
-    return replace(likelier, in_even_light=poses.in_even_light)
+    return likelier
 
 
 def _fit_skewed(
@@ -239,6 +241,8 @@ def _in_even_light(light: Light) -> Light:
 
 
 def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
+    """Fit both poses with levels that vary: these may hide a dot, which even levels must show."""
+    check_code(poses.best)
     unknowns = without_fine_light(poses.best.unknowns)
     best, other = fit_levels(problem, starts, poses.other.parameters.pose, unknowns)
-    return TwoPoses(best, other, poses.best)
+    return TwoPoses(best, other)

@@ -106,9 +106,7 @@ def _checked(
     if prior is not None:
         poses = choose_by_prior(poses.best.sample.problem, poses, prior)
     check_fit(poses.best)
-    check_code(poses.best, target.ring)
-    if poses.in_even_light is not None:
-        check_code(poses.in_even_light, target.ring)
+    check_code(poses.best)
     measurement = _measurement(camera, target, start, poses, prior)
     check_precision(measurement)
     return measurement
@@ -161,6 +159,7 @@ def fit_problem_of(
             window = replace(window, rays=shutter.rays_at_one_moment(window.rays))
         return FitProblem(
             window=window,
+            ring=target.ring,
             circles=circles_of(target.rings),
             measured_count=count,
             outer_radius_m=radius_m,

@@ -13,6 +13,7 @@ from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.plate import Circles
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import Window
+from kgcp.targets.layout import Ring
 
 _CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
 _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
@@ -23,6 +24,7 @@ class FitProblem:
     """A window with a target in it, and what it is seen with."""
 
     window: Window
+    ring: Ring  # the target's own, of which the code must be seen
     circles: Circles  # all circles of the plate
     # the first so many of them are measured; of the others only what they add there is modelled
     measured_count: int

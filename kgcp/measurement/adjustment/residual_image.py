@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.errors import Rejection
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
@@ -73,8 +75,9 @@ def residual_image_of(
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
     if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and needs_varying_levels(fit):
-        best = fit_in_any_light(problem, pose, start.blur).likelier.best
-        fit = best if best.parameters.field is not None else fit
+        with contextlib.suppress(Rejection):  # a code that is not seen is what residuals show
+            best = fit_in_any_light(problem, pose, start.blur).likelier.best
+            fit = best if best.parameters.field is not None else fit
     problem = fit.sample.problem  # which says over which curve an unknown tone was fitted
     parameters = fit.parameters.at(pose)
     light = parameters.light

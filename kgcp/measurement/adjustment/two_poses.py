@@ -40,8 +40,6 @@ class TwoPoses:
     # the better and the worse one, on the same pixels with the same noise
     best: TargetFit
     other: TargetFit
-    # the better one with even levels: levels that vary may hide a dot; None if they do not vary
-    in_even_light: TargetFit | None = None
 
 
 def fit_both_poses(problem: FitProblem, pose: Pose, blur: Blur) -> TwoPoses:
@@ -120,7 +118,7 @@ def choose_by_prior(problem: FitProblem, poses: TwoPoses, prior: NormalPrior) ->
         best = adjust(problem, poses.other.parameters, poses.best.unknowns)
         turned = TwoPoses(best, _mirrored_fit(best))
     else:
-        turned = TwoPoses(poses.other, poses.best, poses.in_even_light)
+        turned = TwoPoses(poses.other, poses.best)
         best = turned.best
     is_better = advantage(turned, pose_covariance(best), prior) >= 0.0
     return turned if is_better else poses

@@ -49,11 +49,11 @@ def fit_plate(
 @pytest.mark.parametrize("radius_px", [12.0, 40.0])
 @pytest.mark.parametrize("code_deg", [CODE, (0.0, 43.0, 180.0)], ids=["whole", "one dot dirty"])
 def test_the_target_s_own_code_passes(
-    fit_plate: FitPlate, target: Target, code_deg: tuple[float, ...], radius_px: float
+    fit_plate: FitPlate, code_deg: tuple[float, ...], radius_px: float
 ) -> None:
     fit = fit_plate(code_deg, radius_px)
     check_fit(fit)
-    check_code(fit, target.ring)
+    check_code(fit)
 
 
 @pytest.mark.parametrize(("outlying", "is_refused"), [(0.25, False), (0.35, True)])
@@ -94,11 +94,11 @@ MOVED = (0.0, 43.0, 88.0, 180.0)  # by less than half a dot
     ],
 )
 def test_other_dots_are_another_code(
-    fit_plate: FitPlate, target: Target, code_deg: tuple[float, ...], radius_px: float
+    fit_plate: FitPlate, code_deg: tuple[float, ...], radius_px: float
 ) -> None:
     fit = fit_plate(code_deg, radius_px)
     with pytest.raises(Rejection) as caught:
-        check_code(fit, target.ring)
+        check_code(fit)
     assert caught.value.reason is Reason.OTHER_CODE
 
 

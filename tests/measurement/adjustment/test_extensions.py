@@ -43,6 +43,7 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
     monkeypatch.setattr(extensions, "advantage_over", lambda *_: 2.0)
     problem = FitProblem(
         window=stand_in(),
+        ring=stand_in(),
         circles=stand_in(),
         measured_count=2,
         outer_radius_m=0.45,
