@@ -24,9 +24,10 @@ from kgcp.measurement.discs.measure import measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.discs.records import Disc
 from kgcp.measurement.records import Measurement
+from kgcp.network.ground.circles_together import place_circles
 from kgcp.network.ground.space_circle import CircleViews, SpaceCircle
 from kgcp.network.ground.target_places import ring_images
-from kgcp.network.ground.target_plane import PlacedCircle, place_circles
+from kgcp.network.ground.target_plane import PlacedCircle
 from kgcp.pipeline.execution.threads import use_one_thread_each
 from kgcp.pipeline.measure import measure_frame
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph

@@ -66,7 +66,14 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
     """Return what to look at before a placed target is used."""
     doubts = []
     rejected = int(np.count_nonzero(~placed.is_used))
-    if rejected:
+    if placed.move is not None:
+        doubts.append(
+            f"{placed.target}: was moved by about {placed.move.distance_m:.2g} m, or others were"
+            f" taken for it: from {placed.move.frame} on, its images show another place; it is"
+            f" placed by the {len(placed.frames) - rejected} of {len(placed.frames)} frames that"
+            " agree"
+        )
+    elif rejected:
         frames = f"{rejected} of {len(placed.frames)} frames do"
         if rejected == 1:
             frames = f"1 of {len(placed.frames)} frames does"
@@ -78,7 +85,7 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
         doubts.append(
             f"{placed.target}: its images contradict each other by {placed.own_noise_px:.3g} px,"
             " those of other targets do not: it was moved, or something else was taken for it;"
-            " its place lies between, and may be off by more than is stated"
+            " its place lies between, and is stated as uncertain as that of a single frame"
         )
     if placed.ambiguity < MIN_AMBIGUITY:
         doubts.append(

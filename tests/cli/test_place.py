@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -13,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from kgcp.cli import main
+from kgcp.geometry.arrays import FloatArray
 from tests.ground_flight import GroundFlight
 
 
@@ -62,11 +65,20 @@ def test_a_wrong_frame_is_left_out_and_named(tmp_path: Path) -> None:
     assert abs(worst["residual_x_px"]) + abs(worst["residual_y_px"]) > 5.0
 
 
-def moved(frames: int, off_m: float) -> GroundFlight:
+def of_names(
+    names: str, wrong: Mapping[tuple[int, str], FloatArray] = MappingProxyType({})
+) -> GroundFlight:
+    """A flight over some of the four targets."""
+    offsets_m = GroundFlight().offsets_m[: len(names)]
+    return GroundFlight(names=tuple(names), offsets_m=offsets_m, wrong=dict(wrong))
+
+
+def moved(frames: int, off_m: float, *, names: str = "ABCD") -> GroundFlight:
     """A flight in whose first frames B lies elsewhere, to the east."""
     rotations = GroundFlight().rotations
     east = np.array([off_m, 0.0, 0.0])
-    return GroundFlight(wrong={(frame, "B"): rotations[frame].T @ east for frame in range(frames)})
+    wrong = {(frame, "B"): rotations[frame].T @ east for frame in range(frames)}
+    return of_names(names, wrong)
 
 
 def places_of(folder: Path) -> dict[str, np.ndarray]:
@@ -76,57 +88,80 @@ def places_of(folder: Path) -> dict[str, np.ndarray]:
     return dict(zip(table["target"].tolist(), table[columns].to_numpy(), strict=True))
 
 
-@pytest.mark.parametrize(("frames", "off_m"), [(6, 0.05), (6, 1.0), (4, 1.0), (4, 6.0)])
-def test_a_target_that_was_moved_makes_no_other_less_sure(
-    tmp_path: Path, frames: int, off_m: float
+@pytest.mark.parametrize(
+    ("names", "frames", "off_m"),
+    [
+        ("ABCD", 6, 0.05),
+        ("ABCD", 6, 1.0),
+        ("ABCD", 3, 0.0005),
+        ("ABCD", 4, 1.0),
+        ("AB", 5, 0.02),
+        ("AB", 6, 1.0),
+        ("AB", 8, 1.0),
+    ],
+)
+def test_a_target_that_was_moved_is_placed_by_most_frames_or_not_at_all(
+    tmp_path: Path, names: str, frames: int, off_m: float
 ) -> None:
-    flight = moved(frames, off_m)
-    undisturbed = GroundFlight().write(tmp_path / "undisturbed")
+    flight = moved(frames, off_m, names=names)
+    undisturbed = of_names(names).write(tmp_path / "undisturbed")
     folder = flight.write(tmp_path / "flight")
-    result = run(folder)
+    result = run(folder, "--json")
     assert result.exit_code == run(undisturbed).exit_code == 0, result.stderr
     found, expected = places_of(folder), places_of(undisturbed)
-    for name in ("A", "C", "D"):
+    for name in names.replace("B", ""):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-6)
     assert "mostly of the reference poses" not in result.stderr
-    sd_x = found["B"][3]
-    if frames == 4:  # most frames agree
-        assert "B: 4 of 12 frames do not fit the others and took no part" in result.stderr
-        assert np.abs(found["B"][:3] - flight.positions_map[1]).max() < 0.001
-        assert sd_x < 2.0 * expected["B"][3]
-    else:
-        assert "B: its images contradict each other by" in result.stderr
-        assert "it was moved" in result.stderr
-        assert sd_x > 0.1 * off_m / np.sqrt(12.0)
+    assert "B: was moved by about" in result.stderr
+    assert f"from f_{frames:03d}.png on" in result.stderr
+    page = (folder / "kgcp" / "places.html").read_text(encoding="utf-8")
+    assert 'class="verdict look"' in page
+    if frames == 6:
+        assert "no more than half of its frames agree" in page
+        assert "B" not in found
+        return
+    shown = flight.positions_map[1]
+    if frames > 6:
+        (shown,) = flight.local_frame.map_from_enu(
+            flight.positions[1:2] + np.array([off_m, 0.0, 0.0])
+        )
+    z = (found["B"][:3] - shown) / found["B"][3:6]
+    assert np.abs(z).max() < 3.0
+    assert (found["B"][3:6] < 4.0 * expected["B"][3:6]).all()
+    (summary,) = (each for each in json.loads(result.stdout)["targets"] if each["target"] == "B")
+    assert summary["moved"]["frame"] == f"f_{frames:03d}.png"
+    assert summary["moved"]["distance_m"] == pytest.approx(off_m, rel=0.3)
+    assert summary["frames_used"] == max(frames, 12 - frames)
 
 
-def test_of_two_targets_the_one_that_was_moved_is_placed_by_most_frames(tmp_path: Path) -> None:
-    """Of two, none stands apart; but its residuals are far beyond what both have alike."""
-    rotations, east = GroundFlight().rotations, np.array([1.0, 0.0, 0.0])
-    offsets_m = GroundFlight().offsets_m[:2]
-    wrong = {(frame, "B"): rotations[frame].T @ east for frame in range(4)}
-    flight = GroundFlight(names=("A", "B"), offsets_m=offsets_m, wrong=wrong)
+@pytest.mark.parametrize("frames", [4, 6])
+def test_a_target_at_two_distant_places_is_placed_by_most_frames_or_not_at_all(
+    tmp_path: Path, frames: int
+) -> None:
+    """Half a frame's width apart."""
+    flight = moved(frames, 6.0)
     folder = flight.write(tmp_path / "flight")
     result = run(folder)
-    assert result.exit_code == 0, result.stderr
-    assert "B: 4 of 12 frames do not fit the others and took no part" in result.stderr
-    found = places_of(folder)
-    z = np.array(
-        [
-            (found[n][:3] - p) / found[n][3:6]
-            for n, p in zip("AB", flight.positions_map, strict=True)
-        ]
-    )
-    assert 0.2 < float(np.sqrt(np.mean(z**2))) < 1.8
-    assert abs(found["B"][6] - 0.9) < 3.0 * found["B"][7] < 0.001
-
-
-def test_a_target_at_two_distant_places_is_not_placed(tmp_path: Path) -> None:
-    folder = moved(6, 6.0).write(tmp_path / "flight")
-    result = run(folder)
     assert result.exit_code == 0
-    assert "B: its images contradict each other by 100 px or more" in result.stderr
-    assert list(places_of(folder)) == ["A", "C", "D"]
+    found = places_of(folder)
+    if frames == 4:
+        assert "B: 4 of 12 frames do not fit the others and took no part" in result.stderr
+        assert np.abs(found["B"][:3] - flight.positions_map[1]).max() < 0.001
+    else:
+        assert "not placed: B: was moved by about 6." in result.stderr
+        assert list(found) == ["A", "C", "D"]
+
+
+def test_contradictions_that_frames_share_are_not_reduced_by_more_frames(tmp_path: Path) -> None:
+    """Another target is taken for B in every second frame: no time at which it was moved."""
+    rotations, east = GroundFlight(seed=4).rotations, np.array([1.0, 0.0, 0.0])
+    wrong = {(frame, "B"): rotations[frame].T @ east for frame in range(0, 12, 2)}
+    folder = GroundFlight(seed=4, wrong=wrong).write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == 0, result.stderr
+    assert "B: its images contradict each other by" in result.stderr
+    off, sd = places_of(folder)["B"][:3] - GroundFlight().positions_map[1], places_of(folder)["B"]
+    assert 0.3 < abs(off[0]) / sd[3] < 2.0
 
 
 def test_deviations_of_poses_count(tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import rotation_about
+from kgcp.network.ground.circles_together import place_circles
+from kgcp.network.ground.moved_circle import best_split
 from kgcp.network.ground.space_circle import (
     CircleViews,
     ExtraNoise,
@@ -19,7 +21,7 @@ from kgcp.network.ground.space_circle import (
     angle_deg,
     outline_noise,
 )
-from kgcp.network.ground.target_plane import common_covariance, place_circle, place_circles
+from kgcp.network.ground.target_plane import PlacedCircle, common_covariance, place_circle
 
 CAMERA = Camera(1500, 1000, 2222.0, 2222.0, 749.5, 499.5, k1=-0.08)
 NORMAL = np.array([0.05, 0.03, 1.0]) / np.linalg.norm([0.05, 0.03, 1.0])
@@ -169,3 +171,55 @@ def test_rays_that_do_not_meet_are_no_circle() -> None:
     )
     with pytest.raises(NoCircleError, match="behind the cameras"):
         place_circle(CAMERA, backwards)
+
+
+@pytest.mark.parametrize(("frames", "steps"), [(8, 20.0), (12, 8.0), (50, 4.0)])
+def test_a_move_is_found_where_it_happened(frames: int, steps: float) -> None:
+    rng, truth, off = np.random.default_rng(12), circle_of(10.0), []
+    shift = np.array([steps * 0.005 * DISTANCE_M / CAMERA.fx, 0.0, 0.0])
+    elsewhere = SpaceCircle(truth.centre_m + shift, truth.normal, truth.radius_m)
+    for _ in range(10):
+        views = views_of(truth, rng, frames=frames)
+        change = (
+            circle_images(CAMERA, elsewhere.in_cameras(views)).moments
+            - circle_images(CAMERA, truth.in_cameras(views)).moments
+        )
+        views.moments[frames // 2 :] += change[frames // 2 :]
+        split = best_split(CAMERA, views, truth, views.cov[:, :2, :2])
+        assert split is not None
+        assert split.gain > 1.0
+        assert split.larger_side(frames).sum() == max(split.first, frames - split.first)
+        off.append(split.first - frames // 2)
+        assert np.linalg.norm(split.off_m) == pytest.approx(np.linalg.norm(shift), rel=1.0)
+    assert abs(float(np.mean(off))) < 0.4
+
+
+@pytest.mark.parametrize("frames", [6, 8, 12, 30])
+def test_circles_that_stay_are_not_moved(frames: int) -> None:
+    rng, truth, gains = np.random.default_rng(13), circle_of(10.0), []
+    for _ in range(40):
+        views = views_of(truth, rng, frames=frames)
+        views.moments[0, :2] += 3.0  # one frame that shows something else
+        split = best_split(CAMERA, views, truth, views.cov[:, :2, :2])
+        assert split is not None
+        gains.append(split.gain)
+    assert max(gains) < 0.9
+
+
+def test_poses_that_drift_move_no_single_circle() -> None:
+    """Errors of poses that follow each other displace all circles of a frame alike."""
+    rng, truth = np.random.default_rng(14), circle_of(10.0)
+    many = [views_of(truth, rng, frames=16) for _ in range(5)]
+    drift = np.where(np.arange(16) < 8, 0.0, 0.1)
+    for views in many:
+        east = np.einsum("nji,j->ni", views.world_from_camera, [1.0, 0.0, 0.0])[:, :2]
+        views.moments[:, :2] += drift[:, None] * east
+    placed, noise = place_circles(CAMERA, many)
+    assert all(isinstance(each, PlacedCircle) and each.move is None for each in placed)
+    assert noise.centre_px > 0.03
+
+
+def test_fewer_than_six_frames_show_no_move() -> None:
+    truth = circle_of(10.0)
+    views = views_of(truth, np.random.default_rng(15), frames=5)
+    assert best_split(CAMERA, views, truth, views.cov[:, :2, :2]) is None

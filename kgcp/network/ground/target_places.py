@@ -24,12 +24,13 @@ from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import static_position
+from kgcp.network.ground.circles_together import MovedCircleError, place_circles
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import (
     MOST_EXTRA_PX,
+    Move,
     PlacedCircle,
     common_covariance,
-    place_circles,
 )
 from kgcp.targets.plain import AnyTarget, Shape, shape_of
 
@@ -73,7 +74,11 @@ class PlacedTarget:
         Squares of the residuals over what was expected.
     own_noise_px : float or None
         How far its images deviate beyond what is stated [px], if by far more than those of most
-        targets; None: they do not.
+        targets; None: they do not. If they do, both covariances together are those of a single
+        frame: more frames do not reduce what may be alike in many.
+    move : TargetMove or None
+        That it was moved during the flight, and placed by the frames of one place; None: nothing is
+        seen of that.
     check : PlaceCheck
         Against flight.toml.
     """
@@ -93,6 +98,7 @@ class PlacedTarget:
     common_cov: FloatArray
     variance_factor: float
     own_noise_px: float | None
+    move: TargetMove | None
     check: PlaceCheck
 
     @property
@@ -124,6 +130,14 @@ class PlacedTarget:
     def worst_frame(self) -> str:
         """The frame that fits least."""
         return self.frames[int(np.argmax(self.chi2))]
+
+
+@dataclass(frozen=True, slots=True)
+class TargetMove:
+    """A target that has two places in a flight."""
+
+    frame: str  # the first that shows the second place
+    distance_m: float  # between them, nearly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,6 +236,14 @@ def place_targets(
     outcomes, noise = place_circles(camera, all_views)
     placed = []
     for target, frames, views, outcome in zip(usable, all_frames, all_views, outcomes, strict=True):
+        if isinstance(outcome, MovedCircleError):
+            move = _moved(outcome.move, frames)
+            skipped[target.name] = (
+                f"was moved by about {move.distance_m:.2g} m, or others were taken for it: from"
+                f" {move.frame} on, its images show another place, and no more than half of its"
+                " frames agree on one"
+            )
+            continue
         if isinstance(outcome, NoCircleError):
             skipped[target.name] = str(outcome)
             continue
@@ -240,8 +262,15 @@ def place_targets(
             None if calibration is None else calibration.cov,
             _CODED_EDGE_SD_PX,
         )
+        if own_px is not None:
+            # contradictions may be alike in many frames: more frames do not reduce them
+            common = common + (np.count_nonzero(outcome.fit.is_used) - 1.0) * outcome.fit.cov
         placed.append(_on_the_map(target, frames, outcome, own_px, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
+
+
+def _moved(move: Move, frames: Sequence[str]) -> TargetMove:
+    return TargetMove(frames[move.first], float(np.linalg.norm(move.off_m)))
 
 
 def _has_pose(sighting: Sighting) -> bool:
@@ -367,6 +396,7 @@ def _on_the_map(
         common_cov=common_cov,
         variance_factor=fit.variance_factor,
         own_noise_px=own_noise_px,
+        move=None if placed.move is None else _moved(placed.move, frames),
         check=_check(target, circle, cov + common_cov, enu_from_map, local_frame),
     )
 

@@ -13,7 +13,7 @@ fits is part of the result.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,18 +41,13 @@ _MOST_STEPS = 60
 _ROUND_STEPS = 3  # between two reweightings, of what changes anyway
 _CONVERGED = 1e-5  # decrease of χ² that means nothing
 _ROBUST_ROUNDS = 12
-_REJECTED_CHI2 = 37.0  # of five numbers: by chance once in 1.7 million, as 5 σ of one
 _CAUCHY_CHI2 = 12.0
 _MEDIAN_CHI2 = 4.351  # of five numbers
 _SAME_NORMAL_DEG = 0.5
 _LEAST_KEPT = 0.5  # share of the frames: if fewer agree, none is believed
-_EXTRA_ROUNDS = 6  # of noise and of frames that are left out because of it
-_SETTLED_NOISE = 0.1  # change of a deviation between two rounds
-# A circle whose images are off by so many times as much as the median circle's was moved, or others
-# were taken for it. What poses lack, all circles have about alike.
-_APART, _LEAST_CIRCLES = 4.0, 3
-_MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
-_DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
+REJECTED_CHI2 = 37.0
+"""Of a frame's five numbers, at most: by chance once in 1.7 million, as 5 σ of one."""
+
 MOST_EXTRA_PX = 100.0
 """Largest deviation that is estimated [px]; where it is reached, nothing fits."""
 
@@ -78,6 +73,14 @@ class CircleFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A circle that has two places."""
+
+    first: int  # frame that shows the second place
+    off_m: FloatArray  # (3,): from the first to the second place, nearly
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PlacedCircle:
     """A circle placed from many frames.
 
@@ -93,6 +96,9 @@ class PlacedCircle:
         What was added to the stated covariances.
     is_apart : bool
         Whether that is its own, since its images contradict each other more than those of others.
+    move : Move or None
+        That it was moved while it was photographed; the fit is to the frames of one place. None:
+        nothing is seen of that.
     """
 
     fit: CircleFit
@@ -100,6 +106,7 @@ class PlacedCircle:
     ambiguity: float
     noise: ExtraNoise
     is_apart: bool = False
+    move: Move | None = None
 
 
 def place_circle(
@@ -140,17 +147,27 @@ def place_circle(
         used = int(np.count_nonzero(best.is_used))
         raise NoCircleError(f"only {used} of {len(views)} frames agree with each other")
     if other is None or _is_same(best.circle, other.circle):
-        return _without_other(camera, views, best, noise)
+        return without_other(camera, views, best, noise)
     return PlacedCircle(best, other, other.cost - best.cost, noise)
 
 
-def _without_other(
+def without_other(
     camera: Camera, views: CircleViews, best: CircleFit, noise: ExtraNoise
 ) -> PlacedCircle:
     """Return a circle whose mirrored normal leads to no other place."""
     mirrored = best.circle.mirrored(views.camera_m[best.is_used])
     worse = _robust_cost(_chi2_of(camera, views, mirrored, noise))
     return PlacedCircle(best, None, max(0.0, worse - best.cost), noise)
+
+
+def seen_in(camera: Camera, views: CircleViews, placed: PlacedCircle, part: BoolArray) -> CircleFit:
+    """Return the fit to a part (n,) of the frames with the residuals of all of them."""
+    fit = placed.fit
+    residuals = views.moments - circle_images(camera, fit.circle.in_cameras(views)).moments
+    is_used = part.copy()
+    is_used[part] = fit.is_used
+    chi2 = _chi2_of(camera, views, fit.circle, placed.noise)
+    return replace(fit, residuals=residuals, chi2=chi2, is_used=is_used)
 
 
 def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]]) -> ExtraNoise:
@@ -180,123 +197,6 @@ def extra_noise(camera: Camera, placed: Sequence[tuple[CircleViews, CircleFit]])
     return ExtraNoise(*found, *factors)
 
 
-def place_circles(
-    camera: Camera, many: Sequence[CircleViews]
-) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
-    """Place several circles, with the deviations that their residuals show together.
-
-    A circle that stands apart by its residuals has deviations of its own, and no part in those of
-    the others. One that its residuals contradict though none stands apart, as of two circles, is
-    placed by most of its frames, or with deviations of its own.
-
-    Returns
-    -------
-    placed : list of PlacedCircle or NoCircleError
-        In the circles' order.
-    noise : ExtraNoise
-        What was added to the stated covariances of circles that do not stand apart.
-    """
-    noise, own = ExtraNoise(), dict[int, ExtraNoise]()
-    used = [noise] * len(many)
-    outcomes = [_attempt(camera, views, noise) for views in many]
-    for _ in range(_EXTRA_ROUNDS):
-        noise, own = _noise_of_all(camera, many, outcomes)
-        settled = True
-        for index, views in enumerate(many):
-            if not _is_alike(used[index], own.get(index, noise)):
-                used[index] = own.get(index, noise)
-                outcomes[index] = _attempt(camera, views, used[index])
-                settled = False
-        if settled:
-            break
-    for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
-        if not isinstance(outcome, PlacedCircle):
-            continue
-        if index in own or outcome.fit.variance_factor > _MOST_FACTOR:
-            outcomes[index] = _by_most_frames(camera, views, noise) or _by_own_noise(
-                camera, views, outcome
-            )
-    return outcomes, noise
-
-
-def _by_own_noise(
-    camera: Camera, views: CircleViews, outcome: PlacedCircle
-) -> PlacedCircle | NoCircleError:
-    """Place a circle by all frames, with the deviations that its own residuals show."""
-    if outcome.fit.variance_factor > _MOST_FACTOR:
-        again = _attempt(camera, views, extra_noise(camera, [(views, outcome.fit)]))
-        if isinstance(again, NoCircleError):
-            return again
-        outcome = again
-    return replace(outcome, is_apart=True)
-
-
-def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | None:
-    """Place a circle by the frames that most agree with; None if no more than half agree.
-
-    Three frames of an even draw give each start: where a circle was moved, a start by all frames
-    leads to between its places.
-    """
-    rng = np.random.default_rng(0)
-    best: CircleFit | None = None
-    for _ in range(_DRAWS):
-        drawn = views.chosen(np.isin(np.arange(len(views)), rng.permutation(len(views))[:3]))
-        try:
-            start = place_circle(camera, drawn, noise).fit.circle
-        except NoCircleError:
-            continue
-        fit = _without_outliers(camera, views, start, noise)
-        if fit is not None and (best is None or fit.cost < best.cost):
-            best = fit
-    if best is None or not 2 * np.count_nonzero(best.chi2 <= _REJECTED_CHI2) > len(views):
-        return None
-    return _without_other(camera, views, best, noise)
-
-
-def _noise_of_all(
-    camera: Camera, many: Sequence[CircleViews], outcomes: Sequence[PlacedCircle | NoCircleError]
-) -> tuple[ExtraNoise, dict[int, ExtraNoise]]:
-    """Return the deviations that circles show together, and those of circles that stand apart."""
-    pairs = {
-        index: (views, outcome.fit)
-        for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True))
-        if isinstance(outcome, PlacedCircle)
-    }
-    if not pairs:
-        return ExtraNoise(), {}
-    own = {index: extra_noise(camera, [pair]) for index, pair in pairs.items()}
-    apart = _apart({index: _deviation_px(pairs[index][0], own[index]) for index in pairs})
-    common = extra_noise(camera, [pair for index, pair in pairs.items() if index not in apart])
-    return common, {index: own[index] for index in apart}
-
-
-def _apart(deviation_px: Mapping[int, float]) -> set[int]:
-    """Return the circles whose images are off by far more than those of most."""
-    if len(deviation_px) < _LEAST_CIRCLES:
-        return set()
-    limit_px = _APART * float(np.median(list(deviation_px.values())))
-    apart = {index for index, px in deviation_px.items() if px > limit_px}
-    return apart if 2 * len(apart) < len(deviation_px) else set()
-
-
-def _deviation_px(views: CircleViews, noise: ExtraNoise) -> float:
-    """Return the deviation of a circle's places in its images, per coordinate [px]."""
-    stated = 0.5 * float(np.median(np.trace(views.cov[:, :2, :2], axis1=1, axis2=2)))
-    return math.sqrt(stated + noise.centre_px**2)
-
-
-def _is_alike(first: ExtraNoise, second: ExtraNoise) -> bool:
-    """Tell whether another adjustment with this noise would change next to nothing."""
-    return bool(
-        np.allclose(
-            (first.centre_px, first.outline_px, first.centre_factor, first.outline_factor),
-            (second.centre_px, second.outline_px, second.centre_factor, second.outline_factor),
-            rtol=_SETTLED_NOISE,
-            atol=1e-4,
-        )
-    )
-
-
 def common_covariance(
     camera: Camera,
     views: CircleViews,
@@ -320,7 +220,7 @@ def common_covariance(
     """
     kept = views.chosen(fit.is_used)
     slopes = circle_slopes(camera, fit.circle.in_cameras(kept))
-    weights = np.linalg.inv(_total(camera, kept, fit.circle, noise))
+    weights = np.linalg.inv(total_covariances(camera, kept, fit.circle, noise))
     design = _design(kept, fit.circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
     gain = fit.cov @ np.einsum("nmp,nmk->npk", design, weights).transpose(1, 0, 2).reshape(6, -1)
     common = np.zeros((6, 6))
@@ -338,20 +238,13 @@ def common_covariance(
     return common
 
 
-def _attempt(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | NoCircleError:
-    try:
-        return place_circle(camera, views, noise)
-    except NoCircleError as error:
-        return error
-
-
 def _fit(
     camera: Camera, views: CircleViews, start: SpaceCircle, noise: ExtraNoise
 ) -> CircleFit | None:
     """Return the robust fit from a start; None if it leads nowhere."""
     circle, weights = start, np.ones(len(views))
     for _ in range(_ROBUST_ROUNDS):
-        covs = _total(camera, views, circle, noise)
+        covs = total_covariances(camera, views, circle, noise)
         moved = _minimised(camera, views, circle, covs, weights, _ROUND_STEPS)
         if moved is None:
             return None
@@ -363,19 +256,19 @@ def _fit(
         weights = renewed
         if is_settled:
             break
-    return _without_outliers(camera, views, circle, noise)
+    return fit_to_agreeing(camera, views, circle, noise)
 
 
-def _without_outliers(
+def fit_to_agreeing(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> CircleFit | None:
     """Return the fit to the frames that agree: all others are rejected as a whole."""
     used = np.zeros(len(views), dtype=np.bool_)
-    covs = _total(camera, views, circle, noise)
+    covs = total_covariances(camera, views, circle, noise)
     chi2 = _chi2(camera, views, circle, covs)
     for _ in range(_ROBUST_ROUNDS):
         scale = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
-        kept = chi2 <= _REJECTED_CHI2 * scale
+        kept = chi2 <= REJECTED_CHI2 * scale
         if np.array_equal(kept, used) or np.count_nonzero(kept) < LEAST_FRAMES:
             break
         used = kept
@@ -383,7 +276,7 @@ def _without_outliers(
         if moved is None:
             return None
         circle = moved
-        covs = _total(camera, views, circle, noise)
+        covs = total_covariances(camera, views, circle, noise)
         chi2 = _chi2(camera, views, circle, covs)
     if not used.any():
         return None
@@ -455,11 +348,11 @@ def _chi2(camera: Camera, views: CircleViews, circle: SpaceCircle, covs: FloatAr
 def _chi2_of(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> FloatArray:
-    return _chi2(camera, views, circle, _total(camera, views, circle, noise))
+    return _chi2(camera, views, circle, total_covariances(camera, views, circle, noise))
 
 
 def _robust_cost(chi2: FloatArray) -> float:
-    return float(np.sum(np.minimum(chi2, _REJECTED_CHI2)))
+    return float(np.sum(np.minimum(chi2, REJECTED_CHI2)))
 
 
 def _normal_equations(
@@ -488,7 +381,7 @@ def _design(
     return np.concatenate((by_centre @ camera_from_world, turned, by_radius[..., None]), axis=2)
 
 
-def _total(
+def total_covariances(
     camera: Camera, views: CircleViews, circle: SpaceCircle, noise: ExtraNoise
 ) -> FloatArray:
     """Return the covariances (n, 5, 5) of moments with everything that differs between frames."""

@@ -308,6 +308,9 @@ def _numbers(placed: PlacedTarget) -> dict[str, object]:
         "rejected": [
             frame for frame, used in zip(placed.frames, placed.is_used, strict=True) if not used
         ],
+        "moved": None
+        if placed.move is None
+        else {"frame": placed.move.frame, "distance_m": placed.move.distance_m},
         "variance_factor": placed.variance_factor,
         "residual_m": residual,
         "sd_residual_m": None if cov is None else np.sqrt(np.diag(cov)).tolist(),

@@ -41,6 +41,7 @@ def render_places(page: PlacesPage) -> str:
         page=page,
         placement=page.placement,
         statements=statements,
-        is_good=not page.doubts and not any(is_doubtful for _, is_doubtful in statements),
+        is_good=not (page.doubts or page.placement.skipped)
+        and not any(is_doubtful for _, is_doubtful in statements),
         images=embedded_pictures(page.figures),
     )

@@ -1,0 +1,227 @@
+"""Several circles in space placed together, from frames that share their errors.
+
+What the exterior orientations lack, the residuals of all circles show. A circle that was moved
+while it was photographed must not count among them, nor be placed between its places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kgcp.geometry.camera import Camera
+from kgcp.network.ground.moved_circle import Split, best_split
+from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError
+from kgcp.network.ground.target_plane import (
+    REJECTED_CHI2,
+    CircleFit,
+    Move,
+    PlacedCircle,
+    extra_noise,
+    fit_to_agreeing,
+    place_circle,
+    seen_in,
+    total_covariances,
+    without_other,
+)
+
+_EXTRA_ROUNDS = 6  # of noise and of frames that are left out because of it
+_SETTLED_NOISE = 0.1  # change of a deviation between two rounds
+# A circle whose images are off by so many times as much as the median circle's was moved, or others
+# were taken for it. What poses lack, all circles have about alike.
+_APART, _LEAST_CIRCLES = 4.0, 3
+_MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
+_DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
+
+
+class MovedCircleError(NoCircleError):
+    """A circle was moved, and no more than half of its frames show one place."""
+
+    def __init__(self, move: Move) -> None:
+        super().__init__("no more than half of the frames show one place")
+        self.move = move
+
+
+def place_circles(
+    camera: Camera, many: Sequence[CircleViews]
+) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
+    """Place several circles, with the deviations that their residuals show together.
+
+    A circle that was moved, as its frames before and after say, is placed by the side with more
+    frames. One that stands apart by its residuals has deviations of its own, and no part in those
+    of the others. One that its residuals contradict though none stands apart, as of two circles, is
+    placed by most of its frames, or with deviations of its own.
+
+    Parameters
+    ----------
+    many : sequence of CircleViews
+        Each in the order in which its frames were taken.
+
+    Returns
+    -------
+    placed : list of PlacedCircle or NoCircleError
+        In the circles' order; a `MovedCircleError`, if no more than half of the frames show one
+        place.
+    noise : ExtraNoise
+        What was added to the stated covariances of circles that do not stand apart.
+    """
+    sides = [np.ones(len(views), dtype=np.bool_) for views in many]
+    moves: dict[int, Move] = {}
+    while True:
+        chosen = [views.chosen(side) for views, side in zip(many, sides, strict=True)]
+        outcomes, noise = _with_common_noise(camera, chosen)
+        found = _splits(camera, chosen, outcomes)
+        if not found:
+            break
+        for index, split in found.items():
+            frames = np.flatnonzero(sides[index])
+            larger = split.larger_side(len(frames))
+            sides[index][frames[~larger]] = False
+            moves.setdefault(index, Move(int(frames[split.first]), split.off_m))
+    for index, move in moves.items():
+        outcome = outcomes[index]
+        if isinstance(outcome, PlacedCircle):
+            fit = seen_in(camera, many[index], outcome, sides[index])
+            is_most = 2 * np.count_nonzero(fit.is_used) > len(many[index])
+            moved = replace(outcome, fit=fit, move=move)
+            outcomes[index] = moved if is_most else MovedCircleError(move)
+    return outcomes, noise
+
+
+def _splits(
+    camera: Camera,
+    many: Sequence[CircleViews],
+    outcomes: Sequence[PlacedCircle | NoCircleError],
+) -> dict[int, Split]:
+    """Return the splits of the circles that were moved.
+
+    Poses whose errors follow each other seem to move all circles: what most gain by a second place
+    does not count.
+    """
+    splits = {}
+    for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
+        if isinstance(outcome, PlacedCircle):
+            circle = outcome.fit.circle
+            covs = total_covariances(camera, views, circle, ExtraNoise())[:, :2, :2]
+            split = best_split(camera, views, circle, covs)
+            if split is not None:
+                splits[index] = split
+    limit = 1.0
+    if len(splits) >= _LEAST_CIRCLES:
+        limit = max(1.0, _APART * float(np.median([split.gain for split in splits.values()])))
+    return {index: split for index, split in splits.items() if split.gain > limit}
+
+
+def _with_common_noise(
+    camera: Camera, many: Sequence[CircleViews]
+) -> tuple[list[PlacedCircle | NoCircleError], ExtraNoise]:
+    """Place several circles, with the deviations that their residuals show together."""
+    noise, own = ExtraNoise(), dict[int, ExtraNoise]()
+    used = [noise] * len(many)
+    outcomes = [_attempt(camera, views, noise) for views in many]
+    for _ in range(_EXTRA_ROUNDS):
+        noise, own = _noise_of_all(camera, many, outcomes)
+        settled = True
+        for index, views in enumerate(many):
+            if not _is_alike(used[index], own.get(index, noise)):
+                used[index] = own.get(index, noise)
+                outcomes[index] = _attempt(camera, views, used[index])
+                settled = False
+        if settled:
+            break
+    for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
+        if not isinstance(outcome, PlacedCircle):
+            continue
+        if index in own or outcome.fit.variance_factor > _MOST_FACTOR:
+            outcomes[index] = _by_most_frames(camera, views, noise) or _by_own_noise(
+                camera, views, outcome
+            )
+    return outcomes, noise
+
+
+def _by_own_noise(
+    camera: Camera, views: CircleViews, outcome: PlacedCircle
+) -> PlacedCircle | NoCircleError:
+    """Place a circle by all frames, with the deviations that its own residuals show."""
+    if outcome.fit.variance_factor > _MOST_FACTOR:
+        again = _attempt(camera, views, extra_noise(camera, [(views, outcome.fit)]))
+        if isinstance(again, NoCircleError):
+            return again
+        outcome = again
+    return replace(outcome, is_apart=True)
+
+
+def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | None:
+    """Place a circle by the frames that most agree with; None if no more than half agree.
+
+    Three frames of an even draw give each start: where a circle was moved, a start by all frames
+    leads to between its places.
+    """
+    rng = np.random.default_rng(0)
+    best: CircleFit | None = None
+    for _ in range(_DRAWS):
+        drawn = views.chosen(np.isin(np.arange(len(views)), rng.permutation(len(views))[:3]))
+        try:
+            start = place_circle(camera, drawn, noise).fit.circle
+        except NoCircleError:
+            continue
+        fit = fit_to_agreeing(camera, views, start, noise)
+        if fit is not None and (best is None or fit.cost < best.cost):
+            best = fit
+    if best is None or not 2 * np.count_nonzero(best.chi2 <= REJECTED_CHI2) > len(views):
+        return None
+    return without_other(camera, views, best, noise)
+
+
+def _noise_of_all(
+    camera: Camera, many: Sequence[CircleViews], outcomes: Sequence[PlacedCircle | NoCircleError]
+) -> tuple[ExtraNoise, dict[int, ExtraNoise]]:
+    """Return the deviations that circles show together, and those of circles that stand apart."""
+    pairs = {
+        index: (views, outcome.fit)
+        for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True))
+        if isinstance(outcome, PlacedCircle)
+    }
+    if not pairs:
+        return ExtraNoise(), {}
+    own = {index: extra_noise(camera, [pair]) for index, pair in pairs.items()}
+    apart = _apart({index: _deviation_px(pairs[index][0], own[index]) for index in pairs})
+    common = extra_noise(camera, [pair for index, pair in pairs.items() if index not in apart])
+    return common, {index: own[index] for index in apart}
+
+
+def _apart(deviation_px: Mapping[int, float]) -> set[int]:
+    """Return the circles whose images are off by far more than those of most."""
+    if len(deviation_px) < _LEAST_CIRCLES:
+        return set()
+    limit_px = _APART * float(np.median(list(deviation_px.values())))
+    apart = {index for index, px in deviation_px.items() if px > limit_px}
+    return apart if 2 * len(apart) < len(deviation_px) else set()
+
+
+def _deviation_px(views: CircleViews, noise: ExtraNoise) -> float:
+    """Return the deviation of a circle's places in its images, per coordinate [px]."""
+    stated = 0.5 * float(np.median(np.trace(views.cov[:, :2, :2], axis1=1, axis2=2)))
+    return math.sqrt(stated + noise.centre_px**2)
+
+
+def _is_alike(first: ExtraNoise, second: ExtraNoise) -> bool:
+    """Tell whether another adjustment with this noise would change next to nothing."""
+    return bool(
+        np.allclose(
+            (first.centre_px, first.outline_px, first.centre_factor, first.outline_factor),
+            (second.centre_px, second.outline_px, second.centre_factor, second.outline_factor),
+            rtol=_SETTLED_NOISE,
+            atol=1e-4,
+        )
+    )
+
+
+def _attempt(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | NoCircleError:
+    try:
+        return place_circle(camera, views, noise)
+    except NoCircleError as error:
+        return error
