@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import rotation_about
 from kgcp.georef.sighting import Sighting
@@ -18,6 +19,27 @@ POSE = CameraPose(
     rotation_about(np.array([0.1, 0.2, 0.3])) @ np.diag([1.0, -1.0, -1.0]),
 )
 SD_PX, SD_DISTANCE, SD_POSITION_M = 0.005, 1e-4, 0.002
+
+
+def sightings_of(
+    stated_m: FloatArray, distances_m: FloatArray, pixels: FloatArray, sd_common: float
+) -> list[Sighting]:
+    """Return targets with a relative deviation of their distances that all frames share."""
+    return [
+        Sighting(
+            frame="f",
+            number=1,
+            target=f"T{row}",
+            instance=0,
+            time_s=None,
+            centre_px=pixels[row],
+            centre_cov_px2=SD_PX**2 * np.eye(2),
+            distance_m=distance_m,
+            sd_distance_m=SD_DISTANCE * distance_m,
+            sd_common_distance_m=sd_common * distance_m,
+        )
+        for row, distance_m in enumerate(distances_m.tolist()[: len(stated_m)])
+    ]
 
 
 @pytest.mark.parametrize("targets", [4, 6])
@@ -34,21 +56,7 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
         distances_m = distances_m * (1.0 + SD_DISTANCE * rng.standard_normal(targets))
         distances_m = distances_m * (1.0 + sd_own * rng.standard_normal(targets))
         distances_m = distances_m * (1.0 + sd_alike * rng.standard_normal())
-        sightings = [
-            Sighting(
-                frame="f",
-                number=1,
-                target=name,
-                instance=0,
-                time_s=None,
-                centre_px=pixel,
-                centre_cov_px2=SD_PX**2 * np.eye(2),
-                distance_m=distance_m,
-                sd_distance_m=SD_DISTANCE * distance_m,
-                sd_common_distance_m=max(sd_own, sd_alike) * distance_m,
-            )
-            for name, pixel, distance_m in zip(names, pixels, distances_m.tolist(), strict=True)
-        ]
+        sightings = sightings_of(stated_m, distances_m, pixels, max(sd_own, sd_alike))
         cov_m2 = SD_POSITION_M**2 * np.eye(3)
         places = (TargetPosition(place, cov_m2) for place in stated_m)
         positions = dict(zip(names, places, strict=True))
@@ -59,3 +67,24 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
         z.append((found.pose.centre_m - POSE.centre_m) / np.sqrt(found.cov.diagonal()[:3]))
     assert used >= 0.95 * 40 * targets
     assert 0.5 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
+
+
+def test_a_print_that_sightings_and_flight_state_counts_once() -> None:
+    """Targets near each other: how far away the camera is, their distances say."""
+    offsets_m = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.2, 0.0]])
+    seen = POSE.in_camera(offsets_m)
+    distances_m = np.linalg.norm(seen, axis=1)
+    sightings = sightings_of(offsets_m, distances_m, CAMERA.project(seen), 0.002)
+    cov_m2 = 0.01**2 * np.eye(3)
+    positions = {f"T{row}": TargetPosition(each, cov_m2) for row, each in enumerate(offsets_m)}
+    found = [
+        orient_frames(["f"], sightings, positions, CAMERA, sd_scale=sd_scale)[0]
+        for sd_scale in (0.0, 0.002, 0.004)
+    ]
+    sight = POSE.centre_m / np.linalg.norm(POSE.centre_m)
+    sds = [
+        float(np.sqrt(sight @ each.cov[:3, :3] @ sight)) for each in found if each.cov is not None
+    ]
+    assert sds[0] == pytest.approx(0.002 * np.linalg.norm(POSE.centre_m), rel=0.3)
+    assert sds[1] == pytest.approx(sds[0], rel=1e-9)
+    assert sds[2] > 1.4 * sds[0]

@@ -103,8 +103,7 @@ class PlateAttitude:
 def print_scale_sd(targets: Iterable[AnyTarget]) -> float:
     """Return `sd_scale` of `orient_frames`: how well the static targets are printed, as stated.
 
-    That of the least well known one, as a share of its diameter. Sightings may state it as well,
-    but need not: it may have been stated after they were measured.
+    That of the least well known one, as a share of its diameter.
     """
     static = [target for target in targets if target.position_m is not None]
     shares = [target.sd_outer_diameter_m / target.outer_diameter_m for target in static]
@@ -136,8 +135,9 @@ def orient_frames(
     has_free_focal : bool
         Whether the focal length is unknown, to a factor of two.
     sd_scale : float
-        Of the logarithm of what all distances may be off by, alike, besides the common share that
-        the sightings state: see `print_scale_sd`.
+        Of the logarithm of what all distances may be off by, alike, by their prints: see
+        `print_scale_sd`. The common share that the sightings state has what was stated of their
+        prints in it, and the calibration: the larger one of the two counts.
     """
     by_frame: dict[str, list[Sighting]] = {frame: [] for frame in frames}
     for each in sightings:
@@ -174,7 +174,6 @@ def point_images(
         for each in sightings
     ]
     known = np.isfinite(sds)
-    common = [(each.sd_common_distance_m or 0.0) / each.distance_m for each in sightings]
     return PointImages(
         np.array([place.position_m for place in places]),
         np.array([no_cov if place.cov_m2 is None else place.cov_m2 for place in places]),
@@ -182,8 +181,13 @@ def point_images(
         np.array([each.centre_cov_px2 for each in sightings]),
         np.where(known, [each.distance_m for each in sightings], np.nan),
         np.array(sds),
-        math.hypot(sd_scale, float(np.median(common))),
+        max(sd_scale, float(np.median([_common_share(each) for each in sightings]))),
     )
+
+
+def _common_share(sighting: Sighting) -> float:
+    """Return what a sighting states that its distance may be off by in all frames, as a share."""
+    return (sighting.sd_common_distance_m or 0.0) / sighting.distance_m
 
 
 def _by_points(
@@ -398,7 +402,8 @@ def _pose_by_ring(
     )
     from_plate = np.vstack((cross_matrix(sight), np.eye(3)))
     cov = from_pose @ pose_cov @ from_pose.T + from_plate @ plate.cov @ from_plate.T
-    cov[:3, :3] += sd_scale**2 * np.outer(sight, sight)
+    # what the ring's own common share lacks
+    cov[:3, :3] += max(0.0, sd_scale**2 - _common_share(ring) ** 2) * np.outer(sight, sight)
     if place.cov_m2 is not None:
         cov[:3, :3] += place.cov_m2
     return CameraPose(place.position_m - sight, rotation), np.asarray(cov)
