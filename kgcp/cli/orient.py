@@ -176,8 +176,8 @@ def _report(poses: FlightPoses) -> None:
             where = f"{len(frames)} of {measured} frames, {frames[0]} the first"
             where += "; look at its position_m" if 2 * len(frames) > measured else ""
         click.echo(f"kgcp: look: {name} left out in {where}", err=True)
-    if poses.doubt:
-        click.echo(f"kgcp: look: {poses.doubt}", err=True)
+    for doubt in poses.doubts:
+        click.echo(f"kgcp: look: {doubt}", err=True)
     if poses.focal_px is not None:
         focal, sd = poses.focal_px
         click.echo(f"focal length {focal:.2f} ± {sd:.2f} px", err=True)

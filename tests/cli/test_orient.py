@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 
 from benchmarks.ground.orient import DEVICE_M
 from kgcp.cli import main
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.io.flight.field_file import field_toml
@@ -98,6 +99,76 @@ def test_diameters_that_are_all_wrong_displace_no_pose(
     placed = run("place", folder, "--poses", folder / "kgcp" / "poses.csv", "--json")
     for target in json.loads(placed.stdout)["targets"]:
         assert abs(target["diameter_m"] - 0.9) < 3.0 * target["sd_diameter_m"] < 0.003
+
+
+def misplace(folder: Path, flight: GroundFlight, off_m: FloatArray) -> None:
+    """State positions that are off by so much (n, 3)."""
+    toml = folder / "flight.toml"
+    text = toml.read_text("utf-8")
+    for true, wrong in zip(flight.positions_map, flight.positions_map + off_m, strict=True):
+        assert str(true.tolist()) in text
+        text = text.replace(str(true.tolist()), str(wrong.tolist()))
+    toml.write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("sd_position_m", "off_m", "words"),
+    [
+        (0.01, 0.1, "contradict each other: that of"),
+        (0.002, 0.1, "contradict each other: that of B is off by 0.1"),
+        (0.01, 0.2, "that of"),
+        (0.002, 0.5, "B left out in 1"),
+    ],
+)
+def test_a_height_that_is_wrong_does_not_pass_in_silence(
+    tmp_path: Path, sd_position_m: float, off_m: float, words: str
+) -> None:
+    """Of four targets nearly in a plane: the poses take up most of it, frame by frame."""
+    flight = GroundFlight()
+    folder = flight.write(tmp_path / "flight", sd_position_m=sd_position_m)
+    misplace(folder, flight, np.array([[0, 0, 0], [0, 0, off_m], [0, 0, 0], [0, 0, 0]]))
+    result = run("orient", folder, "--json")
+    if result.exit_code:
+        assert "no frame can be oriented; of 12 frames" in result.stderr
+        return
+    assert words in result.stderr
+    if "contradict" in words:
+        (doubt,) = json.loads(result.stdout)["doubts"]
+        assert "B" in doubt
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_positions_as_good_as_stated_contradict_nothing(tmp_path: Path, seed: int) -> None:
+    flight, rng = GroundFlight(seed=seed), np.random.default_rng(seed)
+    folder = flight.write(tmp_path / "flight", sd_position_m=0.01)
+    misplace(folder, flight, 0.01 * rng.standard_normal((4, 3)))
+    result = run("orient", folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["doubts"] == []
+    off, sds = poses_of(folder, flight)
+    assert 0.2 < float(np.sqrt(np.mean((off / sds) ** 2))) < 1.7
+
+
+def test_where_most_frames_cannot_be_oriented_that_is_told(tmp_path: Path) -> None:
+    exchanged = {
+        (frame, name): other for frame in range(8) for name, other in (("A", "B"), ("B", "A"))
+    }
+    flight = GroundFlight(renamed=exchanged)
+    folder = flight.write(tmp_path / "flight")
+    result = run("orient", folder)
+    assert result.exit_code == 0, result.stderr
+    assert "only 4 of 12 frames with 4 targets or more could be oriented" in result.stderr
+    off, sds = poses_of(folder, flight)
+    assert np.isfinite(off).all(axis=1).sum() == 4
+    assert np.nanmax(np.abs(off / sds)) < 3.0
+
+
+def test_distances_that_contradict_an_unknown_focal_length_are_told(tmp_path: Path) -> None:
+    """Positions and images determine the focal length; half the diameter contradicts them."""
+    folder = GroundFlight(stated_diameter_m=0.45).write(tmp_path / "flight", sd_position_m=0.002)
+    result = run("orient", folder, "--free-focal")
+    assert result.exit_code == 1
+    assert "the distances are 50 % shorter than the positions say" in result.stderr
 
 
 def vouch(folder: Path, sd_diameter_m: float) -> None:

@@ -215,8 +215,8 @@ def _by_points(
     try:
         found = resected(images)
     except NoPoseError as error:
-        reason = "" if has_free_focal else _scale_reason(images, resected)
-        return FramePose(frame, names, None, None, (), reason or str(error))
+        reason = _scale_reason(images, resected) or str(error)
+        return FramePose(frame, names, None, None, (), reason)
     if abs(found.distance_scale) > _MOST_SCALE_SD * images.sd_scale:
         return FramePose(frame, names, None, None, (), _scale_words(found.distance_scale))
     sd_focal = math.sqrt(found.cov[6, 6]) if has_free_focal else None
@@ -230,9 +230,11 @@ def _scale_reason(images: PointImages, resected: Callable[[PointImages], Resecti
     """Return that all distances are wrong alike, if points fit well without them; else nothing."""
     unknown = np.full(len(images), np.nan)
     with contextlib.suppress(NoPoseError):
-        pose = resected(replace(images, distances_m=unknown, sd_distances_m=unknown)).pose
-        true_m = np.linalg.norm(pose.in_camera(images.positions_m), axis=1)
-        logs = np.log(images.distances_m / true_m)
+        found = resected(replace(images, distances_m=unknown, sd_distances_m=unknown))
+        if len(found.cov) > 6 and math.sqrt(found.cov[6, 6]) > FOCAL_DETERMINED:
+            return ""
+        true_m = np.linalg.norm(found.pose.in_camera(images.positions_m), axis=1)
+        logs = np.log(images.distances_m * found.pose.focal_scale / true_m)
         scale, limit = float(np.nanmedian(logs)), _MOST_SCALE_SD * images.sd_scale
         if abs(scale) > limit > np.nanmedian(np.abs(logs - scale)):
             return _scale_words(scale)

@@ -218,6 +218,58 @@ def _normal_equations(
     return normal, right, cost
 
 
+def position_equations(
+    camera: Camera, images: PointImages, pose: CameraPose, sd_focal: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return normal equations of corrections to the points' positions, the pose eliminated.
+
+    Parameters
+    ----------
+    images : PointImages
+        Their `position_cov` does not count.
+    pose : CameraPose
+        Near the right one.
+    sd_focal : float
+        As for `orient`.
+
+    Returns
+    -------
+    normal : (3 n, 3 n) array
+        Singular: the whole can be shifted and turned.
+    right : (3 n,) array
+    squares : float
+        Weighted squares of the residuals, without corrections.
+        None instead of the three: a point is behind the camera, or the pose is not determined.
+    """
+    residuals = _residuals(camera, images, pose)
+    if not np.isfinite(residuals[:, 0]).all():
+        return None
+    count = len(images)
+    design, by_point = _design(camera, images, pose)
+    weights = np.linalg.inv(_covariances(images, np.zeros_like(by_point)))
+    unknowns = 7 if sd_focal else 6
+    by_pose = np.zeros((count, 3, unknowns + 1))
+    by_pose[:, :, :unknowns] = design[:, :, :unknowns]
+    by_pose[:, 2, unknowns] = 1.0  # what all distances are too long by, alike
+    prior = np.zeros(unknowns + 1)
+    prior[unknowns] = 1.0 / max(images.sd_scale, 1e-9) ** 2
+    if sd_focal:
+        prior[6] = 1.0 / sd_focal**2
+    by_position = np.zeros((count, 3, count, 3))
+    by_position[np.arange(count), :, np.arange(count)] = by_point
+    by_positions = by_position.reshape(count, 3, 3 * count)
+    both = np.concatenate((by_pose, by_positions, np.nan_to_num(residuals)[..., None]), axis=2)
+    square = np.einsum("nip,nij,njq->pq", both, weights, both)
+    eliminated = unknowns + 1
+    square[range(eliminated), range(eliminated)] += prior
+    try:
+        solved = np.linalg.solve(square[:eliminated, :eliminated], square[:eliminated, eliminated:])
+    except np.linalg.LinAlgError:
+        return None
+    reduced = square[eliminated:, eliminated:] - square[eliminated:, :eliminated] @ solved
+    return reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
+
+
 def scale_at(camera: Camera, images: PointImages, pose: CameraPose) -> float:
     """Return the logarithm of what all distances are too long by, alike; 0: they are not."""
     if not images.sd_scale:

@@ -29,6 +29,7 @@ from kgcp.io.tables.poses import (
 )
 from kgcp.io.tables.provenance import derived_provenance
 from kgcp.network.ground.frame_poses import FramePose, orient_frames, print_scale_sd
+from kgcp.network.ground.position_check import WrongPosition, wrong_position
 from kgcp.network.ground.resection import MIN_POINTS
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
@@ -67,12 +68,15 @@ class FlightPoses:
     local_frame : LocalFrame
     provenance : mapping of str
         The metadata of the table.
+    wrong_position : WrongPosition or None
+        That positions of targets contradict each other.
     """
 
     flight: Flight
     poses: tuple[FramePose, ...]
     local_frame: LocalFrame
     provenance: Mapping[str, str]
+    wrong_position: WrongPosition | None = None
 
     @property
     def oriented(self) -> tuple[FramePose, ...]:
@@ -114,18 +118,34 @@ class FlightPoses:
         return math.expm1(logs), sds
 
     @property
-    def doubt(self) -> str:
-        """What is wrong with the distances of all targets; empty: nothing is seen."""
-        if self.distance_scale is None:
-            return ""
-        share, sd = self.distance_scale
-        if abs(share) <= _SIGNIFICANT * sd:
-            return ""
-        return (
-            f"the distances are {1000.0 * abs(share):.1f} ‰ (± {1000.0 * sd:.1f})"
-            f" {'longer' if share > 0.0 else 'shorter'} than the positions say; look at the"
-            " targets' diameters and at the focal length"
-        )
+    def doubts(self) -> tuple[str, ...]:
+        """What to look at before the poses are used."""
+        doubts = []
+        enough = [each for each in self.poses if len(each.targets) >= MIN_POINTS]
+        oriented = sum(each.residuals is not None for each in enough)
+        if 2 * oriented < len(enough):
+            doubts.append(
+                f"only {oriented} of {len(enough)} frames with {MIN_POINTS} targets or more could"
+                " be oriented by them; look at position_m and at the names of the targets"
+            )
+        wrong = self.wrong_position
+        if wrong is not None:
+            first, *others = wrong.targets
+            doubts.append(
+                "the positions of the targets contradict each other: that of"
+                f" {first} is off by {wrong.off_m:.2g} m"
+                + (f", or that of {' or '.join(others)} is wrong" if others else "")
+                + f" (χ² {wrong.chi2:.0f} of 3); poses may be off by more than is stated"
+            )
+        if self.distance_scale is not None:
+            share, sd = self.distance_scale
+            if abs(share) > _SIGNIFICANT * sd:
+                doubts.append(
+                    f"the distances are {1000.0 * abs(share):.1f} ‰ (± {1000.0 * sd:.1f})"
+                    f" {'longer' if share > 0.0 else 'shorter'} than the positions say; look at the"
+                    " targets' diameters and at the focal length"
+                )
+        return tuple(doubts)
 
     def summary(self) -> dict[str, object]:
         """Return all numbers for machines."""
@@ -143,7 +163,7 @@ class FlightPoses:
             },
             "reasons": dict(sorted(reasons.items())),
             "distance_scale": None if scale is None else {"value": scale[0], "sd": scale[1]},
-            "doubts": [self.doubt] if self.doubt else [],
+            "doubts": self.doubts,
             "focal_px": None if focal is None else {"value": focal[0], "sd": focal[1]},
         }
 
@@ -181,6 +201,7 @@ def orient_flight(
     data = FlightData(flight, frames)
     positions = data.target_positions
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
+    sd_scale = print_scale_sd(flight.all_targets)
     with np.errstate(all="ignore"):  # poses are tried anywhere: what is not finite is no result
         poses = orient_frames(
             frames,
@@ -189,8 +210,9 @@ def orient_flight(
             flight.camera,
             min_points=options.min_points,
             has_free_focal=options.has_free_focal,
-            sd_scale=print_scale_sd(flight.all_targets),
+            sd_scale=sd_scale,
         )
+        wrong = wrong_position(poses, sightings, positions.static, flight.camera, sd_scale)
     if not any(each.pose is not None for each in poses):
         reasons = Counter(each.reason for each in poses)
         reason, count = reasons.most_common(1)[0]
@@ -204,7 +226,7 @@ def orient_flight(
         "free_focal": options.has_free_focal,
     }
     provenance = derived_provenance(flight, table, choices, has_reference=False)
-    return FlightPoses(flight, tuple(poses), positions.local_frame, provenance)
+    return FlightPoses(flight, tuple(poses), positions.local_frame, provenance, wrong)
 
 
 def write_poses(poses: FlightPoses, folder: Path) -> tuple[Path, ...]:
