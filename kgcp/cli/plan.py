@@ -113,7 +113,9 @@ def command(
     Example:
       kgcp plan sample_flight --height 20 --height 40 --exposure 0.0005 --plot plan.png
     """  # noqa: D301 - \b is click's mark for lines that stay
+    from kgcp.cli.doubts import print_doubts
     from kgcp.io.flight.flight import read_camera_and_targets
+    from kgcp.quality.checks.plate import check_plates
     from kgcp.simulation.outlook import Conditions, look_ahead, usual_heights
     from kgcp.targets.code_design import chosen_targets
 
@@ -129,6 +131,7 @@ def command(
         check_figure_name(plot)
     heights = sorted(set(heights_m)) or usual_heights(camera, target)
     outlooks = look_ahead(camera, calibration, target, heights, conditions)
+    print_doubts(check_plates([target]))
     if as_json:
         _print_json(target.name, conditions, outlooks)
     else:

@@ -53,6 +53,16 @@ def test_the_table_has_a_line_per_height_and_its_conditions(flight: Path) -> Non
     assert max(map(len, lines)) <= 100
 
 
+def test_a_layout_that_is_hard_to_find_is_told(flight: Path) -> None:
+    text = FLIGHT.replace(f"inner_diameter_m = {0.45}", "inner_diameter_m = 0.3")
+    assert text != FLIGHT
+    (flight / "flight.toml").write_text(text, encoding="utf-8")
+    result = run(flight, "--height", "40")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("kgcp: doubt: the inner diameter of 'A' is 0.33 of the outer")
+    assert result.stderr.count("\n") == 1
+
+
 def test_json_has_the_same_numbers(flight: Path) -> None:
     result = run(flight, "--json", "--accuracy", "0.01")
     assert result.exit_code == 0, result.output

@@ -52,6 +52,7 @@ class Cause(StrEnum):
         "diameters",
         "diameters are radii, or in millimetres, inches or feet",
     )
+    LAYOUT = "layout", "the search misses rings of such proportions: inner diameter, dots"
     DISTANCE_SCALE = (
         "distance_scale",
         "all distances are wrong by one factor: focal length or diameters",

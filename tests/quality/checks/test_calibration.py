@@ -56,6 +56,27 @@ def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
     assert words in doubt.sentence
 
 
+@pytest.mark.parametrize(
+    ("ratio", "dot_share", "dots", "words"),
+    [
+        (0.36, 0.5, 4, "is 0.36 of the outer one"),
+        (0.74, 0.5, 4, "is 0.74 of the outer one"),
+        (0.4, 0.75, 6, "take 36% of the ring"),
+        (0.4, 0.57, 6, ""),
+        (0.5, 0.57, 4, ""),
+        (0.7, 0.57, 6, ""),
+    ],
+)
+def test_layouts_that_the_search_misses_are_told(
+    ratio: float, dot_share: float, dots: int, words: str
+) -> None:
+    code_deg = tuple(60.0 * k + k for k in range(dots))
+    ring = Ring("A", 0.9, 0.9 * ratio, 0.45 * (1 + ratio), 0.45 * dot_share * (1 - ratio), code_deg)
+    doubts = check_plates([Target(ring)])
+    assert [doubt.code for doubt in doubts] == ([Cause.LAYOUT] if words else [])
+    assert all(words in doubt.sentence for doubt in doubts)
+
+
 @pytest.mark.parametrize("diameter", [0.05, 0.3, 0.9, 3.0])
 def test_usual_diameters_raise_no_doubt(diameter: float) -> None:
     ring = Ring("A", diameter, diameter / 2, diameter / 1.4, diameter / 7, (0.0, 43.0))
