@@ -17,7 +17,6 @@ from kgcp.network.ground.moved_circle import Split, best_split
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError
 from kgcp.network.ground.target_plane import (
     REJECTED_CHI2,
-    CircleFit,
     Move,
     PlacedCircle,
     extra_noise,
@@ -161,7 +160,6 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
     leads to between its places.
     """
     rng = np.random.default_rng(0)
-    best: CircleFit | None = None
     for _ in range(_DRAWS):
         drawn = views.chosen(np.isin(np.arange(len(views)), rng.permutation(len(views))[:3]))
         try:
@@ -169,11 +167,9 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
         except NoCircleError:
             continue
         fit = fit_to_agreeing(camera, views, start, noise)
-        if fit is not None and (best is None or fit.cost < best.cost):
-            best = fit
-    if best is None or not 2 * np.count_nonzero(best.chi2 <= REJECTED_CHI2) > len(views):
-        return None
-    return without_other(camera, views, best, noise)
+        if fit is not None and 2 * np.count_nonzero(fit.chi2 <= REJECTED_CHI2) > len(views):
+            return without_other(camera, views, fit, noise)
+    return None
 
 
 def _noise_of_all(
