@@ -19,6 +19,7 @@ from kgcp.network.ground.target_plane import (
     REJECTED_CHI2,
     Move,
     PlacedCircle,
+    circle_through,
     extra_noise,
     fit_to_agreeing,
     place_circle,
@@ -163,8 +164,10 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
     for _ in range(_DRAWS):
         drawn = views.chosen(np.isin(np.arange(len(views)), rng.permutation(len(views))[:3]))
         try:
-            start = place_circle(camera, drawn, noise).fit.circle
+            start = circle_through(camera, drawn, noise)
         except NoCircleError:
+            continue
+        if start is None:
             continue
         fit = fit_to_agreeing(camera, views, start, noise)
         if fit is not None and 2 * np.count_nonzero(fit.chi2 <= REJECTED_CHI2) > len(views):

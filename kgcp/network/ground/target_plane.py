@@ -151,6 +151,25 @@ def place_circle(
     return PlacedCircle(best, other, other.cost - best.cost, noise)
 
 
+def circle_through(camera: Camera, views: CircleViews, noise: ExtraNoise) -> SpaceCircle | None:
+    """Return the circle of least squares through a few views, none left out; None: there is none.
+
+    Raises
+    ------
+    NoCircleError
+        As `circle_starts`.
+    """
+    weights, best, least = np.ones(len(views)), None, math.inf
+    for start in circle_starts(camera, views):
+        covs = total_covariances(camera, views, start, noise)
+        circle = _minimised(camera, views, start, covs, weights, _ROUND_STEPS)
+        if circle is not None:
+            cost = _weighted_cost(camera, views, circle, covs, weights)
+            if cost < least:
+                best, least = circle, cost
+    return best
+
+
 def without_other(
     camera: Camera, views: CircleViews, best: CircleFit, noise: ExtraNoise
 ) -> PlacedCircle:
