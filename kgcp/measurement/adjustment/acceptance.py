@@ -10,6 +10,7 @@ import numpy as np
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.measurement.adjustment.problem import SMALL_RING_PX
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import plateau_levels
@@ -19,7 +20,7 @@ from kgcp.targets.layout import Ring
 _MAX_OUTLIERS = 0.3
 _MAX_EDGE_NOISE = 0.15  # of the contrast: the largest residuals near edges
 _NO_SENSE = 2.0
-_MAX_RELATIVE_SD = 0.01
+_MAX_RELATIVE_SD, _MAX_RELATIVE_SD_OF_SMALL = 0.01, 0.02
 _POSITIONS = 72  # around the code circle
 _MIN_PIXELS = 3
 _EXTRA, _LACK = 0.45, 0.6  # of a dot's contrast: another dot, or the lack of one
@@ -66,7 +67,8 @@ def check_precision(observation: Measurement) -> None:
     if observation.uncertainty is None:
         return
     share = observation.uncertainty.sd_distance_m / observation.pose.distance_m
-    if share > _MAX_RELATIVE_SD:
+    is_small = observation.appearance.radius_px < SMALL_RING_PX
+    if share > (_MAX_RELATIVE_SD_OF_SMALL if is_small else _MAX_RELATIVE_SD):
         raise Rejection(Reason.POOR_FIT, f"distance uncertain by {share:.1%}")
 
 

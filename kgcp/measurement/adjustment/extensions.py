@@ -37,7 +37,6 @@ from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
 from kgcp.measurement.records import ToneBase
-from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 
 _NUDGE = np.zeros(PARAM_COUNT)
 _NUDGE[Param.SKEW_XXX :] = 1e-6  # px³: without any skew its derivatives are left out
@@ -138,15 +137,14 @@ def _fit_in_any_light(
         seen where the levels are even; `POOR_FIT` if varying levels do not explain the image
         either.
     """
-    is_small = problem.outer_radius_px < SMALLEST_UNEVEN_PX
     try:
         plain = _with_skew(problem, fit_both_poses(problem, pose, blur))
     except Rejection:
-        plateaus = None if is_small else find_plateaus()
+        plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:
             raise
     else:
-        if is_small or not needs_varying_levels(plain.best):
+        if not needs_varying_levels(plain.best):
             return plain
         plateaus = find_plateaus()
         if plateaus is None or not plateaus.is_uneven:

@@ -15,6 +15,8 @@ from kgcp.measurement.image_model.rolling_shutter import RollingShutter
 from kgcp.measurement.image_model.window import Window
 from kgcp.targets.layout import Ring
 
+SMALL_RING_PX = 12.5
+"""Radius below which rings hardly show ink and plate beside their edges."""
 _CLIPPED = 0.002  # share of a window's pixels from which on clipping shows in bins
 _FEW_PIXELS = 400  # enough to come near the minimum, at a fraction of the time
 

@@ -30,7 +30,7 @@ from kgcp.measurement.adjustment.normal_equations import (
 )
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import Sample, select_pixels
-from kgcp.measurement.adjustment.problem import FitProblem
+from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
 from kgcp.measurement.adjustment.solver import (
     PredictedImage,
     TargetFit,
@@ -76,7 +76,9 @@ _UNEVEN_EXCESS, _UNEVEN_EXCESS_OF_BINS = 1.9, 3.0
 # that agree along edges inflate the covariance so much: of 58 frames with dirt, one of R 15 px had
 # an excess of 1.3, an inflation of 6.5, and an error of 4.6 σ without levels that vary. In even
 # light, with an excess above 1.2, the largest inflation is 3.5 (the flight of a coarse renderer).
-_DOUBTFUL_EXCESS, _UNEVEN_INFLATION = 1.2, 4.0
+# Rings below `SMALL_RING_PX` hardly fill a cell: two under highlights, 5 and 6 σ off in even light,
+# had excesses of 0.6 and 0.8 and inflations of 1.8 and 2.2; of 120 in even light three have both.
+_DOUBTFUL, _DOUBTFUL_IN_SMALL_RING = (1.2, 4.0), (0.5, 1.6)
 _TELLING_POWER = 0.05  # of the cell that tells most
 
 
@@ -117,8 +119,9 @@ def needs_varying_levels(fit: TargetFit) -> bool:
     excess, is_binned = excess_of_cells(fit), fit.sample.problem.window.binning > 1
     if excess > (_UNEVEN_EXCESS_OF_BINS if is_binned else _UNEVEN_EXCESS):
         return True
-    is_doubtful = excess > _DOUBTFUL_EXCESS and not is_binned
-    return is_doubtful and pose_covariance(fit).inflation > _UNEVEN_INFLATION
+    is_small = fit.sample.problem.outer_radius_px < SMALL_RING_PX
+    doubtful, inflation = _DOUBTFUL_IN_SMALL_RING if is_small else _DOUBTFUL
+    return excess > doubtful and not is_binned and pose_covariance(fit).inflation > inflation
 
 
 def fit_levels(

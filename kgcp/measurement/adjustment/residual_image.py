@@ -23,7 +23,6 @@ from kgcp.measurement.adjustment.unknowns import adjust_with_streak
 from kgcp.measurement.image_model.blur import Blur, variance_in_bins
 from kgcp.measurement.image_model.photometry import plateau_levels
 from kgcp.measurement.image_model.plate import circles_of
-from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX
 from kgcp.targets.layout import Target
 
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 97)
@@ -74,7 +73,7 @@ def residual_image_of(
     variance = variance_in_bins((blur_px or _USUAL_BLUR_PX) ** 2, binning)
     start = Parameters.of(pose, Blur(variance, variance, 0.0), first_levels(problem, pose))
     fit = adjust_with_streak(problem, start, moves=False)
-    if problem.outer_radius_px >= SMALLEST_UNEVEN_PX and needs_varying_levels(fit):
+    if needs_varying_levels(fit):
         with contextlib.suppress(Rejection):  # a code that is not seen is what residuals show
             best = fit_in_any_light(problem, pose, start.blur).likelier.best
             fit = best if best.parameters.field is not None else fit

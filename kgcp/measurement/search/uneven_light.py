@@ -10,8 +10,8 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.search.templates import ANGLES, edge_rows
 from kgcp.targets.layout import Ring
 
-SMALLEST_UNEVEN_PX = 12.5
-"""Radius below which rings hardly show ink and plate beside their edges: their light is even."""
+SMALLEST_UNEVEN_PX = 8.0
+"""Radius below which no levels are read beside edges: the light of such rings is even."""
 # samples to either side of an angle: more than a dot, less than a shadow
 _HALF_INK, _HALF_PLATE = 10, 5
 # which of them is the level, by size: the plate's is the median; dots that blur spreads are

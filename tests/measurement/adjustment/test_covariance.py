@@ -47,8 +47,10 @@ def some_covariance(seed: int) -> FloatArray:
     [
         (11.0, 1.0, None, 1.0),  # even light
         (11.0, 1.5, None, math.sqrt(1.4)),
-        (11.0, 6.0, None, 1.4),  # dirt on a ring too small for levels to vary
+        (11.0, 6.0, None, 1.4),  # dirt that cells of a small ring do not show
         (13.0, 6.0, None, 1.0),  # levels could have varied, and did not need to
+        (11.0, 1.0, 0, 1.8),  # levels that vary on a small ring …
+        (11.0, 1.0, 1, 1.8),
         (30.0, 1.0, 0, 1.2),  # levels that vary …
         (30.0, 1.0, 1, 1.0),  # … with a shadow's edge
     ],

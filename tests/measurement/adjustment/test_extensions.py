@@ -62,15 +62,18 @@ def test_the_other_base_is_tried_where_levels_leave_residuals_that_agree(
 
 
 @pytest.mark.parametrize(
-    ("excess", "inflation", "binning", "is_asked"),
+    ("excess", "inflation", "radius_px", "binning", "is_asked"),
     [
-        (1.0, 6.5, 1, False),  # even light, whatever else is wrong
-        (1.3, 3.5, 1, False),  # of a coarse renderer in even light
-        (1.3, 6.5, 1, True),  # dirt on a small ring
-        (1.8, 1.0, 1, False),
-        (2.0, 1.0, 1, True),
-        (2.0, 6.5, 2, False),  # bins: a tone curve within them displaces edges
-        (3.1, 1.0, 2, True),
+        (1.0, 6.5, 30.0, 1, False),  # even light, whatever else is wrong
+        (1.3, 3.5, 30.0, 1, False),  # of a coarse renderer in even light
+        (1.3, 6.5, 30.0, 1, True),  # dirt on a ring of 15 px
+        (1.8, 1.0, 30.0, 1, False),
+        (2.0, 1.0, 30.0, 1, True),
+        (2.0, 6.5, 90.0, 2, False),  # bins: a tone curve within them displaces edges
+        (3.1, 1.0, 90.0, 2, True),
+        (0.6, 1.8, 10.0, 1, True),  # a highlight on a ring of 8 px
+        (0.6, 1.4, 10.0, 1, False),
+        (0.4, 6.5, 10.0, 1, False),
     ],
 )
 def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
@@ -78,11 +81,13 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
     *,
     excess: float,
     inflation: float,
+    radius_px: float,
     binning: int,
     is_asked: bool,
 ) -> None:
     monkeypatch.setattr(random_levels, "excess_of_cells", lambda _: excess)
     monkeypatch.setattr(random_levels, "pose_covariance", lambda _: stand_in(inflation=inflation))
     window = stand_in(binning=binning)
-    fit = stand_in(sample=stand_in(problem=stand_in(window=window)))
+    problem = stand_in(window=window, outer_radius_px=radius_px)
+    fit = stand_in(sample=stand_in(problem=problem))
     assert needs_varying_levels(fit) == is_asked
