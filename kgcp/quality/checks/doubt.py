@@ -70,6 +70,10 @@ class Cause(StrEnum):
     NO_TIMES = "no_times", "frames have no time"
     FRAME_ORDER = "frame_order", "times or reference poses belong to the next or previous frame"
     REFERENCE = "reference", "reference poses are of another place, or turned"
+    STATIC_TARGETS = (
+        "static_targets",
+        "a static target is not where position_m says, by its distances to the others",
+    )
     CAMERA_POSITION = (
         "camera_position",
         "the frames' own GPS position or altitude is not near the vehicle",

@@ -18,6 +18,7 @@ from kgcp.quality.checks.encounters import Encounters
 from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.quality.checks.mount import check_mount
 from kgcp.quality.checks.patterns import check_lone_frames, unexplained
+from kgcp.quality.checks.static_targets import check_static_targets
 from kgcp.quality.consistency import Consistency
 
 
@@ -41,7 +42,11 @@ def measured_doubts(
     consistency : Consistency or None
         Of the same sightings and poses.
     """
-    doubts = [*plausibility, *_of_altitude(sightings, headers)]
+    doubts = [
+        *plausibility,
+        *_of_altitude(sightings, headers),
+        *check_static_targets(sightings, target_positions.static, camera),
+    ]
     # Where an input cannot be right, all that follows from it disagrees.
     if poses is not None and not any(doubt.is_grave for doubt in plausibility):
         encounters = Encounters.of(sightings, target_positions, poses, camera)

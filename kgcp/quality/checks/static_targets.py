@@ -1,0 +1,204 @@
+"""Static targets against each other: no pose of the camera is needed."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from kgcp.geometry.camera import Camera
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
+
+_CONTRADICTION = 5.0  # standard deviations of a distance between two targets in one frame
+_LEAST_SHARE, _LEAST_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
+_PRINT_SD = 0.005  # of a distance from the camera: the print, where nothing is stated
+_FLOOR_M = 0.002  # of what distorts a distance besides
+_SPEED_M_S = 10.0  # of the camera, while rows are read one after the other
+_MOST_SCALE = 0.02  # of the logarithm of a factor that all distances may have in common
+_LEAST_OF_SCALE = 3  # pairs of targets that tell a common factor from a wrong position
+_NAMED_FRAMES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """The distance of two targets in one frame."""
+
+    frame: str
+    names: tuple[str, str]
+    measured_m: float
+    stated_m: float
+    sd_m: float
+
+
+def check_static_targets(
+    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], camera: Camera
+) -> tuple[Doubt, ...]:
+    """Compare the distances between static targets in every frame with those of their positions.
+
+    A factor that all distances have in common, of prints or focal length, is taken out.
+
+    Parameters
+    ----------
+    positions : mapping of str to TargetPosition
+        Of the static targets, in the ENU frame.
+    """
+    pairs = _pairs(sightings, positions, camera)
+    if not pairs:
+        return ()
+    scale = _common_scale(pairs)
+    if abs(math.log(scale)) > _MOST_SCALE:
+        of_scale = _of_scale(pairs, scale)
+        if of_scale is not None:
+            return (of_scale,)
+        scale = 1.0
+    wrong = {id(pair): abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m for pair in pairs}
+    by_names: dict[tuple[str, str], list[_Pair]] = defaultdict(list)
+    for pair in pairs:
+        by_names[pair.names].append(pair)
+    bad = {names: [pair for pair in of if wrong[id(pair)]] for names, of in by_names.items()}
+    contradicting = {
+        names
+        for names, frames in bad.items()
+        if len(frames) >= max(min(_LEAST_FRAMES, len(by_names[names])), 1)
+        and len(frames) >= _LEAST_SHARE * len(by_names[names])
+    }
+    if contradicting:
+        return (_of_targets(by_names, bad, contradicting, scale),)
+    return _of_frames(pairs, wrong)
+
+
+def _pairs(
+    sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], camera: Camera
+) -> list[_Pair]:
+    by_frame: dict[str, dict[str, Sighting]] = defaultdict(dict)
+    for each in sightings:
+        if each.target in positions and not each.instance and each.pose is not None:
+            by_frame[each.frame][each.target] = each
+    return [
+        pair
+        for frame, seen in by_frame.items()
+        for names in combinations(sorted(seen), 2)
+        if (pair := _pair(frame, names, seen, positions, camera)) is not None
+    ]
+
+
+def _pair(
+    frame: str,
+    names: tuple[str, str],
+    seen: Mapping[str, Sighting],
+    positions: Mapping[str, TargetPosition],
+    camera: Camera,
+) -> _Pair | None:
+    first, second = (seen[name] for name in names)
+    if first.pose is None or second.pose is None:
+        return None
+    between = second.pose.translation_m - first.pose.translation_m
+    stated = positions[names[1]].position_m - positions[names[0]].position_m
+    measured_m = float(np.linalg.norm(between))
+    if not measured_m > 0.0:
+        return None
+    rows = second.rows_since_middle(camera) - first.rows_since_middle(camera)
+    variance = _FLOOR_M**2 + (_SPEED_M_S * camera.readout_s * rows) ** 2
+    along = between / measured_m
+    for sighting, pose in ((first, first.pose), (second, second.pose)):
+        variance += (_PRINT_SD * float(pose.translation_m @ along)) ** 2
+        if sighting.pose_cov is not None:
+            variance += float(along @ sighting.pose_cov[:3, :3] @ along)
+        cov = positions[sighting.target].cov_m2
+        if cov is not None:
+            variance += float(np.trace(cov)) / 3.0
+    return _Pair(frame, names, measured_m, float(np.linalg.norm(stated)), math.sqrt(variance))
+
+
+def _common_scale(pairs: Sequence[_Pair]) -> float:
+    """Return the median ratio of measured and stated distances, weighted by how well it shows."""
+    apart = [pair for pair in pairs if pair.stated_m > 0.0]
+    if not apart:
+        return 1.0
+    ratios = np.array([pair.measured_m / pair.stated_m for pair in apart])
+    weights = np.array([pair.stated_m / pair.sd_m for pair in apart])
+    order = np.argsort(ratios)
+    half = np.searchsorted(np.cumsum(weights[order]), 0.5 * float(weights.sum()))
+    return float(ratios[order][half])
+
+
+def _of_scale(pairs: Sequence[_Pair], scale: float) -> Doubt | None:
+    """Return the doubt about all distances alike; None: they do not differ by one factor."""
+    agreeing = {
+        pair.names for pair in pairs if abs(_off_m(pair, scale)) <= _CONTRADICTION * pair.sd_m
+    }
+    names = {pair.names for pair in pairs}
+    if len(names) < _LEAST_OF_SCALE or 2 * len(agreeing) <= len(names):
+        return None
+    return grave(
+        Cause.DISTANCE_SCALE,
+        f"static targets are {100.0 * abs(scale - 1.0):.2g} %"
+        f" {'further from' if scale > 1.0 else 'nearer to'} each other by their images than by"
+        " position_m",
+        "look at their diameters and at the units of position_m",
+        {"scale": scale},
+    )
+
+
+def _off_m(pair: _Pair, scale: float) -> float:
+    return pair.measured_m / scale - pair.stated_m
+
+
+def _of_targets(
+    by_names: Mapping[tuple[str, str], Sequence[_Pair]],
+    bad: Mapping[tuple[str, str], Sequence[_Pair]],
+    contradicting: set[tuple[str, str]],
+    scale: float,
+) -> Doubt:
+    """Return the doubt about the targets that contradict most others."""
+    others = Counter(name for names in by_names for name in names)
+    against = Counter(name for names in contradicting for name in names)
+    most = max(count / others[name] for name, count in against.items())
+    blamed = sorted(name for name, count in against.items() if count / others[name] == most)
+    worst = max(
+        (names for names in contradicting if set(names) & set(blamed)),
+        key=lambda names: abs(float(np.median([_off_m(pair, scale) for pair in bad[names]]))),
+    )
+    off_m = float(np.median([_off_m(pair, scale) for pair in bad[worst]]))
+    return grave(
+        Cause.STATIC_TARGETS,
+        f"static targets: {worst[0]} and {worst[1]} are {abs(off_m):.2g} m"
+        f" {'further from' if off_m > 0.0 else 'nearer to'} each other by their images than by"
+        f" position_m, in {len(bad[worst])} of {len(by_names[worst])} frames;"
+        f" {_and(blamed)} contradict{'s' * (len(blamed) == 1)} most others",
+        "look at position_m, at the names, and whether one was moved: 'kgcp place' and"
+        " 'kgcp orient' show more",
+        {"off_m": off_m, "frames": float(len(bad[worst]))},
+    )
+
+
+def _of_frames(pairs: Sequence[_Pair], wrong: Mapping[int, bool]) -> tuple[Doubt, ...]:
+    """Return the doubt about targets in single frames that contradict most others there."""
+    seen, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+    for pair in pairs:
+        for name in pair.names:
+            seen[pair.frame, name] += 1
+            against[pair.frame, name] += wrong[id(pair)]
+    lone = [key for key, count in against.items() if count >= 2 and 2 * count > seen[key]]
+    if not lone:
+        return ()
+    words = ", ".join(f"{name} in {frame}" for frame, name in lone[:_NAMED_FRAMES])
+    more = f" and {len(lone) - _NAMED_FRAMES} more" if len(lone) > _NAMED_FRAMES else ""
+    return (
+        mild(
+            Cause.SINGLE_FRAMES,
+            f"static targets: {words}{more} contradict their distances to most others",
+            "look at them with 'kgcp detect --overlay', and leave them out (--exclude)",
+            {"measurements": float(len(lone))},
+        ),
+    )
+
+
+def _and(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

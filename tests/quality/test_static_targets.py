@@ -1,0 +1,160 @@
+"""Static targets against each other: wrong positions, exchanged names, moves, single frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.camera import Camera
+from kgcp.geometry.pose import Pose
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.quality.checks.doubt import Cause, Doubt
+from kgcp.quality.checks.static_targets import check_static_targets
+from tests.ground_flight import CAMERA, GroundFlight
+
+Changed = Callable[[int, str, Pose], tuple[str, Pose]]
+SD_M = 0.01
+
+
+def seen(
+    flight: GroundFlight, changed: Changed = lambda _, name, pose: (name, pose)
+) -> list[Sighting]:
+    """The targets of all frames, some of them changed."""
+    sightings = []
+    for row, frame in enumerate(flight.frame_names):
+        for column, true in enumerate(flight.names):
+            pose, cov = flight.measured(row, column)
+            name, pose = changed(row, true, pose)
+            sightings.append(
+                Sighting(
+                    frame=frame,
+                    number=row + 1,
+                    target=name,
+                    instance=0,
+                    time_s=None,
+                    centre_px=CAMERA.project(pose.translation_m[None])[0],
+                    centre_cov_px2=None,
+                    distance_m=pose.distance_m,
+                    sd_distance_m=None,
+                    sd_common_distance_m=None,
+                    pose=pose,
+                    pose_cov=cov,
+                )
+            )
+    return sightings
+
+
+def stated(flight: GroundFlight, off_m: FloatArray | float = 0.0) -> dict[str, TargetPosition]:
+    places = flight.positions + off_m
+    cov_m2 = SD_M**2 * np.eye(3)
+    return {
+        name: TargetPosition(place, cov_m2)
+        for name, place in zip(flight.names, places, strict=True)
+    }
+
+
+def check(
+    sightings: list[Sighting], positions: dict[str, TargetPosition], camera: Camera = CAMERA
+) -> tuple[Doubt, ...]:
+    return check_static_targets(sightings, positions, camera)
+
+
+def shifted(pose: Pose, off_m: FloatArray) -> Pose:
+    return Pose(pose.rotation, pose.translation_m + off_m)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_positions_and_prints_as_good_as_stated_raise_no_doubt(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    flight = GroundFlight(seed=seed)
+    prints = dict(zip(flight.names, 1.0 + 0.005 * rng.standard_normal(4), strict=True))
+
+    def printed(_: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        return name, Pose(pose.rotation, prints[name] * pose.translation_m)
+
+    assert check(seen(flight, printed), stated(flight, SD_M * rng.standard_normal((4, 3)))) == ()
+
+
+def test_prints_that_are_all_wrong_alike_raise_no_doubt_up_to_two_percent() -> None:
+    for permille in (-15.0, 15.0):
+        flight = GroundFlight(stated_diameter_m=0.9 * (1.0 + 1e-3 * permille))
+        assert check(seen(flight), stated(flight)) == ()
+    flight = GroundFlight(stated_diameter_m=0.45)
+    (doubt,) = check(seen(flight), stated(flight))
+    assert doubt.code is Cause.DISTANCE_SCALE
+    assert "50 % nearer to each other" in doubt.sentence
+
+
+@pytest.mark.parametrize("off_m", [0.3, 3.0])
+def test_a_position_that_is_wrong_is_told_with_its_target(off_m: float) -> None:
+    flight = GroundFlight()
+    (doubt,) = check(seen(flight), stated(flight, np.outer([0, 1, 0, 0], [off_m, 0.0, 0.0])))
+    assert doubt.code is Cause.STATIC_TARGETS
+    assert doubt.is_grave
+    assert "B contradicts most others" in doubt.sentence
+    assert doubt.figures["frames"] >= 6
+    assert 0.6 * off_m < abs(doubt.figures["off_m"]) < 1.1 * off_m
+
+
+def test_names_that_are_exchanged_are_told() -> None:
+    offsets_m = np.vstack((GroundFlight().offsets_m, [[0.5, 1.0, 0.0]]))
+    flight = GroundFlight(names=("A", "B", "C", "D", "E"), offsets_m=offsets_m)
+    other = {"A": "E", "E": "A"}
+    (doubt,) = check(
+        seen(flight, lambda _, name, pose: (other.get(name, name), pose)), stated(flight)
+    )
+    assert "A and E contradict most others" in doubt.sentence
+
+
+def test_a_target_that_was_moved_is_told() -> None:
+    flight = GroundFlight()
+
+    def moved(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        east = flight.rotations[row].T @ np.array([0.4, 0.0, 0.0])
+        return name, shifted(pose, east) if name == "C" and row >= 6 else pose
+
+    (doubt,) = check(seen(flight, moved), stated(flight))
+    assert 4 <= doubt.figures["frames"] <= 6
+    assert "C contradicts most others" in doubt.sentence
+
+
+def test_another_target_in_a_single_frame_is_told_with_the_frame() -> None:
+    flight = GroundFlight()
+
+    def taken(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        return name, shifted(pose, np.array([2.0, 1.0, 0.0])) if (row, name) == (5, "D") else pose
+
+    (doubt,) = check(seen(flight, taken), stated(flight))
+    assert doubt.code is Cause.SINGLE_FRAMES
+    assert not doubt.is_grave
+    assert "D in f_005.png" in doubt.sentence
+
+
+def test_two_targets_contradict_each_other() -> None:
+    flight = GroundFlight(names=("A", "B"), offsets_m=GroundFlight().offsets_m[:2])
+    assert check(seen(flight), stated(flight)) == ()
+    (doubt,) = check(seen(flight), stated(flight, np.outer([0, 1], [1.0, 0.0, 0.0])))
+    assert "A and B contradict most others" in doubt.sentence
+    (doubt,) = check(seen(flight), {name: stated(flight)["A"] for name in "AB"})
+    assert "8 m further from each other" in doubt.sentence
+
+
+def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
+    flight = GroundFlight()
+    rolling = replace(CAMERA, readout_s=0.03)
+
+    def sheared(_: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        rows = CAMERA.project(pose.translation_m[None])[0, 1] / (CAMERA.height - 1) - 0.5
+        return name, shifted(pose, np.array([0.0, 8.0 * 0.03 * rows, 0.0]))
+
+    assert check(seen(flight, sheared), stated(flight), rolling) == ()
+
+
+def test_frames_with_one_target_tell_nothing() -> None:
+    flight = GroundFlight(names=("A",), offsets_m=GroundFlight().offsets_m[:1])
+    assert check(seen(flight), stated(flight)) == ()
