@@ -33,6 +33,9 @@ _SETTLED_NOISE = 0.1  # change of a deviation between two rounds
 # A circle whose images are off by so many times as much as the median circle's was moved, or others
 # were taken for it. What poses lack, all circles have about alike.
 _APART, _LEAST_CIRCLES = 4.0, 3
+_FRAMES_OF_TWO = (
+    8  # that show either of two circles: their variances differ 16-fold by chance in 1e-6
+)
 _MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
 _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
 
@@ -187,13 +190,22 @@ def _noise_of_all(
     if not pairs:
         return ExtraNoise(), {}
     own = {index: extra_noise(camera, [pair]) for index, pair in pairs.items()}
-    apart = _apart({index: _deviation_px(pairs[index][0], own[index]) for index in pairs})
+    apart = _apart(
+        {index: _deviation_px(pairs[index][0], own[index]) for index in pairs},
+        min(int(np.count_nonzero(fit.is_used)) for _, fit in pairs.values()),
+    )
     common = extra_noise(camera, [pair for index, pair in pairs.items() if index not in apart])
     return common, {index: own[index] for index in apart}
 
 
-def _apart(deviation_px: Mapping[int, float]) -> set[int]:
-    """Return the circles whose images are off by far more than those of most."""
+def _apart(deviation_px: Mapping[int, float], frames: int) -> set[int]:
+    """Return the circles whose images are off by far more than those of most.
+
+    Of two circles the worse one, if both are seen in enough frames to know their deviations.
+    """
+    if len(deviation_px) == 2 and frames >= _FRAMES_OF_TWO:
+        best, worst = sorted(deviation_px, key=lambda index: deviation_px[index])
+        return {worst} if deviation_px[worst] > _APART * deviation_px[best] else set()
     if len(deviation_px) < _LEAST_CIRCLES:
         return set()
     limit_px = _APART * float(np.median(list(deviation_px.values())))
