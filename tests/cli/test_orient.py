@@ -163,6 +163,24 @@ def test_where_most_frames_cannot_be_oriented_that_is_told(tmp_path: Path) -> No
     assert np.nanmax(np.abs(off / sds)) < 3.0
 
 
+@pytest.mark.parametrize("options", [(), ("--free-focal",)])
+@pytest.mark.parametrize("pair", ["AB", "AC"])
+def test_two_of_four_names_that_are_exchanged_in_a_third_of_the_frames(
+    tmp_path: Path, pair: str, options: tuple[str, ...]
+) -> None:
+    """These frames are refused: two of four do not tell which two are right."""
+    one, other = tuple(pair)
+    renamed = {(frame, a): b for frame in (0, 3, 6, 9) for a, b in ((one, other), (other, one))}
+    flight = GroundFlight(renamed=renamed)
+    folder = flight.write(tmp_path / "flight")
+    result = run("orient", folder, *options)
+    assert result.exit_code == 0, result.stderr
+    assert "8 of 12 frames oriented" in result.stderr
+    off, sds = poses_of(folder, flight)
+    assert np.isnan(off[[0, 3, 6, 9]]).all()
+    assert 0.1 < np.nanmax(np.abs(off / sds)) < 3.0
+
+
 def test_distances_that_contradict_an_unknown_focal_length_are_told(tmp_path: Path) -> None:
     """Positions and images determine the focal length; half the diameter contradicts them."""
     folder = GroundFlight(stated_diameter_m=0.45).write(tmp_path / "flight", sd_position_m=0.002)

@@ -214,7 +214,7 @@ def test_poses_of_other_frames_are_no_poses(
     [
         (("--targets", "A,Z"), "'Z': is not in flight.toml"),
         (("--min-frames", "40"), "12 of them with a reference pose; 40 are needed"),
-        (("--poses", "none.csv"), "none.csv"),
+        (("--poses", "none.csv"), "none.csv: does not exist; name a file of poses (--poses)"),
     ],
 )
 def test_what_cannot_be_placed_is_one_line(

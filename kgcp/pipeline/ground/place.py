@@ -277,6 +277,8 @@ def _poses(
 ) -> ReferencePoses:
     if file is None:
         return data.reference_poses
+    if not file.is_file():
+        raise KgcpError(f"{file}: does not exist; name a file of poses", option="poses")
     return read_reference_poses(file, crs=flight.crs, frames=sorted(set(frames)))
 
 
