@@ -101,6 +101,19 @@ def test_a_position_that_is_wrong_is_told_with_its_target(off_m: float) -> None:
     assert 0.6 * off_m < abs(doubt.figures["off_m"]) < 1.1 * off_m
 
 
+def test_prints_that_are_stated_as_less_certain_are_allowed_for() -> None:
+    flight = GroundFlight()
+
+    def larger(_: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        return name, Pose(pose.rotation, (1.2 if name == "A" else 1.0) * pose.translation_m)
+
+    sightings = seen(flight, larger)
+    (doubt,) = check(sightings, stated(flight))
+    assert "A contradicts" in doubt.sentence
+    known = [replace(each, sd_common_distance_m=0.1 * each.distance_m) for each in sightings]
+    assert check(known, stated(flight)) == ()
+
+
 def test_names_that_are_exchanged_are_told() -> None:
     offsets_m = np.vstack((GroundFlight().offsets_m, [[0.5, 1.0, 0.0]]))
     flight = GroundFlight(names=("A", "B", "C", "D", "E"), offsets_m=offsets_m)

@@ -17,7 +17,7 @@ from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
 _CONTRADICTION = 5.0  # standard deviations of a distance between two targets in one frame
 _LEAST_SHARE, _LEAST_FRAMES = 0.25, 2  # of the frames with two targets, that must contradict
-_PRINT_SD = 0.005  # of a distance from the camera: the print, where nothing is stated
+_PRINT_SD = 0.005  # of a distance from the camera: the print, where no more is stated
 _FLOOR_M = 0.002  # of what distorts a distance besides
 _SPEED_M_S = 10.0  # of the camera, while rows are read one after the other
 _MOST_SCALE = 0.02  # of the logarithm of a factor that all distances may have in common
@@ -107,7 +107,8 @@ def _pair(
     variance = _FLOOR_M**2 + (_SPEED_M_S * camera.readout_s * rows) ** 2
     along = between / measured_m
     for sighting, pose in ((first, first.pose), (second, second.pose)):
-        variance += (_PRINT_SD * float(pose.translation_m @ along)) ** 2
+        share = max(_PRINT_SD, (sighting.sd_common_distance_m or 0.0) / sighting.distance_m)
+        variance += (share * float(pose.translation_m @ along)) ** 2
         if sighting.pose_cov is not None:
             variance += float(along @ sighting.pose_cov[:3, :3] @ along)
         cov = positions[sighting.target].cov_m2
