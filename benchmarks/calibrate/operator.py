@@ -60,6 +60,9 @@ CASES = {
     "unknown_srgb": Case(ToneCurve.SRGB, Response.UNKNOWN, 1.5),
     "unknown_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.5),
     "unknown_linear": Case(ToneCurve.LINEAR, Response.UNKNOWN, 1.5),
+    "unknown_clipped": Case(ToneCurve.LINEAR, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
+    "unknown_clipped_film": Case(ToneCurve.FILM, Response.UNKNOWN, 1.6, gain=1.5 / _BRIGHT),
+    "unknown_linear_jpeg": Case(ToneCurve.LINEAR, Response.UNKNOWN, 2.5, quality=92),
     "consumer": Case(ToneCurve.FILM, Response.UNKNOWN, 2.5, sharpening=0.5, quality=92),
 }
 
@@ -253,7 +256,7 @@ def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
 
 
 HEAD = (
-    f"{'case':15}{'':8}{'R px':>6}{'ratio':>6}{'found':>9}{'bound px':>10}{'/ bound':>9}"
+    f"{'case':21}{'':8}{'R px':>6}{'ratio':>6}{'found':>9}{'bound px':>10}{'/ bound':>9}"
     f"{'limit':>7}{'bias px':>9} ± {'se':6}{'R bias':>9}{'z':>6}{'Mahal.²':>9}{'ms':>7}"
 )
 
@@ -263,7 +266,7 @@ def line(outcome: Outcome) -> str:
     setup = outcome.setup
     found = f"{len(outcome.errors)}/{outcome.present}"
     head = (
-        f"{setup.case:15}{setup.polarity.value:8}{setup.radius_px:6g}{setup.ratio:6.1f}{found:>9}"
+        f"{setup.case:21}{setup.polarity.value:8}{setup.radius_px:6g}{setup.ratio:6.1f}{found:>9}"
     )
     if not len(outcome.errors):
         return head

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.discs.adjust_disc import (
     DiscRejection,
@@ -49,15 +50,20 @@ _LEAST_SD = 0.01  # of each parameter, however many discs agree
 _MASK_STEP, _MOST_STEPS = 1.25, 2
 _LEAST_SHARPENING, _SIGNIFICANT = 0.05, 4.0
 _BENT = {Tone.SRGB: Tone.UNKNOWN, Tone.LINEAR: Tone.UNKNOWN_FROM_LINE}
-_WORTHY_BENDS = 6.0  # least gain of twice the log-likelihood by three parameters (Akaike), …
-# … times this power of the excess. Burnt, sharpened photographs have an excess of 4 to 6, their
-# bends gain up to 1200, and what these pretend displaces the discs. Film's curve, with an excess of
-# 1 to 1.5, gains 70 to 800 on nine discs (`benchmarks.calibrate.operator`).
+# Least gain of twice the log-likelihood by three parameters: noise makes more once in a thousand
+# times. A straight line that is bent by chance makes discs larger or smaller by 1 %.
+_WORTHY_BENDS = 16.0
+# Times this power of the excess. Burnt, sharpened photographs have an excess of 4 to 6, their bends
+# gain up to 1200, and what these pretend displaces the discs. Film's curve, with an excess of 1 to
+# 1.5, gains 70 to 800 on nine discs (`benchmarks.calibrate.operator`).
 _BY_EXCESS = 3
 # By a mask that is not quite the camera's, the wrong one of two bent curves may be likelier. So
 # those are compared again by their own masks whose loss is larger by less than this share of what
 # the bends gain. Farther ones would win ties alone, and displace edges by 0.15 px then.
 _NEARLY = 0.2
+# Where a line is likelier than sRGB's curve, the latter bent is to be likelier than a bent line by
+# more than this share of that: linear cameras under JPEG (`benchmarks.calibrate.operator`).
+_LIKE_LINE = 0.25
 _LITTLE_BENT = 0.02  # standard deviation of the waves of a curve that is not bent
 _MEDIAN_SQUARE = {1: 0.455, 4: 3.357}  # of χ² with so many degrees of freedom
 
@@ -86,7 +92,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
     plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
     bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
-    best = _likeliest([_with_best_mask(joint) for joint in _worthy(plain, bent)])
+    sds = [fit.sd for fit in fits]
+    best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
@@ -163,7 +170,8 @@ def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFi
 
     By a bent curve only if it is significantly likelier than a plain one. Where discs contradict
     each other more than their noise lets them, the model lacks something that the bends may stand
-    for.
+    for. A line is bent itself unless sRGB's curve is much likelier when bent: nearly straight but
+    for its dark end, that one makes discs too large or too small.
     """
     known, best = _likeliest(plain), _likeliest(bent)
     if known is None or best is None:
@@ -171,6 +179,11 @@ def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFi
     gain = known.loss - best.loss
     if 2.0 * gain <= _WORTHY_BENDS * _excess(best) ** _BY_EXCESS:
         return [known]
+    line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
+    if known.tone is Tone.LINEAR and line is not None:
+        farther = max(joint.loss for joint in plain) - known.loss
+        if line.loss - best.loss <= _LIKE_LINE * farther:
+            return [line]
     return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
 
 
@@ -188,22 +201,26 @@ def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
         return None
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
     states = [_state_by(fit, tone, sharpening) for fit in fits]
-    return _adjusted_together(fits, states, tone, SHARPENING_PX)
+    return _adjusted_together(fits, states, tone, SHARPENING_PX, [fit.sd for fit in fits])
 
 
 def _adjusted_together(
-    fits: Sequence[DiscFit], states: Sequence[DiscState], tone: Tone, sharpening_px: float
+    fits: Sequence[DiscFit],
+    states: Sequence[DiscState],
+    tone: Tone,
+    sharpening_px: float,
+    sds: Sequence[FloatArray],
 ) -> JointFit | None:
     samples = [
         fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
     ]
     try:
-        return adjust_together(samples, states, tone, sharpening_px)
+        return adjust_together(samples, states, tone, sharpening_px, sds)
     except (NoFit, np.linalg.LinAlgError):
         return None
 
 
-def _with_best_mask(joint: JointFit) -> JointFit:
+def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     """Return discs adjusted by the mask that makes them likeliest.
 
     Its width is tried in steps, and a parabola through the last three gives the rest.
@@ -215,7 +232,8 @@ def _with_best_mask(joint: JointFit) -> JointFit:
 
     def at(step: float) -> JointFit | None:
         states = [fit.state for fit in joint.fits]
-        return _adjusted_together(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
+        mask_px = _MASK_STEP**step * SHARPENING_PX
+        return _adjusted_together(joint.fits, states, joint.tone, mask_px, sds)
 
     # anew, since the pixels beside the modelled ones are masked by what is known by now
     tried = {0: at(0) or joint}

@@ -404,6 +404,11 @@ def disc_fit_at(
     return DiscFit(sample, free, state, share, levels, jacobian, sd, current, scaled, normal)
 
 
+def misfit_by(fit: DiscFit, sd: FloatArray) -> float:
+    """Return the negative log-likelihood of a fit's pixels, up to a constant, by noise (n,)."""
+    return misfit(fit.sample.levels, fit.levels, sd, fit.sample.censoring).total
+
+
 def noise_at(sample: DiscSample, state: DiscState) -> GreyNoise:
     """Return the noise that the residuals of a state show."""
     linear = _linearised(sample, state)

@@ -22,6 +22,7 @@ from kgcp.measurement.discs.fit_disc import (
     NoFit,
     ProcessingPrior,
     disc_fit_at,
+    misfit_by,
     noise_at,
 )
 from kgcp.measurement.image_model.photometry import Tone
@@ -39,7 +40,7 @@ class JointFit:
     tone: Tone
     sharpening_px: float  # σ of the camera's unsharp mask
     fits: tuple[DiscFit, ...]
-    loss: float  # negative log-likelihood of all, with what is usual of cameras
+    loss: float  # negative log-likelihood, with what is usual of cameras, by noise that is given
     precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
     scores: FloatArray  # (k, 4): of each disc, by what is shared; they add up to the prior's
     informations: FloatArray  # (k, 4, 4): their expected covariances
@@ -63,9 +64,20 @@ class _Reduced:
 
 
 def adjust_together(
-    samples: Sequence[DiscSample], states: Sequence[DiscState], tone: Tone, sharpening_px: float
+    samples: Sequence[DiscSample],
+    states: Sequence[DiscState],
+    tone: Tone,
+    sharpening_px: float,
+    sds: Sequence[FloatArray],
 ) -> JointFit:
     """Adjust discs with what they share, from states that share it.
+
+    Parameters
+    ----------
+    sds : sequence of (n,) arrays
+        Noise of each disc's pixels as level, by which the loss is stated: the same for all curves
+        that are compared. The noise that their own residuals show differs by chance, and would make
+        curves likelier by up to 40 for forty discs.
 
     Raises
     ------
@@ -79,8 +91,8 @@ def adjust_together(
         sharpening_px=sharpening_px,
     )
     for _ in range(_NOISE_ROUNDS):
-        sds = [noise_at(sample, state).sd for sample, state in zip(samples, states, strict=True)]
-        fits = _minimised(samples, states, free, usual, sds)
+        own_sds = [noise_at(*pair).sd for pair in zip(samples, states, strict=True)]
+        fits = _minimised(samples, states, free, usual, own_sds)
         states = [fit.state for fit in fits]
     own = np.isin(_SHARED, free.rows)
     reduced = _reduced(fits, 0.0)
@@ -88,7 +100,8 @@ def adjust_together(
     scores, informations = np.zeros((len(fits), count)), np.zeros((len(fits), count, count))
     scores[:, own] = reduced.gradients
     informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
-    loss = _total(fits, usual) + sum(float(np.log(fit.sd).sum()) for fit in fits)
+    loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
+    loss += _penalty(fits[0].state.vector[_SHARED], usual)
     precision = usual.precision + informations.sum(axis=0)
     return JointFit(tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
 
@@ -139,8 +152,13 @@ def _own_total(fit: DiscFit) -> float:
 
 
 def _total(fits: Sequence[DiscFit], usual: ProcessingPrior) -> float:
-    off = fits[0].state.vector[_SHARED] - usual.mean
-    return sum(_own_total(fit) for fit in fits) + 0.5 * float(off @ usual.precision @ off)
+    own = sum(_own_total(fit) for fit in fits)
+    return own + _penalty(fits[0].state.vector[_SHARED], usual)
+
+
+def _penalty(shared: FloatArray, usual: ProcessingPrior) -> float:
+    off = shared - usual.mean
+    return 0.5 * float(off @ usual.precision @ off)
 
 
 def _own_step(fit: DiscFit) -> FloatArray:
