@@ -27,6 +27,9 @@ _SIZE_RATIO = 2.2  # of neighbouring discs: marks differ, letters and dust more
 _SHAPE_RATIO = 1.6  # of the axes of a disc in the affine frame of its neighbour
 _SEEDS = 24
 _LEAST_DISCS = 6
+# A hole narrower than this (half its shorter axis, px) may look filled: with 1.35 px all were seen,
+# with 0.9 px none.
+_LEAST_HOLE_PX = 1.2
 _OUTSIDE = 0.12  # share of a lattice's discs that may be none of the field's
 
 
@@ -315,8 +318,9 @@ class _Kinds:
 
     log_size: FloatArray  # (n,): of seen discs, against the median of their neighbours
     is_hollow: BoolArray
+    half_width_px: FloatArray  # (n,): half the shorter axis
     field_log_size: FloatArray  # (m,): against the field's usual diameter
-    field_is_hollow: BoolArray
+    field_hole: FloatArray  # (m,): diameter of the hole over the disc's
     is_mark: BoolArray  # (m,)
 
     @classmethod
@@ -333,15 +337,17 @@ class _Kinds:
             if around:
                 relative[disc] = sizes[disc] - np.median(sizes[around])
         field_size = np.log(2.0 * field.radii_m() / field.diameter_m)
-        is_hollow = field.inner_radii_m() > 0.0
-        is_mark = (np.abs(field_size) > 0.05) | (is_hollow != (field.inner_diameter_m > 0.0))
-        return cls(relative, seen.is_hollow, field_size, is_hollow, is_mark)
+        hole = field.inner_radii_m() / field.radii_m()
+        is_mark = (np.abs(field_size) > 0.05) | ((hole > 0.0) != (field.inner_diameter_m > 0.0))
+        half_width_px = np.linalg.norm(seen.stretches, ord=-2, axis=(1, 2))
+        return cls(relative, seen.is_hollow, half_width_px, field_size, hole, is_mark)
 
     def agreement(self, discs: IndexArray, points: IndexArray) -> tuple[float, int]:
         """Return how well discs look like points, and how many of them are marks.
 
         Each disc counts at most once, against what the others could be: sizes that are nearer to
-        another kind of disc of the field, and holes that are or are not there.
+        another kind of disc of the field, and holes that are or are not there. A hole that is too
+        small to be seen speaks neither for a place nor against it.
         """
         if not self.is_mark.any():
             return 0.0, 0
@@ -350,9 +356,11 @@ class _Kinds:
             kinds[np.abs(self.log_size[discs, None] - kinds).argmin(axis=1)]
             == self.field_log_size[points]
         )
-        has_hole = self.is_hollow[discs] == self.field_is_hollow[points]
-        is_right = is_nearest & has_hole
-        marks = self.is_mark[points]
+        hole = self.field_hole[points]
+        has_hole = self.is_hollow[discs] == (hole > 0.0)
+        may_look_filled = (hole > 0.0) & (hole * self.half_width_px[discs] < _LEAST_HOLE_PX)
+        is_right = is_nearest & (has_hole | (may_look_filled & ~self.is_hollow[discs]))
+        marks = self.is_mark[points] & has_hole
         return float(np.count_nonzero(is_right) - len(discs)), int(
             np.count_nonzero(marks & is_right)
         )

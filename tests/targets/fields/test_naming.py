@@ -104,6 +104,29 @@ def test_part_of_a_field_without_its_mark_is_not_guessed() -> None:
     assert name_discs(found, SQUARE) is NamingProblem.AMBIGUOUS
 
 
+@pytest.mark.parametrize(("radius_px", "is_told"), [(2.0, False), (5.0, True)])
+def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
+    radius_px: float,
+    is_told: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    """All but the far corners are in view, and no mark looks hollow: turned, the mark is away."""
+    found, truth = seen(SQUARE, 0.0, (0.0, 0.0), (0.0, 0.0))
+    turned = SQUARE.points_m()[truth] * [-1.0, -1.0, 1.0] + SQUARE.points_m().max(axis=0)
+    mark = SQUARE.points_m()[SQUARE.inner_radii_m() > 0.0]
+    is_kept = np.linalg.norm(turned - mark, axis=1) > 0.001
+    few = SeenDiscs(
+        found.centres[is_kept],
+        np.tile(radius_px * np.eye(2), (int(is_kept.sum()), 1, 1)),
+        np.zeros(int(is_kept.sum()), dtype=bool),
+    )
+    naming = name_discs(few, SQUARE)
+    if not is_told:
+        assert naming is NamingProblem.AMBIGUOUS
+        return
+    assert isinstance(naming, Naming)
+    assert mark.tolist() not in SQUARE.points_m()[naming.point].tolist()
+
+
 def test_what_is_no_field_is_said() -> None:
     found, _ = seen(SQUARE, 0.0, (0.0, 0.0), (0.0, 0.0))
     few = SeenDiscs(found.centres[:4], found.stretches[:4], found.is_hollow[:4])
