@@ -248,7 +248,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
     if numbers.normals_deg < _NORMALS_DEG:
         doubts.append(f"all photographs look from within {numbers.normals_deg:.0f}°")
     off = calibration.radius_scale - 1.0
-    if calibration.field.is_diameter_stated and abs(off) > _RADIUS_SHARE:
+    if _has_other_discs(calibration):
         doubts.append(f"discs are {100.0 * abs(off):.0f} % {_larger(off)} than stated")
     if calibration.is_turn_unclear:
         doubts.append(
@@ -268,6 +268,12 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
 
 def _fits_badly(numbers: CalibrationNumbers) -> bool:
     return numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px
+
+
+def _has_other_discs(calibration: CameraCalibration) -> bool:
+    """Return whether diameters are not those that the field states."""
+    is_stated = calibration.field.is_diameter_stated
+    return is_stated and abs(calibration.radius_scale - 1.0) > _RADIUS_SHARE
 
 
 def _larger(off: float) -> str:
@@ -296,6 +302,11 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
         advice.append(f"Not determined by these photographs: {names}; come nearer, and tilt more.")
+    if _has_other_discs(calibration):
+        advice.append(
+            "Measure the diameter and the pitch of the print, on which the camera does not depend;"
+            " burnt white displaces edges, too."
+        )
     if calibration.is_turn_unclear:
         advice.append("Give the field a mark: one disc that is hollow, larger or missing.")
     if numbers.light is not None and numbers.light.doubt:

@@ -292,7 +292,14 @@ def test_a_board_without_a_unit_asks_for_it(photos: Path, tmp_path: Path) -> Non
     assert "(--unit)" in result.stderr
     files = (photos / "photo1.png", photos / "photo2.png")
     result = run(*files, "--field", board, "--unit", "cm", "--out", out, *QUIET)
-    assert "the field is found in 2 of 2 photographs, and 3 are needed" in result.stderr
+    assert "the field is found in 2 of 2 photographs, and 3 are needed; take" in result.stderr
+
+
+def test_a_row_too_many_in_the_description_is_one_line(photos: Path, tmp_path: Path) -> None:
+    result = run(photos, "--field", "grid:5x5:30mm:16mm", "--out", tmp_path, *QUIET)
+    assert result.exit_code == 1
+    assert "(5 ambiguous, " in result.stderr
+    assert "correct the field's columns and rows, or show all of it or a mark" in result.stderr
 
 
 def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:

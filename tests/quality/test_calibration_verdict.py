@@ -160,6 +160,22 @@ def test_a_bowed_sheet_is_told_by_its_heights_and_a_larger_one_is_not(
     assert ("in height" in field.doubt) == (ratio > 0.0)
 
 
+@pytest.mark.parametrize(("stated_m", "is_told"), [(0.024, False), (0.0205, True)])
+def test_another_diameter_than_stated_is_told_and_does_no_harm(
+    stated_m: float,
+    is_told: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    marks = (Mark(1, 1, stated_m, 0.01 * stated_m / 0.024),)
+    field = replace(FIELD, diameter_m=stated_m, marks=marks)
+    result = calibrate_camera(views(), field, (CAMERA.width, CAMERA.height), CalibrationSettings())
+    verdict = judge(result, calibration_numbers(result))
+    assert ("discs are 17 % larger than stated" in verdict.sentence) == is_told
+    measure = "Measure the diameter and the pitch of the print"
+    assert any(measure in each for each in verdict.advice) == is_told
+    sd_px = float(np.sqrt(result.covariance.cov[0, 0]))
+    assert abs(result.camera.fx - CAMERA.fx) < 3.0 * sd_px
+
+
 def test_a_larger_field_is_told_if_a_distance_was_measured() -> None:
     larger = 0.01 * FIELD.points_m()
     names = FIELD.names()

@@ -43,6 +43,7 @@ from kgcp.pipeline.execution.executor import WorkerPool, open_pool
 from kgcp.pipeline.execution.journal import Journal, fingerprint, to_text
 from kgcp.pipeline.execution.resilient_map import TaskFailure
 from kgcp.pipeline.execution.threads import single_threaded
+from kgcp.targets.fields.naming import NamingProblem
 from kgcp.targets.fields.points import AnyField
 
 _LOSSES = {TaskFailure.CRASHED: Reason.WORKER_DIED, TaskFailure.TIMED_OUT: Reason.TIMED_OUT}
@@ -315,10 +316,14 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
     if len(found) < LEAST_VIEWS:
         reasons = Counter(result.reason for result in results if isinstance(result, PhotoMiss))
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        remedy = "take more photographs, 12 at best"
+        if NamingProblem.AMBIGUOUS in reasons:
+            remedy = "correct the field's columns and rows, or show all of it or a mark"
+        elif why:
+            remedy = "correct the description of the field, or take more photographs"
         raise KgcpError(
             f"the field is found in {len(found)} of {len(results)} photographs"
-            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; correct the"
-            " description of the field, or take more photographs"
+            f"{f' ({why})' if why else ''}, and {LEAST_VIEWS} are needed; {remedy}"
         )
     return [
         NamedView(
