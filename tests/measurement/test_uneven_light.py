@@ -313,6 +313,24 @@ def test_a_plate_half_in_shade_is_found(photograph: Photograph) -> None:
     assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=1e-3)
 
 
+@pytest.mark.parametrize(("smaller", "least"), [(3.0, 4), (1.9, 5)])
+def test_small_plates_half_in_shade_are_found_in_linear_images(
+    photograph: Photograph, smaller: float, least: int
+) -> None:
+    """Rings of 15 and 24 px: core and surround differ by as much as ink and shaded plate."""
+    found = 0
+    for seed in range(6):
+        rng = np.random.default_rng(800 + seed)
+        pose = some_pose(rng)
+        pose = Pose(pose.rotation, smaller * pose.translation_m)
+        grey = photograph(LENS, pose, rng, gain=0.65, field=shadow_edge(rng))
+        (seen,) = examine(grey, LENS, (TARGET_PLATE.target,), DetectSettings()).outcomes
+        if isinstance(seen, Measurement):
+            found += 1
+            assert seen.pose.distance_m == pytest.approx(pose.distance_m, rel=5e-3)
+    assert found >= least
+
+
 def test_the_light_that_was_fitted_can_be_seen(photograph: Photograph) -> None:
     rng = np.random.default_rng(22)
     pose, field = some_pose(rng), shadow_edge(rng)

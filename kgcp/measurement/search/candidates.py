@@ -146,16 +146,14 @@ def _mark_dotted(values: FloatArray, least: float, dotted: BoolArray) -> None:
         disc, code, plate = values[i, 0], values[i, 1], values[i, 2]
         black = code[_rank(0.25)]
         contrast = min(disc[_rank(0.5)], plate[_rank(0.5)]) - black
-        brightest = min(disc[_rank(0.7)], plate[_rank(0.8)]) - black
-        uneven = max(
-            code[_rank(0.35)] - code[_rank(0.05)],
-            disc[_rank(0.7)] - disc[_rank(0.3)],
-            plate[_rank(0.8)] - plate[_rank(0.4)],
-        )
+        brightest_disc, brightest_plate = disc[_rank(0.7)] - black, plate[_rank(0.8)] - black
         dotted[i] = (
             contrast > least
             and code[_rank(0.96)] - black > _MIN_DOT_CONTRAST * contrast
-            and uneven < _UNEVEN * brightest
+            and code[_rank(0.35)] - code[_rank(0.05)]
+            < _UNEVEN * min(brightest_disc, brightest_plate)
+            and disc[_rank(0.7)] - disc[_rank(0.3)] < _UNEVEN * brightest_disc
+            and plate[_rank(0.8)] - plate[_rank(0.4)] < _UNEVEN * brightest_plate
         )
 
 

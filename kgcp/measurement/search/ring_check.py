@@ -2,10 +2,10 @@
 
 The ring filter also answers to much else. Here few samples per place decide, dark ones on the ring
 and bright ones around it, in more and more directions; most places are dropped after eight. At last
-the samples on ring, core and surround, 24 each, must be of one grey value each. Order
-statistics measure that, not means: dots brighten and something in the way may hide a part of any
-circle, which moves the mean and the largest values, but not those of lower rank. docs/method.md,
-"Ring check", has the ranks.
+the samples on the ring, 24, must be of one grey value, and those on core and surround vary no more
+than shade makes them. Order statistics measure that, not means: dots brighten and something in the
+way may hide a part of any circle, which moves the mean and the largest values, but not those of
+lower rank. docs/method.md, "Ring check", has the ranks.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ _FINE = np.array((0.9, 1.0, 1.1))  # and of each of those
 _FEW, _MANY, _ALL = 8, 16, 24  # directions that are sampled first, then, and at last
 _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
 _MIN_CONTRAST = 5  # grey values: less is noise
-_CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of ring, core and surround, of the contrast
+_CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of the ring, of the contrast
 _LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
-_SAME_WHITE = 0.8  # largest difference of core and surround, of the contrast
+# Spread of core and of surround, and their difference, of the contrast in shade: in a linear image
+# half in shade that takes away half of the light, they are as much as the contrast.
+_UNEVEN = 1.2
 # Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
 # value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
 # a third may be dark, hidden or beyond the plate, and only bright ranks tell.
@@ -256,9 +258,10 @@ def _clearness(
     ring_dark, ring, ring_bright = _order_statistics(values[0], _RING_RANKS)
     core_dark, core, core_bright = _order_statistics(values[1], _CORE_RANKS)
     contrast, spread = core - ring, ring_bright - ring_dark
-    limit = clear * contrast
     # Most fail by ring and core alone: the surround is sampled only where they do not.
-    if contrast < _MIN_CONTRAST or spread > limit or core_bright - core_dark > limit:
+    if contrast < _MIN_CONTRAST or spread > clear * contrast:
+        return 0.0
+    if core_bright - core_dark > _UNEVEN * contrast:
         return 0.0
     for k in range(_ALL):
         near = pixels[at + steps[trial, _NEAR, _MANY + k]]
@@ -266,10 +269,11 @@ def _clearness(
     plate_dark, plate, plate_bright = _order_statistics(values[2], _PLATE_RANKS)
     difference = abs(core - plate)
     contrast = min(core, plate) - ring
-    limit = clear * contrast
-    if contrast < _MIN_CONTRAST or spread > limit or core_bright - core_dark > limit:
+    if contrast < _MIN_CONTRAST or spread > clear * contrast:
         return 0.0
-    if plate_bright - plate_dark > limit or difference > _SAME_WHITE * contrast:
+    if core_bright - core_dark > _UNEVEN * contrast:
+        return 0.0
+    if max(plate_bright - plate_dark, difference) > _UNEVEN * contrast:
         return 0.0
     return float(max(contrast - 0.5 * spread, 1.0))
 

@@ -47,12 +47,13 @@ class PlainCheck:
         )
         ring, core, plate = np.sort(ring), np.sort(core), np.sort(np.maximum(near, far))
         contrast = min(core[11], plate[14]) - ring[4]
-        spreads = ring[8] - ring[1], core[17] - core[7], plate[19] - plate[11]
-        if contrast < 5 or max(spreads) > clear * contrast:
+        spread = ring[8] - ring[1]
+        if contrast < 5 or spread > clear * contrast:
             return 0.0
-        if abs(core[11] - plate[14]) > 0.8 * contrast:
+        by_shade = core[17] - core[7], plate[19] - plate[11], abs(core[11] - plate[14])
+        if max(by_shade) > 1.2 * contrast:
             return 0.0
-        return float(max(contrast - 0.5 * spreads[0], 1.0))
+        return float(max(contrast - 0.5 * spread, 1.0))
 
     def best(self, radius: float, clear: float) -> tuple[float, float]:
         """Clearness and radius of the clearest ring; clearness 0 without any."""
