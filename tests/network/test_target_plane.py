@@ -173,7 +173,7 @@ def test_rays_that_do_not_meet_are_no_circle() -> None:
         place_circle(CAMERA, backwards)
 
 
-@pytest.mark.parametrize(("frames", "steps"), [(8, 20.0), (12, 8.0), (50, 4.0)])
+@pytest.mark.parametrize(("frames", "steps"), [(8, 20.0), (12, 8.0), (50, 4.0), (120, 4.0)])
 def test_a_move_is_found_where_it_happened(frames: int, steps: float) -> None:
     rng, truth, off = np.random.default_rng(12), circle_of(10.0), []
     shift = np.array([steps * 0.005 * DISTANCE_M / CAMERA.fx, 0.0, 0.0])

@@ -33,9 +33,9 @@ _SETTLED_NOISE = 0.1  # change of a deviation between two rounds
 # A circle whose images are off by so many times as much as the median circle's was moved, or others
 # were taken for it. What poses lack, all circles have about alike.
 _APART, _LEAST_CIRCLES = 4.0, 3
-_FRAMES_OF_TWO = (
-    8  # that show either of two circles: their variances differ 16-fold by chance in 1e-6
-)
+# That show either of two circles, at least: with eight, their variances differ 16-fold by chance
+# once in 70 000 flights.
+_FRAMES_OF_TWO = 8
 _MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
 _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
 
