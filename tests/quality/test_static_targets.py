@@ -171,3 +171,34 @@ def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
 def test_frames_with_one_target_tell_nothing() -> None:
     flight = GroundFlight(names=("A",), offsets_m=GroundFlight().offsets_m[:1])
     assert check(seen(flight), stated(flight)) == ()
+
+
+def test_positions_that_are_stated_as_less_certain_are_allowed_for() -> None:
+    flight, off_m = GroundFlight(), np.outer([0, 1, 0, 0], [0.4, 0.0, 0.0])
+    unsure = {
+        name: TargetPosition(place.position_m, 0.1**2 * np.eye(3))
+        for name, place in stated(flight, off_m).items()
+    }
+    assert check(seen(flight), stated(flight, off_m)) != ()
+    assert check(seen(flight), unsure) == ()
+
+
+def test_another_plate_of_the_same_code_is_passed_over() -> None:
+    flight = GroundFlight()
+    sightings = seen(flight)
+    others = [
+        replace(each, instance=1, pose=shifted(each.pose, np.array([2.0, 0.0, 0.0])))
+        for each in sightings
+        if each.target == "B" and each.pose is not None
+    ]
+    assert check([*sightings, *others], stated(flight)) == ()
+
+
+def test_one_of_three_frames_is_no_wrong_position() -> None:
+    flight = GroundFlight(frames=3)
+
+    def taken(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        return name, shifted(pose, np.array([2.0, 1.0, 0.0])) if (row, name) == (1, "D") else pose
+
+    (doubt,) = check(seen(flight, taken), stated(flight))
+    assert doubt.code is Cause.SINGLE_FRAMES
