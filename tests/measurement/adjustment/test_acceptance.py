@@ -122,7 +122,7 @@ def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlaceP
     pose = place_plate((205.4, 190.7), 20.0)
     along = pose.translation_m / pose.distance_m
 
-    def observed(relative_sd: float) -> Measurement:
+    def observed(relative_sd: float, radius_px: float = 20.0) -> Measurement:
         cov = 1e-8 * np.eye(6)
         cov[:3, :3] += (relative_sd * pose.distance_m) ** 2 * np.outer(along, along)
         return Measurement(
@@ -133,13 +133,15 @@ def test_a_distance_of_a_per_cent_is_refused(camera: Camera, place_plate: PlaceP
             pose=pose,
             centre_px=camera.project(pose.translation_m),
             heading_deg=0.0,
-            appearance=Appearance(20.0, 0.1, 0.8, 0.0),
+            appearance=Appearance(radius_px, 0.1, 0.8, 0.0),
             alternative=None,
             uncertainty=propagate(camera, pose, cov),
         )
 
     check_precision(observed(0.009))
+    check_precision(observed(0.019, radius_px=12.0))
     check_precision(replace(observed(0.5), uncertainty=None))
-    with pytest.raises(Rejection) as caught:
-        check_precision(observed(0.011))
-    assert caught.value.reason is Reason.POOR_FIT
+    for doubtful in (observed(0.011), observed(0.021, radius_px=12.0)):
+        with pytest.raises(Rejection) as caught:
+            check_precision(doubtful)
+        assert caught.value.reason is Reason.POOR_FIT

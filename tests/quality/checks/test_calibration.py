@@ -59,9 +59,10 @@ def test_diameters_of_other_units_are_told(diameter: float, words: str) -> None:
 @pytest.mark.parametrize(
     ("ratio", "dot_share", "dots", "words"),
     [
-        (0.36, 0.5, 4, "is 0.36 of the outer one"),
-        (0.74, 0.5, 4, "is 0.74 of the outer one"),
-        (0.4, 0.75, 6, "take 36% of the ring"),
+        (0.39, 0.5, 4, "is 0.39 of the outer one"),
+        (0.71, 0.5, 4, "is 0.71 of the outer one"),
+        (0.4, 0.73, 6, "take 34% of the ring"),
+        (0.4, 0.7, 6, ""),
         (0.4, 0.57, 6, ""),
         (0.5, 0.57, 4, ""),
         (0.7, 0.57, 6, ""),
