@@ -194,7 +194,7 @@ def _report(results: CalibrationResults) -> None:
                 f"{row.photo}: not used: {REASONS.get(row.reason, row.reason)}{detail}", err=True
             )
     click.echo(
-        f"{numbers.views} photographs, {numbers.discs_used} of {numbers.discs} discs; RMS"
+        f"{numbers.photographs}, {numbers.discs_used} of {numbers.discs} discs; RMS"
         f" {numbers.rms_px:.4f} px per point, {numbers.rms_fixed_px:.4f} px with the field as"
         " stated",
         err=True,

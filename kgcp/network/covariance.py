@@ -3,11 +3,12 @@
 The formal covariance s₀² N⁻¹ assumes that all discs are independent. They are not: whatever
 distorts a photograph (a shutter, the light, a model that does not fit) displaces all its discs.
 Halves of the same sets of photographs differ by 2 to 7 formal standard deviations. The covariance
-is therefore estimated from the scatter between photographs, whose residuals are divided by a power
-of their redundancy. CR2 of Bell & McCaffrey (2002), with the power 1/2, still assumes that the
-discs of a photograph are independent; halves differ by 1.0 to 2.1 of its standard deviations. CR3,
-with the power 1, is the jackknife; with three to five photographs, one of which dominates, halves
-differ by 0.3 to 0.5 of its standard deviations. The power used here is between the two.
+is therefore estimated from the scatter between photographs, those of one place together, whose
+residuals are divided by a power of their redundancy. CR2 of Bell & McCaffrey (2002), with the power
+1/2, still assumes that the discs of a photograph are independent; halves differ by 1.0 to 2.1 of
+its standard deviations. CR3, with the power 1, is the jackknife; with three to five photographs,
+one of which dominates, halves differ by 0.3 to 0.5 of its standard deviations. The power used here
+is between the two.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import linalg, optimize
 
-from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.network.bursts import place_numbers
 from kgcp.network.equations import (
     ReducedSystem,
     ViewRows,
@@ -54,12 +56,14 @@ def precision(network: Network, solution: Solution) -> Precision:
     squares = float(np.sum(whitened(network, solution.residuals, solution.weights) ** 2))
     squares += prior_cost(network, solution.estimate)
     factor = squares / max(_degrees_of_freedom(network, solution.weights, len(inverse)), 1)
+    places = place_numbers(network, solution.estimate)
     return Precision(
         factor,
         inverse,
         _pose_inverses(system, inverse),
         _redundancy_numbers(equations, system, inverse, len(solution.weights)),
-        _camera_covariance(network, equations, inverse, factor),
+        _camera_covariance(network, _by_place(equations, places), inverse, factor),
+        places,
     )
 
 
@@ -170,34 +174,62 @@ def _redundancy_numbers(
     return redundancy
 
 
-def _camera_covariance(
-    network: Network, equations: Sequence[ViewRows], inverse: FloatArray, factor: float
-) -> FloatArray:
-    """Return the covariance (c p, c p) of the camera parameters, clustered by photograph.
+def _by_place(equations: Sequence[ViewRows], places: IndexArray) -> list[list[ViewRows]]:
+    """Return the equations of each place's photographs."""
+    groups: list[list[ViewRows]] = [[] for _ in range(int(places.max()) + 1)]
+    for view, place in zip(equations, places.tolist(), strict=True):
+        groups[place].append(view)
+    return groups
 
-    It is raised to the formal one where it is smaller, as it can be by chance of few photographs.
+
+def _camera_covariance(
+    network: Network, places: Sequence[Sequence[ViewRows]], inverse: FloatArray, factor: float
+) -> FloatArray:
+    """Return the covariance (c p, c p) of the camera parameters, clustered by place.
+
+    It is raised to the formal one where it is smaller, as it can be by chance of few places.
     """
     cameras = network.cameras.values.size
     reach = inverse[:cameras]
     formal = factor * inverse[:cameras, :cameras]
-    influences = [reach[:, view.columns] @ _score(view, inverse) for view in equations]
+    influences = []
+    for views in places:
+        projected, residuals, columns = _together(views)
+        score = _score(projected, residuals, inverse[np.ix_(columns, columns)])
+        influences.append(reach[:, columns] @ score)
     clustered = sum((np.outer(each, each) for each in influences), np.zeros_like(formal))
     clustered *= (len(influences) - 1) / len(influences)  # as of any jackknife
-    # what comes from priors does not scatter between photographs
+    # what comes from priors does not scatter between places
     known = inverse[:cameras, :cameras] / network.cameras.sd.ravel() ** 2
     clustered += known @ inverse[:cameras, :cameras]
     return never_below(clustered, formal)
 
 
-def _score(view: ViewRows, inverse: FloatArray) -> FloatArray:
-    """Return a photograph's Aᵀ (I - H)^-p r (k,), the pose eliminated, with the power p.
+def _together(views: Sequence[ViewRows]) -> tuple[FloatArray, FloatArray, IndexArray]:
+    """Return the equations of a place: derivatives (n, k), residuals (n,), columns (k,).
+
+    Poses are eliminated, and n is the number of rows of all photographs.
+    """
+    parts = [_without_pose(view) for view in views]
+    residuals = np.concatenate([part for _, part in parts])
+    columns = dict.fromkeys(np.concatenate([view.columns for view in views]).tolist())
+    index = {column: at for at, column in enumerate(columns)}
+    projected = np.zeros((len(residuals), len(columns)))
+    first = 0
+    for view, (own, _) in zip(views, parts, strict=True):
+        last = first + len(own)
+        projected[first:last, [index[column] for column in view.columns.tolist()]] = own
+        first = last
+    return projected, residuals, np.array(list(columns))
+
+
+def _score(projected: FloatArray, residuals: FloatArray, shared: FloatArray) -> FloatArray:
+    """Return a place's Aᵀ (I - H)^-p r (k,), the poses eliminated, with the power p.
 
     By the eigenvalues of H, in whichever space is smaller: that of the observations, or that of the
     unknowns, where H is LᵀAᵀA L with the Cholesky factor L of the cofactors.
     """
-    projected, residuals = _without_pose(view)
-    shared = inverse[np.ix_(view.columns, view.columns)]
-    if len(view.columns) < len(residuals):
+    if len(shared) < len(residuals):
         root = np.linalg.cholesky(shared)
         values, vectors = np.linalg.eigh(root.T @ (projected.T @ projected) @ root)
         along = vectors.T @ (root.T @ (projected.T @ residuals))

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.network.adjust import ROBUST, adjust_network
+from kgcp.network.bursts import place_numbers
 from kgcp.network.calibration_records import LensModel
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.covariance import precision
@@ -37,7 +38,7 @@ def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) 
     """Return the adjustment with the terms asked for, or with as many as are worth it.
 
     Every lens has k1. Another term, or a second focal length, is worth it if it is significant over
-    the photographs, known better than beforehand, and photographs that took no part in its
+    the places of the photographs, known better than beforehand, and places that took no part in its
     estimation fit better with it.
     """
     settings = problem.settings
@@ -45,16 +46,17 @@ def with_chosen_parameters(problem: CalibrationProblem, state: AdjustedNetwork) 
     kept = problem.with_unknowns(state, replace(state.unknowns, terms=terms, is_same_aspect=True))
     if settings.is_same_aspect is False:
         kept = problem.with_unknowns(kept, _with(kept.unknowns, _ASPECT))
-    if settings.lens is not LensModel.AUTO:
+    places = place_numbers(kept.network, kept.estimate)
+    if settings.lens is not LensModel.AUTO or not places.any():
         return kept
-    validation = _CrossValidation(kept.network.observations, kept.solution.is_used)
+    validation = _CrossValidation(kept.network.observations, kept.solution.is_used, places)
     misfit = validation.misfit(kept)
     is_aspect_open = settings.is_same_aspect is None and _is_camera_turned(kept)
     for addition in _ADDITIONS if is_aspect_open else _ADDITIONS[1:]:
         trial = problem.with_unknowns(kept, _with(kept.unknowns, addition))
         trial_misfit = validation.misfit(trial)
         is_better = trial_misfit < (1.0 - _LEAST_GAIN) * misfit
-        if is_better and _is_worth_it(trial, addition, len(problem.views)):
+        if is_better and _is_worth_it(trial, addition):
             kept, misfit = trial, trial_misfit
     return kept
 
@@ -71,9 +73,11 @@ def _is_camera_turned(state: AdjustedNetwork) -> bool:
     return bool(np.abs(np.mean(np.exp(2j * directions))) < _MOST_ALIKE)
 
 
-def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str], views: int) -> bool:
-    limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), views - 1)
-    cov = precision(state.network, state.solution).camera_cov
+def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str]) -> bool:
+    known = precision(state.network, state.solution)
+    freedom = max(int(known.places.max()), 1)
+    limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), freedom)
+    cov = known.camera_cov
     names = state.network.model.names
     values = state.estimate.cameras[0]
     columns = [names.index(name) for name in addition]
@@ -89,20 +93,20 @@ def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str], views: int) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CrossValidation:
-    """Photographs that take no part in the estimation, in turns (cross-validation).
+    """Places that take no part in the estimation, in turns (cross-validation).
 
     All models are judged by the same discs with the same covariances.
     """
 
     observations: Observations
     is_used: BoolArray
+    places: IndexArray  # (v,): of the photographs, by `place_numbers`
 
     def misfit(self, state: AdjustedNetwork) -> float:
-        """Return the mean square of the residuals of photographs that took no part."""
+        """Return the mean square of the residuals of places that took no part."""
         network, estimate = state.network, state.estimate
         # the field as it is estimated by all: only the camera is on trial
         points = PointPrior(estimate.points, None)
-        views = np.arange(len(network.view_camera))
         own = replace(
             network,
             points=points,
@@ -111,8 +115,8 @@ class _CrossValidation:
         measured = replace(network.observations, cov=self.observations.cov)
         judged = replace(own, observations=measured.chosen(self.is_used))
         misfits: list[FloatArray] = []
-        for fold in range(min(_FOLDS, len(views))):
-            is_left_out = views % _FOLDS == fold
+        for fold in range(min(_FOLDS, int(self.places.max()) + 1)):
+            is_left_out = self.places % _FOLDS == fold
             start = _part_of_estimate(estimate, ~is_left_out)
             values = adjust_network(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
             left = _part(judged, is_left_out).observations

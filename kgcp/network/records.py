@@ -134,4 +134,5 @@ class Precision:
     inverse: FloatArray  # (u, u)
     pose_inverses: FloatArray  # (v, 6, 6): translation, left rotation vector; as `inverse`
     redundancy: FloatArray  # (n,): of the two coordinates together, 0…2
-    camera_cov: FloatArray  # (c p, c p): clustered by photograph, never below s₀² N⁻¹
+    camera_cov: FloatArray  # (c p, c p): clustered by place, never below s₀² N⁻¹
+    places: IndexArray  # (v,): number of each photograph's place, by `place_numbers`

@@ -18,7 +18,7 @@ from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
 
 _CELLS = (8, 6)  # of the frame, that discs cover or do not
-_LEAST_VIEWS = 4
+_LEAST_PLACES = 4
 _LEAST_DISCS = 6  # per photograph
 _MOST_REJECTED = 0.1
 _FOCAL_SHARE = 0.01
@@ -74,6 +74,7 @@ class CalibrationNumbers:
     """What the verdict depends on."""
 
     views: int
+    places: int  # that they were taken from
     discs: int
     discs_used: int
     rms_fixed_px: float
@@ -90,6 +91,14 @@ class CalibrationNumbers:
     flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
     field: FieldDeviation | None  # None: it was taken as stated
     light: DiscLight | None  # None: levels are not known
+
+    @property
+    def photographs(self) -> str:
+        """How many photographs there are, and from how many places if these are fewer."""
+        if self.places == self.views:
+            return f"{self.views} photographs"
+        places = "1 place" if self.places == 1 else f"{self.places} places"
+        return f"{self.views} photographs from {places}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +137,7 @@ def calibration_numbers(
     heights = estimate.points[:, 2]
     return CalibrationNumbers(
         len(calibration.views),
+        int(calibration.precision.places.max()) + 1,
         len(places),
         int(np.count_nonzero(calibration.solution.is_used)),
         calibration.rms_fixed_px,
@@ -210,8 +220,10 @@ def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Calibr
 
 def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
     reasons = []
-    if numbers.views < _LEAST_VIEWS:
-        reasons.append(f"{numbers.views} photographs are fewer than {_LEAST_VIEWS}")
+    if numbers.views < _LEAST_PLACES:
+        reasons.append(f"{numbers.views} photographs are fewer than {_LEAST_PLACES}")
+    elif numbers.places < _LEAST_PLACES:
+        reasons.append(f"{numbers.photographs} only, fewer than {_LEAST_PLACES}")
     if numbers.discs_used < _LEAST_DISCS * numbers.views:
         reasons.append("there are fewer than 6 discs per photograph")
     rejected = 1.0 - numbers.discs_used / numbers.discs
@@ -225,6 +237,12 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> li
     if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > _far_off(numbers):
         reasons.append("the lens looks like a fisheye, which kgcp's camera is not")
     return reasons
+
+
+def _more_photographs(numbers: CalibrationNumbers) -> str:
+    if numbers.places == numbers.views:
+        return "Take 12 photographs or more."
+    return f"Take photographs from 12 places or more: a burst counts once ({numbers.photographs})."
 
 
 def _far_off(numbers: CalibrationNumbers) -> float:
@@ -297,8 +315,8 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tupl
             " field rigid. If those that do not fit are the only ones to reach the corners, it may"
             " be a lens that no model here describes."
         )
-    if numbers.views < 12:
-        advice.append("Take 12 photographs or more.")
+    if numbers.places < 12:
+        advice.append(_more_photographs(numbers))
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
         advice.append(f"Not determined by these photographs: {names}; come nearer, and tilt more.")

@@ -84,6 +84,27 @@ def simulated(
     )
 
 
+def repeated(once: SimulatedNetwork, times: int) -> SimulatedNetwork:
+    """Return a burst from each pose: all photographs, one after another, `times` times."""
+    network, truth, seen = once.network, once.truth, once.network.observations
+    views = len(network.view_camera)
+    observations = Observations(
+        np.concatenate([seen.view + views * number for number in range(times)]),
+        np.tile(seen.point, times),
+        np.tile(seen.places, (times, 1)),
+        np.tile(seen.cov, (times, 1, 1)),
+    )
+    view_camera = np.tile(network.view_camera, times)
+    return SimulatedNetwork(
+        replace(network, view_camera=view_camera, observations=observations),
+        replace(
+            truth,
+            rotations=np.tile(truth.rotations, (times, 1, 1)),
+            translations=np.tile(truth.translations, (times, 1)),
+        ),
+    )
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """Return the same numbers for every test."""

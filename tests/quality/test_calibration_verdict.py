@@ -396,6 +396,26 @@ def test_negatives_are_to_be_looked_at() -> None:
     assert any("no negatives" in text for text in verdict.advice)
 
 
+def in_burst(made: list[NamedView]) -> list[NamedView]:
+    return made + [replace(view, photo=f"{view.photo}b") for view in made]
+
+
+def test_a_burst_counts_as_one_place() -> None:
+    result = calibrated(in_burst(views()), lens=LensModel.AUTO)
+    numbers = calibration_numbers(result)
+    assert (numbers.views, numbers.places) == (12, 6)
+    verdict = judge(result, numbers)
+    assert verdict.grade is CalibrationGrade.GOOD
+    assert any("12 places or more" in text for text in verdict.advice)
+
+
+def test_bursts_from_three_places_are_too_few() -> None:
+    result = calibrated(in_burst(views()[:3]))
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is CalibrationGrade.UNUSABLE
+    assert "6 photographs from 3 places only, fewer than 4" in verdict.sentence
+
+
 def test_one_photograph_three_times_is_no_traceback() -> None:
     once = views()[0]
     copies = [replace(once, photo=f"copy{index}") for index in range(3)]

@@ -179,6 +179,7 @@ def _summary(
         "tangled": calibration.tangled,
         "photographs": len(photos),
         "photographs_used": numbers.views,
+        "places": numbers.places,
         "discs": numbers.discs,
         "discs_used": numbers.discs_used,
         "rms_fixed_px": numbers.rms_fixed_px,
