@@ -14,8 +14,9 @@ from kgcp.network.records import Estimate, Network
 
 # Of the distance between camera and points, and rad between two rotations. Displacements that the
 # model of the lens lacks, with wavelengths of an eighth to half of the frame, act on the camera
-# alike in photographs 0.015 apart (correlation 0.91 to 1.00), less at 0.03 (0.60 to 1.00) and 0.04
-# (0.31 to 1.00). In sets of photographs without bursts, the nearest two are 0.06 to 0.4 apart.
+# alike in photographs 0.015 apart (correlation 0.86 to 1.00), less at 0.03 (0.54 to 1.00) and 0.04
+# (0.30 to 1.00): `benchmarks.calibrate.bursts`. In published sets of photographs, the nearest
+# two are 0.03 to 0.4 apart.
 _NEAR = 0.03
 
 
