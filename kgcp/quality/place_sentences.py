@@ -95,6 +95,27 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
     return tuple(doubts)
 
 
+def step_sentence(placement: Placement) -> str:
+    """Return that reference poses seem to step, or a single target to move; empty if none does."""
+    stepped = [(each.target, each.step) for each in placement.targets if each.step is not None]
+    if not stepped:
+        return ""
+    target, step = max(stepped, key=lambda each: each[1].distance_m)
+    images = f"from {step.frame} on, its images show another place, by about {step.distance_m:.2g}"
+    if len(stepped) == 1:
+        return (
+            f"{target}: {images} m: the reference poses step or drift, or it was moved, which one"
+            " target alone does not tell; its place lies between, and is stated as uncertain as"
+            " that of a single frame"
+        )
+    names = ", ".join(name for name, _ in stepped)
+    return (
+        f"the reference poses step or drift, {names} seem to move alike: of {target},"
+        f" {images} m; their places lie between, and are stated as uncertain as those of a single"
+        " frame"
+    )
+
+
 def noise_sentence(placement: Placement) -> str:
     """Return by how much the residuals exceed the stated deviations; empty if hardly."""
     noise = placement.noise

@@ -134,6 +134,84 @@ def test_a_target_that_was_moved_is_placed_by_most_frames_or_not_at_all(
     assert summary["frames_used"] == max(frames, 12 - frames)
 
 
+def stepped(names: str, steps_m: FloatArray, *, seed: int = 1) -> GroundFlight:
+    """A flight whose reference poses are off by (12, 3) metres: all targets are, alike."""
+    offsets_m = GroundFlight().offsets_m[: len(names)]
+    rotations = GroundFlight(seed=seed).rotations
+    wrong = {
+        (frame, name): rotations[frame].T @ step
+        for frame, step in enumerate(steps_m)
+        for name in names
+    }
+    return GroundFlight(names=tuple(names), offsets_m=offsets_m, seed=seed, wrong=wrong)
+
+
+@pytest.mark.parametrize("names", ["A", "AB", "ABC"])
+@pytest.mark.parametrize("size_m", [0.01, 0.03])
+@pytest.mark.parametrize("frames", [5, 6, 8])
+def test_poses_that_step_move_no_target(
+    tmp_path: Path, names: str, size_m: float, frames: int
+) -> None:
+    steps_m = np.outer(np.arange(12) >= frames, [size_m, 0.0, 0.0])
+    flight = stepped(names, steps_m)
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "was moved by" not in result.stderr
+    assert "the reference poses step or drift" in result.stderr
+    assert f"from f_{frames:03d}.png on" in result.stderr
+    assert ("or it was moved" in result.stderr) == (len(names) == 1)
+    found = places_of(folder)
+    for name, true in zip(names, flight.positions_map, strict=True):
+        z = (found[name][:3] - true - [0.5 * size_m, 0.0, 0.0]) / found[name][3:6]
+        assert np.abs(z).max() < 1.0
+        assert 0.4 * size_m < found[name][3] < 1.5 * size_m
+    for target in json.loads(result.stdout)["targets"]:
+        assert target["frames_used"] == 12
+        assert target["moved"] is None
+
+
+@pytest.mark.parametrize("names", ["A", "AB"])
+def test_poses_that_drift_leave_honest_deviations(tmp_path: Path, names: str) -> None:
+    ratios = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        drift_m = 0.006 * np.cumsum(rng.standard_normal((12, 3)), axis=0)
+        flight = stepped(names, drift_m - drift_m.mean(axis=0), seed=seed)
+        folder = flight.write(tmp_path / str(seed))
+        result = run(folder)
+        assert result.exit_code == 0, result.stderr
+        assert "was moved by" not in result.stderr
+        found = places_of(folder)
+        for name, true in zip(names, flight.positions_map, strict=True):
+            ratios.append((found[name][:3] - true) / found[name][3:6])
+    assert np.abs(ratios).max() < 3.0
+
+
+def test_a_step_that_stated_deviations_explain_is_no_doubt(tmp_path: Path) -> None:
+    flight = stepped("A", np.outer(np.arange(12) >= 6, [0.02, 0.0, 0.0]))
+    folder = flight.write(tmp_path / "flight")
+    path = folder / "reference.csv"
+    head, *lines = path.read_text(encoding="utf-8").splitlines()
+    lines = [f"{line},0.02,0.02,0.03" for line in lines]
+    path.write_text("\n".join((f"{head},sd_x,sd_y,sd_z", *lines)), encoding="utf-8")
+    result = run(folder)
+    assert result.exit_code == 0, result.stderr
+    assert "another place" not in result.stderr
+
+
+@pytest.mark.parametrize(("frames", "off_m"), [(4, 0.5), (6, 1.0)])
+def test_a_single_target_moves_by_more_than_poses_step(
+    tmp_path: Path, frames: int, off_m: float
+) -> None:
+    flight = stepped("A", np.outer(np.arange(12) >= frames, [off_m, 0.0, 0.0]))
+    folder = flight.write(tmp_path / "flight")
+    result = run(folder)
+    assert result.exit_code == (frames == 6)
+    assert "was moved by about" in result.stderr
+    assert "reference poses step" not in result.stderr
+
+
 @pytest.mark.parametrize("frames", [4, 6])
 def test_a_target_at_two_distant_places_is_placed_by_most_frames_or_not_at_all(
     tmp_path: Path, frames: int

@@ -33,6 +33,13 @@ _SETTLED_NOISE = 0.1  # change of a deviation between two rounds
 # A circle whose images are off by so many times as much as the median circle's was moved, or others
 # were taken for it. What poses lack, all circles have about alike.
 _APART, _LEAST_CIRCLES = 4.0, 3
+# Splits of two circles are alike if so many of the frames that show both are on the same sides, and
+# if what one moves by differs from the other's by no more than this share: along the rays, images
+# hardly show it.
+_LEAST_SAME_SIDE, _MOST_UNLIKE = 0.8, 0.75
+# Which no poses are off by unless they say so [m]: without fixed ambiguities they change by
+# decimetres, and half a degree of attitude is 0.26 m at 30 m.
+_MOST_STEP_M = 0.3
 # That show either of two circles, at least: with eight, their variances differ 16-fold by chance
 # once in 70 000 flights.
 _FRAMES_OF_TWO = 8
@@ -54,9 +61,12 @@ def place_circles(
     """Place several circles, with the deviations that their residuals show together.
 
     A circle that was moved, as its frames before and after say, is placed by the side with more
-    frames. One that stands apart by its residuals has deviations of its own, and no part in those
-    of the others. One that its residuals contradict though none stands apart, as of two circles, is
-    placed by most of its frames, or with deviations of its own.
+    frames. If all seem to move alike, the poses did; of a single circle, it cannot be told: they
+    are placed by the frames of both sides.
+
+    One that stands apart by its residuals has deviations of its own, and no part in those of the
+    others. One that its residuals contradict though none stands apart, as of two circles, is placed
+    by most of its frames, or with deviations of its own.
 
     Parameters
     ----------
@@ -76,7 +86,7 @@ def place_circles(
     while True:
         chosen = [views.chosen(side) for views, side in zip(many, sides, strict=True)]
         outcomes, noise = _with_common_noise(camera, chosen)
-        found = _splits(camera, chosen, outcomes)
+        found, steps = _splits(camera, chosen, outcomes)
         if not found:
             break
         for index, split in found.items():
@@ -91,18 +101,38 @@ def place_circles(
             is_most = 2 * np.count_nonzero(fit.is_used) > len(many[index])
             moved = replace(outcome, fit=fit, move=move)
             outcomes[index] = moved if is_most else MovedCircleError(move)
+    for index, split in steps.items():
+        if index not in moves:
+            outcomes[index] = _by_both_sides(camera, many[index], outcomes[index], split)
     return outcomes, noise
+
+
+def _by_both_sides(
+    camera: Camera, views: CircleViews, outcome: PlacedCircle | NoCircleError, split: Split
+) -> PlacedCircle | NoCircleError:
+    """Place a circle between the places that the frames before and after a step of poses show."""
+    if isinstance(outcome, NoCircleError) or outcome.is_apart:
+        return outcome
+    off_m = float(np.linalg.norm(split.off_m))
+    sights_m = np.linalg.norm(outcome.fit.circle.centre_m - views.camera_m, axis=1)
+    half_px = 0.5 * camera.fx * off_m / float(np.median(sights_m))
+    noise = replace(outcome.noise, centre_px=max(outcome.noise.centre_px, half_px))
+    again = _attempt(camera, views, noise)
+    if isinstance(again, NoCircleError):
+        return again
+    return replace(again, step=Move(split.first, split.off_m))
 
 
 def _splits(
     camera: Camera,
     many: Sequence[CircleViews],
     outcomes: Sequence[PlacedCircle | NoCircleError],
-) -> dict[int, Split]:
-    """Return the splits of the circles that were moved.
+) -> tuple[dict[int, Split], dict[int, Split]]:
+    """Return the splits of the circles that were moved, and those that the poses may have made.
 
     Poses whose errors follow each other seem to move all circles: what most gain by a second place
-    does not count.
+    does not count, nor what others move by alike. A single circle does not tell a move from a step
+    of the poses, but for one that is larger than those are.
     """
     splits = {}
     for index, (views, outcome) in enumerate(zip(many, outcomes, strict=True)):
@@ -115,7 +145,44 @@ def _splits(
     limit = 1.0
     if len(splits) >= _LEAST_CIRCLES:
         limit = max(1.0, _APART * float(np.median([split.gain for split in splits.values()])))
-    return {index: split for index, split in splits.items() if split.gain > limit}
+    found = {index: split for index, split in splits.items() if split.gain > 1.0}
+    moved = {
+        index: split
+        for index, split in found.items()
+        if split.gain > limit and not _is_of_poses(index, many, splits)
+    }
+    stay = {index: split for index, split in splits.items() if index not in moved}
+    stepped = sum(index in found for index in stay)
+    if not stepped or 2 * stepped < len(stay):
+        return moved, {}
+    return moved, {index: split for index, split in stay.items() if _APART * split.gain > 1.0}
+
+
+def _is_of_poses(index: int, many: Sequence[CircleViews], splits: Mapping[int, Split]) -> bool:
+    """Tell whether half of the other circles move alike, or a single one by what poses may."""
+    split = splits[index]
+    if len(splits) == 1:
+        return float(np.linalg.norm(split.off_m)) < _MOST_STEP_M
+    alike = sum(
+        _is_same_split(many[index], split, many[other], splits[other])
+        for other in splits
+        if other != index
+    )
+    return 2 * alike >= len(splits) - 1
+
+
+def _is_same_split(views: CircleViews, split: Split, others: CircleViews, other: Split) -> bool:
+    """Tell whether two circles seem to move at nearly the same frame, and by nearly the same."""
+    rows = {tuple(place): row for row, place in enumerate(others.camera_m.tolist())}
+    same = [
+        (row >= split.first) == (rows[tuple(place)] >= other.first)
+        for row, place in enumerate(views.camera_m.tolist())
+        if tuple(place) in rows
+    ]
+    if not same or np.mean(same) < _LEAST_SAME_SIDE or split.gain > _APART * other.gain:
+        return False
+    largest_m = max(np.linalg.norm(split.off_m), np.linalg.norm(other.off_m))
+    return bool(np.linalg.norm(split.off_m - other.off_m) <= _MOST_UNLIKE * largest_m)
 
 
 def _with_common_noise(

@@ -79,6 +79,10 @@ class PlacedTarget:
     move : TargetMove or None
         That it was moved during the flight, and placed by the frames of one place; None: nothing is
         seen of that.
+    step : TargetMove or None
+        That the reference poses step, or, of a single target, that this or a move of the target
+        shows; it is placed by the frames of both places, and both covariances together are those
+        of a single frame. None: nothing is seen of that.
     check : PlaceCheck
         Against flight.toml.
     """
@@ -99,6 +103,7 @@ class PlacedTarget:
     variance_factor: float
     own_noise_px: float | None
     move: TargetMove | None
+    step: TargetMove | None
     check: PlaceCheck
 
     @property
@@ -262,8 +267,8 @@ def place_targets(
             None if calibration is None else calibration.cov,
             _CODED_EDGE_SD_PX,
         )
-        if own_px is not None:
-            # contradictions may be alike in many frames: more frames do not reduce them
+        if own_px is not None or outcome.step is not None:
+            # contradictions and steps may be alike in many frames: more frames do not reduce them
             common = common + (np.count_nonzero(outcome.fit.is_used) - 1.0) * outcome.fit.cov
         placed.append(_on_the_map(target, frames, outcome, own_px, common, local_frame))
     return Placement(tuple(placed), skipped, noise)
@@ -397,6 +402,7 @@ def _on_the_map(
         variance_factor=fit.variance_factor,
         own_noise_px=own_noise_px,
         move=None if placed.move is None else _moved(placed.move, frames),
+        step=None if placed.step is None else _moved(placed.step, frames),
         check=_check(target, circle, cov + common_cov, enu_from_map, local_frame),
     )
 

@@ -99,6 +99,9 @@ class PlacedCircle:
     move : Move or None
         That it was moved while it was photographed; the fit is to the frames of one place. None:
         nothing is seen of that.
+    step : Move or None
+        That poses may have changed instead; the fit is to the frames of both places. None: nothing
+        is seen of that.
     """
 
     fit: CircleFit
@@ -107,6 +110,7 @@ class PlacedCircle:
     noise: ExtraNoise
     is_apart: bool = False
     move: Move | None = None
+    step: Move | None = None
 
 
 def place_circle(

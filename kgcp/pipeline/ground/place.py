@@ -40,6 +40,7 @@ from kgcp.quality.place_sentences import (
     doubts_of,
     noise_sentence,
     position_sentence,
+    step_sentence,
 )
 from kgcp.report.places.figures import draw_places
 from kgcp.report.places.page import PlacesPage, render_places
@@ -108,8 +109,8 @@ class FlightPlaces:
     def doubts(self) -> tuple[str, ...]:
         """What to look at before the places are used."""
         doubts = [doubt for placed in self.placement.targets for doubt in doubts_of(placed)]
-        noise = noise_sentence(self.placement)
-        return (*doubts, noise) if noise else tuple(doubts)
+        of_all = (step_sentence(self.placement), noise_sentence(self.placement))
+        return (*doubts, *(sentence for sentence in of_all if sentence))
 
     def gcps(self) -> tuple[Gcp, ...]:
         """Return a ground control point for every sighting that took part, at the placed target."""
