@@ -157,6 +157,44 @@ def test_two_targets_contradict_each_other() -> None:
     assert "8 m further from each other" in doubt.sentence
 
 
+@pytest.mark.parametrize("factor", [-1.0, 1.0])
+def test_an_error_below_two_percent_of_a_single_distance_is_no_factor(factor: float) -> None:
+    offsets_m = np.array([[-10.0, -3.0, 0.0], [10.0, -3.0, 0.5]])
+    flight = GroundFlight(names=("A", "B"), offsets_m=offsets_m)
+    assert check(seen(flight), stated(flight)) == ()
+    (doubt,) = check(seen(flight), stated(flight, np.outer([0, factor], [0.39, 0.0, 0.0])))
+    assert doubt.code is Cause.STATIC_TARGETS
+    assert abs(doubt.figures["off_m"]) == pytest.approx(0.39, abs=0.1)
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_one_wrong_position_of_three_is_no_factor_of_all_distances(wrong: int) -> None:
+    flight = GroundFlight(names=("A", "B", "C"), offsets_m=GroundFlight().offsets_m[:3])
+    (doubt,) = check(seen(flight), stated(flight, np.outer(np.arange(3) == wrong, [0.3, 0.0, 0.0])))
+    assert doubt.code is Cause.STATIC_TARGETS
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("is_common", [False, True])
+def test_prints_and_focal_lengths_off_by_permille_are_no_doubt(
+    count: int, *, is_common: bool
+) -> None:
+    offsets_m = GroundFlight().offsets_m[:count]
+    for seed in range(10):
+        rng = np.random.default_rng(100 + seed)
+        flight = GroundFlight(names=tuple("ABCD"[:count]), offsets_m=offsets_m, seed=seed)
+        prints = 1.0 + 0.003 * rng.standard_normal(1 if is_common else count)
+        factors = dict(zip(flight.names, np.resize(prints, count).tolist(), strict=True))
+
+        def printed(
+            _: int, name: str, pose: Pose, factors: dict[str, float] = factors
+        ) -> tuple[str, Pose]:
+            return name, Pose(pose.rotation, factors[name] * pose.translation_m)
+
+        positions = stated(flight, SD_M * rng.standard_normal((count, 3)))
+        assert check(seen(flight, printed), positions) == ()
+
+
 def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
     flight = GroundFlight()
     rolling = replace(CAMERA, readout_s=0.03)

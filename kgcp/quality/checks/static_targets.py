@@ -41,7 +41,8 @@ def check_static_targets(
 ) -> tuple[Doubt, ...]:
     """Compare the distances between static targets in every frame with those of their positions.
 
-    A factor that all distances have in common, of prints or focal length, is taken out.
+    A factor that all distances have in common, of prints or focal length, is taken out, if enough
+    distances tell it from a wrong position.
 
     Parameters
     ----------
@@ -52,11 +53,10 @@ def check_static_targets(
     if not pairs:
         return ()
     scale = _common_scale(pairs)
-    if abs(math.log(scale)) > _MOST_SCALE:
-        of_scale = _of_scale(pairs, scale)
-        if of_scale is not None:
-            return (of_scale,)
+    if not _is_of_all(pairs, scale):
         scale = 1.0
+    if abs(math.log(scale)) > _MOST_SCALE:
+        return (_of_scale(scale),)
     wrong = {id(pair): abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m for pair in pairs}
     by_names: dict[tuple[str, str], list[_Pair]] = defaultdict(list)
     for pair in pairs:
@@ -129,14 +129,26 @@ def _common_scale(pairs: Sequence[_Pair]) -> float:
     return float(ratios[order][half])
 
 
-def _of_scale(pairs: Sequence[_Pair], scale: float) -> Doubt | None:
-    """Return the doubt about all distances alike; None: they do not differ by one factor."""
-    agreeing = {
-        pair.names for pair in pairs if abs(_off_m(pair, scale)) <= _CONTRADICTION * pair.sd_m
-    }
-    names = {pair.names for pair in pairs}
-    if len(names) < _LEAST_OF_SCALE or 2 * len(agreeing) <= len(names):
-        return None
+def _is_of_all(pairs: Sequence[_Pair], scale: float) -> bool:
+    """Tell whether most distances agree better with a factor, not only those of a single target.
+
+    A wrong position has an effect on the distances to its target alone.
+    """
+    by_names: dict[tuple[str, str], list[bool]] = defaultdict(list)
+    for pair in pairs:
+        off_m = abs(_off_m(pair, scale))
+        agrees = off_m < min(abs(_off_m(pair, 1.0)), _CONTRADICTION * pair.sd_m)
+        by_names[pair.names].append(agrees)
+    agreeing = [names for names, agrees in by_names.items() if 2 * sum(agrees) > len(agrees)]
+    return (
+        len(agreeing) >= _LEAST_OF_SCALE
+        and 2 * len(agreeing) > len(by_names)
+        and not set.intersection(*(set(names) for names in agreeing))
+    )
+
+
+def _of_scale(scale: float) -> Doubt:
+    """Return the doubt about all distances alike."""
     return grave(
         Cause.DISTANCE_SCALE,
         f"static targets are {100.0 * abs(scale - 1.0):.2g} %"
