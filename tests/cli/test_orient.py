@@ -135,6 +135,7 @@ def test_a_height_that_is_wrong_does_not_pass_in_silence(
     if "contradict" in words:
         (doubt,) = json.loads(result.stdout)["doubts"]
         assert "B" in doubt
+        assert "or a diameter is wrong" in doubt
 
 
 @pytest.mark.parametrize("seed", range(6))

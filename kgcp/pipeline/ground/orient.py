@@ -135,7 +135,8 @@ class FlightPoses:
                 "the positions of the targets contradict each other: that of"
                 f" {first} is off by {wrong.off_m:.2g} m"
                 + (f", or that of {' or '.join(others)} is wrong" if others else "")
-                + f" (χ² {wrong.chi2:.0f} of 3); poses may be off by more than is stated"
+                + f" (χ² {wrong.chi2:.0f} of 3), or a diameter is wrong; poses may be off by more"
+                " than is stated"
             )
         if self.distance_scale is not None:
             share, sd = self.distance_scale
