@@ -68,10 +68,8 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
     rejected = int(np.count_nonzero(~placed.is_used))
     if placed.move is not None:
         doubts.append(
-            f"{placed.target}: was moved by about {placed.move.distance_m:.2g} m, or others were"
-            f" taken for it: from {placed.move.frame} on, its images show another place; it is"
-            f" placed by the {len(placed.frames) - rejected} of {len(placed.frames)} frames that"
-            " agree"
+            f"{placed.target}: {placed.move.as_move}; it is placed by the"
+            f" {len(placed.frames) - rejected} of {len(placed.frames)} frames that agree"
         )
     elif rejected:
         frames = f"{rejected} of {len(placed.frames)} frames do"

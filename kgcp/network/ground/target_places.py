@@ -144,6 +144,14 @@ class TargetMove:
     frame: str  # the first that shows the second place
     distance_m: float  # between them, nearly
 
+    @property
+    def as_move(self) -> str:
+        """The words for a target that did not stay where it was."""
+        return (
+            f"was moved by about {self.distance_m:.2g} m, or others were taken for it: from"
+            f" {self.frame} on, its images show another place"
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceCheck:
@@ -244,9 +252,7 @@ def place_targets(
         if isinstance(outcome, MovedCircleError):
             move = _moved(outcome.move, frames)
             skipped[target.name] = (
-                f"was moved by about {move.distance_m:.2g} m, or others were taken for it: from"
-                f" {move.frame} on, its images show another place, and no more than half of its"
-                " frames agree on one"
+                f"{move.as_move}, and no more than half of its frames agree on one"
             )
             continue
         if isinstance(outcome, NoCircleError):
