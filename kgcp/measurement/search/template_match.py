@@ -29,7 +29,7 @@ from kgcp.measurement.search.templates import (
     edge_rows,
     templates_of,
 )
-from kgcp.measurement.search.uneven_light import SMALLEST_UNEVEN_PX, evened_patch
+from kgcp.measurement.search.uneven_light import SMALLEST_EVENED_PX, evened_patch
 from kgcp.targets.layout import Ring
 
 # Tuning of the comparison. Its benchmarks are `benchmarks.search.hard_frames`, for what is found
@@ -128,7 +128,7 @@ def code_in_even_light(
 
     None where the light is even, where a part is not a ring, and of a small ring.
     """
-    if _radius_px(camera, pose, ring) < SMALLEST_UNEVEN_PX:
+    if _radius_px(camera, pose, ring) < SMALLEST_EVENED_PX:
         return None
     radii_m = 0.5 * ring.outer_diameter_m * SAMPLED_RADII
     points = camera.project_circles(pose.rotation, pose.translation_m, radii_m, CIRCLE)
@@ -160,7 +160,7 @@ def match_templates(patch: FloatArray, ring: Ring, radius_px: float) -> Template
     template_match = _matched(patch, ring, whole, None)
     if template_match.is_clear:
         return template_match
-    if template_match.score > _WORTH_EVENING and radius_px >= SMALLEST_UNEVEN_PX:
+    if template_match.score > _WORTH_EVENING and radius_px >= SMALLEST_EVENED_PX:
         even = evened_patch(patch, ring, whole.shift)
         if even is not None:
             in_even_light = _matched(even, ring, best_placement(correlate(even, templates)), None)

@@ -10,7 +10,7 @@ from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.search.templates import ANGLES, edge_rows
 from kgcp.targets.layout import Ring
 
-SMALLEST_UNEVEN_PX = 8.0
+SMALLEST_EVENED_PX = 8.0
 """Radius below which no levels are read beside edges: the light of such rings is even."""
 # samples to either side of an angle: more than a dot, less than a shadow
 _HALF_INK, _HALF_PLATE = 10, 5

@@ -17,7 +17,6 @@ from kgcp.network.ground.moved_circle import Split, best_split
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError
 from kgcp.network.ground.target_plane import (
     REJECTED_CHI2,
-    Move,
     PlacedCircle,
     circle_through,
     extra_noise,
@@ -33,15 +32,15 @@ _SETTLED_NOISE = 0.1  # change of a deviation between two rounds
 # A circle whose images are off by so many times as much as the median circle's was moved, or others
 # were taken for it. What poses lack, all circles have about alike.
 _APART, _LEAST_CIRCLES = 4.0, 3
-# Splits of two circles are alike if so many of the frames that show both are on the same sides, and
-# if what one moves by differs from the other's by no more than this share: along the rays, images
-# hardly show it.
+# Splits of two circles are alike if this share of the frames that show both are on the same sides,
+# and if their offsets differ by no more than this share of the larger one: along the rays, images
+# hardly show an offset.
 _LEAST_SAME_SIDE, _MOST_UNLIKE = 0.8, 0.75
-# Which no poses are off by unless they say so [m]: without fixed ambiguities they change by
-# decimetres, and half a degree of attitude is 0.26 m at 30 m.
+# A step larger than this is no error of poses that do not state it [m]: without fixed ambiguities
+# they change by decimetres, and half a degree of attitude is 0.26 m at 30 m.
 _MOST_STEP_M = 0.3
-# That show either of two circles, at least: with eight, their variances differ 16-fold by chance
-# once in 70 000 flights.
+# Each of two circles must be seen in at least so many frames to stand apart: with eight, their
+# variances differ 16-fold by chance once in 70 000 flights.
 _FRAMES_OF_TWO = 8
 _MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
 _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
@@ -50,7 +49,7 @@ _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the fr
 class MovedCircleError(NoCircleError):
     """A circle was moved, and no more than half of its frames show one place."""
 
-    def __init__(self, move: Move) -> None:
+    def __init__(self, move: Split) -> None:
         super().__init__("no more than half of the frames show one place")
         self.move = move
 
@@ -82,7 +81,7 @@ def place_circles(
         What was added to the stated covariances of circles that do not stand apart.
     """
     sides = [np.ones(len(views), dtype=np.bool_) for views in many]
-    moves: dict[int, Move] = {}
+    moves: dict[int, Split] = {}
     while True:
         chosen = [views.chosen(side) for views, side in zip(many, sides, strict=True)]
         outcomes, noise = _with_common_noise(camera, chosen)
@@ -93,7 +92,7 @@ def place_circles(
             frames = np.flatnonzero(sides[index])
             larger = split.larger_side(len(frames))
             sides[index][frames[~larger]] = False
-            moves.setdefault(index, Move(int(frames[split.first]), split.off_m))
+            moves.setdefault(index, replace(split, first=int(frames[split.first])))
     for index, move in moves.items():
         outcome = outcomes[index]
         if isinstance(outcome, PlacedCircle):
@@ -120,7 +119,7 @@ def _by_both_sides(
     again = _attempt(camera, views, noise)
     if isinstance(again, NoCircleError):
         return again
-    return replace(again, step=Move(split.first, split.off_m))
+    return replace(again, step=split)
 
 
 def _splits(

@@ -25,10 +25,10 @@ from kgcp.georef.local_frame import LocalFrame
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import static_position
 from kgcp.network.ground.circles_together import MovedCircleError, place_circles
+from kgcp.network.ground.moved_circle import Split
 from kgcp.network.ground.space_circle import CircleViews, ExtraNoise, NoCircleError, SpaceCircle
 from kgcp.network.ground.target_plane import (
     MOST_EXTRA_PX,
-    Move,
     PlacedCircle,
     common_covariance,
 )
@@ -280,7 +280,7 @@ def place_targets(
     return Placement(tuple(placed), skipped, noise)
 
 
-def _moved(move: Move, frames: Sequence[str]) -> TargetMove:
+def _moved(move: Split, frames: Sequence[str]) -> TargetMove:
     return TargetMove(frames[move.first], float(np.linalg.norm(move.off_m)))
 
 

@@ -24,6 +24,7 @@ from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle_image import circle_images, circle_slopes
 from kgcp.network.ground.circle_start import circle_starts
+from kgcp.network.ground.moved_circle import Split
 from kgcp.network.ground.space_circle import (
     CircleViews,
     ExtraNoise,
@@ -73,14 +74,6 @@ class CircleFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Move:
-    """A circle that has two places."""
-
-    first: int  # frame that shows the second place
-    off_m: FloatArray  # (3,): from the first to the second place, nearly
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PlacedCircle:
     """A circle placed from many frames.
 
@@ -96,10 +89,10 @@ class PlacedCircle:
         What was added to the stated covariances.
     is_apart : bool
         Whether that is its own, since its images contradict each other more than those of others.
-    move : Move or None
+    move : Split or None
         That it was moved while it was photographed; the fit is to the frames of one place. None:
         nothing is seen of that.
-    step : Move or None
+    step : Split or None
         That poses may have changed instead; the fit is to the frames of both places. None: nothing
         is seen of that.
     """
@@ -109,8 +102,8 @@ class PlacedCircle:
     ambiguity: float
     noise: ExtraNoise
     is_apart: bool = False
-    move: Move | None = None
-    step: Move | None = None
+    move: Split | None = None
+    step: Split | None = None
 
 
 def place_circle(

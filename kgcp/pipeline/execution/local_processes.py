@@ -81,18 +81,19 @@ class Preparation:
 
         One that fails is not begun again: then `slow` does it.
         """
-        with self._part_ended:
-            while self._parts_left:
+        while True:
+            with self._part_ended:
+                if not self._parts_left:
+                    self._part_ended.wait_for(lambda: not self._parts_begun)
+                    return
                 part = self._parts_left.pop(0)
                 self._parts_begun += 1
-                self._part_ended.release()
-                try:
-                    do(part)
-                finally:
-                    self._part_ended.acquire()
+            try:
+                do(part)
+            finally:
+                with self._part_ended:
                     self._parts_begun -= 1
                     self._part_ended.notify_all()
-            self._part_ended.wait_for(lambda: not self._parts_begun)
 
 
 class WorkerProcess:

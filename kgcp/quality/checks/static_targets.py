@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -57,15 +58,15 @@ def check_static_targets(
         scale = 1.0
     if abs(math.log(scale)) > _MOST_SCALE:
         return (_of_scale(scale),)
-    wrong = {id(pair): abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m for pair in pairs}
+    wrong = {pair for pair in pairs if abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m}
     by_names: dict[tuple[str, str], list[_Pair]] = defaultdict(list)
     for pair in pairs:
         by_names[pair.names].append(pair)
-    bad = {names: [pair for pair in of if wrong[id(pair)]] for names, of in by_names.items()}
+    bad = {names: [pair for pair in of if pair in wrong] for names, of in by_names.items()}
     contradicting = {
         names
         for names, frames in bad.items()
-        if len(frames) >= max(min(_LEAST_FRAMES, len(by_names[names])), 1)
+        if len(frames) >= min(_LEAST_FRAMES, len(by_names[names]))
         and len(frames) >= _LEAST_SHARE * len(by_names[names])
     }
     if contradicting:
@@ -191,13 +192,13 @@ def _of_targets(
     )
 
 
-def _of_frames(pairs: Sequence[_Pair], wrong: Mapping[int, bool]) -> tuple[Doubt, ...]:
+def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> tuple[Doubt, ...]:
     """Return the doubt about targets in single frames that contradict most others there."""
     seen, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for pair in pairs:
         for name in pair.names:
             seen[pair.frame, name] += 1
-            against[pair.frame, name] += wrong[id(pair)]
+            against[pair.frame, name] += pair in wrong
     lone = [key for key, count in against.items() if count >= 2 and 2 * count > seen[key]]
     if not lone:
         return ()
