@@ -1,7 +1,8 @@
 """Cramér-Rao bound of the centroid of a disc or a ring, from the exact rendering.
 
 Unknown besides the centroid: diameter and tilt, point spread, two levels, the light's gradient, and
-two bends of the tone curve where the camera's response is unknown. Pixels farther from the edge
+two bends of the tone curve where the camera's response is unknown. The texture of the ground is a
+random field of known deviation and correlation. Pixels farther from the edge
 than `AROUND_PX` are not used: on a board they belong to the neighbours.
 """
 
@@ -14,6 +15,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.discs.ground_texture import GroundTexture
 from kgcp.simulation.crlb import censored_information
 from kgcp.simulation.disc_field import FieldScene, field_irradiance
 from kgcp.simulation.imaging import Optics, Sensor
@@ -31,6 +33,7 @@ def centroid_bound(
     gain: float,
     *,
     tone_is_unknown: bool,
+    texture: GroundTexture | None = None,
 ) -> FloatArray:
     """Return the least covariance (2, 2) of the centroid of a scene's only disc [px²].
 
@@ -95,5 +98,12 @@ def centroid_bound(
     jacobian = np.stack([column.ravel()[used] for column in columns])
     scales = np.linalg.norm(jacobian, axis=1)
     jacobian /= scales[:, None]
-    inverse = np.linalg.inv((jacobian * information.ravel()[used]) @ jacobian.T)
+    weighted = jacobian * information.ravel()[used]
+    if texture is not None:
+        off = off[:, used]
+        distances_px = np.hypot(*(np.subtract.outer(each, each) for each in off))
+        noise = np.diag(1.0 / information.ravel()[used])
+        of_ground = light(ground=1.0, ink=0.0).ravel()[used]
+        weighted = np.linalg.solve(noise + texture.cov(distances_px, of_ground), jacobian.T).T
+    inverse = np.linalg.inv(weighted @ jacobian.T)
     return np.asarray(inverse[:2, :2] / np.outer(scales[:2], scales[:2]))

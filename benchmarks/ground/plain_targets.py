@@ -28,6 +28,7 @@ from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.adjustment.covariance import propagate
 from kgcp.measurement.discs.adjust_disc import geometry_of
 from kgcp.measurement.discs.covariance import moments_by_stretch
+from kgcp.measurement.discs.ground_texture import GroundTexture, TextureModes, sectors_about
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.plain_pose import CircleMoments, circles_about, fit_circles, pose_towards
 from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_radius_px
@@ -60,6 +61,8 @@ _KINDS = {  # shape, polarity, and whether it has a border
     "black ring": ((1.0, 0.5), PlainPolarity.DARK, True),
     "bare white disc": ((1.0,), PlainPolarity.BRIGHT, False),
 }
+_SECTOR_PIXELS = 150  # of ground, to tell its texture
+_PHOTOGRAPH_NOISE = 0.3 / 255.0  # at least, of the photographs' pixels, to tell their texture
 _FOCAL = 0.85  # of the photographs' width
 _OTHER_SIZES = (0.6, 0.75, 1.3, 1.6)  # of the wanted target, against a round thing's
 _SMALLEST_PX, _LARGEST_PX = 4.0, 25.0
@@ -146,6 +149,7 @@ def look(
         if target.border_m is None and not _is_even(light, camera, pose, radius_px):
             continue
         shown += 1
+        ground = _ground_about(light, camera.project(pose.translation_m[None])[0], radius_px)
         image_plate(camera, PlainPlate(target, _BRIGHT, _DARK), pose, _OPTICS).paste(light)
         grey = sensor.expose(light, 1.0, rng)
         truth_px = camera.project(pose.translation_m[None])[0]
@@ -164,6 +168,8 @@ def look(
         assert outcome.uncertainty is not None
         errors.append(error)
         sds.append(np.sqrt(np.diag(outcome.uncertainty.centre_cov_px2)))
+        if target.border_m is None:
+            edges = _edge_covs(kind, radius_px, *ground)
         limits.append(_bound_px(target, edges, pose, prediction.prior))
         off_m = outcome.distance_m - pose.distance_m
         z_distance.append(off_m / outcome.uncertainty.sd_distance_m)
@@ -192,6 +198,21 @@ def _is_even(light: FloatArray, camera: Camera, pose: Pose, radius_px: float) ->
     off_px = np.hypot(columns - x, rows - y) - radius_px
     around = light[(off_px > 0.0) & (off_px < 6.0)]
     return float(np.std(around)) < _EVEN * (_BRIGHT - float(np.median(around)))
+
+
+def _ground_about(
+    light: FloatArray, centre_px: FloatArray, radius_px: float
+) -> tuple[float, GroundTexture]:
+    """Return the mean light of the ground under and around a disc, and its texture."""
+    rows, columns = np.indices(light.shape).astype(np.float64)
+    off_px = np.stack((columns - centre_px[0], rows - centre_px[1]))
+    is_near = np.hypot(*off_px) < radius_px + AROUND_PX
+    near_px = off_px[:, is_near]
+    terms = np.column_stack((np.ones(near_px.shape[1]), near_px.T))
+    plane = np.linalg.lstsq(terms, light[is_near], rcond=None)[0]
+    modes = TextureModes.of(sectors_about(np.zeros(2), near_px, _SECTOR_PIXELS))
+    residuals = light[is_near] - terms @ plane
+    return float(plane[0]), modes.likeliest(terms, residuals, _PHOTOGRAPH_NOISE)
 
 
 def _placed(
@@ -236,7 +257,9 @@ def _prediction(
     )
 
 
-def _edge_covs(kind: str, radius_px: float) -> FloatArray:
+def _edge_covs(
+    kind: str, radius_px: float, ground: float | None = None, texture: GroundTexture | None = None
+) -> FloatArray:
     """Return the least covariances (k, 5, 5) of the circles' centres and stretches [px²].
 
     By the bound of the centre: an edge that is displaced by cos φ tells the centre, by cos² φ the
@@ -248,6 +271,7 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     camera = Camera(81, 81, 200_000.0, 200_000.0, 40.0, 40.0)
     is_bright = polarity is PlainPolarity.BRIGHT
     inside, outside = (_BRIGHT, _DARK) if is_bright else (_DARK, _BRIGHT)
+    outside = outside if ground is None else ground
     angle = np.linspace(0.0, 2.0 * math.pi, 360, endpoint=False)
     c, s = np.cos(angle), np.sin(angle)
     moved = np.stack((c, s, c * c, 2.0 * c * s, s * s))
@@ -260,7 +284,9 @@ def _edge_covs(kind: str, radius_px: float) -> FloatArray:
     covs = []
     for disc in discs:
         scene = FieldScene((disc,), ground=outside, ink=inside)
-        bound = centroid_bound(camera, scene, _OPTICS, _SENSOR, 1.0, tone_is_unknown=False)
+        bound = centroid_bound(
+            camera, scene, _OPTICS, _SENSOR, 1.0, tone_is_unknown=False, texture=texture
+        )
         covs.append(0.5 * float(np.trace(bound)) * pattern)
     return np.array(covs)
 

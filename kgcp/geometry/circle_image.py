@@ -34,6 +34,7 @@ def _fourier_slopes(count: int) -> FloatArray:
 
 _SLOPES = _fourier_slopes(OUTLINE_POINTS)
 _STEP = 2.0 * np.pi / OUTLINE_POINTS
+_LEAST_AREA = 1e-20  # px², or of the normalised plane: rounding of coordinates has as much
 
 
 def plane_axes(normals: FloatArray) -> FloatArray:
@@ -108,7 +109,9 @@ class Eccentricity:
 
 
 def circle_images(camera: Camera, circles: Circles3D) -> CircleImages:
-    """Return outlines, areas and moments of circles' images; NaN unless wholly before the camera.
+    """Return outlines, areas and moments of circles' images; NaN of those that have none.
+
+    They must be wholly before the camera, and not endlessly far.
 
     Parameters
     ----------
@@ -183,6 +186,7 @@ def _moments(outlines: FloatArray) -> tuple[FloatArray, FloatArray]:
     x, y = np.moveaxis(outlines - middle[:, None], -1, 0)
     dx, dy = x @ _SLOPES.T * _STEP, y @ _SLOPES.T * _STEP
     area = 0.5 * np.sum(x * dy - y * dx, axis=1)
+    area[np.abs(area) < _LEAST_AREA] = np.nan
     orientation = area  # the same sign in all integrals: it cancels
     mean_x = 0.5 * np.sum(x * x * dy, axis=1) / orientation
     mean_y = -0.5 * np.sum(y * y * dx, axis=1) / orientation

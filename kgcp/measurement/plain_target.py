@@ -55,8 +55,8 @@ from kgcp.targets.plain import PlainTarget
 
 # Tuning; `benchmarks.ground.plain_targets` counts what is found and what is taken for a target.
 _MOST_TRIES = 24  # edges that are measured per target
-# The variances on ground that is not known to be even: its texture displaces edges over longer
-# stretches than the arcs that the covariance is made from.
+# The variances on ground that is not known to be even, where they are not made from its texture: it
+# displaces edges over longer stretches than the arcs that the covariance is made from.
 _BARE = 3.5
 _SHAPE_PX, _SHAPE = 1.0, 0.2  # how far an edge's semi-axes may be from the expected ones
 # of a normal that is free: least ratio of an edge's axes; what is sought, of the largest image
@@ -121,6 +121,7 @@ def look_for_plain(
         free = [each for each in edges if not any(one.covers(each.ellipse) for one in measured)]
         edges = _alike(free, expected, prediction)
         candidate = _only_candidate(grey, camera, target, prediction, edges)
+        candidate = _on_texture(grey, camera, target, prediction, candidate)
     except Rejection as rejection:
         return Miss(target.name, rejection.reason, rejection.detail)
     return _measurement(camera, target, candidate)
@@ -186,6 +187,17 @@ def _try_edge(
     start = _start(camera, target, prediction, edge.ellipse)
     circles = _measured_circles(grey, camera, target, prediction, start, edge)
     check_edge(circles.discs[0])
+    return _checked(camera, target, prediction, start, circles)
+
+
+def _checked(
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    start: Pose,
+    circles: _Circles,
+) -> _Candidate:
+    """Return measured circles with their poses, if they agree with the prediction."""
     try:
         tolerant = fit_circles(camera, tolerated(circles.images), start, prediction.prior)
         check_agreement(camera, target, prediction, tolerant, len(circles.discs))
@@ -193,6 +205,41 @@ def _try_edge(
     except np.linalg.LinAlgError:
         raise Rejection(Reason.POOR_FIT, "singular equations") from None
     return _Candidate(circles, fit, other)
+
+
+def _on_texture(
+    grey: GreyArray,
+    camera: Camera,
+    target: PlainTarget,
+    prediction: PlainPrediction,
+    candidate: _Candidate,
+) -> _Candidate:
+    """Measure the outer edge of a target without a border by the texture of the ground around it.
+
+    Only of the accepted one: what other edges have around them is no ground. Rings that are
+    measured as a whole stay as they are.
+
+    Raises
+    ------
+    Rejection
+        If it no longer agrees with the prediction.
+    """
+    discs, images = candidate.circles.discs, candidate.circles.images
+    if target.border_m is not None or len(discs) < len(target.radii_m):
+        return candidate
+    outer = measure_disc(
+        grey,
+        discs[0].outline,
+        neighbours=[each.outline for each in discs[1:]],
+        response=camera.response,
+        is_ground_even=False,
+    )
+    if isinstance(outer, DiscMiss):
+        return candidate
+    covs = np.array([outer.cov, *images.covs[1:]])
+    moments = np.array([outer.vector, *images.moments[1:]])
+    circles = _Circles((outer, *discs[1:]), CircleMoments(images.radii_m, moments, covs))
+    return _checked(camera, target, prediction, candidate.fit.pose, circles)
 
 
 def _alike(

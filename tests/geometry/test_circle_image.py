@@ -134,3 +134,10 @@ def test_derivatives_are_those_of_the_moments() -> None:
 def test_circles_behind_the_camera_have_no_image() -> None:
     behind = replace(circles(), centres_m=CENTRES * [1.0, 1.0, -1.0])
     assert np.isnan(circle_images(CAMERA, behind).moments).all()
+
+
+def test_a_circle_endlessly_far_has_no_image() -> None:
+    """Its moments would be those of rounding."""
+    far = Circles3D(np.array([[0.0, 0.0, 1e20]]), circles().axes[:1], RADII[:1])
+    assert np.isnan(circle_images(CAMERA, far).moments).all()
+    assert np.isnan(circle_slopes(CAMERA, far).by_centre).any()

@@ -91,6 +91,25 @@ def test_true_centre_within_its_deviations(target: PlainTarget) -> None:
     assert math.isnan(outcome.score)
 
 
+@pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
+def test_without_a_border_the_texture_of_the_ground_is_allowed_for(target: PlainTarget) -> None:
+    """On the same grass, a border that is not there would be taken for even ground."""
+    bare, rng = replace(target, border_m=None), np.random.default_rng(4)
+    grass = cv2.GaussianBlur(rng.standard_normal((CAMERA.height, CAMERA.width)), (0, 0), 1.0)
+    off_px, sd_px = [], []
+    for x_px in (70.4, 80.1, 90.7, 101.2, 110.9, 120.3):
+        pose = pose_at(x_px, 71.7, bare)
+        light: FloatArray = 0.3 + 0.15 * grass
+        image_plate(CAMERA, PlainPlate(bare), pose, Optics(0.6)).paste(light)
+        outcome = looked(Sensor().expose(light, 1.0, rng), prediction_of(pose), bare)
+        assert isinstance(outcome, Measurement)
+        assert outcome.uncertainty is not None
+        off_px.append(outcome.centre_px - CAMERA.project(pose.translation_m[None])[0])
+        sd_px.append(np.sqrt(np.diag(outcome.uncertainty.centre_cov_px2)))
+    assert 0.005 < float(np.mean(sd_px)) < 0.03
+    assert 0.6 < float(np.sqrt(np.mean(np.square(np.array(off_px) / sd_px)))) < 1.4
+
+
 def test_a_far_ring_is_measured_as_a_whole() -> None:
     target = replace(RING, border_m=0.9)
     pose = pose_towards(2.5 * pose_at(90.4, 71.7, RING).translation_m, NORMAL)

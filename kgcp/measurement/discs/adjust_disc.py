@@ -66,6 +66,7 @@ class DiscTask:
     outline: DiscOutline
     others: Sequence[Geometry]  # edges whose pixels are left out
     inner: FloatArray = field(default_factory=lambda: NO_INNER)  # as of `DiscPixels`
+    is_ground_even: bool = True  # or has a texture of its own
 
     @property
     def is_dark(self) -> bool:
@@ -141,7 +142,7 @@ def adjust_disc(
         if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
             free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)
-        foreign = _foreign(fit, window, index)
+        foreign = foreign_pixels(fit)
         if foreign is not None:
             fit = _adjust_on(task, window, limits, index[~foreign[index]], fit.state, free)
         state = fit.state
@@ -224,8 +225,9 @@ def _check_inside(grey: GreyArray, geometry: Geometry) -> None:
         raise DiscRejection(DiscReason.CUT, "at the border of the photograph")
 
 
-def _foreign(fit: DiscFit, window: DiscWindow, index: IndexArray) -> BoolArray | None:
+def foreign_pixels(fit: DiscFit) -> BoolArray | None:
     """Return which pixels of the window show neither disc nor ground; None if there are none."""
+    window, index = fit.sample.window, fit.sample.index
     black, white = fit.state.plateaus(fit.free.tone)
     limit = np.maximum(_FOREIGN_SIGMAS * fit.sd, _FOREIGN_CONTRAST * (white - black))
     clips = fit.sample.censoring

@@ -44,6 +44,7 @@ from kgcp.measurement.discs.records import (
     moments_of_ellipse,
 )
 from kgcp.measurement.discs.ring_unknowns import RingUnknowns
+from kgcp.measurement.discs.textured_ground import fit_on_texture
 
 _LARGEST_SD_PX = 1.0  # of the centre, and of the moments over the radius
 _NEIGHBOUR_RADII, _NEIGHBOUR_PX = 4.0, 40.0  # beyond the nearer of these, no window reaches
@@ -106,6 +107,7 @@ def measure_disc(
     inner: FloatArray = NO_INNER,
     response: Response = Response.UNKNOWN,
     operator: Operator = Operator.MODEL,
+    is_ground_even: bool = True,
 ) -> Disc | DiscMiss:
     """Measure one disc, or one edge of a ring, or a ring as a whole.
 
@@ -119,8 +121,10 @@ def measure_disc(
         Of a ring that is measured as a whole: its circles within the outline, from the outside to
         the inside, as centre and radius where the outline is the unit circle. They move and grow
         with it.
+    is_ground_even : bool
+        False: its ground has a texture, as grass and gravel have.
     """
-    task = DiscTask(grey, outline, _others(outline, neighbours), inner)
+    task = DiscTask(grey, outline, _others(outline, neighbours), inner, is_ground_even)
     return _measured([task], response, operator, None)[0]
 
 
@@ -156,7 +160,10 @@ def _fitted(task: DiscTask, camera: CameraTone) -> tuple[DiscFit, DiscScatter] |
             task, unknowns_of_disc(task, camera), first_blur_px(task, camera)
         )
         check_disc_fit(fit, task.outline)
-        return (fit, scatter_of(fit)) if not len(task.inner) else _with_ring_unknowns(fit)
+        if len(task.inner):
+            return _with_ring_unknowns(fit)
+        scatter = scatter_of(fit)
+        return (fit, scatter) if task.is_ground_even else fit_on_texture(fit, scatter, task.others)
     except DiscRejection as rejection:
         return DiscMiss(task.outline, rejection.reason, rejection.detail)
     except (NoFit, np.linalg.LinAlgError):

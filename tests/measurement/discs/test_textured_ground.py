@@ -1,0 +1,134 @@
+"""Discs on textured ground: the texture as it was drawn, errors and deviations against truth."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.circle_image import circle_images
+from kgcp.geometry.pose import Pose, rotation_about
+from kgcp.measurement.discs.ground_texture import GroundTexture, TextureModes, sectors_about
+from kgcp.measurement.discs.measure import measure_disc
+from kgcp.measurement.discs.records import Disc, DiscOutline, Polarity, ellipse_of_moments
+from kgcp.measurement.plain_pose import circles_about, pose_towards
+from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.plate import PlainPlate, image_plate
+from kgcp.targets.plain import PlainPolarity, PlainTarget
+
+WIDTH, HEIGHT = 44, 36
+CAMERA = Camera(WIDTH, HEIGHT, 900.0, 900.0, 22.3, 17.4, response=Response.LINEAR)
+SD, LENGTH_PX, LEVEL = 0.05, 1.8, 0.3
+BRIGHT = PlainTarget("W", (0.4,), PlainPolarity.BRIGHT, (0.0, 0.0, 0.0))
+DARK = PlainTarget("B", (0.4,), PlainPolarity.DARK, (0.0, 0.0, 0.0))
+
+
+@functools.cache
+def root_of_texture() -> FloatArray:
+    """A root of the covariance of all pixels of a frame."""
+    rows, columns = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    off = np.hypot(np.subtract.outer(rows, rows), np.subtract.outer(columns, columns)) / LENGTH_PX
+    return np.asarray(np.linalg.cholesky(SD**2 * (1.0 + off) * np.exp(-off)))
+
+
+def ground(rng: np.random.Generator, level: float = LEVEL) -> FloatArray:
+    texture = root_of_texture() @ rng.standard_normal(WIDTH * HEIGHT)
+    return np.asarray(level + texture.reshape(HEIGHT, WIDTH))
+
+
+def pose_of(rng: np.random.Generator, radius_px: float) -> Pose:
+    x_px, y_px = rng.uniform((20.0, 16.0), (24.0, 20.0))
+    ray = np.array([(x_px - CAMERA.cx) / CAMERA.fx, (y_px - CAMERA.cy) / CAMERA.fy, 1.0])
+    normal = rotation_about(np.array([*rng.normal(0.0, 0.4, 2), 0.0]))[:, 2]
+    return pose_towards(ray / np.linalg.norm(ray) * CAMERA.fx * 0.2 / radius_px, normal)
+
+
+def moments_of(pose: Pose) -> FloatArray:
+    return np.asarray(circle_images(CAMERA, circles_about(pose, np.array([0.2]))).moments[0])
+
+
+def frame_of(
+    target: PlainTarget, pose: Pose, light: FloatArray, rng: np.random.Generator
+) -> GreyArray:
+    image_plate(CAMERA, PlainPlate(target, 0.7, 0.06), pose, Optics(0.6)).paste(light)
+    return Sensor().expose(light, 1.0, rng)
+
+
+def measured(grey: GreyArray, pose: Pose, polarity: Polarity, *, is_even: bool) -> Disc:
+    outline = DiscOutline.predicted(ellipse_of_moments(moments_of(pose)), polarity)
+    disc = measure_disc(grey, outline, response=Response.LINEAR, is_ground_even=is_even)
+    assert isinstance(disc, Disc)
+    return disc
+
+
+def test_texture_is_found_as_it_was_drawn() -> None:
+    rng, found = np.random.default_rng(3), []
+    rows, columns = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
+    places_px = np.stack((columns, rows)).astype(np.float64)
+    chosen = np.hypot(columns - 21.0, rows - 17.0) < 13.0
+    sectors = sectors_about(np.array((21.0, 17.0)), places_px, 400)
+    modes = TextureModes.of([each.only(chosen) for each in sectors])
+    terms = np.column_stack((np.ones(len(rows)), columns - 21.0, rows - 17.0))
+    for _ in range(40):
+        noisy = ground(rng).ravel() + 0.005 * rng.standard_normal(WIDTH * HEIGHT)
+        found.append(modes.likeliest(terms, noisy - LEVEL, 0.005))
+    lengths_px = [each.length_px for each in found]
+    assert np.median(lengths_px) == LENGTH_PX
+    assert min(lengths_px) >= 1.2
+    assert max(lengths_px) <= 2.7
+    assert 0.9 < np.mean([each.sd for each in found]) / SD < 1.1
+
+
+def test_covariance_is_as_far_as_pixels_see_the_ground() -> None:
+    texture = GroundTexture(0.1, 2.0)
+    cov = texture.cov(np.array([[0.0, 2.0], [2.0, 0.0]]), np.array([1.0, 0.5]))
+    neighbours = 0.01 * 0.5 * 2.0 * math.exp(-1.0)
+    np.testing.assert_allclose(cov, [[0.01, neighbours], [neighbours, 0.0025]])
+
+
+@pytest.mark.parametrize(
+    ("target", "polarity", "level", "radius_px"),
+    [(BRIGHT, Polarity.BRIGHT, 0.3, 5.0), (DARK, Polarity.DARK, 0.5, 8.0)],
+    ids=["bright", "dark"],
+)
+def test_errors_are_smaller_and_as_stated(
+    target: PlainTarget, polarity: Polarity, level: float, radius_px: float
+) -> None:
+    rng = np.random.default_rng(11)
+    errors, plain_errors, normalised, squares = [], [], [], []
+    for _ in range(60):
+        pose = pose_of(rng, radius_px)
+        grey = frame_of(target, pose, ground(rng, level), rng)
+        disc = measured(grey, pose, polarity, is_even=False)
+        off = disc.vector - moments_of(pose)
+        errors.append(off[:2])
+        plain = measured(grey, pose, polarity, is_even=True)
+        plain_errors.append(plain.vector[:2] - moments_of(pose)[:2])
+        normalised.append(off[:2] / np.sqrt(np.diag(disc.cov)[:2]))
+        squares.append(float(off @ np.linalg.solve(disc.cov, off)))
+    rms, plain_rms = (float(np.sqrt(np.mean(np.square(each)))) for each in (errors, plain_errors))
+    assert 0.3 < rms / plain_rms < 0.75
+    assert 0.85 < float(np.sqrt(np.mean(np.square(normalised)))) < 1.2
+    assert 3.0 < float(np.median(squares)) < 5.8, "χ² of five"
+
+
+def test_even_ground_changes_nothing() -> None:
+    rng = np.random.default_rng(5)
+    pose = pose_of(rng, 7.0)
+    grey = frame_of(BRIGHT, pose, np.full((HEIGHT, WIDTH), LEVEL), rng)
+    textured, even = (measured(grey, pose, Polarity.BRIGHT, is_even=each) for each in (False, True))
+    sds = np.sqrt(np.diag(even.cov))
+    assert np.abs((textured.vector - even.vector) / sds).max() < 1.0
+    assert 0.8 < float(np.median(np.sqrt(np.diag(textured.cov)) / sds)) < 1.3
+
+
+def test_burnt_ground_shows_no_texture() -> None:
+    rng = np.random.default_rng(6)
+    pose = pose_of(rng, 7.0)
+    grey = frame_of(DARK, pose, ground(rng, 1.5), rng)
+    textured, even = (measured(grey, pose, Polarity.DARK, is_even=each) for each in (False, True))
+    np.testing.assert_array_equal(textured.vector, even.vector)
