@@ -7,11 +7,12 @@ import pytest
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.pose import rotation_about
+from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.georef.sighting import Sighting
 from kgcp.georef.target_positions import TargetPosition
 from kgcp.network.ground.frame_poses import orient_frames
 from kgcp.network.ground.point_images import CameraPose
+from tests.ground_flight import GroundFlight
 
 CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 803.2, 596.1, k1=-0.05)
 POSE = CameraPose(
@@ -88,3 +89,52 @@ def test_a_print_that_sightings_and_flight_state_counts_once() -> None:
     assert sds[0] == pytest.approx(0.002 * np.linalg.norm(POSE.centre_m), rel=0.3)
     assert sds[1] == pytest.approx(sds[0], rel=1e-9)
     assert sds[2] > 1.4 * sds[0]
+
+
+@pytest.mark.parametrize(
+    ("sd_scale", "sd_common"), [(0.002, 0.0), (0.002, 0.002), (0.002, 0.001), (0.001, 0.002)]
+)
+def test_a_ring_alone_is_as_sure_as_the_less_sure_of_both_says(
+    sd_scale: float, sd_common: float
+) -> None:
+    """What its sighting and the flight state of the same print counts once."""
+    flight = GroundFlight(frames=5)
+    sd = max(sd_scale, sd_common)
+    sightings = []
+    for row, frame in enumerate(flight.frame_names):
+        for column, name in enumerate(flight.names[: 1 if row == 4 else 4]):
+            pose = flight.pose(row, column)
+            scale = 1.0 + sd if row == 4 else 1.0  # off by one deviation
+            pose = Pose(pose.rotation, scale * pose.translation_m)
+            common = np.zeros((6, 6))
+            common[:3, :3] = sd_common**2 * np.outer(pose.translation_m, pose.translation_m)
+            sightings.append(
+                Sighting(
+                    frame=frame,
+                    number=row + 1,
+                    target=name,
+                    instance=0,
+                    time_s=None,
+                    centre_px=CAMERA.project(pose.translation_m[None])[0],
+                    centre_cov_px2=SD_PX**2 * np.eye(2),
+                    distance_m=pose.distance_m,
+                    sd_distance_m=SD_DISTANCE * pose.distance_m,
+                    sd_common_distance_m=sd_common * pose.distance_m,
+                    pose=pose,
+                    pose_cov=np.diag([1e-4**2] * 3 + [1e-5**2] * 3),
+                    common_pose_cov=common,
+                )
+            )
+    places = {
+        name: TargetPosition(place, None)
+        for name, place in zip(flight.names, flight.positions, strict=True)
+    }
+    poses = orient_frames(flight.frame_names, sightings, places, CAMERA, sd_scale=sd_scale)
+    found = poses[4]
+    assert found.is_by_one_ring
+    assert found.pose is not None
+    assert found.cov is not None
+    sight = flight.positions[0] - flight.centres[4]
+    sight /= np.linalg.norm(sight)
+    off_m = -sight @ (found.pose.centre_m - flight.centres[4])
+    assert off_m / np.sqrt(sight @ found.cov[:3, :3] @ sight) == pytest.approx(1.0, abs=0.1)

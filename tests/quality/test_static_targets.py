@@ -197,13 +197,66 @@ def test_prints_and_focal_lengths_off_by_permille_are_no_doubt(
 
 def test_rows_that_are_read_one_after_the_other_distort_distances() -> None:
     flight = GroundFlight()
-    rolling = replace(CAMERA, readout_s=0.03)
+    rolling = replace(CAMERA, readout_s=0.1)
 
     def sheared(_: int, name: str, pose: Pose) -> tuple[str, Pose]:
         rows = CAMERA.project(pose.translation_m[None])[0, 1] / (CAMERA.height - 1) - 0.5
-        return name, shifted(pose, np.array([0.0, 8.0 * 0.03 * rows, 0.0]))
+        return name, shifted(pose, np.array([0.0, 8.0 * 0.1 * rows, 0.0]))
 
+    assert check(seen(flight, sheared), stated(flight)) != ()
     assert check(seen(flight, sheared), stated(flight), rolling) == ()
+    (doubt,) = check(
+        seen(flight, sheared), stated(flight, np.outer([0, 1, 0, 0], [2.0, 2.0, 0.0])), rolling
+    )
+    assert "B contradicts most others" in doubt.sentence
+
+
+@pytest.mark.parametrize(("off_m", "is_told"), [(0.009, False), (0.018, True)])
+def test_millimetres_between_neighbours_are_no_contradiction(
+    off_m: float,
+    is_told: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    """Nobody surveys better, and plates bend: also of positions that are stated as exact."""
+    flight = GroundFlight(names=("A", "B"), offsets_m=np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    flight.centres[:, :2] *= 0.01  # from above, prints hardly distort the distance
+    exactly = seen(flight, lambda row, name, _: (name, flight.pose(row, "AB".index(name))))
+    exactly = [replace(each, pose_cov=None) for each in exactly]
+    east_m = off_m * np.array([1.0, 0.0, 0.0])
+    positions = {
+        name: TargetPosition(place, None)
+        for name, place in zip(
+            "AB", (flight.positions[0], flight.positions[1] + east_m), strict=True
+        )
+    }
+    assert bool(check(exactly, positions)) == is_told
+
+
+@pytest.mark.parametrize(("factor", "is_told"), [(1.0, False), (10.0, True)])
+def test_places_in_frames_scatter_as_they_state(
+    factor: float,
+    is_told: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    """Small targets, far away: what is measured of them is all there is to contradict."""
+    flight, rng, sd_m = GroundFlight(), np.random.default_rng(4), 0.1
+    sightings = seen(
+        flight, lambda _, name, pose: (name, shifted(pose, factor * sd_m * rng.normal(size=3)))
+    )
+    cov = np.diag([sd_m**2] * 3 + [1e-6] * 3)
+    sightings = [replace(each, pose_cov=cov) for each in sightings]
+    assert bool(check(sightings, stated(flight))) == is_told
+
+
+@pytest.mark.parametrize(("frames", "cause"), [(2, Cause.SINGLE_FRAMES), (4, Cause.STATIC_TARGETS)])
+def test_a_target_elsewhere_in_few_frames_is_their_matter(frames: int, cause: Cause) -> None:
+    """Of twelve frames."""
+    flight = GroundFlight()
+
+    def taken(row: int, name: str, pose: Pose) -> tuple[str, Pose]:
+        is_elsewhere = name == "D" and row < frames
+        return name, shifted(pose, np.array([2.0, 1.0, 0.0])) if is_elsewhere else pose
+
+    (doubt,) = check(seen(flight, taken), stated(flight))
+    assert doubt.code is cause
 
 
 def test_frames_with_one_target_tell_nothing() -> None:

@@ -104,7 +104,7 @@ def test_part_of_a_field_without_its_mark_is_not_guessed() -> None:
     assert name_discs(found, SQUARE) is NamingProblem.AMBIGUOUS
 
 
-@pytest.mark.parametrize(("radius_px", "is_told"), [(2.0, False), (5.0, True)])
+@pytest.mark.parametrize(("radius_px", "is_told"), [(2.0, False), (2.7, True), (5.0, True)])
 def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
     radius_px: float,
     is_told: bool,  # noqa: FBT001 - a parameter of the test
@@ -125,6 +125,20 @@ def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
         return
     assert isinstance(naming, Naming)
     assert mark.tolist() not in SQUARE.points_m()[naming.point].tolist()
+
+
+def test_a_mark_whose_hole_is_not_seen_does_not_count_as_one() -> None:
+    field = Field(
+        "m", GridKind.SQUARE, 9, 6, 0.025, 0.012, marks=(Mark(1, 1, 0.012, 0.004), Mark(6, 3, 0.02))
+    )
+    found, truth = seen(field, 20.0, (0.1, 0.1), (0.0, 0.0))
+    for share, marks in ((1.0, 2), (0.05, 1)):
+        is_hollow = found.is_hollow & (share == 1.0)
+        naming = name_discs(SeenDiscs(found.centres, share * found.stretches, is_hollow), field)
+        assert isinstance(naming, Naming)
+        assert np.array_equal(naming.point, truth[naming.disc])
+        assert len(naming.disc) == 54
+        assert naming.marks == marks
 
 
 def test_what_is_no_field_is_said() -> None:

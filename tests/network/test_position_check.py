@@ -1,0 +1,81 @@
+"""Positions of static targets against each other: which one is wrong, and when none is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kgcp.georef.sighting import Sighting
+from kgcp.georef.target_positions import TargetPosition
+from kgcp.network.ground.frame_poses import UNSTATED_SCALE_SD, FramePose
+from kgcp.network.ground.point_images import CameraPose
+from kgcp.network.ground.position_check import WrongPosition, wrong_position
+from tests.ground_flight import CAMERA, GroundFlight
+
+SD_PX, SD_DISTANCE = 0.005, 2e-4
+
+
+def checked(
+    targets: int, seed: int, *, off_m: float = 0.0, sd_m: float = 0.01, noise: float = 1.0
+) -> tuple[str, WrongPosition | None]:
+    """The target whose height is wrong, and what is found of it; noise in stated deviations."""
+    rng = np.random.default_rng(seed)
+    names = tuple("ABCDEF"[:targets])
+    offsets_m = rng.uniform(-4.0, 4.0, (targets, 3)) * [1.0, 1.0, 0.2]
+    flight = GroundFlight(names, offsets_m, frames=6, seed=seed)
+    sightings, poses = [], []
+    for row, frame in enumerate(flight.frame_names):
+        seen = (flight.positions - flight.centres[row]) @ flight.rotations[row]
+        pixels = CAMERA.project(seen) + noise * SD_PX * rng.standard_normal((targets, 2))
+        far_m = np.linalg.norm(seen, axis=1)
+        far_m = far_m * (1.0 + noise * SD_DISTANCE * rng.standard_normal(targets))
+        sightings += [
+            Sighting(
+                frame=frame,
+                number=row + 1,
+                target=name,
+                instance=0,
+                time_s=None,
+                centre_px=pixel,
+                centre_cov_px2=SD_PX**2 * np.eye(2),
+                distance_m=distance_m,
+                sd_distance_m=SD_DISTANCE * distance_m,
+                sd_common_distance_m=None,
+            )
+            for name, pixel, distance_m in zip(names, pixels, far_m.tolist(), strict=True)
+        ]
+        pose = CameraPose(flight.centres[row], flight.rotations[row])
+        zeros = np.zeros((targets, 3))
+        poses.append(FramePose(frame, names, pose, np.eye(6), names, "", residuals=zeros))
+    places_m = flight.positions + sd_m * rng.standard_normal((targets, 3))
+    wrong = seed % targets
+    places_m[wrong, 2] += off_m
+    cov_m2 = sd_m**2 * np.eye(3)
+    positions = {
+        name: TargetPosition(place, cov_m2) for name, place in zip(names, places_m, strict=True)
+    }
+    return names[wrong], wrong_position(poses, sightings, positions, CAMERA, UNSTATED_SCALE_SD)
+
+
+@pytest.mark.parametrize(("targets", "named"), [(4, (2.2, 3.6)), (6, (1.05, 2.0))])
+def test_the_wrong_one_is_among_the_named_and_few_others(
+    targets: int, named: tuple[float, float]
+) -> None:
+    """Four targets hardly tell which of them is wrong, six do."""
+    found = [checked(targets, seed, off_m=0.1) for seed in range(40)]
+    told = [(true, wrong) for true, wrong in found if wrong is not None]
+    assert len(told) >= 28
+    assert all(true in wrong.targets for true, wrong in told)
+    assert named[0] < float(np.mean([len(wrong.targets) for _, wrong in told])) < named[1]
+    off_m = [wrong.off_m for true, wrong in told if wrong.targets[0] == true]
+    assert float(np.median(off_m)) == pytest.approx(0.1, rel=0.25)
+
+
+@pytest.mark.parametrize("sd_m", [0.0003, 0.01])
+@pytest.mark.parametrize("noise", [0.1, 1.0, 10.0])
+def test_images_worse_or_better_than_stated_contradict_no_position(
+    sd_m: float, noise: float
+) -> None:
+    """What no positions explain widens the images' covariances."""
+    found = [checked(6, seed, sd_m=sd_m, noise=noise)[1] for seed in range(12)]
+    assert found == [None] * 12
