@@ -81,4 +81,7 @@ def covariance_along(axes: FloatArray, sd: FloatArray) -> FloatArray:
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:
     """Return the matrices [v]× (..., 3, 3) of vectors (..., 3), with [v]× w = v × w."""
-    return np.asarray(np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2))
+    matrices = np.zeros((*vectors.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrices[..., j, k], matrices[..., k, j] = -vectors[..., i], vectors[..., i]
+    return matrices

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.calibration import image_by_calibration
 from kgcp.geometry.camera import Camera
 
@@ -39,10 +40,10 @@ _LEAST_AREA = 1e-20  # px², or of the normalised plane: rounding of coordinates
 
 def plane_axes(normals: FloatArray) -> FloatArray:
     """Return two perpendicular unit vectors (n, 3, 2) square to each of n unit vectors (n, 3)."""
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(normals, helper)
+    turns = cross_matrix(normals)
+    first = np.where(np.abs(normals[:, :1]) < 0.9, turns[..., 0], turns[..., 1])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack((first, np.cross(normals, first)), axis=-1)
+    return np.stack((first, (turns @ first[..., None])[..., 0]), axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,13 +80,13 @@ class CircleImages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleSlopes:
-    """Derivatives of the moments (n, 5) of n circles' images."""
+    """The moments of n circles' images, and their derivatives."""
 
+    moments: FloatArray  # (n, 5): as `CircleImages`
     by_centre: FloatArray  # (n, 5, 3): of the circle's centre in the camera frame [m]
     # (n, 5, 3): by a rotation vector of its plane about its own centre, camera frame [rad]
     by_rotation: FloatArray
     by_radius: FloatArray  # (n, 5) [1/m]
-    by_calibration: FloatArray  # (n, 5, 12): by `CALIBRATION_PARAMETERS`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +127,7 @@ def circle_images(camera: Camera, circles: Circles3D) -> CircleImages:
 
 
 def circle_slopes(camera: Camera, circles: Circles3D) -> CircleSlopes:
-    """Return the derivatives of what `circle_images` returns, analytically."""
+    """Return the moments of `circle_images` and their derivatives, analytically."""
     arms = circles.arms_m()
     points = circles.centres_m[:, None] + arms
     normalised = _outlines(circles)
@@ -140,15 +141,30 @@ def circle_slopes(camera: Camera, circles: Circles3D) -> CircleSlopes:
     projection /= points[..., 2, None, None]
     by_point = camera.distort_jacobian(normalised) @ projection
     # a turn ω moves an arm a by ω × a, hence g · (ω × a) = ω · (a × g)
-    by_turn = np.cross(arms[..., None, :], by_point)
-    by_radius = np.einsum("nkij,nkj->nki", by_point, arms / circles.radii_m[:, None, None])
-    by_camera = image_by_calibration(camera, normalised.reshape(-1, 2)).reshape(*x.shape, 2, -1)
+    by_turn = by_point @ cross_matrix(-arms)
+    by_radius = by_point @ (arms / circles.radii_m[:, None, None])[..., None]
     return CircleSlopes(
-        np.einsum("nkmi,nkip->nmp", weights, by_point),
-        np.einsum("nkmi,nkip->nmp", weights, by_turn),
-        np.einsum("nkmi,nki->nm", weights, by_radius),
-        np.einsum("nkmi,nkip->nmp", weights, by_camera),
+        moments,
+        _along_outlines(weights, by_point),
+        _along_outlines(weights, by_turn),
+        _along_outlines(weights, by_radius)[..., 0],
     )
+
+
+def moments_by_calibration(camera: Camera, circles: Circles3D) -> FloatArray:
+    """Return the derivatives (n, 5, 12) of the moments by `CALIBRATION_PARAMETERS`."""
+    normalised = _outlines(circles)
+    outlines = _distorted(camera, normalised)
+    weights = _boundary_weights(outlines, *_moments(outlines))
+    by_camera = image_by_calibration(camera, normalised.reshape(-1, 2))
+    return _along_outlines(weights, by_camera.reshape(*normalised.shape, -1))
+
+
+def _along_outlines(weights: FloatArray, by_point: FloatArray) -> FloatArray:
+    """Return derivatives (n, 5, p) of moments from those of the outlines' points (n, k, 2, p)."""
+    count, points = weights.shape[:2]
+    flat = weights.transpose(0, 2, 1, 3).reshape(count, 5, 2 * points)
+    return np.asarray(flat @ by_point.reshape(count, 2 * points, -1))
 
 
 def eccentricity(camera: Camera, circles: Circles3D) -> Eccentricity:
@@ -188,11 +204,12 @@ def _moments(outlines: FloatArray) -> tuple[FloatArray, FloatArray]:
     area = 0.5 * np.sum(x * dy - y * dx, axis=1)
     area[np.abs(area) < _LEAST_AREA] = np.nan
     orientation = area  # the same sign in all integrals: it cancels
-    mean_x = 0.5 * np.sum(x * x * dy, axis=1) / orientation
-    mean_y = -0.5 * np.sum(y * y * dx, axis=1) / orientation
-    xx = np.sum(x**3 * dy, axis=1) / (3.0 * orientation) - mean_x**2
-    yy = -np.sum(y**3 * dx, axis=1) / (3.0 * orientation) - mean_y**2
-    xy = 0.5 * np.sum(x * x * y * dy, axis=1) / orientation - mean_x * mean_y
+    x2_dy, y2_dx = x * x * dy, y * y * dx
+    mean_x = 0.5 * np.sum(x2_dy, axis=1) / orientation
+    mean_y = -0.5 * np.sum(y2_dx, axis=1) / orientation
+    xx = np.sum(x * x2_dy, axis=1) / (3.0 * orientation) - mean_x**2
+    yy = -np.sum(y * y2_dx, axis=1) / (3.0 * orientation) - mean_y**2
+    xy = 0.5 * np.sum(y * x2_dy, axis=1) / orientation - mean_x * mean_y
     moments = np.column_stack((middle[:, 0] + mean_x, middle[:, 1] + mean_y, xx, xy, yy))
     return np.abs(area), moments
 

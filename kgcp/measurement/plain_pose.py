@@ -16,7 +16,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.circle import circle_planes
-from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
+from kgcp.geometry.circle_image import Circles3D, circle_slopes
 from kgcp.geometry.conic import Ellipse, fit_ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.plate_prior import NormalPrior
@@ -138,9 +138,9 @@ def _equations(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted residuals (5k + 2,), the design (5k + 2, 5) and axes of the two turns."""
     circles = circles_about(pose, images.radii_m)
-    moments, slopes = circle_images(camera, circles).moments, circle_slopes(camera, circles)
+    slopes = circle_slopes(camera, circles)
     axes = pose.rotation[:, :2]
-    off = images.moments - moments
+    off = images.moments - slopes.moments
     if not np.isfinite(off).all():
         raise np.linalg.LinAlgError("circles are not wholly before the camera")
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation @ axes), axis=2)

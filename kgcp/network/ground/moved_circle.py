@@ -9,7 +9,7 @@ from scipy.special import fdtri
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import circle_images, circle_slopes
+from kgcp.geometry.circle_image import circle_slopes
 from kgcp.network.ground.space_circle import CircleViews, SpaceCircle
 
 LEAST_SIDE = 3
@@ -62,8 +62,9 @@ def best_split(
     """
     count = len(views)
     circles = circle.in_cameras(views)
-    residuals = (views.moments - circle_images(camera, circles).moments)[:, :2]
-    design = circle_slopes(camera, circles).by_centre[:, :2]
+    slopes = circle_slopes(camera, circles)
+    residuals = (views.moments - slopes.moments)[:, :2]
+    design = slopes.by_centre[:, :2]
     design = design @ np.swapaxes(views.world_from_camera, 1, 2)
     splits = range(LEAST_SIDE, count - LEAST_SIDE + 1)
     if not splits or not (np.isfinite(residuals).all() and np.isfinite(design).all()):

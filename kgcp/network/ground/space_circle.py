@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.circle_image import Circles3D
 from kgcp.geometry.pose import rotation_about
 
@@ -57,7 +58,7 @@ class SpaceCircle:
         helper = np.eye(3)[int(abs(self.normal[0]) > math.cos(math.radians(30.0)))]
         first = helper - (helper @ self.normal) * self.normal
         first = first / np.linalg.norm(first)
-        return np.stack((first, np.cross(self.normal, first)), axis=1)
+        return np.stack((first, cross_matrix(self.normal) @ first), axis=1)
 
     def moved(self, step: FloatArray) -> SpaceCircle:
         """Return the circle after a step (6,): centre [m], turn about `axes` [rad], radius [m]."""

@@ -18,7 +18,7 @@ from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import Circles3D, circle_images, circle_slopes
+from kgcp.geometry.circle_image import Circles3D, circle_slopes
 from kgcp.geometry.pose import Pose
 from kgcp.georef.exterior_orientation import ExteriorOrientations
 from kgcp.georef.local_frame import LocalFrame
@@ -349,12 +349,10 @@ def ring_images(
     radius_m : float
         Of the circle that was assumed.
     """
-    circles = _circles(poses, radius_m)
-    moments = circle_images(camera, circles).moments
-    slopes = circle_slopes(camera, circles)
+    slopes = circle_slopes(camera, _circles(poses, radius_m))
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation), axis=2)
     cov = by_pose @ np.array(pose_covs) @ np.swapaxes(by_pose, 1, 2)
-    return moments, _with_floor(moments, cov)
+    return slopes.moments, _with_floor(slopes.moments, cov)
 
 
 def _with_floor(moments: FloatArray, cov: FloatArray) -> FloatArray:

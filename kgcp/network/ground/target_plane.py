@@ -22,7 +22,7 @@ from scipy import optimize
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
-from kgcp.geometry.circle_image import circle_images, circle_slopes
+from kgcp.geometry.circle_image import circle_images, circle_slopes, moments_by_calibration
 from kgcp.network.ground.circle_start import circle_starts
 from kgcp.network.ground.moved_circle import Split
 from kgcp.network.ground.space_circle import (
@@ -235,13 +235,15 @@ def common_covariance(
         Of the displacement of edges, the same in all frames [px].
     """
     kept = views.chosen(fit.is_used)
-    slopes = circle_slopes(camera, fit.circle.in_cameras(kept))
+    circles = fit.circle.in_cameras(kept)
+    slopes = circle_slopes(camera, circles)
     weights = np.linalg.inv(total_covariances(camera, kept, fit.circle, noise))
     design = _design(kept, fit.circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
     gain = fit.cov @ np.einsum("nmp,nmk->npk", design, weights).transpose(1, 0, 2).reshape(6, -1)
     common = np.zeros((6, 6))
     if calibration_cov is not None:
-        by_calibration = -gain @ slopes.by_calibration.reshape(-1, len(calibration_cov))
+        by_calibration = moments_by_calibration(camera, circles).reshape(-1, len(calibration_cov))
+        by_calibration = -gain @ by_calibration
         common += by_calibration @ calibration_cov @ by_calibration.T
     # a displacement δ along the whole outline changes the mean moment a²/4 by a δ / 2
     radius = mean_radius(kept.moments)
@@ -378,7 +380,7 @@ def _normal_equations(
     circles = circle.in_cameras(views)
     slopes = circle_slopes(camera, circles)
     design = _design(views, circle, slopes.by_centre, slopes.by_rotation, slopes.by_radius)
-    residuals = views.moments - circle_images(camera, circles).moments
+    residuals = views.moments - slopes.moments
     weighted = np.linalg.solve(covs, design)
     normal = np.einsum("nmp,nmq->pq", weighted, design)
     return 0.5 * (normal + normal.T), np.einsum("nmp,nm->p", weighted, residuals)
