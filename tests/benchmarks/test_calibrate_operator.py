@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from benchmarks.calibrate.operator import Outcome, Setup, line, measure
 from kgcp.measurement.discs.records import Operator, Polarity
 
 
+@cache
 def outcome(case: str, used: Operator = Operator.MODEL, ratio: float = 0.8) -> Outcome:
     return measure(Setup(case, Polarity.DARK, 6.0, ratio, 2, used, 0.05))
 

@@ -20,7 +20,7 @@ from kgcp.targets.layout import Ring
 
 TARGET = TARGET_PLATE.target
 MAIN, REPLICA = TARGET.rings
-FRAMES = 20_000
+FRAMES = 12_000
 OBSERVATION = Measurement(
     target="A",
     ring="A",
