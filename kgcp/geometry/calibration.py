@@ -83,27 +83,16 @@ def image_by_calibration(camera: Camera, normalised: FloatArray) -> FloatArray:
     r2 = x * x + y * y
     above = 1.0 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
     below = 1.0 + r2 * (camera.k4 + r2 * (camera.k5 + r2 * camera.k6))
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    focal = np.array([[camera.fx], [camera.fy]])
-    x_distorted, y_distorted = ((camera.distort(normalised) - [camera.cx, camera.cy]) / focal.T).T
-    by_above = [r2 / below, r2**2 / below, r2**3 / below]
-    by_below = [-above * power for power in (r2 / below**2, r2**2 / below**2, r2**3 / below**2)]
+    slopes = np.zeros((len(x), 2, 12))
+    off = camera.distort(normalised) - [camera.cx, camera.cy]
+    slopes[:, 0, 0], slopes[:, 1, 1] = off[:, 0] / camera.fx, off[:, 1] / camera.fy
+    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
+    radial = [camera.fx, camera.fy] * normalised * (r2 / below)[:, None]
+    share = (-above / below)[:, None]
+    for k_above, k_below in ((4, 9), (5, 10), (8, 11)):  # of r², r⁴, r⁶
+        slopes[:, :, k_above], slopes[:, :, k_below] = radial, share * radial
+        radial = radial * r2[:, None]
     xy2 = 2.0 * x * y
-    k1, k2, k3, k4, k5, k6 = (
-        focal * np.stack((x * change, y * change)) for change in (*by_above, *by_below)
-    )
-    columns = [
-        np.stack((x_distorted, zero)),
-        np.stack((zero, y_distorted)),
-        np.stack((one, zero)),
-        np.stack((zero, one)),
-        k1,
-        k2,
-        focal * np.stack((xy2, r2 + 2.0 * y * y)),
-        focal * np.stack((r2 + 2.0 * x * x, xy2)),
-        k3,
-        k4,
-        k5,
-        k6,
-    ]
-    return np.asarray(np.stack(columns, axis=-1).transpose(1, 0, 2))
+    slopes[:, 0, 6], slopes[:, 1, 6] = camera.fx * xy2, camera.fy * (r2 + 2.0 * y * y)
+    slopes[:, 0, 7], slopes[:, 1, 7] = camera.fx * (r2 + 2.0 * x * x), camera.fy * xy2
+    return slopes

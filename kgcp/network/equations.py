@@ -75,8 +75,7 @@ def _camera_points(network: Network, estimate: Estimate) -> FloatArray:
 
 def whitened(network: Network, residuals: FloatArray, weights: FloatArray) -> FloatArray:
     """Return residuals (n, 2) in units of their standard deviations, times the root weights."""
-    factors = np.linalg.cholesky(network.observations.cov)
-    scaled = np.linalg.solve(factors, residuals[:, :, None])[:, :, 0]
+    scaled = (network.observations.white @ residuals[:, :, None])[:, :, 0]
     return np.asarray(scaled * np.sqrt(weights)[:, None])
 
 
@@ -94,8 +93,7 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
     ray_by_point = np.stack((1.0 / z, zero, -x / z**2, zero, 1.0 / z, -y / z**2), axis=1)
     by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
     by_turn = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
-    white = np.linalg.inv(np.linalg.cholesky(seen.cov[used]))
-    white *= np.sqrt(weights[used])[:, None, None]
+    white = seen.white[used] * np.sqrt(weights[used])[:, None, None]
     by_pose = white @ np.concatenate((by_place, by_turn), axis=2)
     by_camera = white @ image.by_parameter
     residuals = white @ (seen.places[used] - image.places)[:, :, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -82,6 +82,10 @@ class Observations:
     point: IndexArray  # (n,): index of the point of the field
     places: FloatArray  # (n, 2)
     cov: FloatArray  # (n, 2, 2)
+    white: FloatArray = field(init=False)  # (n, 2, 2): W with W cov Wᵀ = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "white", np.linalg.inv(np.linalg.cholesky(self.cov)))
 
     def chosen(self, which: BoolArray) -> Observations:
         """Return some of the observations."""
