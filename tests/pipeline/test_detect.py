@@ -140,13 +140,19 @@ def normals(quaternions: FloatArray) -> FloatArray:
     )
 
 
+@pytest.fixture(scope="module")
+def without_attitudes(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("plain")
+    detect(flight, out, ('poses = "reference.csv"', 'poses = "later.csv"'))
+    return out
+
+
 @pytest.mark.parametrize("edits", [(), (LEVEL,)])
 def test_attitudes_of_vehicle_and_camera_find_the_right_side(
-    flight: Path, tmp_path: Path, edits: tuple[tuple[str, str], ...]
+    flight: Path, without_attitudes: Path, tmp_path: Path, edits: tuple[tuple[str, str], ...]
 ) -> None:
-    detect(flight, tmp_path / "plain", ('poses = "reference.csv"', 'poses = "later.csv"'))
     summary = detect(flight, tmp_path / "level", *edits)
-    plain, level = measured(tmp_path / "plain"), measured(tmp_path / "level")
+    plain, level = measured(without_attitudes), measured(tmp_path / "level")
     assert summary.frames_without_attitude == 0
     assert len(plain) == len(level) >= FRAMES - 1
     assert plain["ambiguity"].median() < 4.0, "the image alone is not sure"
@@ -157,18 +163,6 @@ def test_attitudes_of_vehicle_and_camera_find_the_right_side(
     pd.testing.assert_frame_equal(plain.loc[kept, values], level.loc[kept, values])
     surer = level.loc[kept, "sd_distance_m"] / plain.loc[kept, "sd_distance_m"]
     assert surer.between(0.99, 1.0).all(), "the other pose is hardly elsewhere"
-
-
-def test_the_table_does_not_depend_on_the_number_of_processes(flight: Path, tmp_path: Path) -> None:
-    edits = (
-        LEVEL,
-        ('[[target]]\nname = "A"', '[[target]]\nsd_outer_diameter_m = 3e-4\nname = "A"'),
-    )
-    tables = []
-    for jobs in (0, 2):
-        detect(flight, tmp_path / str(jobs), *edits, jobs=jobs)
-        tables.append((tmp_path / str(jobs) / "detections.parquet").read_bytes())
-    assert tables[0] == tables[1]
 
 
 def test_a_second_look_finds_what_the_reference_promises(
