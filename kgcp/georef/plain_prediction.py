@@ -107,6 +107,7 @@ def _predicted(
     positions: TargetPositions,
     camera: Camera,
 ) -> PlainPrediction | None:
+    """Return where a target must be; None: not before the camera."""
     place = positions.static[target.name]
     camera_from_enu = orientation.enu_from_camera.T
     from_centre_m = place.position_m - orientation.centre_m

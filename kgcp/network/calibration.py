@@ -111,6 +111,7 @@ def calibrate_camera(
 
 
 def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) -> CameraCalibration:
+    """Calibrate from nothing, or go on from an earlier calibration: see `calibrate_camera`."""
     field = problem.field
     if start is not None:
         problem = replace(problem, field=start.field)

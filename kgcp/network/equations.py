@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.geometry.pose import rotation_about
 from kgcp.network.records import Estimate, ImageSlopes, Network, PointPrior, ScaleBar
 
 _LEAST_DEPTH = 1e-9  # of the distance: a point in the camera's own plane has no image
@@ -270,13 +269,7 @@ def moved(
     points = estimate.points
     if not network.points.is_fixed:
         points = points + step[cameras:].reshape(points.shape)
-    turns = [rotation_about(turn) for turn in poses[:, 3:]]
-    return Estimate(
-        estimate.cameras + step[:cameras].reshape(estimate.cameras.shape),
-        np.array([turn @ r for turn, r in zip(turns, estimate.rotations, strict=True)]),
-        estimate.translations + poses[:, :3],
-        points,
-    )
+    return estimate.moved(step[:cameras], poses, points)
 
 
 def inner_constraints(network: Network, points: FloatArray) -> FloatArray:

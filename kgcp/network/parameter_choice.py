@@ -68,12 +68,14 @@ def _with(unknowns: NetworkUnknowns, addition: tuple[str, ...]) -> NetworkUnknow
 
 
 def _is_camera_turned(state: AdjustedNetwork) -> bool:
+    """Tell whether photographs were taken with the camera turned about its axis."""
     across = state.estimate.rotations[:, :2, 0]
     directions = np.arctan2(across[:, 1], across[:, 0])
     return bool(np.abs(np.mean(np.exp(2j * directions))) < _MOST_ALIKE)
 
 
 def _is_worth_it(state: AdjustedNetwork, addition: Sequence[str]) -> bool:
+    """Tell whether terms are determined, and one of them is larger than by chance."""
     known = precision(state.network, state.solution)
     freedom = max(int(known.places.max()), 1)
     limit = stats.t.ppf(1.0 - 0.5 * _SIGNIFICANT / len(addition), freedom)

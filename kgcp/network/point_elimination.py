@@ -13,7 +13,6 @@ import numpy as np
 from scipy import linalg
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.pose import rotation_about
 from kgcp.network.equations import ViewRows
 from kgcp.network.records import Estimate, Network
 
@@ -93,14 +92,7 @@ def moved_by_points(network: Network, estimate: Estimate, system: PointReducedSy
     left = system.point_right - np.einsum("xmi,x->mi", system.coupling, step)
     points = estimate.points + np.einsum("mij,mj->mi", system.point_inverses, left)
     cameras = network.cameras.values.size
-    poses = step[cameras:].reshape(-1, 6)
-    turns = [rotation_about(turn) for turn in poses[:, 3:]]
-    return Estimate(
-        estimate.cameras + step[:cameras].reshape(estimate.cameras.shape),
-        np.array([turn @ r for turn, r in zip(turns, estimate.rotations, strict=True)]),
-        estimate.translations + poses[:, :3],
-        points,
-    )
+    return estimate.moved(step[:cameras], step[cameras:].reshape(-1, 6), points)
 
 
 def determined_by_priors(network: Network, system: PointReducedSystem) -> float:

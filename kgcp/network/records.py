@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.geometry.pose import rotation_about
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +114,22 @@ class Estimate:
     rotations: FloatArray  # (v, 3, 3): p_cam = R p + t
     translations: FloatArray  # (v, 3)
     points: FloatArray  # (m, 3)
+
+    def moved(self, cameras: FloatArray, poses: FloatArray, points: FloatArray) -> Estimate:
+        """Return the values after steps of cameras (c p,) and poses (v, 6), as in `Pose.moved`.
+
+        Parameters
+        ----------
+        points : (m, 3) array
+            The new ones.
+        """
+        turns = np.array([rotation_about(turn) for turn in poses[:, 3:]])
+        return Estimate(
+            self.cameras + cameras.reshape(self.cameras.shape),
+            turns @ self.rotations,
+            self.translations + poses[:, :3],
+            points,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -171,6 +171,7 @@ def _regression(
     used: BoolArray,
     result: RegressionFit,
 ) -> Regression:
+    """Return a fit by its terms, with what of it they and exposure explain."""
     outlier = np.zeros(len(used), dtype=bool)
     outlier[used] = result.outlier
     basic = _without_exposure(names)

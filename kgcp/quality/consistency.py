@@ -143,6 +143,7 @@ def _meet(
     poses: ReferencePoses,
     camera: Camera,
 ) -> list[Meeting]:
+    """Return where moving targets were measured in frames with reference poses, by time."""
     rows = {frame: row for row, frame in enumerate(poses.frames)}
     moving = [
         sighting
@@ -175,6 +176,7 @@ def _discrepancies(
     fitted: CorrectionEstimate,
     time_offset_s: float,
 ) -> tuple[Discrepancy, ...]:
+    """Return what images and poses are apart by, before and after the corrections."""
     residual = equations.offset + equations.design @ fitted.values
     track = equations.track
     cov = track @ (equations.fading + equations.white) @ np.swapaxes(track, 1, 2)

@@ -188,6 +188,7 @@ def _plan_frames(
     elapsed_s: FloatArray,
     lever_arm_m: FloatArray,
 ) -> tuple[FramePlan, ...]:
+    """Plan all frames of a drive; the random numbers of one do not depend on the others."""
     states = drive(elapsed_s)
     enu_from_body = local_frame.level_rotations(states.position_enu_m) @ states.level_from_body
     target_enu_m = states.position_enu_m + enu_from_body @ lever_arm_m
@@ -221,6 +222,7 @@ def _plan_frame(
     present: bool,
     decoy: bool,
 ) -> FramePlan:
+    """Draw from where a frame is taken, what stands in it, its blur and its exposure."""
     distance_m = climb(settings, index, rng)
     reach_m = 0.5 * TARGET_PLATE.target.ring.outer_diameter_m
     camera = hover(

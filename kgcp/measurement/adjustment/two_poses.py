@@ -139,6 +139,7 @@ def advantage(poses: TwoPoses, covariance: PoseCovariance, prior: NormalPrior | 
 
 
 def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
+    """Fit from the mirrored pose; a hopeless one is left after few steps."""
     parameters = fit.parameters
     mirrored = parameters.at(parameters.pose.mirrored())
     linear = None

@@ -39,6 +39,7 @@ def read_codes(
 
 
 def _read(values: np.ndarray, outline: DiscOutline, ring: CodeRing) -> int | None:
+    """Read the sectors around a disc; None: no clear ring is there, or it leaves the frame."""
     count = ring.bits * _PER_SECTOR
     angles = 2.0 * np.pi / count * np.arange(count)
     ellipse = outline.ellipse

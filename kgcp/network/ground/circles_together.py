@@ -298,6 +298,7 @@ def _is_alike(first: ExtraNoise, second: ExtraNoise) -> bool:
 
 
 def _attempt(camera: Camera, views: CircleViews, noise: ExtraNoise) -> PlacedCircle | NoCircleError:
+    """Return what `place_circle` returns or raises."""
     try:
         return place_circle(camera, views, noise)
     except NoCircleError as error:

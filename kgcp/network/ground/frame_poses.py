@@ -200,6 +200,7 @@ def _by_points(
     *,
     has_free_focal: bool,
 ) -> FramePose:
+    """Orient a frame by three targets or more; where that fails, give the reason."""
     usable = [each for each in sightings if each.centre_cov_px2 is not None]
     names = tuple(each.target for each in usable)
     if len(usable) < 3:
@@ -259,6 +260,7 @@ def _of_resection(
     sd_focal: float | None,
     images: PointImages,
 ) -> FramePose:
+    """Return a resection with the deviation of what all distances have in common."""
     # where all distances are off alike, images and positions alone tell how far away they are
     sight = images.positions_m[found.is_used].mean(axis=0) - found.pose.centre_m
     sd_scale = math.sqrt(float(sight @ found.cov[:3, :3] @ sight)) / float(sight @ sight)

@@ -379,6 +379,7 @@ def _on_the_map(
     common_cov: FloatArray,
     local_frame: LocalFrame,
 ) -> PlacedTarget:
+    """Return a circle in the axes of the map, compared with what is stated of its target."""
     fit = placed.fit
     circle = fit.circle
     enu_from_map = local_frame.grid_rotation(circle.centre_m)
@@ -424,6 +425,7 @@ def _check(
     enu_from_map: FloatArray,
     local_frame: LocalFrame,
 ) -> PlaceCheck:
+    """Compare a circle with the stated place and diameter of its target."""
     residual, residual_cov = None, None
     if target.position_m is not None:
         stated = static_position(target.position_m, target, local_frame)

@@ -110,6 +110,7 @@ _RADIANS = 3, 4
 
 
 def _check_heading(course: Course) -> tuple[Doubt, ...]:
+    """Compare headings with the course; where they differ, name the readings that fit."""
     heading = course.attitude_deg[:, 2]
     off = course.median_off_deg
     if off <= _LARGEST_DEG:

@@ -75,6 +75,7 @@ def check_visibility(
 
 
 def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: float) -> Doubt:
+    """Return the doubt about poses far away, by the first slip without which they are near."""
     figures = {"distance_m": off_m}
     sentence = f"reference poses and trajectory are {off_m / 1000.0:.4g} km apart at least"
     swapped_poses = poses.position_map[:, [1, 0, 2]]

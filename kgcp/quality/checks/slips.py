@@ -144,6 +144,7 @@ def clock_slip(shift_s: float, words: str) -> Slip:
 
 
 def _of_camera(camera: Camera) -> Iterator[Slip]:
+    """Yield slips of a calibration: of frame size, focal length, signs and axes."""
     for factor, word in ((0.5, "double"), (2.0, "half")):
         resized = replace(
             camera,

@@ -77,6 +77,7 @@ def check_static_targets(
 def _pairs(
     sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], camera: Camera
 ) -> list[_Pair]:
+    """Return the distances between all pairs of static targets, frame by frame."""
     by_frame: dict[str, dict[str, Sighting]] = defaultdict(dict)
     for each in sightings:
         if each.target in positions and not each.instance and each.pose is not None:
@@ -96,6 +97,7 @@ def _pair(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
 ) -> _Pair | None:
+    """Return the distance of two targets with all that may distort it; None: both are at one place."""
     first, second = (seen[name] for name in names)
     if first.pose is None or second.pose is None:
         return None

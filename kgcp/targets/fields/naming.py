@@ -325,6 +325,10 @@ class _Kinds:
 
     @classmethod
     def of(cls, seen: SeenDiscs, field: Field, lattice: _Lattice) -> _Kinds:
+        """Return how discs look beside their neighbours on the lattice, and how they should.
+
+        A disc that has no neighbours counts as one of the usual size.
+        """
         sizes = 0.5 * np.log(np.linalg.det(seen.stretches))
         relative = np.zeros(len(sizes))
         for (u, v), disc in lattice.items():
