@@ -8,7 +8,7 @@ disc has its own ellipse, blur and light. What they say together is the prior fo
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,9 +89,15 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
-    fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
-    plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
-    bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
+    firsts = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
+    fits = [fit for _, fit in firsts]
+    starts = {Tone.SRGB: [fit.state for fit in fits]}
+    if tone is Tone.UNKNOWN:
+        starts[Tone.LINEAR] = [_state_by_line(*first) for first in firsts]
+    plain = _joints(fits, starts)
+    bent = []
+    if tone is Tone.UNKNOWN:
+        bent = _joints(fits, {_BENT[known]: states for known, states in starts.items()})
     sds = [fit.sd for fit in fits]
     best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
     if best is None:
@@ -135,7 +141,7 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     return [large[i] for i in half[::step][:count]]
 
 
-def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
+def _first_fits(tasks: Sequence[DiscTask]) -> list[tuple[DiscTask, DiscFit]]:
     """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
 
     Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
@@ -148,16 +154,22 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
             fit = adjust_disc(task, DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_disc_fit(fit, task.outline)
-            fits.append(fit)
+            fits.append((task, fit))
             is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
             if not is_burnt and not is_in_curved_light(fit, task):
-                clean.append(fit)
+                clean.append((task, fit))
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
-def _joints(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> list[JointFit]:
-    """Return discs adjusted together by each of some curves, if they can be."""
-    return [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
+def _joints(fits: Sequence[DiscFit], starts: Mapping[Tone, Sequence[DiscState]]) -> list[JointFit]:
+    """Return discs adjusted together by each of some curves, from states of each disc, if any."""
+    sds = [fit.sd for fit in fits]
+    joints = [
+        _adjusted_together(fits, _sharing(states), tone, SHARPENING_PX, sds)
+        for tone, states in starts.items()
+        if states
+    ]
+    return [joint for joint in joints if joint]
 
 
 def _likeliest(joints: Sequence[JointFit]) -> JointFit | None:
@@ -193,15 +205,6 @@ def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
     waves = np.arange(WAVES)
     precision[waves, waves] = _LITTLE_BENT**-2
     return ProcessingPrior(known.mean, precision)
-
-
-def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
-    """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
-    if not fits:
-        return None
-    sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
-    states = [_state_by(fit, tone, sharpening) for fit in fits]
-    return _adjusted_together(fits, states, tone, SHARPENING_PX, [fit.sd for fit in fits])
 
 
 def _adjusted_together(
@@ -258,13 +261,29 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     return between if between is not None and between.loss < middle else tried[best]
 
 
-def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
-    """Return the state of a fit by sRGB's curve, for another tone curve with the same levels."""
-    vector = fit.state.vector.copy()
-    vector[Row.SHARPENING] = sharpening
-    if not tone.is_srgb:
+def _state_by_line(task: DiscTask, fit: DiscFit) -> DiscState:
+    """Return the state of a disc adjusted by a straight line; if it cannot be, by sRGB's levels.
+
+    Burnt white has another level by every curve. From that by sRGB's, which may be twice as high,
+    discs adjusted together by a line take all residuals for noise, and stay there.
+    """
+    try:
+        own = adjust_disc(task, DiscUnknowns.of(Tone.LINEAR, sharpening_px=SHARPENING_PX))
+        check_disc_fit(own, task.outline)
+    except (DiscRejection, NoFit, np.linalg.LinAlgError):
+        vector = fit.state.vector.copy()
         vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(Tone.SRGB)
-    return DiscState(vector)
+        return DiscState(vector)
+    return own.state
+
+
+def _sharing(states: Sequence[DiscState]) -> list[DiscState]:
+    """Return states with the sharpening that is usual among them."""
+    sharpening = float(np.median([state.vector[Row.SHARPENING] for state in states]))
+    vectors = [state.vector.copy() for state in states]
+    for vector in vectors:
+        vector[Row.SHARPENING] = sharpening
+    return [DiscState(vector) for vector in vectors]
 
 
 def _known_by(joint: JointFit) -> ProcessingPrior:

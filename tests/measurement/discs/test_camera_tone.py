@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,9 @@ from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask
 from kgcp.measurement.discs.camera_tone import _worthy, learn_tone
 from kgcp.measurement.discs.joint_tone import JointFit
+from kgcp.measurement.discs.measure import learn_camera, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.discs.records import Disc
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
@@ -89,6 +93,29 @@ def test_noise_does_not_bend_a_straight_line(levels: tuple[float, float], seed: 
     assert learned.tone is Tone.UNKNOWN_FROM_LINE
     assert learned.known.mean[:3].tolist() == [0.0, 0.0, 0.0]
     assert learned.known.mean[3] == pytest.approx(0.5 * (seed > 0), abs=0.15)
+
+
+@pytest.mark.parametrize("levels", [(0.1, 0.62), (0.62, 0.1)])
+def test_burnt_white_does_not_bend_a_straight_line(levels: tuple[float, float]) -> None:
+    """Of white at 1.5 times full scale; curves that were bent displaced edges by 0.1 px."""
+    rng = np.random.default_rng(7)
+    camera = Camera(160, 130, 200_000.0, 200_000.0, 79.5, 64.5)
+    outlines, edges = [], []
+    for _ in range(3):
+        places = (30.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + rng.uniform(-0.5, 0.5, 2)) / 2e5
+        discs = tuple(SimulatedDisc((x, y, 0.0), 16.0 / 2e5) for x, y in places.tolist())
+        scene = FieldScene(discs, *levels, gradient=(0.004, 0.003))
+        grey = photograph(camera, POSE, scene, Optics(0.6), Sensor(), rng, 1.5 / 0.62)
+        outlines.append((grey, find_outlines(grey)))
+    learned = learn_camera(outlines, Response.UNKNOWN)
+    assert learned.tone is Tone.UNKNOWN_FROM_LINE
+    assert learned.known is not None
+    assert learned.known.mean[:3].tolist() == [0.0, 0.0, 0.0]
+    for grey, found in outlines:
+        measured = measure_discs(grey, found, camera=learned)
+        edges += [math.sqrt(4.0 * disc.vector[2]) for disc in measured if isinstance(disc, Disc)]
+    assert len(edges) >= 55
+    assert np.mean(edges) == pytest.approx(8.0, abs=0.04)
 
 
 def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
