@@ -99,7 +99,7 @@ def test_without_a_border_the_texture_of_the_ground_is_allowed_for(target: Plain
     off_px, sd_px = [], []
     for x_px in (70.4, 80.1, 90.7, 101.2, 110.9, 120.3):
         pose = pose_at(x_px, 71.7, bare)
-        light: FloatArray = 0.3 + 0.15 * grass
+        light = np.asarray(0.3 + 0.15 * grass, dtype=np.float64)
         image_plate(CAMERA, PlainPlate(bare), pose, Optics(0.6)).paste(light)
         outcome = looked(Sensor().expose(light, 1.0, rng), prediction_of(pose), bare)
         assert isinstance(outcome, Measurement)
