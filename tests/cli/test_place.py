@@ -201,6 +201,8 @@ def test_poses_that_step_move_no_target(
     for target in json.loads(result.stdout)["targets"]:
         assert target["frames_used"] == 12
         assert target["moved"] is None
+        assert target["poses_step"]["frame"] == f"f_{frames:03d}.png"
+        assert target["poses_step"]["distance_m"] == pytest.approx(size_m, rel=0.5)
 
 
 @pytest.mark.usefixtures("_no_figures")

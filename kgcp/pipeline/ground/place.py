@@ -30,7 +30,7 @@ from kgcp.io.tables.places import (
     residual_rows,
 )
 from kgcp.io.tables.provenance import derived_provenance
-from kgcp.network.ground.target_places import PlacedTarget, Placement, place_targets
+from kgcp.network.ground.target_places import PlacedTarget, Placement, TargetMove, place_targets
 from kgcp.network.ground.target_plane import MOST_EXTRA_PX
 from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.export import write_formats
@@ -311,9 +311,8 @@ def _numbers(placed: PlacedTarget) -> dict[str, object]:
         "rejected": [
             frame for frame, used in zip(placed.frames, placed.is_used, strict=True) if not used
         ],
-        "moved": None
-        if placed.move is None
-        else {"frame": placed.move.frame, "distance_m": placed.move.distance_m},
+        "moved": _split_numbers(placed.move),
+        "poses_step": _split_numbers(placed.step),
         "variance_factor": placed.variance_factor,
         "residual_m": residual,
         "sd_residual_m": None if cov is None else np.sqrt(np.diag(cov)).tolist(),
@@ -322,3 +321,7 @@ def _numbers(placed: PlacedTarget) -> dict[str, object]:
         * check.sd_diameter_residual_m
         / check.stated_diameter_m,
     }
+
+
+def _split_numbers(move: TargetMove | None) -> dict[str, object] | None:
+    return None if move is None else {"frame": move.frame, "distance_m": move.distance_m}
