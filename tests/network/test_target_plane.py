@@ -219,6 +219,24 @@ def test_poses_that_drift_move_no_single_circle() -> None:
     assert noise.centre_px > 0.03
 
 
+@pytest.mark.parametrize("seed", [5, 7])
+def test_a_bad_outline_among_many_good_ones_has_deviations_of_its_own(seed: int) -> None:
+    """Its places are as good as theirs, and its shapes are forty times as bad as stated."""
+    rng, truth = np.random.default_rng(seed), circle_of(10.0)
+    many = [views_of(truth, rng, frames=5) for _ in range(20)]
+    unit = np.linalg.cholesky(outline_noise(many[0].moments))
+    noise = 0.2 * np.einsum("nij,nj->ni", unit, rng.standard_normal((5, 5)))
+    many[0].moments[:, 2:] += noise[:, 2:]
+    placed, common = place_circles(CAMERA, many)
+    worst = placed[0]
+    assert isinstance(worst, PlacedCircle)
+    assert worst.is_apart
+    assert worst.noise.outline_px == pytest.approx(0.2, rel=0.6)
+    assert common.outline_px < 0.07
+    z = errors_of(worst.fit.circle, truth) / np.sqrt(np.diag(worst.fit.cov))
+    assert 0.3 < float(np.sqrt(np.mean(z**2))) < 2.0
+
+
 def test_fewer_than_six_frames_show_no_move() -> None:
     truth = circle_of(10.0)
     views = views_of(truth, np.random.default_rng(15), frames=5)

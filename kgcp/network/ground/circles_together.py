@@ -43,6 +43,7 @@ _MOST_STEP_M = 0.3
 # variances differ 16-fold by chance once in 70 000 flights.
 _FRAMES_OF_TWO = 8
 _MOST_FACTOR = 10.0  # of the variance, that the estimated noise may leave
+_AGREEING_FACTOR = 3.0  # of the frames that agree; three exceed it by chance once in 700
 _DRAWS = 40  # of three frames: one of them is right in 99.9 % if 60 % of the frames are
 
 
@@ -239,7 +240,9 @@ def _by_most_frames(camera: Camera, views: CircleViews, noise: ExtraNoise) -> Pl
         if start is None:
             continue
         fit = fit_to_agreeing(camera, views, start, noise)
-        if fit is not None and 2 * np.count_nonzero(fit.chi2 <= REJECTED_CHI2) > len(views):
+        if fit is None or fit.variance_factor > _AGREEING_FACTOR:
+            continue
+        if 2 * np.count_nonzero(fit.chi2 <= REJECTED_CHI2) > len(views):
             return without_other(camera, views, fit, noise)
     return None
 

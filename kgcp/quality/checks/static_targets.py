@@ -97,7 +97,7 @@ def _pair(
     positions: Mapping[str, TargetPosition],
     camera: Camera,
 ) -> _Pair | None:
-    """Return the distance of two targets, with all that may distort it; None if it is zero."""
+    """Return the distance of two targets and its deviation; None: both are at one place."""
     first, second = (seen[name] for name in names)
     if first.pose is None or second.pose is None:
         return None
