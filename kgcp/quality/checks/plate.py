@@ -9,7 +9,7 @@ from kgcp.targets.layout import Ring, Target
 from kgcp.targets.plain import AnyTarget
 
 _LARGEST_M, _SMALLEST_M = 8.0, 0.02
-_UNITS = (("inches", 0.0254), ("feet", 0.3048), ("centimetres", 0.01), ("millimetres", 0.001))
+_UNITS = (("inches", 0.0254), ("feet", 0.3048), ("centimetres", 0.01))
 _USUAL_M = 0.15, 3.0
 # Of simulated targets within these, the search finds 97 %; of rings with a ratio of 0.35 it finds
 # 55 %, with 0.3 32 % and with 0.75 69 % (`python -m benchmarks.search.layouts`).

@@ -127,6 +127,23 @@ def test_a_hole_too_small_to_be_seen_does_not_speak_against_its_place(
     assert mark.tolist() not in SQUARE.points_m()[naming.point].tolist()
 
 
+@pytest.mark.parametrize(("diameter_m", "is_mark"), [(0.0128, True), (0.0124, False)])
+def test_a_disc_marks_a_field_if_its_size_can_be_told(
+    diameter_m: float,
+    is_mark: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    """7 % larger than the others, and 3 %, which blur or light may do."""
+    field = Field("m", GridKind.SQUARE, 9, 6, 0.025, 0.012, marks=(Mark(1, 1, diameter_m),))
+    found, truth = seen(field, 20.0, (0.1, 0.1), (0.0, 0.0))
+    naming = name_discs(found, field)
+    if not is_mark:
+        assert naming is NamingProblem.AMBIGUOUS
+        return
+    assert isinstance(naming, Naming)
+    assert np.array_equal(naming.point, truth[naming.disc])
+    assert naming.marks == 1
+
+
 def test_a_mark_whose_hole_is_not_seen_does_not_count_as_one() -> None:
     field = Field(
         "m", GridKind.SQUARE, 9, 6, 0.025, 0.012, marks=(Mark(1, 1, 0.012, 0.004), Mark(6, 3, 0.02))

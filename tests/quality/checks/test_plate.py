@@ -1,0 +1,56 @@
+"""Which layouts of targets are told as hard to find, and which sizes as those of other units."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from kgcp.quality.checks.doubt import Cause
+from kgcp.quality.checks.plate import check_plates
+from kgcp.targets.layout import Ring, Target
+
+SEVEN_DEG = (0.0, 50.0, 102.0, 155.0, 206.0, 258.0, 311.0)
+
+
+def target(outer_m: float = 0.9, inner_ratio: float = 0.5, white_share: float = 0.1) -> Target:
+    ring_m2 = (1.0 - inner_ratio**2) * outer_m**2
+    dot_m = math.sqrt(white_share * ring_m2 / len(SEVEN_DEG))
+    code_m = 0.5 * (1.0 + inner_ratio) * outer_m
+    return Target(Ring("A", outer_m, inner_ratio * outer_m, code_m, dot_m, SEVEN_DEG))
+
+
+@pytest.mark.parametrize(
+    ("inner_ratio", "white_share", "words"),
+    [
+        (0.5, 0.1, ""),
+        (0.4, 0.1, ""),
+        (0.38, 0.1, "is 0.38 of the outer one, and many rings beyond 0.4 to 0.7 are not found"),
+        (0.7, 0.1, ""),
+        (0.72, 0.1, "is 0.72 of the outer one"),
+        (0.5, 0.32, ""),
+        (0.5, 0.35, "the dots of 'A' take 35% of the ring, and many are not found"),
+    ],
+)
+def test_layouts_that_are_hard_to_find_are_told(
+    inner_ratio: float, white_share: float, words: str
+) -> None:
+    doubts = check_plates([target(inner_ratio=inner_ratio, white_share=white_share)])
+    assert [doubt.code for doubt in doubts] == [Cause.LAYOUT] * bool(words)
+    assert all(words in doubt.sentence and not doubt.is_grave for doubt in doubts)
+
+
+@pytest.mark.parametrize(
+    ("outer_m", "words"),
+    [
+        (0.03, ""),
+        (7.0, ""),
+        (0.01, "an outer diameter of 0.01 m"),
+        (24.0, "24 m (0.61 m if these are inches, 0.24 m if these are centimetres)"),
+        (90.0, "90 m (2.29 m if these are inches, 0.9 m if these are centimetres)"),
+    ],
+)
+def test_diameters_in_other_units_are_told(outer_m: float, words: str) -> None:
+    doubts = check_plates([target(outer_m)])
+    assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
+    assert all(words in doubt.sentence and doubt.is_grave for doubt in doubts)
