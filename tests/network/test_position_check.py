@@ -79,3 +79,11 @@ def test_images_worse_or_better_than_stated_contradict_no_position(
     """What no positions explain widens the images' covariances."""
     found = [checked(6, seed, sd_m=sd_m, noise=noise)[1] for seed in range(12)]
     assert found == [None] * 12
+
+
+def test_a_wrong_position_is_told_in_images_worse_than_stated() -> None:
+    found = [checked(6, seed, off_m=0.1, noise=10.0) for seed in range(12)]
+    told = [(true, wrong) for true, wrong in found if wrong is not None]
+    assert len(told) >= 11
+    assert all(wrong.targets[0] == true for true, wrong in told)
+    assert float(np.median([wrong.off_m for _, wrong in told])) == pytest.approx(0.1, rel=0.15)
