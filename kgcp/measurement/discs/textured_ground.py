@@ -52,6 +52,7 @@ _EVERY_OF_MIDDLE = 7  # of the disc's middle, which tells its level
 _GROUND = 0.98  # share of the ground that a pixel sees, at least, to tell the texture
 _FEWEST = 10  # pixels, to tell noise or texture
 _OF_DISC = 2  # parameters that the disc's pixels alone tell: level and blur
+_LEAST_LEFT = 1.0  # of the scatter, after the fit
 _LEAST_NOISE_COUNTS = 0.3  # quantisation alone
 _SLOPES = np.array((Row.SLOPE_X, Row.SLOPE_Y))
 
@@ -89,7 +90,7 @@ def fit_on_texture(
         if number < _TEXTURE_ROUNDS:
             columns = np.vstack((_by_ground(now), now.jacobian[_SLOPES])).T
             texture = modes.likeliest(columns, sample.levels - now.levels, noise)
-        normal, gradient, square = _equations(now, sectors, texture, noise)
+        normal, gradient = _with_priors(now, _equations(now, sectors, texture, noise))
         step = np.zeros(COUNT)
         step[fit.free.rows] = np.linalg.solve(normal, gradient)
         if not np.isfinite(step).all():
@@ -98,10 +99,12 @@ def fit_on_texture(
         if number >= _TEXTURE_ROUNDS and np.abs(step[:GEOMETRY_COUNT]).max() < _SETTLED_PX:
             break
         now = _linearised(fit, sample, state)
+    arcs = sectors_about(centre_px, places_px, math.ceil(places_px.shape[1] / scatter.arcs))
+    ratio = _scatter_ratio(normal, _equations(now, arcs, texture, noise))
     to_moments = moments_by_stretch(state.geometry)
     cov = np.linalg.inv(normal)[:GEOMETRY_COUNT, :GEOMETRY_COUNT]
-    changed = replace(scatter, independent=to_moments @ cov @ to_moments.T, ratio=square)
-    return replace(fit, state=state), changed
+    independent = to_moments @ cov @ to_moments.T
+    return replace(fit, state=state), replace(scatter, independent=independent, ratio=ratio)
 
 
 def _ground_share(fit: DiscFit) -> FloatArray:
@@ -170,24 +173,40 @@ def _is_seen(fit: DiscFit) -> BoolArray:
 
 def _equations(
     fit: DiscFit, sectors: Sequence[Sector], texture: GroundTexture, noise: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return normal equations (p, p) and (p,), priors included, and the mean square residual.
-
-    Residuals are in units of what texture and noise make them.
-    """
-    free, residuals = fit.free, fit.sample.levels - fit.levels
-    rows, by_ground, seen = fit.jacobian[free.rows], _by_ground(fit), _is_seen(fit)
-    products = np.zeros((len(rows) + 1, len(rows) + 1))
-    for sector in sectors:
+) -> FloatArray:
+    """Return the equations (k, p, p + 1) of each sector: normal matrix and gradient."""
+    rows, by_ground, seen = fit.jacobian[fit.free.rows], _by_ground(fit), _is_seen(fit)
+    both = np.vstack((rows, fit.sample.levels - fit.levels)).T
+    products = np.zeros((len(sectors), len(rows), len(rows) + 1))
+    for of_sector, sector in zip(products, sectors, strict=True):
         part = sector.only(seen)
         cov = texture.cov(part.distances_px, by_ground[part.index])
         cov.ravel()[:: len(cov) + 1] += noise * noise
-        both = np.vstack((rows[:, part.index], residuals[part.index]))
         root, failure = dpotrf(cov, lower=1, clean=0)
         if failure:
             raise NoFit
-        half, _ = dtrtrs(root, both.T, lower=1)
-        products += half.T @ half
-    normal = products[:-1, :-1] + free.precision[np.ix_(free.rows, free.rows)]
-    gradient = products[:-1, -1] + (free.precision @ (free.mean - fit.state.vector))[free.rows]
-    return normal, gradient, float(products[-1, -1] / np.count_nonzero(seen))
+        half, _ = dtrtrs(root, both[part.index], lower=1)
+        of_sector[:] = half[:, :-1].T @ half
+    return products
+
+
+def _with_priors(fit: DiscFit, equations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the normal matrix (p, p) and the gradient (p,) of all sectors and the priors."""
+    free, total = fit.free, equations.sum(axis=0)
+    normal = total[:, :-1] + free.precision[np.ix_(free.rows, free.rows)]
+    return normal, total[:, -1] + (free.precision @ (free.mean - fit.state.vector))[free.rows]
+
+
+def _scatter_ratio(normal: FloatArray, equations: FloatArray) -> float:
+    """Return the scatter of the arcs' gradients over the expected one, as they move the ellipse.
+
+    A stone or a painted line at the edge is no texture: it pulls at one arc.
+    """
+    inverse = np.linalg.inv(normal)
+    own = inverse[:GEOMETRY_COUNT]
+    to_own = np.linalg.solve(np.linalg.cholesky(own[:, :GEOMETRY_COUNT]), own)
+    moved = equations[:, :, -1] @ to_own.T
+    # of an arc whose normal matrix is A, the fit leaves A − A N⁻¹ A
+    products = to_own @ equations[:, :, :-1]
+    left = float(np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products))
+    return float(np.sum(moved * moved)) / max(left, _LEAST_LEFT)
