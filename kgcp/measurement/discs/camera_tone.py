@@ -98,10 +98,10 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     bent = []
     if tone is Tone.UNKNOWN:
         bent = _joints(fits, {_BENT[known]: states for known, states in starts.items()})
-    sds = [fit.sd for fit in fits]
-    best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
-    if best is None:
+    if not plain:
         return CameraTone(tone, SHARPENING_PX)
+    sds = _least_noise([*plain, *bent])
+    best = _likeliest([_with_best_mask(each, sds) for each in _worthy(plain, bent, sds)], sds)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
@@ -163,21 +163,30 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[tuple[DiscTask, DiscFit]]:
 
 def _joints(fits: Sequence[DiscFit], starts: Mapping[Tone, Sequence[DiscState]]) -> list[JointFit]:
     """Return discs adjusted together by each of some curves, from states of each disc, if any."""
-    sds = [fit.sd for fit in fits]
     joints = [
-        _adjusted_together(fits, _sharing(states), tone, SHARPENING_PX, sds)
+        _adjusted_together(fits, _sharing(states), tone, SHARPENING_PX)
         for tone, states in starts.items()
         if states
     ]
     return [joint for joint in joints if joint]
 
 
-def _likeliest(joints: Sequence[JointFit]) -> JointFit | None:
-    """Return the likeliest; None if there is none."""
-    return min(joints, key=lambda joint: joint.loss, default=None)
+def _least_noise(joints: Sequence[JointFit]) -> list[FloatArray]:
+    """Return the noise of each disc's pixels by the curve that leaves the least.
+
+    What a wrong curve leaves would count as noise of just those pixels that tell it from others.
+    """
+    return min((joint.sds for joint in joints), key=lambda sds: sum(np.log(sd).sum() for sd in sds))
 
 
-def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFit]:
+def _likeliest(joints: Sequence[JointFit], sds: Sequence[FloatArray]) -> JointFit:
+    """Return the likeliest by some noise of each disc's pixels."""
+    return min(joints, key=lambda joint: joint.loss_by(sds))
+
+
+def _worthy(
+    plain: Sequence[JointFit], bent: Sequence[JointFit], sds: Sequence[FloatArray]
+) -> list[JointFit]:
     """Return discs by the likeliest curve, and by others that are nearly as likely.
 
     By a bent curve only if it is significantly likelier than a plain one. Where discs contradict
@@ -185,18 +194,20 @@ def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFi
     for. A line is bent itself unless sRGB's curve is much likelier when bent: nearly straight but
     for its dark end, that one makes discs too large or too small.
     """
-    known, best = _likeliest(plain), _likeliest(bent)
-    if known is None or best is None:
-        return [joint for joint in (best or known,) if joint]
-    gain = known.loss - best.loss
+    known = _likeliest(plain, sds)
+    if not bent:
+        return [known]
+    best = _likeliest(bent, sds)
+    least = best.loss_by(sds)
+    gain = known.loss_by(sds) - least
     if 2.0 * gain <= _WORTHY_BENDS * _excess(best) ** _BY_EXCESS:
         return [known]
     line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
     if known.tone is Tone.LINEAR and line is not None:
-        farther = max(joint.loss for joint in plain) - known.loss
-        if line.loss - best.loss <= _LIKE_LINE * farther:
+        farther = max(joint.loss_by(sds) for joint in plain) - known.loss_by(sds)
+        if line.loss_by(sds) - least <= _LIKE_LINE * farther:
             return [line]
-    return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
+    return [joint for joint in bent if joint.loss_by(sds) - least < _NEARLY * gain]
 
 
 def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
@@ -212,13 +223,12 @@ def _adjusted_together(
     states: Sequence[DiscState],
     tone: Tone,
     sharpening_px: float,
-    sds: Sequence[FloatArray],
 ) -> JointFit | None:
     samples = [
         fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
     ]
     try:
-        return adjust_together(samples, states, tone, sharpening_px, sds)
+        return adjust_together(samples, states, tone, sharpening_px)
     except (NoFit, np.linalg.LinAlgError):
         return None
 
@@ -236,29 +246,30 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     def at(step: float) -> JointFit | None:
         states = [fit.state for fit in joint.fits]
         mask_px = _MASK_STEP**step * SHARPENING_PX
-        return _adjusted_together(joint.fits, states, joint.tone, mask_px, sds)
+        return _adjusted_together(joint.fits, states, joint.tone, mask_px)
 
     # anew, since the pixels beside the modelled ones are masked by what is known by now
     tried = {0: at(0) or joint}
+    loss = {0: tried[0].loss_by(sds)}
     for direction in (1, -1):
         step = direction
         while abs(step) <= _MOST_STEPS:
             other = at(step)
             if other is None:
                 break
-            tried[step] = other
-            if other.loss > tried[step - direction].loss:
+            tried[step], loss[step] = other, other.loss_by(sds)
+            if loss[step] > loss[step - direction]:
                 break
             step += direction
-        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
+        if min(loss, key=loss.__getitem__):  # this was the right direction
             break
-    best = min(tried, key=lambda step: tried[step].loss)
+    best = min(loss, key=loss.__getitem__)
     if best - 1 not in tried or best + 1 not in tried:
         return tried[best]
-    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
+    before, middle, after = (loss[best + k] for k in (-1, 0, 1))
     bend = before + after - 2.0 * middle
     between = at(best + 0.5 * (before - after) / bend) if bend > 0.0 else None
-    return between if between is not None and between.loss < middle else tried[best]
+    return between if between and between.loss_by(sds) < middle else tried[best]
 
 
 def _state_by_line(task: DiscTask, fit: DiscFit) -> DiscState:
