@@ -67,29 +67,27 @@ def load_compiled_code() -> bool:
 
 
 @single_threaded()
-def compile_search() -> bool:
+def compile_search() -> None:
     """Compile what is missing of the search: by looking for the drawn plate."""
     grey, target = _drawn_plate(), Target(_RING)
     candidates = find_dotted(grey, find_rings(grey, DetectSettings()), [_RING])
     (match,), _ = find_code(candidates[_RING], _RING, DetectSettings())
     start = initial_pose(grey, _CAMERA, target, match)
     match_templates_at(grey, _CAMERA, start.pose, _RING)
-    return True
 
 
 @single_threaded()
-def compile_adjustment() -> bool:
+def compile_adjustment() -> None:
     """Compile what is missing of the adjustment: by measuring the drawn plate where it is."""
     grey, distance_m = _drawn_plate(), _CAMERA.fx * 0.5 * _RING.outer_diameter_m / _RADIUS_PX
     pose = Pose(np.eye(3), np.array([0.0, 0.0, distance_m])).tilted(_TILT_RAD)
     start = InitialPose(_RING.name, 1.0, pose, _RADIUS_PX, edge_shift_px=0.0, blur_px=_BLUR_PX)
     for response in _RESPONSES:
         measure_by_model(grey, replace(_CAMERA, response=response), Target(_RING), start)
-    return True
 
 
 @single_threaded()
-def compile_code() -> bool:
+def compile_code() -> None:
     """Load what most frames need, and compile what is missing: by measuring a drawn plate."""
     grey = _drawn_plate()
     for response in _RESPONSES:
@@ -97,7 +95,6 @@ def compile_code() -> bool:
             camera = replace(_CAMERA, response=response)
             examine(grey, camera, (Target(_RING),), DetectSettings())
             _loaded.add(response)
-    return True
 
 
 def compilation() -> Preparation:

@@ -68,15 +68,15 @@ class Preparation:
     def __init__(
         self,
         quick: Callable[[], bool],
-        slow: Callable[[], bool],
-        parts: Sequence[Callable[[], bool]] = (),
+        slow: Callable[[], object],
+        parts: Sequence[Callable[[], object]] = (),
     ) -> None:
         self.quick, self.slow = quick, slow
         self.lock = threading.Lock()  # of `slow`
         self._parts_left, self._parts_begun = list(parts), 0
         self._part_ended = threading.Condition()
 
-    def share_parts(self, do: Callable[[Callable[[], bool]], bool]) -> None:
+    def share_parts(self, do: Callable[[Callable[[], object]], object]) -> None:
         """Do the parts that no other process has begun, and wait for the end of all others.
 
         One that fails is not begun again: then `slow` does it.
@@ -142,18 +142,18 @@ class WorkerProcess:
 
     def _prepare(self, connection: _Connection, preparation: Preparation) -> None:
         """Let a new process get ready, however long it takes: not counted as work."""
-        if self._prepared_by(connection, preparation.quick):
+        do = partial(self._do, connection)
+        if do(preparation.quick):
             return
-        preparation.share_parts(partial(self._prepared_by, connection))
+        preparation.share_parts(do)
         with preparation.lock:  # meanwhile another process may have done what is slow
-            if self._prepared_by(connection, preparation.quick):
-                return
-            self._prepared_by(connection, preparation.slow)
+            if not do(preparation.quick):
+                do(preparation.slow)
 
-    def _prepared_by(self, connection: _Connection, prepare: Callable[[], bool]) -> bool:
-        """Call a function in the process, which returns whether nothing is left to prepare."""
+    def _do(self, connection: _Connection, prepare: Callable[[], object]) -> object:
+        """Return what a function of the preparation returns in the process."""
         self._send(connection, prepare)
-        return bool(self._answer(connection, _LONGEST_WAIT_S, ()))
+        return self._answer(connection, _LONGEST_WAIT_S, ())
 
     def _answer(self, connection: _Connection, limit_s: float | None, sent: object) -> Any:  # noqa: ANN401 - of any call
         try:

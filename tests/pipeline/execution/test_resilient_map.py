@@ -72,7 +72,7 @@ def is_prepared(path: Path) -> bool:
     return path.exists() and path.read_text(encoding="utf-8").endswith("ready ")
 
 
-def prepare(path: Path) -> bool:
+def prepare(path: Path) -> None:
     """Write down begin and end of a long preparation, unless another process is through with it."""
     if not is_prepared(path):
         with path.open("a", encoding="utf-8") as file:
@@ -80,7 +80,6 @@ def prepare(path: Path) -> bool:
         time.sleep(0.2)
         with path.open("a", encoding="utf-8") as file:
             file.write("ready ")
-    return True
 
 
 def pool(jobs: int, limit_s: float = LIMIT_S) -> Executor:
@@ -143,7 +142,7 @@ def test_one_process_prepares_what_all_of_them_need(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "begin ready "
 
 
-def meet(folder: Path, own: str, other: str) -> bool:
+def meet(folder: Path, own: str, other: str) -> None:
     """Wait until another process does the other part, which proves that neither waits."""
     with (folder / own).open("a", encoding="utf-8") as file:
         file.write("begun ")
@@ -151,7 +150,6 @@ def meet(folder: Path, own: str, other: str) -> bool:
     while not (folder / other).exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     (folder / f"{own} ended").touch()
-    return True
 
 
 def both_ended(folder: Path) -> bool:
