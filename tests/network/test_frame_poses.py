@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,21 @@ def test_prints_are_off_one_by_one_or_alike(targets: int, sd_own: float, sd_alik
         z.append((found.pose.centre_m - POSE.centre_m) / np.sqrt(found.cov.diagonal()[:3]))
     assert used >= 0.95 * 24 * targets
     assert 0.5 < float(np.sqrt(np.mean(np.square(z)))) < 1.3
+
+
+@pytest.mark.parametrize("wrong", [0.8, 1.25])
+def test_diameters_off_by_half_are_told_whatever_the_focal_length(wrong: float) -> None:
+    """Positions and images tell the focal length; distances were measured by a wrong one."""
+    camera = replace(CAMERA, fx=wrong * CAMERA.fx, fy=wrong * CAMERA.fy, k1=wrong**2 * CAMERA.k1)
+    places_m = np.array([[-4, -3, 0], [4, -3, 2.5], [4, 3, -2], [-4, 3, 2], [0, 1, -1.5]], float)
+    seen = POSE.in_camera(places_m)
+    distances_m = 0.5 * wrong * np.linalg.norm(seen, axis=1)
+    sightings = sightings_of(places_m, distances_m, CAMERA.project(seen), 0.0)
+    cov_m2 = 0.001**2 * np.eye(3)
+    positions = {f"T{row}": TargetPosition(each, cov_m2) for row, each in enumerate(places_m)}
+    (found,) = orient_frames(["f"], sightings, positions, camera, has_free_focal=True)
+    assert found.pose is None
+    assert "the distances are 50 % shorter than the positions say" in found.reason
 
 
 def test_a_print_that_sightings_and_flight_state_counts_once() -> None:

@@ -53,6 +53,22 @@ def test_bent_curves_that_are_nearly_as_likely_are_compared_by_their_own_masks(
 
 
 @pytest.mark.parametrize(
+    ("of_line", "worthy"),
+    [
+        (740.0, {Tone.UNKNOWN_FROM_LINE}),  # a fifth of what the straight line is likelier by
+        (755.0, {Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE}),
+        (765.0, {Tone.UNKNOWN}),
+    ],
+)
+def test_a_line_is_bent_itself_unless_srgb_s_curve_is_much_likelier(
+    of_line: float, worthy: set[Tone]
+) -> None:
+    plain = [joint(Tone.SRGB, 1200.0), joint(Tone.LINEAR, 1000.0)]
+    bent = [joint(Tone.UNKNOWN, 700.0), joint(Tone.UNKNOWN_FROM_LINE, of_line)]
+    assert {each.tone for each in _worthy(plain, bent)} == worthy
+
+
+@pytest.mark.parametrize(
     ("curve", "tone", "waves"),
     [
         (ToneCurve.FILM, Tone.UNKNOWN, (0.0, -0.7, 0.0)),
