@@ -299,7 +299,22 @@ def test_a_row_too_many_in_the_description_is_one_line(photos: Path, tmp_path: P
     result = run(photos, "--field", "grid:5x5:30mm:16mm", "--out", tmp_path, *QUIET)
     assert result.exit_code == 1
     assert "(5 ambiguous, " in result.stderr
-    assert "correct the field's columns and rows, or show all of it or a mark" in result.stderr
+    assert (
+        "correct the field's columns, rows and marks, or show all of it or a mark" in result.stderr
+    )
+
+
+def test_the_other_polarity_is_one_line_that_says_so(photos: Path, tmp_path: Path) -> None:
+    result = run(photos, "--field", "grid:5x4:30mm:16mm:bright", "--out", tmp_path, *QUIET)
+    assert result.exit_code == 1
+    assert "correct the field's polarity (':bright' for bright discs" in result.stderr
+
+
+def test_an_empty_folder_is_one_line_without_a_flight(tmp_path: Path) -> None:
+    result = run(tmp_path, "--field", "grid:5x4:30mm:16mm", *QUIET)
+    assert result.exit_code == 1
+    assert "holds no images; put them there or name another folder" in result.stderr
+    assert "flight.toml" not in result.stderr
 
 
 def test_a_place_that_is_not_there_is_one_line(tmp_path: Path) -> None:

@@ -49,18 +49,21 @@ _UNDECODED = re.compile("[\\udc80-\\udcff]")  # how bytes that are not UTF-8 com
 _MOST_BYTES_PER_PIXEL = 32
 _MOST_METADATA_BYTES = 1 << 26
 
+CORRECT_FOLDER = "correct [frames] folder in flight.toml"
+
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 # libjpeg's words for data that it had to guess; it decodes on and only mentions it on stderr.
 _GUESSED_PIXELS = ("Corrupt JPEG data", "Premature end of JPEG file")
 
 
-def list_frames(folder: Path) -> list[str]:
+def list_frames(folder: Path, remedy: str = CORRECT_FOLDER) -> list[str]:
     """List the images below a folder, as sorted relative paths with `/`.
 
     Hidden files and folders are passed over; the suffix decides, in any case. Links to files
     are followed, links to folders below `folder` are not (they may run in circles). Where the
-    flight's own folder has the frames, the results in it are not among them.
+    flight's own folder has the frames, the results in it are not among them. `remedy` is what to do
+    if this is not the right folder.
 
     Raises
     ------
@@ -68,7 +71,7 @@ def list_frames(folder: Path) -> list[str]:
         If the folder is missing or unreadable, holds no image, or a name is not UTF-8.
     """
     if not is_folder(folder):
-        raise KgcpError(f"{folder}: is not a folder; correct [frames] folder in flight.toml")
+        raise KgcpError(f"{folder}: is not a folder; {remedy}")
     names = []
     is_flight = is_file(folder / "flight.toml")
     for parent, folders, files in os.walk(folder, onerror=_refuse_folder):
@@ -77,14 +80,14 @@ def list_frames(folder: Path) -> list[str]:
             name for name in folders if name[0] != "." and not (is_top and name == RESULTS_NAME)
         ]
         names += [(Path(parent) / name).relative_to(folder).as_posix() for name in files]
-    frames = frames_among(names, str(folder))
+    frames = frames_among(names, str(folder), remedy)
     for name in frames:
         if _UNDECODED.search(name):
             raise KgcpError(f"{folder}: the name {name!r} is not UTF-8; rename the file")
     return frames
 
 
-def frames_among(names: Sequence[str], folder: str) -> list[str]:
+def frames_among(names: Sequence[str], folder: str, remedy: str = CORRECT_FOLDER) -> list[str]:
     """Return the images among the files of a folder, by their paths below it, sorted.
 
     Raises
@@ -99,14 +102,13 @@ def frames_among(names: Sequence[str], folder: str) -> list[str]:
     counts = Counter(PurePosixPath(name).suffix.lower() for name in shown)
     counts.pop("", None)
     if not counts:
-        raise KgcpError(
-            f"{folder}: holds no images; put the frames there or correct [frames] folder in"
-            " flight.toml"
-        )
+        raise KgcpError(f"{folder}: holds no images; put them there or {remedy}")
     suffix, count = counts.most_common(1)[0]
-    kind, remedy = _kind_of(suffix)
+    kind, conversion = _kind_of(suffix)
+    if kind == "files":
+        conversion += f", or {remedy}"
     raise KgcpError(
-        f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {remedy}"
+        f"{folder}: holds no images that kgcp reads, but {count} {suffix} {kind}; {conversion}"
     )
 
 
@@ -161,7 +163,7 @@ def _kind_of(suffix: str) -> tuple[str, str]:
         )
     if suffix in _PHONE_SUFFIXES:
         return "files of a phone", "convert them to JPEG or PNG of the same size"
-    return "files", ("convert them to JPEG, PNG or TIFF, or correct [frames] folder in flight.toml")
+    return "files", "convert them to JPEG, PNG or TIFF"
 
 
 def _refuse_folder(error: OSError) -> None:

@@ -122,7 +122,7 @@ def find_photos(places: Sequence[Path]) -> list[Photo]:
     photos: list[Photo] = []
     for place in places:
         if is_folder(place):
-            names = list_frames(place)
+            names = list_frames(place, "name another folder")
             prefix = f"{place.name}/" if len(places) > 1 else ""
             photos += [Photo(f"{prefix}{name}", place / name) for name in names]
         elif is_file(place) and place.suffix.lower() in FRAME_SUFFIXES:
@@ -318,7 +318,15 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
         remedy = "take more photographs, 12 at best"
         if NamingProblem.AMBIGUOUS in reasons:
-            remedy = "correct the field's columns and rows, or show all of it or a mark"
+            remedy = (
+                "correct the field's columns, rows and marks, or show all of it or a mark;"
+                " mirrored photographs cannot be used"
+            )
+        elif max(reasons, key=reasons.__getitem__, default="") == "too_few":
+            remedy = (
+                "correct the field's polarity (':bright' for bright discs on dark ground), or come"
+                " nearer"
+            )
         elif why:
             remedy = "correct the description of the field, or take more photographs"
         raise KgcpError(

@@ -19,6 +19,9 @@ from kgcp.settings import require_range
 LEAST_POINTS, MOST_POINTS = 6, 5000
 """Of a field: fewer determine no pose with something to check it."""
 
+_LARGEST_DISC_M = 3.0  # diameter: 3 mm and more, typed for metres, are told
+_MOST_OFF_BAR = 0.05  # of the stated distance of its discs
+
 
 class GridKind(StrEnum):
     """How the discs of a field lie to each other."""
@@ -118,7 +121,7 @@ class Field:
 
     def __post_init__(self) -> None:
         require_range("pitch_m", self.pitch_m, 0.0, 100.0, unit="m", open_low=True)
-        require_range("diameter_m", self.diameter_m, 0.0, 100.0, unit="m", open_low=True)
+        require_diameter("diameter_m", self.diameter_m)
         for key, count in (("columns", self.columns), ("rows", self.rows)):
             require_range(key, count, 2, 1000)
         require_hole("inner_diameter_m", self.inner_diameter_m, self.diameter_m)
@@ -141,7 +144,7 @@ class Field:
             )
         if len(self.names()) < LEAST_POINTS:
             raise SettingError("mark", "leaves fewer than 6 discs", "delete marks")
-        check_bars(self.bars, self.names())
+        check_bars(self.bars, self.names(), self.points_m())
 
     def _check_marks(self) -> None:
         places = {(mark.column, mark.row) for mark in self.marks}
@@ -156,7 +159,7 @@ class Field:
                     "count column and row from 0",
                 )
             if not mark.is_missing:
-                require_range("diameter_m", mark.diameter_m, 0.0, 100.0, unit="m", open_low=True)
+                require_diameter("diameter_m", mark.diameter_m)
                 require_hole("inner_diameter_m", mark.inner_diameter_m, mark.diameter_m)
 
     def _places(self) -> list[tuple[int, int]]:
@@ -282,8 +285,12 @@ class Field:
         return np.array([special.get(place, usual) for place in self.discs()])
 
 
-def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...]) -> None:
-    """Raise `SettingError` for bars that are not between two discs with these names."""
+def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...], points_m: FloatArray) -> None:
+    """Raise `SettingError` for bars that are not between two discs with these names and places.
+
+    A print may be off by some percent. A bar of another length is between other discs, or mistyped,
+    and would bend the field until it fits.
+    """
     for bar in bars:
         for key, name in (("from", bar.first), ("to", bar.second)):
             if name not in names:
@@ -296,6 +303,25 @@ def check_bars(bars: tuple[FieldBar, ...], names: tuple[str, ...]) -> None:
             raise SettingError("to", "is where the bar begins", "name its other end")
         require_range("length_m", bar.length_m, 0.0, 1000.0, unit="m", open_low=True)
         require_range("sd_m", bar.sd_m, 0.0, 1.0, unit="m", open_low=True)
+        ends_m = points_m[[names.index(bar.first), names.index(bar.second)]]
+        stated_m = float(np.linalg.norm(ends_m[1] - ends_m[0]))
+        if abs(bar.length_m - stated_m) > _MOST_OFF_BAR * stated_m:
+            raise SettingError(
+                "length_m",
+                f"{bar.length_m:g} m, but {bar.first} and {bar.second} are {stated_m:g} m apart",
+                "correct the bar, or the field",
+            )
+
+
+def require_diameter(key: str, diameter_m: float) -> None:
+    """Raise `SettingError` unless a disc can have a diameter [m]."""
+    if diameter_m > _LARGEST_DISC_M:
+        raise SettingError(
+            key,
+            f"{diameter_m:g} m is out of range",
+            f"give metres: {diameter_m:g} mm are {1e-3 * diameter_m:g}",
+        )
+    require_range(key, diameter_m, 0.0, _LARGEST_DISC_M, unit="m", open_low=True)
 
 
 def require_hole(key: str, inner_m: float, outer_m: float) -> None:

@@ -20,6 +20,7 @@ from kgcp.targets.fields.layout import (
     FieldBar,
     FieldPolarity,
     check_bars,
+    require_diameter,
     require_hole,
 )
 
@@ -144,7 +145,7 @@ class PointField:
         _require_once("name", [point.name for point in self.points])
         self._check_codes()
         self._check_places()
-        check_bars(self.bars, self.names())
+        check_bars(self.bars, self.names(), self.points_m())
 
     def _check_codes(self) -> None:
         codes = [point.code for point in self.points if point.code is not None]
@@ -267,7 +268,7 @@ def _check_point(point: FieldPoint) -> None:
     where = f"of {point.name}"
     if not all(abs(value) <= _FARTHEST_M for value in point.position_m):
         raise SettingError("position_m", f"{where} is out of range", "give it in metres")
-    require_range(f"diameter_m {where}", point.diameter_m, 0.0, 100.0, unit="m", open_low=True)
+    require_diameter(f"diameter_m {where}", point.diameter_m)
     require_hole(f"inner_diameter_m {where}", point.inner_diameter_m, point.diameter_m)
     if abs(math.hypot(*point.normal) - 1.0) > _UNIT_OFF:
         raise SettingError(f"normal {where}", "is not of length 1", "divide it by its length")

@@ -85,7 +85,7 @@ def test_a_field_toml_is_read_back_as_it_was_written(tmp_path: Path) -> None:
         FieldPolarity.BRIGHT,
         (Mark(2, 3, 0.01, 0.003), Mark(0, 0, 0.0151, is_missing=True)),
         (1e-5, 2e-5, 3e-4),
-        (FieldBar("r0c1", "r7c5", 0.2, 1e-5),),
+        (FieldBar("r0c1", "r7c5", 0.176, 1e-5),),
     )
     assert read_field(write(tmp_path, "field.toml", field_toml(field))) == field
 
@@ -269,7 +269,7 @@ ring = [2.1, 3.1]
 [[bar]]
 from = "B"
 to = "C"
-length_m = 0.1
+length_m = 0.112
 sd_m = 0.00001
 """
 POINTS_CSV = """\
@@ -299,7 +299,7 @@ def test_points_with_coordinates_of_their_own(tmp_path: Path) -> None:
     )
     assert fourth.code is None
     assert field.code == CodeRing(14, 2.1, 3.1)
-    assert field.bars == (FieldBar("B", "C", 0.1, 0.00001),)
+    assert field.bars == (FieldBar("B", "C", 0.112, 0.00001),)
     copy = write(tmp_path, "copy.toml", field_toml(field))
     assert read_field(copy) == field
 

@@ -85,6 +85,14 @@ def test_codes_may_come_closer_across_an_edge() -> None:
             "lie in one row",
         ),
         ({"bars": (FieldBar("p0", "p9", 0.1, 1e-5),)}, "'p9' is not a disc"),
+        (
+            {"bars": (FieldBar("p0", "p1", 0.7, 1e-5),)},
+            "0.7 m, but p0 and p1 are 0.0[0-9]+ m apart",
+        ),
+        (
+            {"points": changed(diameter_m=13.0)},
+            "13 m is out of range; give metres: 13 mm are 0.013",
+        ),
         ({"flat_sd_m": (0.0, 1e-4, 1e-4)}, "flat_sd_m"),
     ],
 )
