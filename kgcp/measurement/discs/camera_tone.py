@@ -8,7 +8,7 @@ disc has its own ellipse, blur and light. What they say together is the prior fo
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,19 +89,13 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
-    firsts = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
-    fits = [fit for _, fit in firsts]
-    starts = {Tone.SRGB: [fit.state for fit in fits]}
-    if tone is Tone.UNKNOWN:
-        starts[Tone.LINEAR] = [_state_by_line(*first) for first in firsts]
-    plain = _joints(fits, starts)
-    bent = []
-    if tone is Tone.UNKNOWN:
-        bent = _joints(fits, {_BENT[known]: states for known, states in starts.items()})
-    if not plain:
+    fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
+    plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
+    bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
+    sds = [fit.sd for fit in fits]
+    best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
+    if best is None:
         return CameraTone(tone, SHARPENING_PX)
-    sds = _least_noise([*plain, *bent])
-    best = _likeliest([_with_best_mask(each, sds) for each in _worthy(plain, bent, sds)], sds)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
@@ -141,7 +135,7 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     return [large[i] for i in half[::step][:count]]
 
 
-def _first_fits(tasks: Sequence[DiscTask]) -> list[tuple[DiscTask, DiscFit]]:
+def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
 
     Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
@@ -154,39 +148,24 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[tuple[DiscTask, DiscFit]]:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
             fit = adjust_disc(task, DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_disc_fit(fit, task.outline)
-            fits.append((task, fit))
+            fits.append(fit)
             is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
             if not is_burnt and not is_in_curved_light(fit, task):
-                clean.append((task, fit))
+                clean.append(fit)
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 
 
-def _joints(fits: Sequence[DiscFit], starts: Mapping[Tone, Sequence[DiscState]]) -> list[JointFit]:
-    """Return discs adjusted together by each of some curves, from states of each disc, if any."""
-    joints = [
-        _adjusted_together(fits, _sharing(states), tone, SHARPENING_PX)
-        for tone, states in starts.items()
-        if states
-    ]
-    return [joint for joint in joints if joint]
+def _joints(fits: Sequence[DiscFit], tones: Sequence[Tone]) -> list[JointFit]:
+    """Return discs adjusted together by each of some curves, if they can be."""
+    return [joint for joint in (_from_first_fits(fits, tone) for tone in tones) if joint]
 
 
-def _least_noise(joints: Sequence[JointFit]) -> list[FloatArray]:
-    """Return the noise of each disc's pixels by the curve that leaves the least.
-
-    What a wrong curve leaves would count as noise of just those pixels that tell it from others.
-    """
-    return min((joint.sds for joint in joints), key=lambda sds: sum(np.log(sd).sum() for sd in sds))
+def _likeliest(joints: Sequence[JointFit]) -> JointFit | None:
+    """Return the likeliest; None if there is none."""
+    return min(joints, key=lambda joint: joint.loss, default=None)
 
 
-def _likeliest(joints: Sequence[JointFit], sds: Sequence[FloatArray]) -> JointFit:
-    """Return the likeliest by some noise of each disc's pixels."""
-    return min(joints, key=lambda joint: joint.loss_by(sds))
-
-
-def _worthy(
-    plain: Sequence[JointFit], bent: Sequence[JointFit], sds: Sequence[FloatArray]
-) -> list[JointFit]:
+def _worthy(plain: Sequence[JointFit], bent: Sequence[JointFit]) -> list[JointFit]:
     """Return discs by the likeliest curve, and by others that are nearly as likely.
 
     By a bent curve only if it is significantly likelier than a plain one. Where discs contradict
@@ -194,20 +173,18 @@ def _worthy(
     for. A line is bent itself unless sRGB's curve is much likelier when bent: nearly straight but
     for its dark end, that one makes discs too large or too small.
     """
-    known = _likeliest(plain, sds)
-    if not bent:
-        return [known]
-    best = _likeliest(bent, sds)
-    least = best.loss_by(sds)
-    gain = known.loss_by(sds) - least
+    known, best = _likeliest(plain), _likeliest(bent)
+    if known is None or best is None:
+        return [joint for joint in (best or known,) if joint]
+    gain = known.loss - best.loss
     if 2.0 * gain <= _WORTHY_BENDS * _excess(best) ** _BY_EXCESS:
         return [known]
     line = next((joint for joint in bent if joint.tone is Tone.UNKNOWN_FROM_LINE), None)
     if known.tone is Tone.LINEAR and line is not None:
-        farther = max(joint.loss_by(sds) for joint in plain) - known.loss_by(sds)
-        if line.loss_by(sds) - least <= _LIKE_LINE * farther:
+        farther = max(joint.loss for joint in plain) - known.loss
+        if line.loss - best.loss <= _LIKE_LINE * farther:
             return [line]
-    return [joint for joint in bent if joint.loss_by(sds) - least < _NEARLY * gain]
+    return [joint for joint in bent if joint.loss - best.loss < _NEARLY * gain]
 
 
 def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
@@ -218,17 +195,27 @@ def _without_bends(known: ProcessingPrior) -> ProcessingPrior:
     return ProcessingPrior(known.mean, precision)
 
 
+def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
+    """Adjust discs with what they share, from fits by sRGB's curve; None if they cannot be."""
+    if not fits:
+        return None
+    sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
+    states = [_state_by(fit, tone, sharpening) for fit in fits]
+    return _adjusted_together(fits, states, tone, SHARPENING_PX, [fit.sd for fit in fits])
+
+
 def _adjusted_together(
     fits: Sequence[DiscFit],
     states: Sequence[DiscState],
     tone: Tone,
     sharpening_px: float,
+    sds: Sequence[FloatArray],
 ) -> JointFit | None:
     samples = [
         fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
     ]
     try:
-        return adjust_together(samples, states, tone, sharpening_px)
+        return adjust_together(samples, states, tone, sharpening_px, sds)
     except (NoFit, np.linalg.LinAlgError):
         return None
 
@@ -246,55 +233,38 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     def at(step: float) -> JointFit | None:
         states = [fit.state for fit in joint.fits]
         mask_px = _MASK_STEP**step * SHARPENING_PX
-        return _adjusted_together(joint.fits, states, joint.tone, mask_px)
+        return _adjusted_together(joint.fits, states, joint.tone, mask_px, sds)
 
     # anew, since the pixels beside the modelled ones are masked by what is known by now
     tried = {0: at(0) or joint}
-    loss = {0: tried[0].loss_by(sds)}
     for direction in (1, -1):
         step = direction
         while abs(step) <= _MOST_STEPS:
             other = at(step)
             if other is None:
                 break
-            tried[step], loss[step] = other, other.loss_by(sds)
-            if loss[step] > loss[step - direction]:
+            tried[step] = other
+            if other.loss > tried[step - direction].loss:
                 break
             step += direction
-        if min(loss, key=loss.__getitem__):  # this was the right direction
+        if min(tried, key=lambda step: tried[step].loss):  # this was the right direction
             break
-    best = min(loss, key=loss.__getitem__)
+    best = min(tried, key=lambda step: tried[step].loss)
     if best - 1 not in tried or best + 1 not in tried:
         return tried[best]
-    before, middle, after = (loss[best + k] for k in (-1, 0, 1))
+    before, middle, after = (tried[best + k].loss for k in (-1, 0, 1))
     bend = before + after - 2.0 * middle
     between = at(best + 0.5 * (before - after) / bend) if bend > 0.0 else None
-    return between if between and between.loss_by(sds) < middle else tried[best]
+    return between if between is not None and between.loss < middle else tried[best]
 
 
-def _state_by_line(task: DiscTask, fit: DiscFit) -> DiscState:
-    """Return the state of a disc adjusted by a straight line; if it cannot be, by sRGB's levels.
-
-    Burnt white has another level by every curve. From that by sRGB's, which may be twice as high,
-    discs adjusted together by a line take all residuals for noise, and stay there.
-    """
-    try:
-        own = adjust_disc(task, DiscUnknowns.of(Tone.LINEAR, sharpening_px=SHARPENING_PX))
-        check_disc_fit(own, task.outline)
-    except (DiscRejection, NoFit, np.linalg.LinAlgError):
-        vector = fit.state.vector.copy()
+def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:
+    """Return the state of a fit by sRGB's curve, for another tone curve with the same levels."""
+    vector = fit.state.vector.copy()
+    vector[Row.SHARPENING] = sharpening
+    if not tone.is_srgb:
         vector[[Row.BLACK, Row.WHITE]] = fit.state.plateaus(Tone.SRGB)
-        return DiscState(vector)
-    return own.state
-
-
-def _sharing(states: Sequence[DiscState]) -> list[DiscState]:
-    """Return states with the sharpening that is usual among them."""
-    sharpening = float(np.median([state.vector[Row.SHARPENING] for state in states]))
-    vectors = [state.vector.copy() for state in states]
-    for vector in vectors:
-        vector[Row.SHARPENING] = sharpening
-    return [DiscState(vector) for vector in vectors]
+    return DiscState(vector)
 
 
 def _known_by(joint: JointFit) -> ProcessingPrior:

@@ -40,7 +40,7 @@ class JointFit:
     tone: Tone
     sharpening_px: float  # σ of the camera's unsharp mask
     fits: tuple[DiscFit, ...]
-    penalty: float  # negative log-likelihood of what they share, by what is usual of cameras
+    loss: float  # negative log-likelihood, with what is usual of cameras, by noise that is given
     precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
     scores: FloatArray  # (k, 4): of each disc, by what is shared; they add up to the prior's
     informations: FloatArray  # (k, 4, 4): their expected covariances
@@ -49,19 +49,6 @@ class JointFit:
     def shared(self) -> FloatArray:
         """What the discs share (4,)."""
         return np.asarray(self.fits[0].state.vector[_SHARED])
-
-    @property
-    def sds(self) -> list[FloatArray]:
-        """Noise of each disc's pixels as level, as the residuals show it."""
-        return [fit.noise.sd for fit in self.fits]
-
-    def loss_by(self, sds: Sequence[FloatArray]) -> float:
-        """Return the negative log-likelihood, with what is usual of cameras, by given noise.
-
-        Curves are compared by the same noise. That of their own residuals differs by chance, and
-        would make curves likelier by up to 40 for forty discs.
-        """
-        return self.penalty + sum(map(misfit_by, self.fits, sds))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +68,16 @@ def adjust_together(
     states: Sequence[DiscState],
     tone: Tone,
     sharpening_px: float,
+    sds: Sequence[FloatArray],
 ) -> JointFit:
     """Adjust discs with what they share, from states that share it.
+
+    Parameters
+    ----------
+    sds : sequence of (n,) arrays
+        Noise of each disc's pixels as level, by which the loss is stated: the same for all curves
+        that are compared. The noise that their own residuals show differs by chance, and would make
+        curves likelier by up to 40 for forty discs.
 
     Raises
     ------
@@ -105,9 +100,10 @@ def adjust_together(
     scores, informations = np.zeros((len(fits), count)), np.zeros((len(fits), count, count))
     scores[:, own] = reduced.gradients
     informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
-    penalty = _penalty(fits[0].state.vector[_SHARED], usual)
+    loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
+    loss += _penalty(fits[0].state.vector[_SHARED], usual)
     precision = usual.precision + informations.sum(axis=0)
-    return JointFit(tone, sharpening_px, tuple(fits), penalty, precision, scores, informations)
+    return JointFit(tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
 
 
 def _minimised(
