@@ -35,7 +35,7 @@ from kgcp.measurement.plain_prediction import SIGMAS, PlainPrediction, smallest_
 from kgcp.measurement.plain_target import look_for_plain
 from kgcp.measurement.plate_prior import NormalPrior
 from kgcp.measurement.records import Measurement
-from kgcp.pipeline.execution.threads import use_one_thread_each
+from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc
 from kgcp.simulation.flight import grow_ground
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
@@ -486,6 +486,7 @@ def print_looks(looks: Looks) -> None:
     print(line, dict(looks.reasons) or "", flush=True)
 
 
+@single_threaded()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run both experiments and print their figures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -503,7 +504,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--kind", choices=[*_KINDS], action="append")
     parser.add_argument("--free", action="store_true", help="normals are not known at all")
     chosen = parser.parse_args(arguments)
-    use_one_thread_each()
     photographs = []
     if chosen.real is not None:
         paths = sorted(p for p in chosen.real.iterdir() if p.suffix.lower() in {".jpg", ".png"})

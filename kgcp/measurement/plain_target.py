@@ -217,7 +217,8 @@ def _on_texture(
     """Measure the outer edge of a target without a border by the texture of the ground around it.
 
     Only of the accepted one: what other edges have around them is no ground. Rings that are
-    measured as a whole stay as they are.
+    measured as a whole, or of which a circle is missing, stay as they are; so do burnt discs, and
+    those on burnt ground.
 
     Raises
     ------
@@ -239,7 +240,11 @@ def _on_texture(
     covs = np.array([outer.cov, *images.covs[1:]])
     moments = np.array([outer.vector, *images.moments[1:]])
     circles = _Circles((outer, *discs[1:]), CircleMoments(images.radii_m, moments, covs))
-    return _checked(camera, target, prediction, candidate.fit.pose, circles)
+    try:
+        return _checked(camera, target, prediction, candidate.fit.pose, circles)
+    except Rejection as rejection:
+        detail = f"{rejection.detail}, by the texture of its ground; {prediction}"
+        raise Rejection(rejection.reason, detail) from None
 
 
 def _alike(

@@ -60,7 +60,7 @@ class DiscScatter:
 
 def scatter_of(fit: DiscFit) -> DiscScatter:
     """Return the parts of the covariance of centroid and second moments."""
-    scaled, inverse = fit.scaled, np.linalg.inv(fit.normal)
+    scaled, inverse = fit.scaled, np.linalg.inv(fit.normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
     root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
     to_own = np.linalg.solve(root, own)  # in units of N⁻¹
@@ -71,9 +71,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
         fit.misfit.weight,
         _arcs(fit),
     )
-    # of an arc whose normal matrix is A, a fit to independent residuals leaves A − A N⁻¹ A
-    left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
-    ratio = float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
+    ratio = scatter_ratio(sums, products, to_own, inverse)
     if _edges_tell_displacement(fit):  # then `RingUnknowns` has what that does
         left_px = _TONED_RING_SHARE * fit.state.blur.mean_sd_px if fit.free.tone.is_shaped else 0.0
         common_px = max(_FLOOR_PX, left_px)
@@ -94,6 +92,27 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
         ratio,
         arcs,
     )
+
+
+def scatter_ratio(
+    sums: FloatArray, products: FloatArray, to_own: FloatArray, inverse: FloatArray
+) -> float:
+    """Return the scatter of the arcs' scores over the one that the model expects.
+
+    Parameters
+    ----------
+    sums : (arcs, 5) array
+        Scores of every arc, as they move the ellipse.
+    products : (arcs, 5, p) array
+        Normal matrices A of the arcs, of which the rows are carried to the ellipse in the same way.
+    to_own : (5, p) array
+        What carries them: the rows of the ellipse in N⁻¹, in units of their own root.
+    inverse : (p, p) array
+        N⁻¹, of all arcs and the priors.
+    """
+    # of an arc whose normal matrix is A, a fit to residuals as expected leaves A − A N⁻¹ A
+    left = np.sum(products.sum(axis=0) * to_own) - np.sum((products @ inverse) * products)
+    return float(np.sum(sums * sums)) / max(float(left), _LEAST_LEFT)
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:

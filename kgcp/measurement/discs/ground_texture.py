@@ -1,9 +1,9 @@
 """The texture of ground as a random field: grass, gravel, worn asphalt.
 
-Its light is alike at neighbouring pixels. The correlation over a distance d is Matérn's function
-for ν = 3/2, (1 + d/ℓ) exp(−d/ℓ) (Rasmussen and Williams, Gaussian Processes for Machine Learning,
-2006, eq. 4.17). Standard deviation and ℓ follow from the ground itself, by restricted likelihood
-(Patterson and Thompson, Biometrika 58, 1971).
+Its light is correlated in neighbouring pixels: over a distance d by Matérn's function for ν = 3/2,
+(1 + d/ℓ) exp(−d/ℓ) (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq.
+4.17). Standard deviation and ℓ follow from the ground itself, by restricted likelihood (Patterson
+and Thompson, Biometrika 58, 1971).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class GroundTexture:
         distances_px : (n, n) array
             Between the pixels.
         by_ground : (n,) array
-            Derivatives of the grey values by the light of the ground.
+            Derivatives of the grey values with respect to the light of the ground.
         """
         by_texture = self.sd * by_ground
         return _correlation(distances_px, self.length_px) * np.multiply.outer(
@@ -54,12 +54,17 @@ class Sector:
     """Pixels that are beside each other."""
 
     index: IndexArray  # (n,): of the pixels
-    distances_px: FloatArray  # (n, n)
+    places_px: FloatArray  # (2, n)
 
     def only(self, chosen: BoolArray) -> Sector:
         """Return the sector with those of its pixels that are chosen, of all there are."""
         kept = chosen[self.index]
-        return Sector(self.index[kept], self.distances_px[np.ix_(kept, kept)])
+        return Sector(self.index[kept], self.places_px[:, kept])
+
+    def distances_px(self) -> FloatArray:
+        """Return the distances (n, n) between the pixels."""
+        x, y = self.places_px
+        return np.asarray(np.hypot(np.subtract.outer(x, x), np.subtract.outer(y, y)))
 
 
 def sectors_about(centre_px: FloatArray, places_px: FloatArray, most_pixels: int) -> list[Sector]:
@@ -69,12 +74,8 @@ def sectors_about(centre_px: FloatArray, places_px: FloatArray, most_pixels: int
     """
     x, y = places_px - centre_px[:, None]
     order = np.argsort(np.arctan2(y, x), kind="stable")
-    sectors = []
-    for index in np.array_split(order, math.ceil(len(order) / most_pixels)):
-        x, y = places_px[:, index]
-        distances = np.hypot(np.subtract.outer(x, x), np.subtract.outer(y, y))
-        sectors.append(Sector(index, distances))
-    return sectors
+    parts = np.array_split(order, math.ceil(len(order) / most_pixels))
+    return [Sector(index, places_px[:, index]) for index in parts]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,19 +103,19 @@ class TextureModes:
         for length_px in _LENGTHS_PX:
             modes = []
             for part in ground:
-                values, vectors = np.linalg.eigh(_correlation(part.distances_px, length_px))
+                values, vectors = np.linalg.eigh(_correlation(part.distances_px(), length_px))
                 modes.append(_Modes(part.index, vectors, values))
             by_length.append(tuple(modes))
         return cls(tuple(by_length))
 
     def likeliest(self, columns: FloatArray, residuals: FloatArray, noise: float) -> GroundTexture:
-        """Return the length of the greatest restricted likelihood, and the mean variance by it.
+        """Return the length of the greatest restricted likelihood, and the mean variance at it.
 
         Parameters
         ----------
         columns : (n, k) array
-            Derivatives of the grey values of all pixels by what is adjusted, too; the first one by
-            the light of the ground. Pixels of the ground are taken to see nothing else.
+            Derivatives of the grey values of all pixels with respect to what is adjusted, too; the
+            first is the light of the ground. Pixels of the ground are taken to see nothing else.
         residuals : (n,) array
         noise : float
             Standard deviation of the pixels' own noise.

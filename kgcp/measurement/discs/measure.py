@@ -122,7 +122,8 @@ def measure_disc(
         the inside, as centre and radius where the outline is the unit circle. They move and grow
         with it.
     is_ground_even : bool
-        False: its ground has a texture, as grass and gravel have.
+        False: its ground has a texture, as grass and gravel have. Not of a ring as a whole, and not
+        by other operators.
     """
     task = DiscTask(grey, outline, _others(outline, neighbours), inner, is_ground_even)
     return _measured([task], response, operator, None)[0]
