@@ -50,17 +50,15 @@ from kgcp.measurement.image_model.noise import find_censoring
 
 # Tuning; `benchmarks.ground.plain_targets --kind "bare white disc"` has errors and deviations.
 _ROUNDS, _TEXTURE_ROUNDS = 5, 2
-_SETTLED_PX, _UNSETTLED_PX = (
-    0.001,
-    0.02,
-)  # a step that ends the rounds, and one that ends in nothing
+_SETTLED_PX = 0.001  # a step that ends the rounds
+_UNSETTLED_PX = 0.02  # a last step that leaves no result
 # Pixels in a sector: of 150, deviations are 7 % smaller than errors; of 400, 2 %.
 _MOST_PIXELS = 400
 _MOST_IN_MODES, _TEXTURE_SECTORS = 150, 8  # of those that tell the texture
 _EVERY_OF_MIDDLE = 7  # of the disc's middle, which tells its level
 # Share of the ground that a pixel sees: at least, to tell the texture; at most, to be on the disc
 _GROUND, _DISC = 0.98, 0.5
-_FEWEST = 10  # pixels, to tell the noise
+_FEWEST = 10  # pixels, to tell noise or texture
 _OF_DISC = 2  # parameters that the disc's pixels alone tell: level and blur
 _MUCH_CLIPPED = 0.05  # share of the disc's pixels, or of the ground's
 # A larger disc lies on more than one kind of ground: half on grass and half on asphalt, errors at R
@@ -86,14 +84,16 @@ def fit_on_texture(
     Raises
     ------
     NoFit
-        If the equations cannot be solved or do not settle, or disc or ground are burnt.
+        If the equations cannot be solved or do not settle, if disc or ground are burnt, or hardly
+        any ground is left.
     """
     sample, state = _sample_with_all_ground(fit, others), fit.state
     now = _linearised(fit, sample, state)
     seen, ground_share = _is_seen(now), _ground_share(now)
     is_ground, is_disc = ground_share > _GROUND, ground_share < _DISC
-    if min(float(np.mean(seen[each])) for each in (is_ground, is_disc)) < 1.0 - _MUCH_CLIPPED:
-        raise NoFit
+    for part in (is_ground, is_disc):
+        if np.count_nonzero(part) < _FEWEST or np.mean(~seen[part]) > _MUCH_CLIPPED:
+            raise NoFit
     centre_px, places_px = state.geometry[:2], sample.pixels.places_px
     sectors = sectors_about(centre_px, places_px, _MOST_PIXELS)
     small = sectors_about(centre_px, places_px, _MOST_IN_MODES)
