@@ -250,6 +250,7 @@ def _without_ripples(outlines: list[DiscOutline]) -> list[DiscOutline]:
     tree = cKDTree(centres)
 
     def is_ripple(i: int) -> bool:
+        """Tell whether an outline is the faint edge that sharpening leaves beside another one."""
         return any(
             abs(radii[i] - radii[j]) <= _RIPPLE_PX
             and outlines[i].polarity is outlines[j].polarity.other

@@ -96,9 +96,9 @@ def fit_on_texture(
             raise NoFit
     centre_px, places_px = state.geometry[:2], sample.pixels.places_px
     sectors = sectors_about(centre_px, places_px, _MOST_PIXELS)
-    small = sectors_about(centre_px, places_px, _MOST_IN_MODES)
-    every = math.ceil(len(small) / _TEXTURE_SECTORS)
-    modes = TextureModes.of([each.only(is_ground & seen) for each in small[::every]])
+    narrow = sectors_about(centre_px, places_px, _MOST_IN_MODES)
+    every = math.ceil(len(narrow) / _TEXTURE_SECTORS)
+    modes = TextureModes.of([each.only(is_ground & seen) for each in narrow[::every]])
     for number in range(_ROUNDS):
         noise = _noise(now)
         if number < _TEXTURE_ROUNDS:
@@ -157,6 +157,7 @@ def _sample_with_all_ground(fit: DiscFit, others: Sequence[Geometry]) -> DiscSam
     limits = find_censoring(window.levels, window.levels_per_count)
 
     def sample_of(index: IndexArray) -> DiscSample:
+        """Take pixels of the window, by their flat indices."""
         return DiscSample.of(
             window,
             index,

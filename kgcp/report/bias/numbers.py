@@ -239,6 +239,7 @@ def _range_rows(
     """
 
     def row(label: str, low: float, high: float) -> RangeRow | None:
+        """Return the row of a range of distances [m]; None if it is empty."""
         inside = (distance_m >= low) & (distance_m < high)
         if not inside.any():
             return None
