@@ -77,7 +77,7 @@ def error_of(found: FieldPose, pose: CameraPose) -> FloatArray:
 def test_poses_are_as_good_as_stated(field: AnyField, beyond_px: float) -> None:
     rng = np.random.default_rng(3)
     z = []
-    for _ in range(8):
+    for _ in range(6):
         pose = drawn_pose(rng)
         found = orient_by_field(CAMERA, field, *images(field, pose, rng, beyond_px))
         z.append(error_of(found, pose))

@@ -91,3 +91,28 @@ def test_cells_ask_for_levels_and_edges_where_cells_leave_a_doubt(
     problem = stand_in(window=window, outer_radius_px=radius_px)
     fit = stand_in(sample=stand_in(problem=problem))
     assert needs_varying_levels(fit) == is_asked
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "advantage", "is_even"),
+    [
+        (10.0, 8.9, True),
+        (10.0, 24.9, True),
+        (10.0, 25.1, False),
+        (10.0, -0.1, False),  # a fit that has ended beside its minimum
+        (12.6, 8.9, False),
+    ],
+)
+def test_small_rings_are_in_even_light_where_levels_explain_little_more(
+    monkeypatch: pytest.MonkeyPatch, *, radius_px: float, advantage: float, is_even: bool
+) -> None:
+    problem = stand_in(outer_radius_px=radius_px)
+    plain, varying = (stand_in(best=stand_in(sample=stand_in(problem=problem))) for _ in range(2))
+    monkeypatch.setattr(extensions, "fit_both_poses", lambda *_: plain)
+    monkeypatch.setattr(extensions, "_with_skew", lambda _, poses: poses)
+    monkeypatch.setattr(extensions, "needs_varying_levels", lambda _: True)
+    monkeypatch.setattr(extensions, "_with_levels", lambda *_: varying)
+    monkeypatch.setattr(extensions, "advantage_over", lambda *_: advantage)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    chosen = extensions._fit_in_any_light(problem, pose, Blur(0.5, 0.5, 0.0), lambda: None)
+    assert chosen is (plain if is_even else varying)

@@ -111,7 +111,7 @@ def test_errors_are_smaller_and_as_stated(
 ) -> None:
     rng = np.random.default_rng(11)
     errors, plain_errors, normalised, squares = [], [], [], []
-    for _ in range(60):
+    for _ in range(36):
         pose = pose_of(rng, radius_px)
         grey = frame_of(target, pose, ground(rng, level), rng)
         disc = measured(grey, pose, polarity, is_even=False)
