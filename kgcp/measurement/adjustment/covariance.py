@@ -42,23 +42,16 @@ _ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so man
 _ARCS_OF_NOISE = 20.0  # that residuals scatter less than noise counts against so many that do not
 _LEAST_LEFT = 0.25  # of the scatter, after the fit
 _VECTOR = 4  # numbers that the processor takes at once
-# Of a circle's edge as a whole: no print and no pixel is known better, nor what cameras of unknown
-# tone make of it: on 20 plates of a simulated phone (R 26-110 px) noise reduction under local tone
-# mapping displaced the outer edge by 0.003 px in the mean. That of bins is of the frame's pixels:
-# within bins, a tone curve displaces edges.
-_EDGE_FLOOR_PX = {
-    Tone.LINEAR: 0.0005,
-    Tone.SRGB: 0.0005,
-    Tone.UNKNOWN: 0.002,
-    Tone.UNKNOWN_FROM_LINE: 0.002,
-    Tone.OF_BINS: 0.004,
-}
-# Variance in uneven light, relative to what residuals show of it. Where levels vary: from dirt,
-# highlights and both with other effects on 254 simulated plates (R 13-130 px); with a shadow's edge
-# residuals show it all. On small rings: where levels vary; and up to so much where they do not, as
-# residuals do not say enough of them (`benchmarks.accuracy.small_rings`, without these factors: z
-# of 1.4 in shade and 1.5 with dirt).
-_UNDER_UNEVEN_LIGHT, _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.2, 1.8, 1.4
+# Of a circle's edge as a whole: no print and no pixel is known better. What a camera's processing
+# makes of it goes with how much it sharpens: on simulated plates of R ≥ 26 px, outer edges are
+# displaced in the mean by 0.0000 ± 0.0002 px (111 plates, strength 0), 0.0007 ± 0.0004 (33, 0.5),
+# 0.0030 ± 0.0009 (75, 0.8; mixed) and 0.0025 ± 0.0004 px (36, 1.0; phone). That of bins is of the
+# frame's pixels: within bins, a tone curve displaces edges.
+_EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX, _PER_SHARPENING_PX = 0.0005, 0.004, 0.003
+# Variance on small rings, relative to what residuals show of uneven light: where levels vary; and
+# up to so much where they do not, as residuals do not say enough of them
+# (`benchmarks.accuracy.small_rings`, without these factors: z of 1.4 in shade and 1.5 with dirt).
+_ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 # Of what a skew spread displaces: beyond its third moment nothing is known. Where levels vary they
 # take part of it, and so does noise reduction.
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.25, 0.5
@@ -138,16 +131,13 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
 def unevenness_factor(fit: TargetFit, inflation: float) -> float:
     """Return how many times the variances that residuals show are too small in uneven light.
 
-    On small rings in which levels do not vary, an `inflation` beyond 1 says that the light may be
-    uneven.
+    They are on small rings. If levels do not vary there, an `inflation` beyond 1 says that the
+    light may be uneven.
     """
-    field, problem = fit.parameters.field, fit.sample.problem
-    if field is not None:
-        if problem.outer_radius_px < SMALL_RING_PX:
-            return _ON_SMALL_RINGS
-        return 1.0 if len(field.edges) else _UNDER_UNEVEN_LIGHT
-    if problem.outer_radius_px >= SMALL_RING_PX:
+    if fit.sample.problem.outer_radius_px >= SMALL_RING_PX:
         return 1.0
+    if fit.parameters.field is not None:
+        return _ON_SMALL_RINGS
     return float(_ON_EVEN_SMALL_RINGS ** min(max(inflation - 1.0, 0.0), 1.0))
 
 
@@ -185,15 +175,17 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     is not modelled), and wholly where it does not (compression). And of an edge whose middle is
     clipped only a tail is seen, whose shape is not known exactly.
     """
-    problem = fit.sample.problem
-    floor_px = _EDGE_FLOOR_PX[problem.tone]
+    problem, light = fit.sample.problem, fit.parameters.light
     if problem.tone is Tone.OF_BINS:
-        floor_px /= problem.window.binning
+        floor_px = _EDGE_FLOOR_OF_BINS_PX / problem.window.binning
+    else:
+        processed_px = _PER_SHARPENING_PX * (light.sharpening + light.linear_sharpening)
+        floor_px = math.hypot(_EDGE_FLOOR_PX, processed_px)
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
     noise = noise_of(fit.sample, fit.prediction, is_even=fit.level_equations is None)
     excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
-    black, white = plateau_levels(fit.parameters.light, problem.tone)
+    black, white = plateau_levels(light, problem.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
     scatter_px = math.sqrt(share_along_arcs * at_edges) / slope_per_px
     return max(floor_px, _COMMON_SHARE * scatter_px)
