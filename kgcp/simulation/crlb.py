@@ -58,13 +58,31 @@ def bound_of(shot: Shot) -> Bound:
     streak, where the shot says so; two parameters of the tone curve's bend, where the camera's
     response is unknown.
     """
-    view = _View(shot, _ring_window(shot))
+    equations = equations_of(shot)
+    return propagated(shot, pose_bound(equations.pose, equations.nuisances))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """Derivatives of what the pixels of a view observe, in units of their noise."""
+
+    view: View
+    white: FloatArray  # share of white in the sub-pixels, before it is spread
+    share: FloatArray  # (height, width): of white, in the pixels
+    weight: FloatArray  # (n,): of the pixels, row by row: 1 / noise of the irradiance, or less
+    pose: FloatArray  # (n, 6): by tx ty tz [m] and left rotation vector
+    nuisances: FloatArray  # (n, m)
+
+
+def equations_of(shot: Shot) -> Equations:
+    """Return the equations of which `bound_of` is the solution."""
+    view = View(shot, _ring_window(shot))
     white = view.white(shot.pose)
     share = view.seen(white, shot.optics)
     weight = np.sqrt(_information(view, share))
     nuisances = np.column_stack([c.ravel() * weight for c in _nuisances(view, white, share)])
     pose = weight[:, None] * _pose_derivatives(view)
-    return _propagated(shot.camera, shot.pose, pose_bound(pose, nuisances))
+    return Equations(view, white, share, weight, pose, nuisances)
 
 
 def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
@@ -85,7 +103,7 @@ def pose_bound(pose: FloatArray, nuisances: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class View:
     """A window on the plate: how much white every pixel sees, 0 (ink) … 1."""
 
     shot: Shot
@@ -137,7 +155,7 @@ def _ring_window(shot: Shot) -> PixelWindow:
     return PixelWindow(int(column), int(row), int(width), int(height))
 
 
-def _information(view: _View, share: FloatArray) -> FloatArray:
+def _information(view: View, share: FloatArray) -> FloatArray:
     """Return the information (n,) of each pixel about its irradiance: 1 / variance if it is seen.
 
     A pixel that may clip has less, that of a censored normal variable; one far above the limit
@@ -167,7 +185,7 @@ def censored_information(margin: FloatArray) -> FloatArray:
     return np.asarray(ndtr(margin) - margin * density + above)
 
 
-def _pose_derivatives(view: _View) -> FloatArray:
+def _pose_derivatives(view: View) -> FloatArray:
     """Return the derivatives (n, 6) of the irradiance by tx ty tz [m] and left rotation vector.
 
     Differences are taken along and across the viewing ray: a step along z would move a target
@@ -190,7 +208,7 @@ def _pose_derivatives(view: _View) -> FloatArray:
     return np.asarray(np.column_stack(columns) @ directions.T)
 
 
-def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:
+def _nuisances(view: View, white: FloatArray, share: FloatArray) -> Iterator[FloatArray]:
     """Yield the derivatives of the irradiance by everything unknown that is not the pose."""
     shot = view.shot
     yield share
@@ -211,8 +229,9 @@ def _nuisances(view: _View, white: FloatArray, share: FloatArray) -> Iterator[Fl
         yield bend * (2.0 * share - 1.0)
 
 
-def _propagated(camera: Camera, pose: Pose, covariance: FloatArray) -> Bound:
-    """Propagate the covariance of the pose to distance, centre and normal."""
+def propagated(shot: Shot, covariance: FloatArray) -> Bound:
+    """Propagate the covariance (6, 6) of the pose to distance, centre and normal."""
+    camera, pose = shot.camera, shot.pose
     x, y, z = pose.translation_m
     ray = pose.translation_m / pose.distance_m
     projection = np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / z

@@ -10,15 +10,22 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import evaluate, presets
+from benchmarks.accuracy import disturbed, evaluate, presets
 from benchmarks.accuracy.bands import join_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.settings import DetectSettings
-from kgcp.simulation.crlb import censored_information, pose_bound
+from kgcp.simulation.crlb import (
+    Shot,
+    bound_of,
+    censored_information,
+    equations_of,
+    pose_bound,
+    propagated,
+)
 from kgcp.simulation.flight import TARGET_PLATE, FramePlan, plan_flight
-from kgcp.simulation.imaging import Optics, Sensor
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.presets import SimulationSettings, preset
 
 SMALL = Camera(
@@ -113,6 +120,73 @@ def test_bound_is_that_of_blurred_edges(radius_px: float) -> None:
     assert bound.normal_deg == pytest.approx(ideal_deg, rel=0.1)
     ideal_percent = 100.0 * math.sqrt(ray @ ideal[:3, :3] @ ray) / frame.target.distance_m
     assert 0.95 < bound.distance_percent / ideal_percent < 1.3  # levels and spread cost something
+
+
+def far_shot() -> Shot:
+    """Return a view of a ring of some 14 px, through a camera of unknown tone."""
+    camera = replace(SMALL, response=preset("consumer").camera.response)
+    tilt = Rotation.from_euler("zxy", [40.0, 9.0, -6.0], degrees=True).as_matrix()
+    pose = Pose(tilt, 58.0 * np.array([0.03, -0.02, 1.0]))
+    sensor = Sensor(tone=ToneCurve.SRGB)
+    return Shot(camera, TARGET_PLATE, pose, Optics(0.8), sensor, 0.8, has_unknown_streak=False)
+
+
+def test_unknown_levels_are_eliminated_as_if_their_prior_were_observed() -> None:
+    shot, levels_sd = far_shot(), (0.01, 0.03)
+    equations = equations_of(shot)
+    weight = equations.weight[:, None]
+    more = [each.ravel() for each in disturbed.disturbances(equations, has_skew=True)]
+    contrast = TARGET_PLATE.white - TARGET_PLATE.black
+    levels = contrast * disturbed.levels_of(equations, levels_sd).toarray()
+    smoothing = 0.05 * contrast * disturbed.by_smoothing(equations).ravel()
+    random = weight * np.column_stack((levels, smoothing))
+    count = random.shape[1]
+    known = np.column_stack((equations.nuisances, weight * np.column_stack(more)))
+    seen = np.column_stack((known, random))
+    prior = np.column_stack((np.zeros((count, known.shape[1])), np.eye(count)))
+    pose = np.vstack((equations.pose, np.zeros((count, 6))))
+    expected = propagated(shot, pose_bound(pose, np.vstack((seen, prior))))
+    disturbance = disturbed.Disturbance(levels_sd, has_skew=True, jpeg_quality=None)
+    even, found = disturbed.disturbed_bound(shot, disturbance)
+    assert found == pytest.approx(expected.distance_percent, rel=1e-4)
+    assert even == pytest.approx(bound_of(shot).distance_percent)
+    assert 1.2 < found / even < 3.0
+
+
+def test_what_is_known_of_a_frame_makes_its_bound_smaller() -> None:
+    def bound(
+        levels_sd: float = 0.0, quality: int | None = None, *, has_skew: bool = False
+    ) -> float:
+        disturbance = disturbed.Disturbance((levels_sd, 2.0 * levels_sd), has_skew, quality)
+        return disturbed.disturbed_bound(far_shot(), disturbance)[1]
+
+    least = bound()
+    assert least < bound(has_skew=True) < 1.2 * least
+    assert least < bound(0.005) < bound(0.02)
+    assert 1.1 * least < bound(quality=93) < bound(quality=80)
+
+
+def test_levels_at_knots_add_up_to_ink_and_plate() -> None:
+    equations = equations_of(far_shot())
+    levels = disturbed.levels_of(equations, (0.5, 2.0)).toarray()
+    of_ink, of_plate = (part.sum(axis=1) for part in np.split(levels, 2, axis=1))
+    share = equations.share.ravel()
+    np.testing.assert_allclose(of_ink, 0.5 * (1.0 - share), atol=1e-12)
+    np.testing.assert_allclose(of_plate, 2.0 * share, atol=1e-12)
+
+
+def test_smoothing_takes_the_same_area_of_every_circle() -> None:
+    """r shrinks by β / 2r, π r² by π β: the outer circle's is white's gain, that of others not."""
+    equations = equations_of(far_shot())
+    tilt_deg = math.hypot(9.0, 6.0)
+    area = -4.0 * math.pi * math.cos(math.radians(tilt_deg))
+    assert disturbed.by_smoothing(equations).sum() == pytest.approx(area, rel=0.02)
+
+
+@pytest.mark.parametrize(("count", "low", "high"), [(6, 0.45, 1.55), (16, 0.66, 1.34)])
+def test_few_frames_leave_standardised_errors_open(count: int, low: float, high: float) -> None:
+    np.testing.assert_allclose(disturbed.chance_of_z(count), (low, high), atol=0.01)
+    np.testing.assert_allclose(disturbed.chance_of_rms(np.ones(count)), (low, high), atol=0.02)
 
 
 def random_flight(count: int, covariance: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame]:
