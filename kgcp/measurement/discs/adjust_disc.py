@@ -14,6 +14,7 @@ from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, 
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
+    MUCH_CLIPPED,
     DiscFit,
     DiscSample,
     DiscState,
@@ -38,7 +39,6 @@ from kgcp.measurement.image_model.noise import Censoring, find_censoring, median
 _ROUNDS = 3
 _SETTLED_PX, _SETTLED_BLUR = 0.6, 0.2  # a round that moves less is the last
 _FIRST_BLUR_PX, _FIRST_BLUR = 0.8, 0.3  # pixels, and of the radius at most
-_MUCH_CLIPPED = 0.05  # share of the window's pixels
 _LEAST_CONTRAST_COUNTS = 4.0
 _MAX_OFF_PX, _MAX_OFF = 1.0, 0.25  # how far the centre may be from the outline's: pixels, radii
 _MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it by more than a pixel
@@ -112,8 +112,7 @@ def is_in_curved_light(fit: DiscFit, task: DiscTask) -> bool:
     """
     if len(task.inner) or task.radius_px < _LEAST_CURVED_PX:
         return False
-    is_seen = fit.sample.censoring.share <= _MUCH_CLIPPED
-    return is_seen and fit.curvature_gain > _CURVED
+    return not fit.sample.is_burnt and fit.curvature_gain > _CURVED
 
 
 def adjust_disc(
@@ -139,7 +138,7 @@ def adjust_disc(
             raise DiscRejection(DiscReason.CROWDED, "too little free ground")
         state = state or _start(task, window, index, geometry, blur, free)
         limits = find_censoring(window.levels, window.levels_per_count)
-        if limits.share > _MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
+        if limits.share > MUCH_CLIPPED:  # of a level that is clipped no gradient is seen
             free = free.without_ink_slope()
         fit = _adjust_on(task, window, limits, index, state, free)
         foreign = foreign_pixels(fit)

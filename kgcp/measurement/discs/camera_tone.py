@@ -37,13 +37,12 @@ from kgcp.measurement.discs.tone_curve import WAVES
 from kgcp.measurement.image_model.photometry import Tone
 
 # Discs of a photograph to learn from: as many as have so long an edge together, as a sum of radii,
-# and at least so many. Nine of R 5 px under film's curve leave a third of its second wave, and
-# displace centres by 0.005 px.
+# and at least so many. Of dark ones of 3.5 px under film's curve, nine leave a fifth of its
+# second wave, and displace centres by 0.002 px.
 _RADII_PX, _FEWEST_DISCS = 110.0, 9
 _LEAST_RADIUS_PX = 5.0  # of discs to learn from, if there are enough
 # From there on, the two levels fall off differently enough to tell, but for an unknown curve.
 _LARGE_RADIUS_PX = 20.0
-_MOST_CLIPPED = 0.05  # share of pixels
 _LARGEST_BLUR = 0.3  # of the radius, to start from
 _LEAST_SD = 0.01  # of each parameter, however many discs agree
 # Masks are tried from 1 px on by steps of this factor, if the camera sharpens at all.
@@ -125,7 +124,7 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     count = _FEWEST_DISCS
     if len(large) < min(count, len(tasks)):  # a mark alone does not speak for all
         large = list(tasks)
-    elif large:
+    if large:
         radius_px = float(np.median([task.radius_px for task in large]))
         count = max(round(_RADII_PX / radius_px), count)
     worth = [task.radius_px * task.outline.contrast for task in large]
@@ -149,8 +148,7 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
             fit = adjust_disc(task, DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
             check_disc_fit(fit, task.outline)
             fits.append(fit)
-            is_burnt = fit.sample.censoring.share > _MOST_CLIPPED
-            if not is_burnt and not is_in_curved_light(fit, task):
+            if not fit.sample.is_burnt and not is_in_curved_light(fit, task):
                 clean.append(fit)
     return clean if len(clean) >= min(_FEWEST_DISCS, len(fits) // 2) else fits
 

@@ -26,6 +26,7 @@ from kgcp.measurement.image_model.noise import (
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import Mask, unsharp_mask
 
+MUCH_CLIPPED = 0.05  # share of pixels, above which a level is hardly seen
 SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until more is known
 _MIN_VARIANCE_PX2 = 0.075  # a pixel alone spreads by 1/12 px²
 _MAX_ANISOTROPY = 0.95
@@ -151,17 +152,21 @@ class DiscUnknowns:
         precision[_UNEVEN, _UNEVEN] = _UNEVEN_PRECISIONS
         return replace(self, rows=np.union1d(self.rows, _UNEVEN), precision=precision)
 
-    def in_light(self, radius_px: float, frame_px: int) -> DiscUnknowns:
+    def in_light(self, radius_px: float, frame_px: int, *, is_burnt: bool) -> DiscUnknowns:
         """Return the unknowns of a disc of some size in a photograph of some size.
 
         Light falls off over a photograph, and so by little over a small disc. Where the ground is
         burnt, nothing else keeps its gradient from explaining whatever makes opposite edges differ.
+        Where nothing is burnt, the level of white is seen: what is usual of it, said by each of
+        many discs, would bend the curve that they share.
         """
         sd = min(_FALL * radius_px / (0.5 * frame_px), _PRIOR_SD[Row.SLOPE_X])
         if self.is_light_curved:
             sd = _SHADOW_SLOPE_SD
         precision = self.precision.copy()
         precision[_SLOPES, _SLOPES] = sd**-2
+        if not is_burnt:
+            precision[Row.WHITE, Row.WHITE] = 0.0
         return replace(self, precision=precision)
 
     def penalty(self, vector: FloatArray) -> float:
@@ -289,6 +294,15 @@ class DiscSample:
             radius_px,
         )
 
+    @property
+    def is_burnt(self) -> bool:
+        """Whether a level is clipped, and so hardly seen."""
+        return self.censoring.share > MUCH_CLIPPED
+
+    def unknowns(self, free: DiscUnknowns) -> DiscUnknowns:
+        """Return the unknowns of this disc, for those of any."""
+        return free.in_light(self.radius_px, self.window.frame_px, is_burnt=self.is_burnt)
+
     def by(self, tone: Tone, sharpening_px: float, state: DiscState) -> DiscSample:
         """Return the same pixels for another tone curve and another mask of the camera's."""
         mask = _mask(self.window, self.index, state, sharpening_px, self.pixels)
@@ -368,7 +382,7 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
     NoFit
         If the equations cannot be solved.
     """
-    state, free = start, free.in_light(sample.radius_px, sample.window.frame_px)
+    state, free = start, sample.unknowns(free)
     linear = _linearised(sample, state)
     sd = _noise(sample, linear.share, linear.levels).sd
     for _ in range(_NOISE_ROUNDS):

@@ -121,7 +121,7 @@ def _minimised(
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
         return [
-            disc_fit_at(sample, state, free.in_light(sample.radius_px, sample.window.frame_px), sd)
+            disc_fit_at(sample, state, sample.unknowns(free), sd)
             for sample, state, sd in zip(samples, places, sds, strict=True)
         ]
 

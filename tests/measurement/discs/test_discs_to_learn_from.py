@@ -27,7 +27,9 @@ def tasks(radius_px: float, count: int = 60) -> list[DiscTask]:
     return [DiscTask(photo, outline, []) for outline in find_outlines(photo)]
 
 
-@pytest.mark.parametrize(("radius_px", "least", "most"), [(3.5, 9, 9), (6.0, 17, 20), (14.0, 9, 9)])
+@pytest.mark.parametrize(
+    ("radius_px", "least", "most"), [(3.5, 29, 32), (6.0, 17, 20), (14.0, 9, 9)]
+)
 def test_small_discs_are_learned_from_in_number(
     radius_px: float, least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
