@@ -18,6 +18,7 @@ from kgcp.network.equations import (
     moved,
     prior_cost,
     reduce_poses,
+    scales_of,
     view_rows,
     whitened,
 )
@@ -143,7 +144,7 @@ def _cost(network: Network, estimate: Estimate, weights: FloatArray) -> float:
 
 def _solved(network: Network, estimate: Estimate, system: ReducedSystem) -> FloatArray:
     """Return the step (u,); with inner constraints the field as a whole stays where it is."""
-    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scale = scales_of(system.normal)
     scaled = system.normal * np.outer(scale, scale)
     if network.points.datum_defect == 0:
         factor = linalg.cho_factor(scaled)

@@ -105,8 +105,8 @@ def calibrate_camera(
         return _calibrated(CalibrationProblem(tuple(views), field, size, settings), start)
     except np.linalg.LinAlgError as error:
         raise KgcpError(
-            "the photographs do not determine a camera, however its parameters are limited; take"
-            " some from other sides, or correct the description of the field"
+            "the photographs do not determine a camera, however its parameters are limited; tilt"
+            " the field by 25° to 40° about both axes, or correct its description"
         ) from error
 
 

@@ -27,6 +27,7 @@ from kgcp.network.equations import (
     inner_constraints,
     prior_cost,
     reduce_poses,
+    scales_of,
     view_rows,
     whitened,
 )
@@ -136,7 +137,7 @@ def _degrees_of_freedom(network: Network, weights: FloatArray, unknowns: int) ->
 
 def _inverse(network: Network, system: ReducedSystem) -> FloatArray:
     """Return the inverse (u, u) of the reduced normal equations, under the inner constraints."""
-    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scale = scales_of(system.normal)
     scaled = system.normal * np.outer(scale, scale)
     if network.points.datum_defect == 0:
         inverse: FloatArray = linalg.cho_solve(linalg.cho_factor(scaled), np.eye(len(scale)))

@@ -290,6 +290,20 @@ def inner_constraints(network: Network, points: FloatArray) -> FloatArray:
     return basis
 
 
+def scales_of(normal: FloatArray) -> FloatArray:
+    """Return what makes the diagonal of reduced normal equations (u, u) ones (u,).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If an unknown is not determined: what the poses leave of it is less than its rounding.
+    """
+    diagonal = normal.diagonal()
+    if not np.all(diagonal > 0.0):
+        raise np.linalg.LinAlgError("an unknown is not determined")
+    return np.asarray(1.0 / np.sqrt(diagonal))
+
+
 def bordered_by(normal: FloatArray, basis: FloatArray) -> FloatArray:
     """Return normal equations (u, u) with constraints (u, d) on their unknowns."""
     corner = np.zeros((basis.shape[1],) * 2)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.network.equations import ViewRows
+from kgcp.network.equations import ViewRows, scales_of
 from kgcp.network.records import Estimate, Network
 
 
@@ -86,7 +86,7 @@ def reduce_points(
 
 def moved_by_points(network: Network, estimate: Estimate, system: PointReducedSystem) -> Estimate:
     """Return the estimate after the step that solves the equations."""
-    scale = 1.0 / np.sqrt(system.normal.diagonal())
+    scale = scales_of(system.normal)
     factor = linalg.cho_factor(system.normal * np.outer(scale, scale))
     step = scale * linalg.cho_solve(factor, scale * system.right)
     left = system.point_right - np.einsum("xmi,x->mi", system.coupling, step)

@@ -21,6 +21,7 @@ from kgcp.network.equations import (
     inner_constraints,
     moved,
     reduce_poses,
+    scales_of,
     view_rows,
 )
 from kgcp.network.point_elimination import (
@@ -215,3 +216,10 @@ def test_points_may_be_eliminated_instead_of_poses(rng: np.random.Generator) -> 
     inverse = np.linalg.inv(system.normal)
     blocks = inverse[5:, 5:].reshape(35, 3, 35, 3)[np.arange(35), :, np.arange(35), :]
     assert shares == pytest.approx(float(np.sum(blocks * information)), rel=1e-6)
+
+
+def test_what_rounding_makes_negative_is_not_determined() -> None:
+    """Straight views of a field of 80 discs leave −0.005 of the focal length: 1e-10 of it."""
+    assert scales_of(np.diag([4.0, 0.25])).tolist() == [0.5, 2.0]
+    with pytest.raises(np.linalg.LinAlgError):
+        scales_of(np.diag([-0.005, 700.0]))

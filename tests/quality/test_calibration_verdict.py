@@ -423,6 +423,12 @@ def test_one_photograph_three_times_is_no_traceback() -> None:
         calibrated(copies, PointModel.STIFF)
 
 
+def test_a_field_that_is_never_tilted_is_no_traceback() -> None:
+    straight = [replace(view, covs=1e-4 * view.covs) for view in views(0.0, noise_px=0.01 * SD_PX)]
+    with pytest.raises(KgcpError, match="tilt the field by 25° to 40°"):
+        calibrated(straight)
+
+
 def test_two_photographs_are_too_few() -> None:
     with pytest.raises(KgcpError, match="2 of the photographs show the field, and 3 are needed"):
         calibrated(views()[:2])
