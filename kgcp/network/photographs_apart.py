@@ -8,6 +8,7 @@ others fit.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -20,6 +21,9 @@ _MOST_APART = 0.25  # of the photographs
 _LEAST_LEFT = 4
 _TRIED = 4  # with the largest residuals, each round
 _LEAST_GAIN = 2.0  # by how much the others must fit better
+# Of so few photographs two at once are left out, if the others fit so much better: one after the
+# other, the wrong one goes first where two of six are by another zoom.
+_PAIRS_AMONG, _LEAST_GAIN_BY_PAIR = (6, 8), 5.0
 _NEARLY = 1.5  # RMS over the least one: fewer photographs are left out then
 _USUAL_TERMS = ("k1", "k2")  # which photographs that stand apart may have made insignificant
 
@@ -28,9 +32,9 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     """Return the photographs without which the others fit at least twice as well.
 
     One after another is left out: of those with the largest residuals, the one without which the
-    others fit best. If they do not fit without a quarter of them, all stay. What all photographs
-    contradict is no reason to leave out any: a lens that is none of kgcp's, or a field that is not
-    stated right.
+    others fit best. If they do not fit without a quarter of them, nor six to eight without two, all
+    stay. What all photographs contradict is no reason to leave out any: a lens that is none of
+    kgcp's, or a field that is not stated right.
     """
     limit_px = _FITTING * operator_sd_px(problem.views)
     most = min(int(_MOST_APART * len(problem.views)), len(problem.views) - _LEAST_LEFT)
@@ -40,7 +44,7 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     terms = (*_USUAL_TERMS, *(t for t in state.unknowns.terms if t not in _USUAL_TERMS))
     state = problem.with_unknowns(state, replace(state.unknowns, terms=terms))
     left_out: list[str] = []
-    misfits_px = [first_px]
+    misfits_px, whole = [first_px], (problem, state)
     while len(left_out) < most and misfits_px[-1] > limit_px:
         # the one that displaces the camera need not be the one that fits worst in it
         index = np.arange(len(problem.views))
@@ -54,7 +58,26 @@ def photographs_apart(problem: CalibrationProblem, state: AdjustedNetwork) -> tu
     count = int(np.argmax(np.array(misfits_px) <= _NEARLY * min(misfits_px)))
     is_cleared = count < most or misfits_px[count] <= limit_px  # else some are still among them
     is_gain = _LEAST_GAIN * misfits_px[count] <= first_px
-    return tuple(left_out[:count]) if is_cleared and is_gain else ()
+    return tuple(left_out[:count]) if is_cleared and is_gain else _pair_apart(*whole, limit_px)
+
+
+def _pair_apart(
+    problem: CalibrationProblem, state: AdjustedNetwork, limit_px: float
+) -> tuple[str, ...]:
+    """Return two photographs without which few others fit; none if there are no such two."""
+    least, most = _PAIRS_AMONG
+    if not least <= len(problem.views) <= most:
+        return ()
+    index = np.arange(len(problem.views))
+    misfits_px = {
+        pair: rms_px(without(problem, state, np.isin(index, pair))[1].solution)
+        for pair in combinations(index.tolist(), 2)
+    }
+    best = min(misfits_px, key=misfits_px.__getitem__)
+    is_gain = _LEAST_GAIN_BY_PAIR * misfits_px[best] <= rms_px(state.solution)
+    if not is_gain or misfits_px[best] > limit_px:
+        return ()
+    return tuple(problem.views[each].photo for each in best)
 
 
 def without(

@@ -278,6 +278,25 @@ def test_of_two_halves_by_two_zooms_none_is_left_out() -> None:
     assert any("Keep zoom, focus and crop" in sentence for sentence in verdict.advice)
 
 
+@pytest.mark.parametrize("others", [(4, 5), (0, 3)])
+def test_two_of_six_by_another_zoom_are_left_out_together(others: tuple[int, int]) -> None:
+    """One after the other, the wrong one would go first."""
+    made, by_other_zoom = views(), views(camera=OTHER_ZOOM)
+    for other in others:
+        made[other] = by_other_zoom[other]
+    result = calibrated(made, PointModel.STIFF)
+    assert result.dropped == tuple(f"p{other}" for other in others)
+    assert result.camera.fx == pytest.approx(1500.0, abs=1.0)
+    verdict = judge(result, calibration_numbers(result))
+    assert verdict.grade is CalibrationGrade.LOOK
+    assert "2 photographs do not fit the others" in verdict.sentence
+
+
+def test_three_of_six_by_another_zoom_outvote_none() -> None:
+    result = calibrated(views()[:3] + views(camera=OTHER_ZOOM)[3:], PointModel.STIFF)
+    assert result.dropped == ()
+
+
 def test_a_photograph_of_four_is_not_outvoted() -> None:
     made = views()[:4]
     made[3] = views(camera=OTHER_ZOOM)[3]
