@@ -250,6 +250,19 @@ def test_a_field_in_one_row_is_not_enough(photos: Path, tmp_path: Path) -> None:
     assert "the field is found in 0 of 3 photographs" in result.stderr
 
 
+def test_two_fields_in_each_photograph_are_to_be_covered(photos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index in (1, 2, 3):
+        pair = [cv2.imread(str(photos / f"photo{number}.png")) for number in (index, index + 1)]
+        cv2.imwrite(
+            str(folder / f"{index}.png"), np.hstack([each for each in pair if each is not None])
+        )
+    result = run(folder, "--field", photos / "field.toml", "--out", tmp_path / "out", *QUIET)
+    assert result.exit_code == 1
+    assert "(3 two_fields), and 3 are needed; cover all but one field" in result.stderr
+
+
 def test_photographs_of_another_size_are_left_out(photos: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     shutil.copytree(photos, folder)

@@ -316,17 +316,20 @@ def _views(results: Sequence[PhotoDiscs | PhotoMiss]) -> list[NamedView]:
     if len(found) < LEAST_VIEWS:
         reasons = Counter(result.reason for result in results if isinstance(result, PhotoMiss))
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
+        usual = max(reasons, key=reasons.__getitem__, default="")
         remedy = "take more photographs, 12 at best"
         if NamingProblem.AMBIGUOUS in reasons:
             remedy = (
                 "correct the field's columns, rows and marks, or show all of it or a mark;"
                 " mirrored photographs cannot be used"
             )
-        elif max(reasons, key=reasons.__getitem__, default="") == "too_few":
+        elif usual == NamingProblem.TOO_FEW:
             remedy = (
                 "correct the field's polarity (':bright' for bright discs on dark ground), or come"
                 " nearer"
             )
+        elif usual == NamingProblem.TWO_FIELDS:
+            remedy = "cover all but one field in each photograph; cropped ones cannot be used"
         elif why:
             remedy = "correct the description of the field, or take more photographs"
         raise KgcpError(
