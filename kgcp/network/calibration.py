@@ -239,6 +239,7 @@ def _result(chosen: _Chosen, dropped: tuple[str, ...]) -> CameraCalibration:
         chosen.points,
         rms_px(chosen.fixed.solution),
         problem.radius_scale(state),
+        problem.radius_scales(state),
         tuple(names[weak].tolist()),
         tangled(model.names, _with_focal_difference(model.names, cov), _INFLATION),
         chosen.is_turn_unclear,

@@ -72,6 +72,7 @@ class CameraCalibration:
     points_used: PointModel  # fixed where the field's own shape cannot be estimated
     rms_fixed_px: float  # per point, with the field as it is meant to be
     radius_scale: float  # seen over stated radii
+    radius_scales: FloatArray  # (v,): the same of each photograph
     undetermined: tuple[str, ...]  # camera parameters that these photographs do not determine
     tangled: tuple[str, ...]  # camera parameters that cannot be told apart
     is_turn_unclear: bool  # whether a symmetric field may be turned between photographs

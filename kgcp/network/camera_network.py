@@ -251,12 +251,22 @@ class CalibrationProblem:
 
     def radius_scale(self, state: AdjustedNetwork) -> float:
         """Return the median of measured over expected radii, the latter through the lens."""
+        return float(np.nanmedian(self._radius_ratios(state)))
+
+    def radius_scales(self, state: AdjustedNetwork) -> FloatArray:
+        """Return the same of every photograph (v,)."""
+        ratios, view = self._radius_ratios(state), state.network.observations.view
+        return np.array([np.nanmedian(ratios[view == k]) for k in range(len(self.views))])
+
+    def _radius_ratios(self, state: AdjustedNetwork) -> FloatArray:
+        """Return measured over expected radii (n,); NaN of discs that are not used."""
         observed = self.observations()
         expected = circle_images(state.camera, self._circles(state.estimate, observed)).moments
         measured = np.concatenate([view.vectors for view in self.views])
         usable = np.all(np.isfinite(expected), axis=1) & state.solution.is_used
-        ratio = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
-        return float(np.median(ratio))
+        ratios = np.full(len(measured), np.nan)
+        ratios[usable] = (_determinant(measured[usable]) / _determinant(expected[usable])) ** 0.25
+        return ratios
 
 
 def _centre_of(names: Sequence[str]) -> IndexArray:

@@ -292,6 +292,25 @@ def test_two_of_six_by_another_zoom_are_left_out_together(others: tuple[int, int
     assert "2 photographs do not fit the others" in verdict.sentence
 
 
+@pytest.mark.parametrize(("larger", "is_told"), [(1.15, True), (1.05, False)])
+def test_photographs_of_another_field_are_told_by_their_discs(
+    larger: float, *, is_told: bool
+) -> None:
+    """Its pitch is taken for a distance: the camera is right, and nothing else shows it."""
+    made = views()
+    for k in (1, 4):
+        vectors = made[k].vectors.copy()
+        vectors[:, 2:] *= larger**2
+        made[k] = replace(made[k], vectors=vectors)
+    result = calibrated(made)
+    assert result.radius_scales == pytest.approx(
+        np.where(np.isin(range(6), (1, 4)), larger, 1.0), abs=1e-3
+    )
+    verdict = judge(result, calibration_numbers(result))
+    assert ("another size in p1, p4 than in most" in verdict.sentence) == is_told
+    assert (verdict.grade is CalibrationGrade.GOOD) != is_told
+
+
 def test_three_of_six_by_another_zoom_outvote_none() -> None:
     result = calibrated(views()[:3] + views(camera=OTHER_ZOOM)[3:], PointModel.STIFF)
     assert result.dropped == ()
