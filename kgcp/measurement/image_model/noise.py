@@ -53,8 +53,8 @@ class Censoring:
 
     @property
     def share(self) -> float:
-        """Share of clipped pixels."""
-        return float(np.mean(self.at_high | self.at_low))
+        """Share of clipped pixels; 0 of none."""
+        return float(np.count_nonzero(self.at_high | self.at_low) / max(len(self.at_high), 1))
 
 
 def find_censoring(levels: FloatArray, levels_per_count: float) -> Censoring:

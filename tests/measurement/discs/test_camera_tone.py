@@ -11,6 +11,7 @@ from kgcp.measurement.discs.adjust_disc import DiscTask
 from kgcp.measurement.discs.camera_tone import _worthy, learn_tone
 from kgcp.measurement.discs.joint_tone import JointFit
 from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
@@ -101,6 +102,14 @@ def small_discs(
         grey = photograph(camera, POSE, scene, Optics(0.6), sensor, rng)
         tasks.append([DiscTask(grey, outline, []) for outline in find_outlines(grey)])
     return tasks
+
+
+def test_no_pixels_are_not_burnt() -> None:
+    """All of a window may be foreign: a mean of them would warn on stderr."""
+    none, both = np.zeros(0, np.bool_), np.array([True, False])
+    assert Censoring(0.998, 0.002, none, none).share == 0.0
+    assert Censoring(0.998, 0.002, both, ~both).share == 1.0
+    assert Censoring(0.998, 0.002, both, both).share == 0.5
 
 
 @pytest.mark.parametrize("seed", [0, 1])
