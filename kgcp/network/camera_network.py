@@ -254,9 +254,15 @@ class CalibrationProblem:
         return float(np.nanmedian(self._radius_ratios(state)))
 
     def radius_scales(self, state: AdjustedNetwork) -> FloatArray:
-        """Return the same of every photograph (v,)."""
+        """Return the same of every photograph (v,); NaN if none of its discs is used."""
         ratios, view = self._radius_ratios(state), state.network.observations.view
-        return np.array([np.nanmedian(ratios[view == k]) for k in range(len(self.views))])
+        used = np.isfinite(ratios)
+        return np.array(
+            [
+                np.median(ratios[used & (view == k)]) if np.any(used & (view == k)) else np.nan
+                for k in range(len(self.views))
+            ]
+        )
 
     def _radius_ratios(self, state: AdjustedNetwork) -> FloatArray:
         """Return measured over expected radii (n,); NaN of discs that are not used."""

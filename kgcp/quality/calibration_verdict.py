@@ -306,7 +306,7 @@ def _has_other_discs(calibration: CameraCalibration) -> bool:
 def _of_other_discs(calibration: CameraCalibration) -> list[str]:
     """Return the photographs whose discs are not as large as in most, by the field's pitch."""
     scales = calibration.radius_scales
-    off = np.abs(scales / np.median(scales) - 1.0)
+    off = np.abs(scales / np.nanmedian(scales) - 1.0)
     return [calibration.views[k].photo for k in np.flatnonzero(off > _OTHER_FIELD_SHARE).tolist()]
 
 
