@@ -58,6 +58,7 @@ def _one_line_warnings() -> Iterator[None]:
             file: TextIO | None = None,
             line: str | None = None,
         ) -> None:
+            """Write one of kgcp's warnings as a line; leave others as they are."""
             if issubclass(category, KgcpWarning):
                 click.echo(f"kgcp: warning: {message}", err=True)
             else:

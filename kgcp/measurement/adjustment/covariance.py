@@ -44,7 +44,7 @@ _LEAST_LEFT = 0.25  # of the scatter, after the fit
 _VECTOR = 4  # numbers that the processor takes at once
 # Of a circle's edge as a whole: no print and no pixel is known better. What a camera's processing
 # makes of it goes with how much it sharpens: on simulated plates of R ≥ 26 px, outer edges are
-# displaced in the mean by 0.0000 ± 0.0002 px (111 plates, strength 0), 0.0007 ± 0.0004 (33, 0.5),
+# displaced in the mean by 0.0001 ± 0.0002 px (111 plates, strength 0), 0.0007 ± 0.0004 (33, 0.5),
 # 0.0030 ± 0.0009 (75, 0.8; mixed) and 0.0025 ± 0.0004 px (36, 1.0; phone). That of bins is of the
 # frame's pixels: within bins, a tone curve displaces edges.
 _EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX, _PER_SHARPENING_PX = 0.0005, 0.004, 0.003
@@ -132,8 +132,8 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
 def unevenness_factor(fit: TargetFit, inflation: float) -> float:
     """Return how many times the variances that residuals show are too small in uneven light.
 
-    They are on small rings. If levels do not vary there, an `inflation` beyond 1 says that the
-    light may be uneven.
+    Only those of small rings are. If levels do not vary there, an `inflation` beyond 1 says that
+    the light may be uneven.
     """
     if fit.sample.problem.outer_radius_px >= SMALL_RING_PX:
         return 1.0

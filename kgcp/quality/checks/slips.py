@@ -263,6 +263,7 @@ def _with_times_of_neighbours(step: int) -> Callable[[Encounters], Encounters]:
 
 def _with_poses_of_neighbours(step: int) -> Callable[[Encounters], Encounters]:
     def undone(encounters: Encounters) -> Encounters:
+        """Return the encounters, each with the pose of the frame `step` later."""
         centre = np.roll(encounters.centre_m, -step, axis=0)
         centre[-1 if step > 0 else 0] = np.nan
         return replace(

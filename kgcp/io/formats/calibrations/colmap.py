@@ -44,6 +44,7 @@ def _entry(file: ForeignFile, line: int, row: str) -> Entry:
     name, model, width, height, *params = row.split()
 
     def convert(width: int, height: int) -> Camera:
+        """Return the camera for frames of this size."""
         if model not in _MODELS:
             raise unsupported(file, f"the model {model}", f"line {line}")
         keys = _MODELS[model]

@@ -83,6 +83,7 @@ def _mm_entry(file: ForeignFile, name: str, block: str) -> Entry:
         return file.numbers(values.get(key), 1, f"{where} {key}")[0]
 
     def convert(width: int, height: int) -> Camera:
+        """Return the camera for frames of this size."""
         per_mm = width / width_mm
         if abs(height - per_mm * height_mm) > 1.0:
             raise file.error_at(
