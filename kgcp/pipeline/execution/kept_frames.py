@@ -18,8 +18,9 @@ import numpy as np
 
 from kgcp.geometry.arrays import GreyArray
 
-_MOST_BYTES = 1 << 31  # a thousand frames of 2 Mpx: their number is asked for with each of them
+_MOST_BYTES = 1 << 31  # a thousand frames of 2 Mpx
 _SHARE_OF_DISK = 0.25  # of what is free
+_COUNT = "count"  # a file with a byte for each frame: to list the folder takes ever longer
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +35,11 @@ class KeptFrames:
         path = self._path(frame)
         unfinished = path.with_suffix(f".{os.getpid()}")  # whatever ends this process: not the name
         try:
-            # a thousand paths would take as long as all else
-            number = len(os.listdir(self.folder))  # noqa: PTH208
-            if (number + 1) * grey.nbytes <= self.most_bytes:
+            with (self.folder / _COUNT).open("ab") as count:  # for all processes
+                count.write(b".")
+                count.flush()
+                number = count.tell()
+            if number * grey.nbytes <= self.most_bytes:
                 with unfinished.open("wb") as stream:
                     np.lib.format.write_array(stream, grey, allow_pickle=False)
                 unfinished.replace(path)
