@@ -117,6 +117,20 @@ def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
         template_match.check(DetectSettings().min_score)
 
 
+def test_disc_and_plate_that_differ_in_shade_only_are_one_target(
+    target: Target, place_plate: PlacePlate, draw_frame: DrawFrame
+) -> None:
+    outer = Ellipse(250.0, 170.0, 40.0, 40.0, 0.0)
+    plate = draw_frame((target, place_plate((250.0, 170.0), 40.0, turn_deg=100.0)))
+    rows, columns = np.indices(plate.shape)
+    shade = np.where(columns > 240 + 0.3 * (rows - 170), 0.5, 1.0)
+    inside = np.hypot(columns - 250, rows - 170) < 25
+    crossing = np.where(inside, (rows - 170) / 16, (columns - 250) / 44)  # no light does that
+    for light, expected in ((shade, 1), (np.clip(0.67 + 0.33 * crossing, 0.0, 1.0), 0)):
+        frame = np.rint(plate * light).astype(np.uint8)
+        assert len(find_dotted(frame, (outer,), [target.ring])[target.ring]) == expected
+
+
 def test_a_code_in_view_is_held_against_its_known_heading(
     target: Target,
     place_plate: PlacePlate,
