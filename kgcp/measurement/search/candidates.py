@@ -25,10 +25,10 @@ from kgcp.targets.layout import Ring
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
 _UNEVEN = 0.7  # spread of ink, disc and plate, of the contrast in light: shade leaves a third
-# What disc and plate differ by at one angle, over half of all angles, of the ring's depth at a third
-# of them: 0.6 and less for 900 targets, in shade, too; 0.4 and more for 99 % of textures
+# Spread of what disc and plate differ by, over half of the angles, of the ring's depth: up to 0.6
+# for 900 targets, half in shade or not, and from 0.4 on for 99 % of rings in textures
 _MOST_APART = 0.7
-_ROUNDING = 1.0  # of such differences, in grey values
+_ROUNDING = 1.0  # of that spread, in grey values
 _DISC_SHARE, _PLATE = 0.8, 1.1  # where the plate is seen, of the inner and of the outer radius
 _CIRCLE_LOSS = 0.06  # of the score, where an ellipse stands for the true perspective
 _SEED_REACH = 2.0  # around expected places, of their radii
