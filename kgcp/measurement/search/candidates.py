@@ -24,7 +24,7 @@ from kgcp.targets.layout import Ring
 # (values in docs/method.md, "Constants of the search"), and `benchmarks.search.false_alarms`.
 _MIN_CONTRAST = 0.02  # of the grey values' range
 _MIN_DOT_CONTRAST = 0.1  # of the ring's contrast: what blur leaves of dots
-_UNEVEN = 0.7  # spread of ink, disc and plate, of the contrast in light: shade leaves a third
+_UNEVEN = 0.85  # spread of ink, disc and plate, of the contrast in light: shade leaves a sixth
 # Spread of what disc and plate differ by, over half of the angles, of the ring's depth: up to 0.6
 # for 900 targets, half in shade or not, and from 0.4 on for 99 % of rings in textures
 _MOST_APART = 0.7

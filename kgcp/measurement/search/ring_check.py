@@ -31,9 +31,14 @@ _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
 _MIN_CONTRAST = 5  # grey values: less is noise
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of the ring, of the contrast
 _LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
+# times as bright as the ring beside it: a surround in shade, darker than the filter's mean in light
+_BRIGHTER = 2
 # Spread of core and of surround, and their difference, of the contrast in shade: in a linear image
-# half in shade that takes away half of the light, they are as much as the contrast.
-_UNEVEN = 1.2
+# half in shade that takes away half of the light, they are as much as the contrast. They are more
+# in deeper shade, if it falls on both alike: the spread of what they differ by, over half of the
+# directions, of the ring's depth.
+_UNEVEN, _MOST_UNEVEN = 1.2, 4.0
+_MOST_APART = 0.6
 # Order statistics of 24 samples, from 0. Up to a third of the ring may be dots: its typical grey
 # value is of rank 4, and what is even about it lies between the ranks 1 and 8. Of core and surround
 # a third may be dark, hidden or beyond the plate, and only bright ranks tell.
@@ -230,15 +235,18 @@ def _count_directions(
 ) -> int:
     """Count the directions in which a dark ring is followed by a brighter surround.
 
-    The surround may be seen on the nearer circle alone, if the plate's margin is narrow, or on the
-    farther one alone, if blur brings the ring's edge to the nearer.
+    In even light a grey value lies between them in all directions; in shade, each direction has a
+    light of its own. The surround may be seen on the nearer circle alone, if the plate's margin is
+    narrow, or on the farther one alone, if blur brings the ring's edge to the nearer.
     """
     count = 0
     for k in range(directions):
-        is_dark = pixels[at + steps[trial, _RING, k]] < dark
-        is_near = pixels[at + steps[trial, _NEAR, k]] > bright
-        is_far = pixels[at + steps[trial, _FAR, k]] > bright
-        count += is_dark & (is_near | is_far)
+        ring = np.int64(pixels[at + steps[trial, _RING, k]])
+        near = pixels[at + steps[trial, _NEAR, k]]
+        surround = np.int64(max(near, pixels[at + steps[trial, _FAR, k]]))
+        in_even_light = (ring < dark) & (surround > bright)
+        in_shade = surround > _BRIGHTER * ring + _MIN_CONTRAST
+        count += int(in_even_light | in_shade)
     return count
 
 
@@ -261,21 +269,38 @@ def _clearness(
     # Most fail by ring and core alone: the surround is sampled only where they do not.
     if contrast < _MIN_CONTRAST or spread > clear * contrast:
         return 0.0
-    if core_bright - core_dark > _UNEVEN * contrast:
+    if core_bright - core_dark > _MOST_UNEVEN * contrast:
         return 0.0
     for k in range(_ALL):
         near = pixels[at + steps[trial, _NEAR, _MANY + k]]
         values[2, k] = max(near, pixels[at + steps[trial, _FAR, _MANY + k]])
     plate_dark, plate, plate_bright = _order_statistics(values[2], _PLATE_RANKS)
-    difference = abs(core - plate)
     contrast = min(core, plate) - ring
     if contrast < _MIN_CONTRAST or spread > clear * contrast:
         return 0.0
-    if core_bright - core_dark > _UNEVEN * contrast:
+    uneven = max(core_bright - core_dark, plate_bright - plate_dark, abs(core - plate))
+    if uneven > _MOST_UNEVEN * contrast:
         return 0.0
-    if max(plate_bright - plate_dark, difference) > _UNEVEN * contrast:
+    if uneven > _UNEVEN * contrast and not _are_lit_alike(values):
         return 0.0
     return float(max(contrast - 0.5 * spread, 1.0))
+
+
+@compiled
+def _are_lit_alike(values: GreyArray) -> bool:
+    """Return whether core and surround differ by the same in half of the directions, as in shade.
+
+    `values` (3, 24) are the samples of ring, core and surround.
+    """
+    differences, depths = np.empty(_ALL, np.int64), np.empty(_ALL, np.int64)
+    for k in range(_ALL):
+        core, surround = np.int64(values[1, k]), np.int64(values[2, k])
+        differences[k] = core - surround
+        depths[k] = min(core, surround) - np.int64(values[0, k])
+    differences.sort()
+    depths.sort()
+    spread = np.min(differences[_ALL // 2 :] - differences[: _ALL - _ALL // 2])
+    return bool(spread - 1 < _MOST_APART * depths[2 * _ALL // 3])  # 1: rounding
 
 
 @compiled

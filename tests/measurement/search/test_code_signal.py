@@ -11,7 +11,7 @@ from kgcp.geometry.arrays import GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.search.candidates import find_code, find_dotted
+from kgcp.measurement.search.candidates import find_code, find_dotted, find_rings
 from kgcp.measurement.search.code_signal import (
     CODE_ANGLES_RAD,
     fixed_lag_score,
@@ -123,12 +123,14 @@ def test_disc_and_plate_that_differ_in_shade_only_are_one_target(
     outer = Ellipse(250.0, 170.0, 40.0, 40.0, 0.0)
     plate = draw_frame((target, place_plate((250.0, 170.0), 40.0, turn_deg=100.0)))
     rows, columns = np.indices(plate.shape)
-    shade = np.where(columns > 240 + 0.3 * (rows - 170), 0.5, 1.0)
+    shade = np.where(columns > 240 + 0.3 * (rows - 170), 0.3, 1.0)
     inside = np.hypot(columns - 250, rows - 170) < 25
     crossing = np.where(inside, (rows - 170) / 16, (columns - 250) / 44)  # no light does that
     for light, expected in ((shade, 1), (np.clip(0.67 + 0.33 * crossing, 0.0, 1.0), 0)):
         frame = np.rint(plate * light).astype(np.uint8)
         assert len(find_dotted(frame, (outer,), [target.ring])[target.ring]) == expected
+    found = find_rings(np.rint(plate * shade).astype(np.uint8), DetectSettings())
+    assert any(math.dist((ring.x, ring.y, ring.a), (250.0, 170.0, 40.0)) < 2.0 for ring in found)
 
 
 def test_a_code_in_view_is_held_against_its_known_heading(

@@ -37,21 +37,25 @@ class PlainCheck:
     def directions(self, radius: float, count: int) -> int:
         """In how many directions a dark ring is followed by something brighter."""
         ring, near, far = (self.samples(ratio * radius, count) for ratio in (RING, NEAR, FAR))
-        is_bright = (near > self.bright) | (far > self.bright)
-        return int(np.sum((ring < self.dark) & is_bright))
+        surround = np.maximum(near, far)
+        in_even_light = (ring < self.dark) & (surround > self.bright)
+        return int(np.sum(in_even_light | (surround > 2 * ring + 5)))
 
     def clearness(self, radius: float, clear: float) -> float:
         """Contrast, less half of the ring's spread; 0 if it is not a ring."""
         ring, core, near, far = (
             self.samples(ratio * radius, 24) for ratio in (RING, CORE, NEAR, FAR)
         )
-        ring, core, plate = np.sort(ring), np.sort(core), np.sort(np.maximum(near, far))
+        plate = np.maximum(near, far)
+        apart, depths = np.sort(core - plate), np.sort(np.minimum(core, plate) - ring)
+        are_lit_alike = min(apart[12:] - apart[:12]) - 1 < 0.6 * depths[16]
+        ring, core, plate = np.sort(ring), np.sort(core), np.sort(plate)
         contrast = min(core[11], plate[14]) - ring[4]
         spread = ring[8] - ring[1]
         if contrast < 5 or spread > clear * contrast:
             return 0.0
         by_shade = core[17] - core[7], plate[19] - plate[11], abs(core[11] - plate[14])
-        if max(by_shade) > 1.2 * contrast:
+        if max(by_shade) > (4.0 if are_lit_alike else 1.2) * contrast:
             return 0.0
         return float(max(contrast - 0.5 * spread, 1.0))
 
@@ -90,7 +94,7 @@ def rings_by_definition(pyramid: Pyramid, level: int, peaks: FloatArray) -> Floa
 
 
 def frame_of_rings(seed: int, typical_px: float) -> tuple[GreyArray, FloatArray]:
-    """Dark rings of about a radius on texture, some of them partly hidden; their centres."""
+    """Dark rings of about a radius on texture, some partly hidden or in shade; their centres."""
     rng = np.random.default_rng(seed)
     texture = ndimage.gaussian_filter(rng.normal(size=(260, 340)), 3.0)
     frame = np.clip(120.0 + 350.0 * texture, 0, 255).astype(np.uint8)
@@ -100,6 +104,7 @@ def frame_of_rings(seed: int, typical_px: float) -> tuple[GreyArray, FloatArray]
         black, white = int(rng.integers(0, 90)), int(rng.integers(110, 256))
         for factor, level in ((1.5, white), (1.0, black), (0.5, white)):
             cv2.circle(frame, (int(x), int(y)), round(factor * radius), level, -1)
+    frame[:, 90:180] = frame[:, 90:180] * 0.3
     return cv2.GaussianBlur(frame, (0, 0), 0.8).astype(np.uint8), centres
 
 

@@ -1,0 +1,45 @@
+"""Plates half in shade: how many are measured, and how well, by how much light the shade leaves.
+
+Usage: python -m benchmarks.search.shaded_rings [--frames 40] [--seed 5]
+
+Each frame has a target of R 7 to 35 px, and the edge of one shadow runs across it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import click
+import cv2
+import numpy as np
+
+from benchmarks.accuracy.small_rings import errors_of, settings_of
+from kgcp.simulation.light_settings import Shadow
+
+_LINES = (("clean", 0.5), ("clean", 0.35), ("clean", 0.25), ("consumer", 0.3))
+_DISTANCE_M = (30.0, 140.0)
+
+
+@click.command()
+@click.option("--frames", type=click.IntRange(2), default=40, show_default=True, help="Per line.")
+@click.option("--seed", type=click.IntRange(0), default=5, show_default=True)
+def main(frames: int, seed: int) -> None:
+    """Print the table."""
+    cv2.setNumThreads(0)
+    print("camera    light left  measured  error, median and RMS [%]  z of distance, centre  > 3")
+    for camera, light_left in _LINES:
+        shadow = Shadow(light_left=light_left, edges=1, stripes=0)
+        settings = settings_of(camera, "even", frames)
+        settings = replace(settings, distance_m=_DISTANCE_M, shadow=shadow)
+        relative, distance, centre = errors_of(settings, seed)
+        median, rms = np.median(np.abs(relative)), np.sqrt(np.mean(relative**2))
+        print(
+            f"{camera:10s}{light_left:10.2f}{len(relative):10d}{100.0 * median:16.3f}"
+            f"{100.0 * rms:11.3f}{np.sqrt(np.mean(distance**2)):15.2f}"
+            f"{np.sqrt(np.mean(centre**2)):8.2f}{np.count_nonzero(np.abs(distance) > 3.0):5d}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
