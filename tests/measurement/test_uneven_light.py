@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,6 +21,7 @@ from kgcp.measurement.adjustment.covariance import PoseCovariance, pose_covarian
 from kgcp.measurement.adjustment.fit_target import measure_by_model
 from kgcp.measurement.adjustment.normal_equations import Unknowns
 from kgcp.measurement.adjustment.parameters import Parameters
+from kgcp.measurement.adjustment.pixels import Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.residual_image import residual_image_of
 from kgcp.measurement.adjustment.solver import TargetFit
@@ -29,7 +32,8 @@ from kgcp.simulation.flight import TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.simulation.light_field import Cloud, Highlight, PlateLight, Shade
 from kgcp.simulation.light_settings import Dirt
-from kgcp.simulation.plate import PrintedPlate
+from kgcp.simulation.phone import Phone
+from kgcp.simulation.plate import PrintedPlate, image_plate
 from kgcp.simulation.point_spread import Aberration
 from kgcp.targets.layout import Target
 
@@ -125,6 +129,55 @@ def test_dirt_under_a_film_curve_that_is_not_known_is_no_other_size(
         seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
         sigmas.append((seen.distance_m - pose.distance_m) / seen.sd_distance_m)
     assert 0.2 < math.sqrt(np.mean(np.square(sigmas))) < 1.5
+
+
+def phone_photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
+    """A phone's picture of a plate between dark and bright ground, which change its levels."""
+    sensor = Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2)
+    irradiance = np.full((LENS.height, LENS.width), 0.03)
+    irradiance[:, LENS.width // 2 :] = 0.9
+    image_plate(LENS, TARGET_PLATE, pose, Optics(0.7)).paste(irradiance)
+    colours = Phone().photograph(sensor, irradiance, 0.8, rng)
+    return np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY))
+
+
+def test_a_phones_halos_are_told_from_levels(start_near: StartNear) -> None:
+    """Without the pixels just beside edges, the RMS error of these plates was 0.0116 %."""
+    camera, errors, sigmas = replace(LENS, response=Response.UNKNOWN), [], []
+    for seed in range(6):
+        rng = np.random.default_rng(900 + seed)
+        pose = some_pose(rng)
+        grey = phone_photograph(pose, rng)
+        start = start_near(camera, pose, rng)
+        seen = measure_by_model(grey, camera, TARGET_PLATE.target, start)
+        errors.append(100.0 * (seen.distance_m / pose.distance_m - 1.0))
+        sigmas.append((seen.distance_m - pose.distance_m) / seen.sd_distance_m)
+    assert math.sqrt(np.mean(np.square(errors))) < 0.0095
+    assert 0.35 < math.sqrt(np.mean(np.square(sigmas))) < 1.4
+
+
+@pytest.mark.parametrize(("farther", "near_sigmas"), [(1.35, 3.3), (1.47, 2.0)])
+def test_pixels_beside_edges_tie_the_levels_of_large_rings_together(
+    photograph: Photograph,
+    start_near: StartNear,
+    monkeypatch: pytest.MonkeyPatch,
+    farther: float,
+    near_sigmas: float,
+) -> None:
+    """Of rings of 33 and of 31 px."""
+    used = set()
+
+    def select(*given: Any, near_sigmas: float, **more: Any) -> Sample:  # noqa: ANN401
+        used.add(near_sigmas)
+        return select_pixels(*given, near_sigmas=near_sigmas, **more)
+
+    monkeypatch.setattr(random_levels, "select_pixels", select)
+    rng = np.random.default_rng(300)
+    pose = some_pose(rng)
+    pose = Pose(pose.rotation, farther * pose.translation_m)
+    grey = photograph(LENS, pose, rng, gain=0.65, field=dirt(rng))
+    measure_by_model(grey, LENS, TARGET_PLATE.target, start_near(LENS, pose, rng))
+    assert used == {near_sigmas}
 
 
 def test_dirt_on_a_small_ring_is_told_by_its_edges(

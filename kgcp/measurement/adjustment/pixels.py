@@ -37,8 +37,10 @@ from kgcp.measurement.image_model.sharpening import unsharp_mask
 
 _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
 _BORDER_RADII = 0.2  # … and how far it is looked for at most
-_NEAR_SIGMAS, _NEAR_PX = 2.0, 0.3  # half width of the band around an edge that is used
+_NEAR_PX = 0.3  # half width of the band around an edge that is used, beside the σ of its blur
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
+NEAR_SIGMAS = 2.0
+"""Half width of the band around an edge that is used, in σ of the blur."""
 _SMALL_PX = 40.0  # radius below which sharpening feels the far tails of edges
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
 
@@ -73,6 +75,7 @@ def select_pixels(
     *,
     max_pixels: int | None = None,
     slack_px: float = 0.0,
+    near_sigmas: float = NEAR_SIGMAS,
     plateau_pixels: int = _PLATEAU_PIXELS,
 ) -> Sample:
     """Choose pixels near edges and a share of the plateaus, at most `max_pixels` of both.
@@ -82,7 +85,7 @@ def select_pixels(
     by a pose that may be off by `slack_px`.
 
     Pixels in the far tails of an edge say little about it but cost as much as any other, and they
-    feel first what the model does not know; they are left out.
+    feel first what the model does not know; they are left out, beyond `near_sigmas` of the blur.
 
     Raises
     ------
@@ -97,7 +100,7 @@ def select_pixels(
     if problem.visible is not None:
         sectors = _sectors_about_normal(seen.unblurred.points_m, len(problem.visible))
         unused |= ~problem.visible[sectors]
-    index = _useful_pixels(seen, unused, plateau_pixels)
+    index = _useful_pixels(seen, unused, near_sigmas, plateau_pixels)
     is_thinned = max_pixels is not None and len(index) > max_pixels
     if max_pixels is not None and is_thinned:
         index = index[_GOLDEN * np.arange(len(index)) % 1.0 < max_pixels / len(index)]
@@ -143,7 +146,9 @@ def _sectors_about_normal(points_m: FloatArray, count: int) -> IndexArray:
     return np.asarray(np.rint(turns * count).astype(np.intp) % count)
 
 
-def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau_pixels: int) -> IndexArray:
+def _useful_pixels(
+    seen: SeenPlate, unused: BoolArray, near_sigmas: float, plateau_pixels: int
+) -> IndexArray:
     """Return the pixels near edges and some of the plateaus', without those of `unused`.
 
     None is used within circles that are not measured.
@@ -157,7 +162,7 @@ def _useful_pixels(seen: SeenPlate, unused: BoolArray, plateau_pixels: int) -> I
         seen.unblurred.rho_m,
         seen.unblurred.off_measured_m,
         unused,
-        (_NEAR_SIGMAS * sd_px + _NEAR_PX) * scale,
+        (near_sigmas * sd_px + _NEAR_PX) * scale,
         tail_m,
         _unmeasured_m(seen),
         limit * problem.outer_radius_m,

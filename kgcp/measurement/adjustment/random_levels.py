@@ -29,7 +29,7 @@ from kgcp.measurement.adjustment.normal_equations import (
     solve_damped,
 )
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.pixels import NEAR_SIGMAS, Sample, select_pixels
 from kgcp.measurement.adjustment.problem import SMALL_RING_PX, FitProblem
 from kgcp.measurement.adjustment.solver import (
     PredictedImage,
@@ -68,6 +68,12 @@ _LEAST_SD, _MOST_SD, _FIRST_SD = 1e-4, 1.0, 0.1  # of the levels' prior, of the 
 _FINEST_PX, _FINE, _COARSE = 8.0, 6.0, 0.8  # knots: px, per radius, and radii apart
 _SLACK_PX = 0.4
 _PLATEAU_PIXELS = 1200
+# Half width of the band around an edge that is used, in σ of its blur, on rings from this radius
+# on, four knots of the finest grid. With the pixels just beside edges left out, nothing ties the
+# levels at an edge to those of the plateaus: errors of three flights of phones, R ≥ 26 px, were 1.4
+# to 1.8 times as large. Smaller rings hardly have pixels so far from all edges, and under
+# highlights their errors grew.
+_NEAR_SIGMAS, _NEAR_FROM_PX = 3.3, 4.0 * _FINEST_PX
 _LEAST_CONTRAST = 0.05
 # Mean square of the residuals' sums over cells, relative to that of independent residuals. Above
 # this, the levels vary; frames in even light have about 1.
@@ -160,6 +166,7 @@ def fit_levels(
 def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -> TargetFit:
     """Adjust with a field of levels, in rounds with their own choice of pixels."""
     parameters = start if start.field is not None else replace(start, field=even_field(problem))
+    is_large = problem.outer_radius_px >= _NEAR_FROM_PX
     for _ in range(_ROUNDS):
         sample = select_pixels(
             _evened(problem, parameters),
@@ -167,6 +174,7 @@ def _adjust_levels(problem: FitProblem, start: Parameters, unknowns: Unknowns) -
             parameters.blur,
             parameters.light,
             slack_px=_SLACK_PX,
+            near_sigmas=_NEAR_SIGMAS if is_large else NEAR_SIGMAS,
             plateau_pixels=_PLATEAU_PIXELS,
         )
         fit = _adjust_on(replace(sample, problem=problem), parameters, unknowns)

@@ -14,7 +14,7 @@ from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.parameters import Parameters
-from kgcp.measurement.adjustment.pixels import Sample, select_pixels
+from kgcp.measurement.adjustment.pixels import NEAR_SIGMAS, Sample, select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
 from kgcp.measurement.adjustment.solver import predict
 from kgcp.measurement.image_model.blur import Blur, find_edge_incidence
@@ -129,21 +129,27 @@ def test_surroundings_as_bright_as_the_plate_are_no_loss(
     np.testing.assert_array_equal(found.index, everything.index)
 
 
+@pytest.mark.parametrize(("near_sigmas", "within_sigmas"), [(NEAR_SIGMAS, 1.5), (3.3, 3.0)])
 def test_all_that_says_where_edges_are_is_used(
-    target: Target, camera: Camera, place_plate: PlacePlate, imaging_of: ImagingOf
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    imaging_of: ImagingOf,
+    near_sigmas: float,
+    within_sigmas: float,
 ) -> None:
-    """On a wide plate: all pixels within 1.5 σ of a circle, and levels beyond the ring."""
+    """On a wide plate: all pixels so near to a circle, and levels beyond the ring."""
     pose = place_plate((205.4, 190.7), 40.0, tilt_deg=20.0, turn_deg=31.0)
     grey, _ = photograph(camera, target, pose, WIDE, 0.2)
     problem = imaging_of(grey, camera, target, pose)
-    sample = select_pixels(problem, pose, BLUR, LIGHT)
+    sample = select_pixels(problem, pose, BLUR, LIGHT, near_sigmas=near_sigmas)
     window = problem.window
     everywhere = plate_points(pose, window.rays)
     near = np.zeros(everywhere.shape[1], bool)
     px_per_m = problem.outer_radius_px / problem.outer_radius_m
     for centre, radius in zip(problem.circles.centres_m.T, problem.circles.radii_m, strict=True):
         off_edge = np.hypot(*(everywhere - centre[:, None])) - radius
-        near |= np.abs(off_edge) * px_per_m < 1.5 * BLUR.largest_sd_px
+        near |= np.abs(off_edge) * px_per_m < within_sigmas * BLUR.largest_sd_px
     assert set(np.flatnonzero(near)) <= set(sample.index)
     assert 1.5 < beyond_px(sample, pose).max() < 4.0
     np.testing.assert_array_equal(sample.levels, window.levels[sample.index])
