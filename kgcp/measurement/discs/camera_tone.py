@@ -32,8 +32,9 @@ from kgcp.measurement.discs.fit_disc import (
     NoFit,
     ProcessingPrior,
 )
-from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
+from kgcp.measurement.discs.joint_tone import JointFit, adjust_before_compression, adjust_together
 from kgcp.measurement.discs.tone_curve import WAVES
+from kgcp.measurement.image_model.compression import quantisation_steps
 from kgcp.measurement.image_model.photometry import Tone
 
 # Discs of a photograph to learn from: as many as have so long an edge together, as a sum of radii,
@@ -95,6 +96,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
+    if tone is Tone.UNKNOWN:
+        best = _before_compression(best, sds)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
@@ -254,6 +257,35 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     bend = before + after - 2.0 * middle
     between = at(best + 0.5 * (before - after) / bend) if bend > 0.0 else None
     return between if between is not None and between.loss < middle else tried[best]
+
+
+def _before_compression(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
+    """Adjust discs anew to what they were before JPEG compressed them, if it did.
+
+    It may have hidden what bends the curve. A plain one is bent if that is significant now.
+    """
+    photos = {id(photo): photo for photo in (fit.sample.window.photo for fit in joint.fits)}
+    steps_of = {key: quantisation_steps(photo) for key, photo in photos.items()}
+    steps = [steps_of[id(fit.sample.window.photo)] for fit in joint.fits]
+    if all(each is None for each in steps):
+        return joint
+    states, tone = [fit.state for fit in joint.fits], _BENT.get(joint.tone, joint.tone)
+    bent = _adjusted_together(joint.fits, states, tone, joint.sharpening_px, sds)
+    try:
+        before = None if bent is None else adjust_before_compression(bent, steps)
+    except (NoFit, np.linalg.LinAlgError):
+        return joint
+    if before is None or not (joint.tone.is_shaped or _is_bent(before)):
+        return joint
+    return before
+
+
+def _is_bent(joint: JointFit) -> bool:
+    """Return whether a curve is more bent than one that hardly is, and than the model may lack."""
+    waves, excess = joint.shared[:WAVES], _excess(joint)
+    cov = excess * np.linalg.inv(joint.precision)[:WAVES, :WAVES] + _LITTLE_BENT**2 * np.eye(WAVES)
+    square = excess * float(waves @ np.linalg.solve(cov, waves))
+    return square > _WORTHY_BENDS * excess**_BY_EXCESS
 
 
 def _state_by(fit: DiscFit, tone: Tone, sharpening: float) -> DiscState:

@@ -25,9 +25,11 @@ from kgcp.measurement.discs.fit_disc import (
     misfit_by,
     noise_at,
 )
+from kgcp.measurement.image_model.compression import levels_before
 from kgcp.measurement.image_model.photometry import Tone
 
 _STEPS, _NOISE_ROUNDS = 25, 2
+_COMPRESSION_ROUNDS, _SETTLED = 25, 0.003  # until nothing that is shared moves more in one
 _ENOUGH = 0.1  # of log-likelihood, promised by a step
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _SHARED = np.array(CAMERA_ROWS)
@@ -84,26 +86,91 @@ def adjust_together(
     NoFit
         If the equations cannot be solved.
     """
-    usual = ProcessingPrior.usual()
-    free = DiscUnknowns.of(
-        tone,
-        replace(usual, precision=np.zeros_like(usual.precision)),
-        sharpening_px=sharpening_px,
-    )
+    free, usual = _unknowns(tone, sharpening_px), ProcessingPrior.usual()
     for _ in range(_NOISE_ROUNDS):
         own_sds = [noise_at(*pair).sd for pair in zip(samples, states, strict=True)]
         fits = _minimised(samples, states, free, usual, own_sds)
         states = [fit.state for fit in fits]
+    return _joint(fits, sharpening_px, sds)
+
+
+def adjust_before_compression(joint: JointFit, steps: Sequence[FloatArray | None]) -> JointFit:
+    """Adjust discs of compressed photographs to what they were before (Dempster, Laird & Rubin).
+
+    In turns, the values before compression are what the model and the coefficients let expect,
+    and the model is adjusted to them.
+
+    Parameters
+    ----------
+    joint : JointFit
+        The same discs adjusted to the compressed values.
+    steps : sequence of (8, 8) arrays
+        Of each disc's photograph, by `quantisation_steps`; None: it was not compressed.
+
+    Raises
+    ------
+    NoFit
+        If the equations cannot be solved.
+    """
+    free, usual = _unknowns(joint.tone, joint.sharpening_px), ProcessingPrior.usual()
+    fits = list(joint.fits)
+    for _ in range(_COMPRESSION_ROUNDS):
+        before = fits[0].state.vector[_SHARED]
+        samples, sds, left_sds = [], [], []
+        for fit, step in zip(fits, steps, strict=True):
+            sample, lost = fit.sample, np.zeros(1)
+            if step is not None:
+                places, photo = sample.pixels.places_px, sample.window.photo
+                levels, lost = levels_before(photo, places, fit.levels, fit.sd, step)
+                sample = replace(sample, levels=levels)
+            samples.append(sample)
+            left_sds.append(noise_at(sample, fit.state).sd)
+            sds.append(np.sqrt(left_sds[-1] ** 2 + lost))
+        fits = _minimised(samples, [fit.state for fit in fits], free, usual, sds)
+        if np.abs(fits[0].state.vector[_SHARED] - before).max() < _SETTLED:
+            break
+    # what is lost tells nothing (the missing information of Orchard & Woodbury)
+    telling = [
+        disc_fit_at(fit.sample, fit.state, fit.free, fit.sd**2 / left_sd)
+        for fit, left_sd in zip(fits, left_sds, strict=True)
+    ]
+    return _joint(fits, joint.sharpening_px, sds, telling)
+
+
+def _unknowns(tone: Tone, sharpening_px: float) -> DiscUnknowns:
+    """Return the unknowns of a disc without what is usual of cameras: all say that once."""
+    usual = ProcessingPrior.usual()
+    nothing = replace(usual, precision=np.zeros_like(usual.precision))
+    return DiscUnknowns.of(tone, nothing, sharpening_px=sharpening_px)
+
+
+def _joint(
+    fits: Sequence[DiscFit],
+    sharpening_px: float,
+    sds: Sequence[FloatArray],
+    telling: Sequence[DiscFit] | None = None,
+) -> JointFit:
+    """Collect discs that are adjusted together.
+
+    Parameters
+    ----------
+    sds : sequence of (n,) arrays
+        Noise by which the loss is stated.
+    telling : sequence of DiscFit
+        The same by the noise that their information is stated by; by default, the one they have.
+    """
+    free, usual = fits[0].free, ProcessingPrior.usual()
     own = np.isin(_SHARED, free.rows)
     reduced = _reduced(fits, 0.0)
     count = len(CAMERA_ROWS)
     scores, informations = np.zeros((len(fits), count)), np.zeros((len(fits), count, count))
     scores[:, own] = reduced.gradients
-    informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
+    normals = reduced.normals if telling is None else _reduced(telling, 0.0).normals
+    informations[np.ix_(np.arange(len(fits)), own, own)] = normals
     loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
     loss += _penalty(fits[0].state.vector[_SHARED], usual)
     precision = usual.precision + informations.sum(axis=0)
-    return JointFit(tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
+    return JointFit(free.tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
 
 
 def _minimised(

@@ -40,7 +40,12 @@ class DiscWindow:
     height: int
     levels: FloatArray  # (height · width,): 0…1 of the grey values' range
     levels_per_count: float
-    frame_px: int  # longer side of the photograph
+    photo: GreyArray  # that it is cut out of
+
+    @property
+    def frame_px(self) -> int:
+        """The longer side of the photograph."""
+        return int(max(self.photo.shape))
 
     def places_px(self, index: IndexArray) -> FloatArray:
         """Return the raw pixel coordinates (2, n) of flat indices."""
@@ -59,7 +64,7 @@ def cut_disc_window(grey: GreyArray, geometry: Geometry, reach_px: float) -> Dis
     levels = grey[y0:y1, x0:x1].astype(np.float64).ravel() / scale
     # floats have no steps: as fine as 16 bits
     count = 1.0 / scale if np.issubdtype(grey.dtype, np.integer) else 1.0 / 65535.0
-    return DiscWindow(x0, y0, x1 - x0, y1 - y0, levels, count, max(grey.shape))
+    return DiscWindow(x0, y0, x1 - x0, y1 - y0, levels, count, grey)
 
 
 def outward_px(blur: Blur) -> float:

@@ -1,0 +1,98 @@
+"""JPEG: its steps read from grey values, and what it hides of the tone curve of small discs."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.camera import Camera, Response
+from kgcp.geometry.pose import Pose
+from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
+from kgcp.measurement.discs.camera_tone import learn_tone
+from kgcp.measurement.discs.fit_disc import DiscUnknowns
+from kgcp.measurement.discs.outlines import find_outlines
+from kgcp.measurement.image_model.compression import levels_before, quantisation_steps
+from kgcp.measurement.image_model.photometry import Tone
+from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, photograph
+from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
+
+FILM = Sensor(tone=ToneCurve.FILM, sharpening=0.5)
+# of the standard's table for grey values, which libjpeg scales by the quality
+FIRST_ROW = np.array((16, 11, 10, 16, 24, 40, 51, 61))
+
+
+def small_discs(sensor: Sensor, seed: int, photographs: int = 5) -> list[GreyArray]:
+    """Return photographs of dark discs of R 5 px in light that falls off."""
+    rng = np.random.default_rng(seed)
+    camera = Camera(130, 105, 200_000.0, 200_000.0, 64.5, 52.0)
+    photos = []
+    for _ in range(photographs):
+        places = (24.0 * np.mgrid[-2:3, -1.5:2].reshape(2, -1).T + rng.uniform(-0.5, 0.5, 2)) / 2e5
+        discs = tuple(SimulatedDisc((x, y, 0.0), 10.0 / 2e5) for x, y in places.tolist())
+        scene = FieldScene(discs, 0.62, 0.1, gradient=(0.004, 0.0))
+        pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+        photos.append(photograph(camera, pose, scene, Optics(0.6), sensor, rng))
+    return photos
+
+
+def compressed(grey: GreyArray, quality: int) -> GreyArray:
+    """Return what JPEG leaves."""
+    _, buffer = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE))
+
+
+@pytest.mark.parametrize("quality", [80, 92])
+def test_steps_are_those_of_the_file(quality: int) -> None:
+    grey = np.concatenate(small_discs(FILM, 3, 4))[:416]
+    steps = quantisation_steps(compressed(grey, quality))
+    assert steps is not None
+    scale = 200 - 2 * quality
+    expected = (FIRST_ROW * scale + 50) // 100
+    assert steps[0].tolist() == expected.tolist()
+    # high frequencies that nothing shows: 99 by the table
+    assert steps[0, 7] <= steps[7, 7] <= (121 * scale + 50) // 100
+
+
+def test_no_steps_are_read_from_what_was_not_compressed_or_was_moved() -> None:
+    grey = small_discs(FILM, 4, 1)[0]
+    assert quantisation_steps(grey) is None
+    assert quantisation_steps(compressed(grey, 92)[3:, 5:]) is None
+    assert quantisation_steps(grey.astype(np.uint16) * 257) is None
+    assert quantisation_steps(grey[:6]) is None
+    assert quantisation_steps(np.full((64, 64), 128, np.uint8)) is None
+    assert quantisation_steps(np.full((64, 64), 255, np.uint8)) is None
+
+
+def test_levels_before_compression_are_nearer_to_what_they_were() -> None:
+    """By the model of the very disc: 3.8 grey values instead of 5.3; stated 2.8."""
+    grey = small_discs(FILM, 5, 1)[0]
+    photo = compressed(grey, 75)
+    steps = quantisation_steps(photo)
+    assert steps is not None
+    free = DiscUnknowns.of(Tone.SRGB, sharpening_px=1.0)
+    before, after, stated = [], [], []  # of each disc
+    for outline in find_outlines(grey):
+        fit = adjust_disc(DiscTask(photo, outline, []), free)
+        x, y = fit.sample.window.places_px(fit.sample.index).astype(np.intp)
+        levels, variance = levels_before(photo, np.stack((x, y)), fit.levels, fit.sd, steps)
+        before.append(fit.sample.levels * 255.0 - grey[y, x])
+        after.append(levels * 255.0 - grey[y, x])
+        stated.append(variance * 255.0**2)
+    rms, sd = (np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in (after, before))
+    assert 0.6 < rms / sd < 0.8
+    assert 1.0 < rms / np.sqrt(np.mean(np.concatenate(stated))) < 1.6
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_film_s_curve_is_learned_through_jpeg(seed: int) -> None:
+    """From the compressed values themselves it was sRGB's, with waves of 0.03 at most."""
+    photos = [compressed(photo, 92) for photo in small_discs(FILM, seed, 2)]
+    tasks = [[DiscTask(photo, each, []) for each in find_outlines(photo)] for photo in photos]
+    learned = learn_tone(tasks, Response.UNKNOWN)
+    assert learned.known is not None
+    assert learned.tone is Tone.UNKNOWN
+    first, second, _, strength = learned.known.mean.tolist()
+    assert -1.4 < first + 2.0 * second < -0.6  # what the dark end is steeper by; film's: -1.4
+    assert 0.4 < strength < 0.85
