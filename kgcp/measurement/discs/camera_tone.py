@@ -96,7 +96,7 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
-    if tone is Tone.UNKNOWN:
+    if tone is Tone.UNKNOWN and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
         best = _before_compression(best, sds)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
