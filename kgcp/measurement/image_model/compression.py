@@ -28,7 +28,11 @@ _FEWEST_COEFFICIENTS = 20
 _LARGEST_STEP = 255
 # Least mean of cos(2π c / step) over coefficients c, of what rounded pixels leave of it
 _PERIODIC = 0.6
-_LEAST_DETERMINED = 6  # steps of 64
+_LEAST_DETERMINED = 6  # steps of 64, …
+# … and the share of those that enough coefficients could show. JPEG leaves 0.6 or more of them.
+# Where blocks begin elsewhere, since the photograph was cropped or resized, or where nothing was
+# compressed, it is 0.45 at most: coefficients that fade out above `_NONE` look like multiples.
+_LEAST_SHARE = 0.55
 _LEAST_SD_COUNTS = 0.3  # quantisation of grey values alone
 _IMPOSSIBLE = 1e-8  # probability of an interval, below which only its nearer end counts
 
@@ -36,7 +40,9 @@ _IMPOSSIBLE = 1e-8  # probability of an interval, below which only its nearer en
 def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     """Return the steps (8, 8) that JPEG rounded the blocks' coefficients to; None if it did not.
 
-    Steps that no coefficient shows are as large as the largest of those of lower frequencies.
+    They are in grey values of the orthonormal transform, rows by vertical frequency. None, too, if
+    the photograph was cropped or resized since, or if its steps are 1 for the most part. Steps that
+    no coefficient shows are as large as the largest of those of lower frequencies.
     """
     height, width = (side // _SIDE * _SIDE for side in grey.shape)
     if grey.dtype != np.uint8 or not height or not width:
@@ -49,10 +55,13 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
     if len(useful) < _FEWEST_BLOCKS:
         return None
     uneven = useful[np.argsort(-width_of[useful], kind="stable")[:_MOST_BLOCKS]]
-    size = np.abs(_transformed(blocks[uneven].astype(np.float64)))
-    steps = np.array([_step_of(each) for each in size.reshape(len(size), -1).T])
+    size = np.abs(_transformed(blocks[uneven].astype(np.float64))).reshape(len(uneven), -1)
+    steps = np.array([_step_of(each) for each in size.T])
     seen = np.isfinite(steps)
     if np.count_nonzero(seen) < _LEAST_DETERMINED or np.median(steps[seen]) < 2.0:
+        return None
+    could_be = np.count_nonzero(size > _NONE, axis=0) >= _FEWEST_COEFFICIENTS
+    if np.count_nonzero(seen) < _LEAST_SHARE * np.count_nonzero(could_be):
         return None
     known = np.where(seen, steps, 1.0).reshape(_SIDE, _SIDE)
     lower = np.maximum.accumulate(np.maximum.accumulate(known, axis=0), axis=1)

@@ -37,6 +37,17 @@ def small_discs(sensor: Sensor, seed: int, photographs: int = 5) -> list[GreyArr
     return photos
 
 
+def discs_on_a_grid(blur_px: float, noise: float) -> GreyArray:
+    """Return a photograph of dark discs of R 9 px, with noise in grey values."""
+    rng = np.random.default_rng(1)
+    discs = np.full((600, 800), 190.0)
+    places = 60.0 * np.mgrid[:13, :9].reshape(2, -1).T + 40.0 + rng.uniform(-1.0, 1.0, 2)
+    for place in places.tolist():
+        cv2.circle(discs, [round(16 * each) for each in place], 16 * 9, 50.0, -1, shift=4)
+    blurred = cv2.GaussianBlur(discs, (0, 0), blur_px)
+    return np.rint(blurred + rng.normal(0.0, noise, discs.shape)).astype(np.uint8)
+
+
 def compressed(grey: GreyArray, quality: int) -> GreyArray:
     """Return what JPEG leaves."""
     _, buffer = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -63,6 +74,31 @@ def test_no_steps_are_read_from_what_was_not_compressed_or_was_moved() -> None:
     assert quantisation_steps(grey[:6]) is None
     assert quantisation_steps(np.full((64, 64), 128, np.uint8)) is None
     assert quantisation_steps(np.full((64, 64), 255, np.uint8)) is None
+
+
+@pytest.mark.parametrize("noise", [0.4, 0.8, 1.2])
+@pytest.mark.parametrize("blur_px", [1.0, 2.5, 4.0])
+def test_little_noise_is_not_taken_for_fine_steps(noise: float, blur_px: float) -> None:
+    """Its coefficients, of which few are above 1.4, are all near 2 then."""
+    grey = discs_on_a_grid(blur_px, noise)
+    for part in (grey, grey[:200, :200]):
+        assert quantisation_steps(part) is None
+        assert quantisation_steps(compressed(part, 92)) is not None
+
+
+@pytest.mark.parametrize("quality", [60, 75, 92])
+@pytest.mark.parametrize("blur_px", [0.8, 1.5, 3.0])
+def test_no_steps_are_read_from_blocks_that_begin_elsewhere(blur_px: float, quality: int) -> None:
+    """A crop is periodic in some of its coefficients, but in a third of them at most."""
+    photo = compressed(discs_on_a_grid(blur_px, 1.0), quality)
+    for across, down in ((1, 0), (4, 0), (0, 1), (0, 4), (4, 4), (2, 6)):
+        assert quantisation_steps(photo[down:, across:]) is None
+    for factor in (0.5, 0.8, 1.3):
+        resized = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        assert quantisation_steps(np.asarray(resized, np.uint8)) is None
+    again = quantisation_steps(compressed(photo[3:, 5:], 90))
+    assert again is not None
+    assert again[0, :3].tolist() == [3.0, 2.0, 2.0]  # those of quality 90
 
 
 def test_levels_before_compression_are_nearer_to_what_they_were() -> None:
