@@ -37,10 +37,10 @@ from kgcp.measurement.image_model.sharpening import unsharp_mask
 
 _BORDER_SIGMAS, _BORDER_PX = 2.5, 0.8  # how far beyond the outer circle plate is needed …
 _BORDER_RADII = 0.2  # … and how far it is looked for at most
-_NEAR_PX = 0.3  # half width of the band around an edge that is used, beside the σ of its blur
+_NEAR_PX = 0.3  # added to half the width of the band around an edge that is used
 _PLATEAU_PIXELS = 400  # enough for the levels and their noise
 NEAR_SIGMAS = 2.0
-"""Half width of the band around an edge that is used, in σ of the blur."""
+"""Half the width of the band around an edge that is used, in σ of the blur; see `select_pixels`."""
 _SMALL_PX = 40.0  # radius below which sharpening feels the far tails of edges
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # its multiples are spread evenly
 

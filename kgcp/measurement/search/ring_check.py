@@ -31,7 +31,8 @@ _ENOUGH_OF_FEW, _ENOUGH_OF_MANY = 4, 9  # a hidden quarter and dots leave half
 _MIN_CONTRAST = 5  # grey values: less is noise
 _CLEAR, _CLEAR_LARGE = 0.5, 0.8  # spread of the ring, of the contrast
 _LARGE_PX = 22.0  # radius from which there are so few places that a wider spread costs nothing
-# times as bright as the ring beside it: a surround in shade, darker than the filter's mean in light
+# A surround so many times as bright as the ring beside it counts as bright, even if shade makes it
+# darker than the filter's mean in light.
 _BRIGHTER = 2
 # Spread of core and of surround, and their difference, of the contrast in shade: in a linear image
 # half in shade that takes away half of the light, they are as much as the contrast. They are more
