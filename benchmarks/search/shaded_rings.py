@@ -32,6 +32,9 @@ def main(frames: int, seed: int) -> None:
         settings = settings_of(camera, "even", frames)
         settings = replace(settings, distance_m=_DISTANCE_M, shadow=shadow)
         relative, distance, centre = errors_of(settings, seed)
+        if not len(relative):
+            print(f"{camera:10s}{light_left:10.2f}{0:10d}", flush=True)
+            continue
         median, rms = np.median(np.abs(relative)), np.sqrt(np.mean(relative**2))
         print(
             f"{camera:10s}{light_left:10.2f}{len(relative):10d}{100.0 * median:16.3f}"
