@@ -49,12 +49,12 @@ def quantisation_steps(grey: GreyArray) -> FloatArray | None:
         return None
     blocks = _blocks(grey[:height, :width]).reshape(-1, _SIDE, _SIDE)
     low, high = blocks.min(axis=(1, 2)), blocks.max(axis=(1, 2))
-    width_of = high.astype(np.intp) - low
+    ranges = high.astype(np.intp) - low
     # clipped ones are not exact; of flat ones, roundings are alike and add up
-    useful = np.flatnonzero((low > 0) & (high < _WHITE) & (width_of >= _LEAST_RANGE))
+    useful = np.flatnonzero((low > 0) & (high < _WHITE) & (ranges >= _LEAST_RANGE))
     if len(useful) < _FEWEST_BLOCKS:
         return None
-    uneven = useful[np.argsort(-width_of[useful], kind="stable")[:_MOST_BLOCKS]]
+    uneven = useful[np.argsort(-ranges[useful], kind="stable")[:_MOST_BLOCKS]]
     size = np.abs(_transformed(blocks[uneven].astype(np.float64))).reshape(len(uneven), -1)
     steps = np.array([_step_of(each) for each in size.T])
     seen = np.isfinite(steps)
