@@ -104,7 +104,7 @@ def frame_of_rings(seed: int, typical_px: float) -> tuple[GreyArray, FloatArray]
         black, white = int(rng.integers(0, 90)), int(rng.integers(110, 256))
         for factor, level in ((1.5, white), (1.0, black), (0.5, white)):
             cv2.circle(frame, (int(x), int(y)), round(factor * radius), level, -1)
-    frame[:, 90:180] = frame[:, 90:180] * 0.3
+    frame[:, 90:180] = frame[:, 90:180] * 0.3  # shade
     return cv2.GaussianBlur(frame, (0, 0), 0.8).astype(np.uint8), centres
 
 
