@@ -3,22 +3,22 @@
 An outer edge is where the grey values rise most on the way out of the ring. On a single ray that
 may be the rim of a dot, a shadow or clutter. Over all rays, the edge of one ring is a smooth curve
 about its centre: an ellipse whose centre is a little off the seed's, and whose axes differ a
-little, has to first order the distances
-
-    ρ(θ) = c₀ + c₁ cos θ + c₂ sin θ + c₃ cos 2θ + c₄ sin 2θ
-
-so that a robust linear fit of five numbers tells the edge from the others. docs/method.md, "Edge
-tracking", derives it; `fit_ellipses` puts the exact ellipse through what is left.
+little, has to first order the distances of `harmonic_curves`, so that a robust linear fit of five
+numbers tells the edge from the others. docs/method.md, "Edge tracking", derives it; `fit_ellipses`
+puts the exact ellipse through what is left.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.measurement.search.harmonic_curves import TERMS, fill_in_medians, fit_curves, waves_of
 
 # Tuning of the tracking. Lengths are in units of the seed's radius, which is right to a fifth.
 # The benchmark is `benchmarks.search.hard_frames`; docs/method.md, "Constants of the search", has
@@ -35,33 +35,34 @@ _REACH = 0.17  # of an edge from the first curve; the rises into dots are farthe
 _INLIER = 0.07  # distance from the curve of what counts as its edge, twice that at first
 _MIN_INLIERS, _MIN_INLIERS_AT_FIRST = 0.55, 0.6  # shares: up to 40 % may be hidden
 _FINEST_RADIUS_PX = 12.0  # of rings in the image that they are tracked in, or twice that
-_RIDGE = 1e-3  # keeps the curve through few edges near the mean circle
+
+_IntArray = npt.NDArray[np.signedinteger[Any]]
 
 RAYS_RAD = 2.0 * np.pi / RAYS * np.arange(RAYS)
 _FEW = RAYS // _EVERY
 _MIDDLES = _RADII[_STEP:-_STEP]
 _SPACING = _RADII[1] - _RADII[0]
+_WAVES, _FEW_WAVES = waves_of(RAYS), waves_of(_FEW)
 _HARMONICS = np.stack([np.ones(RAYS), *(f(k * RAYS_RAD) for k in (1, 2) for f in (np.cos, np.sin))])
-_TERMS = len(_HARMONICS)
-# What the normal equations add up for each ray: the lower triangle of products of harmonics, row
-# by row, and then the harmonics themselves for the right-hand side.
-_PAIRS = _TERMS * (_TERMS + 1) // 2
-_PRODUCTS = np.stack([_HARMONICS[i] * _HARMONICS[j] for i in range(_TERMS) for j in range(i + 1)])
-_SUMMANDS = np.ascontiguousarray(np.concatenate((_PRODUCTS, _HARMONICS)).T)
-_FEW_HARMONICS = np.ascontiguousarray(_HARMONICS[:, ::_EVERY])
-_FEW_SUMMANDS = np.ascontiguousarray(_SUMMANDS[::_EVERY])
+
+# For the first look pixels are enough, and single precision, which does twice as many at a time.
+# More samples of a ray, and more rays, fill up vectors.
+_LANES = 32
+_ROUGH_RADII = np.append(_RADII, np.full(_LANES - len(_RADII), _RADII[-1])).astype(np.float32)
+_ROUGH_DIRECTIONS = _HARMONICS[1:3, ::_EVERY].astype(np.float32)
+_SLOPES = len(_MIDDLES)
+# Samples near a curve: of the slopes within reach either side, one more at either end for the
+# parabola, and what the last of them reaches beyond.
+_NEAR = int(2.0 * _REACH / _SPACING) + 1 + 2 + 2 * _STEP
 
 
-@compiled
 def track_edges(
     frame: GreyArray,
     reduced: GreyArray,
     levels: IndexArray,
     centres: FloatArray,
     radii: FloatArray,
-    edges: FloatArray,
-    inlying: BoolArray,
-) -> None:
+) -> tuple[FloatArray, BoolArray]:
     """Look for the outer edges of rings: the steepest rises to brighter that lie on a curve.
 
     Each is tracked in the image in which its radius is 12 to 24 px: there a sample's spacing is
@@ -73,70 +74,146 @@ def track_edges(
         Of a pyramid.
     centres, radii : (n, 2) and (n,) array
         Of the rings in the frame, roughly [px].
+
+    Returns
+    -------
     edges : (n, rays) array
-        Filled in: how far the edge is from the centre, of the radius.
+        How far the edge is from the centre, of the radius.
     inlying : (n, rays) array of bool
-        Filled in: which edges are on the curve; none at all if they are too few for a ring.
+        Which edges are on the curve; none at all if they are too few for a ring.
     """
-    for i in range(len(radii)):
-        octave, factor = 0, 1.0
-        while 2 * octave < len(levels) and radii[i] >= 2.0 * factor * _FINEST_RADIUS_PX:
-            octave, factor = octave + 1, 2.0 * factor
-        x, y = (centres[i, 0] + 0.5) / factor - 0.5, (centres[i, 1] + 0.5) / factor - 0.5
-        radius, edge, is_inlying = radii[i] / factor, edges[i], inlying[i]
-        if octave == 0:  # apart, since the frame may be a read-only array: another type
-            _track_ring(frame, x, y, radius, edge, is_inlying)
-        else:
-            at = levels[2 * octave - 2]
-            image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
-            _track_ring(image, x, y, radius, edge, is_inlying)
+    count = len(radii)
+    curves = np.zeros((TERMS, count))
+    numbers, rises = np.empty((_FEW, count), np.uint8), np.empty((_FEW, count), np.uint8)
+    residuals = np.empty((_FEW, count))
+    _find_rough_edges(frame, reduced, levels, centres, radii, numbers, rises)
+    fill_in_medians(numbers, curves[0])
+    curves[0] = _MIDDLES[0] + _SPACING * curves[0]
+    fit_curves(_MIDDLES[numbers], rises, _FEW_WAVES, _WIDTHS_AT_FIRST, curves, residuals)
+    on_curve = np.count_nonzero(np.abs(residuals) < 2.0 * _INLIER, axis=0)
+    rings = np.flatnonzero(on_curve > _MIN_INLIERS_AT_FIRST * _FEW)
+
+    near, curves = np.empty((RAYS, len(rings))), curves[:, rings]
+    rises, residuals = np.empty((RAYS, len(rings)), np.uint8), np.empty((RAYS, len(rings)))
+    images = frame, reduced, levels
+    _find_edges_near(*images, centres[rings], radii[rings], curves, near, rises)
+    middle = np.sort(near.T.copy(), axis=1)[:, RAYS // 2 - 1 : RAYS // 2 + 1]
+    curves[0], curves[1:] = middle.mean(axis=1), 0.0
+    fit_curves(near, rises, _WAVES, _WIDTHS, curves, residuals)
+    on_curve = (np.abs(residuals) < _INLIER) & (rises > 0)
+    on_curve &= np.count_nonzero(on_curve, axis=0) >= _MIN_INLIERS * RAYS
+    edges, inlying = np.ones((count, RAYS)), np.zeros((count, RAYS), np.bool_)
+    edges[rings], inlying[rings] = near.T, on_curve.T
+    return edges, inlying
+
+
+@inlined
+def _octave_of(radius: float, levels: IndexArray) -> int:
+    """Return how often a frame is halved where a ring is tracked."""
+    octave, largest = 0, 2.0 * _FINEST_RADIUS_PX
+    while 2 * octave < len(levels) and radius >= largest:
+        octave, largest = octave + 1, 2.0 * largest
+    return octave
 
 
 @compiled
-def _track_ring(
-    image: GreyArray, x: float, y: float, radius: float, edge: FloatArray, is_inlying: BoolArray
+def _find_rough_edges(
+    frame: GreyArray,
+    reduced: GreyArray,
+    levels: IndexArray,
+    centres: FloatArray,
+    radii: FloatArray,
+    numbers: GreyArray,
+    rises: GreyArray,
 ) -> None:
-    """Fill in the edge of one ring about a pixel, and which parts of it are on the curve."""
-    rough_edge, strength, residuals = np.empty(_FEW), np.empty(RAYS), np.empty(RAYS)
-    curve = np.empty(_TERMS)
-    is_inlying[:] = False
-    _find_rough_edge(image, x, y, radius, rough_edge, strength)
-    _fit_curve(
-        rough_edge, strength, _FEW_HARMONICS, _FEW_SUMMANDS, _WIDTHS_AT_FIRST, residuals, curve
-    )
-    if np.sum(np.abs(residuals[:_FEW]) < 2.0 * _INLIER) <= _MIN_INLIERS_AT_FIRST * _FEW:
-        return
-    _find_edge_near(image, x, y, radius, curve, edge, strength)
-    _fit_curve(edge, strength, _HARMONICS, _SUMMANDS, _WIDTHS, residuals, curve)
-    is_inlying[:] = (np.abs(residuals) < _INLIER) & (strength > 0.0)
-    is_inlying &= is_inlying.sum() >= _MIN_INLIERS * RAYS
+    """Fill in the numbers of the steepest rises outwards on some of the rays, and the rises."""
+    places, values = np.empty((_FEW, _LANES), np.int32), np.zeros((_LANES, _LANES), np.int16)
+    for i in range(len(radii)):
+        octave = _octave_of(radii[i], levels)
+        x, y = (centres[i, 0] + 0.5) / 2.0**octave - 0.5, (centres[i, 1] + 0.5) / 2.0**octave - 0.5
+        radius, number, rise = radii[i] / 2.0**octave, numbers[:, i], rises[:, i]
+        if octave == 0:  # apart, since the frame may be a read-only array: another type
+            _find_rough_edge(frame, x, y, radius, places, values, number, rise)
+        else:
+            at = levels[2 * octave - 2]
+            image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+            _find_rough_edge(image, x, y, radius, places, values, number, rise)
 
 
 @compiled
 def _find_rough_edge(
-    image: GreyArray, x: float, y: float, radius: float, edge: FloatArray, strength: FloatArray
+    image: GreyArray,
+    x: float,
+    y: float,
+    radius: float,
+    places: _IntArray,
+    values: _IntArray,
+    number: GreyArray,
+    rise: GreyArray,
 ) -> None:
     """Find the steepest rise outwards on some of the rays, in the pixels as they are.
 
-    Addresses first, then grey values: only the second of the two loops cannot be vectorised.
+    Addresses first, then grey values, then slopes: only the second cannot be vectorised, and a
+    vector of what has just been stored one by one would have to wait for it. The steepest slope is
+    found as one number: 32 times the slope, and so much less the farther out it is that of equal
+    slopes the first is the largest.
     """
-    pixels, width = image.reshape(-1), image.shape[1]
-    last_x, last_y = width - 1, image.shape[0] - 1
-    places, values = np.empty(len(_RADII), np.intp), np.empty(len(_RADII))
+    pixels, width = image.reshape(-1), np.int32(image.shape[1])
+    last_x, last_y = np.int32(width - 1), np.int32(image.shape[0] - 1)
+    column, row = np.int32(math.floor(x + 0.5)), np.int32(math.floor(y + 0.5))
+    rest_x, rest_y = np.float32(x + 0.5 - column), np.float32(y + 0.5 - row)
     for k in range(_FEW):
-        dx, dy = radius * _FEW_HARMONICS[1, k], radius * _FEW_HARMONICS[2, k]
-        for j in range(len(_RADII)):
-            column = min(max(int(x + _RADII[j] * dx + 0.5), 0), last_x)
-            row = min(max(int(y + _RADII[j] * dy + 0.5), 0), last_y)
-            places[j] = row * width + column
-        for j in range(len(_RADII)):
-            values[j] = pixels[np.uintp(places[j])]
-        best, steepest = 0, -1.0
-        for j in range(len(_MIDDLES)):
-            slope = values[j + 2 * _STEP] - values[j]
-            if slope > steepest:
-                best, steepest = j, slope
-        edge[k], strength[k] = _MIDDLES[best], max(steepest, 0.0)
+        dx = np.float32(radius) * _ROUGH_DIRECTIONS[0, k]
+        dy = np.float32(radius) * _ROUGH_DIRECTIONS[1, k]
+        for j in range(_LANES):
+            # Each result is cast: sums of 32 bits would be of 64, and take twice the vectors.
+            at_x = np.int32(column + np.int32(np.floor(rest_x + _ROUGH_RADII[j] * dx)))
+            at_y = np.int32(row + np.int32(np.floor(rest_y + _ROUGH_RADII[j] * dy)))
+            at_x = min(max(at_x, np.int32(0)), last_x)
+            at_y = min(max(at_y, np.int32(0)), last_y)
+            places[k, j] = np.int32(np.int32(at_y * width) + at_x)
+    for k in range(_FEW):
+        for j in range(_LANES):
+            values[j, k] = pixels[np.uint32(places[k, j])]
+    steepest = np.full(_LANES, np.int16(-(2**15)))
+    for j in range(_SLOPES):
+        outer, inner, countdown = values[j + 2 * _STEP], values[j], np.int16(_SLOPES - 1 - j)
+        for k in range(_LANES):
+            slope = np.int16(np.int16(32 * np.int16(outer[k] - inner[k])) + countdown)
+            steepest[k] = max(steepest[k], slope)
+    for k in range(_FEW):
+        number[k] = _SLOPES - 1 - steepest[k] % 32
+        rise[k] = max(steepest[k] >> 5, 0)
+
+
+@compiled
+def _find_edges_near(
+    frame: GreyArray,
+    reduced: GreyArray,
+    levels: IndexArray,
+    centres: FloatArray,
+    radii: FloatArray,
+    curves: FloatArray,
+    edges: FloatArray,
+    rises: GreyArray,
+) -> None:
+    """Fill in the steepest rises outwards near curves, on all rays: (rays, n)."""
+    work = (
+        np.empty((_NEAR, RAYS), np.int32),
+        np.empty((2, _NEAR, RAYS)),
+        np.empty((4, _NEAR, RAYS), np.uint8),
+        np.empty((_NEAR, RAYS)),
+    )
+    for i in range(len(radii)):
+        octave = _octave_of(radii[i], levels)
+        x, y = (centres[i, 0] + 0.5) / 2.0**octave - 0.5, (centres[i, 1] + 0.5) / 2.0**octave - 0.5
+        radius, curve, edge, rise = radii[i] / 2.0**octave, curves[:, i], edges[:, i], rises[:, i]
+        if octave == 0:  # apart, since the frame may be a read-only array: another type
+            _find_edge_near(frame, x, y, radius, curve, work, edge, rise)
+        else:
+            at = levels[2 * octave - 2]
+            image = reduced[at[0] : at[1]].reshape((at[2], at[3]))
+            _find_edge_near(image, x, y, radius, curve, work, edge, rise)
 
 
 @compiled
@@ -146,73 +223,84 @@ def _find_edge_near(
     y: float,
     radius: float,
     curve: FloatArray,
+    work: tuple[_IntArray, FloatArray, GreyArray, FloatArray],
     edge: FloatArray,
-    strength: FloatArray,
+    rise: GreyArray,
 ) -> None:
     """Find the steepest rise outwards within reach of a curve on all rays, between samples.
 
-    Three slopes around the steepest give a parabola, whose maximum is the edge.
+    Three slopes around the steepest give a parabola, whose maximum is the edge. Its rise is no more
+    than a weight, and is rounded to a grey value.
     """
-    places, parts = np.empty(len(_RADII), np.intp), np.empty((2, len(_RADII)))
-    values = np.empty(len(_RADII))
+    places, parts, corners, values = work
+    first, last = np.empty(RAYS, np.int32), np.empty(RAYS, np.int32)
     for k in range(RAYS):
         rho = 0.0
-        for i in range(_TERMS):
+        for i in range(len(curve)):
             rho += curve[i] * _HARMONICS[i, k]
-        first = max(math.ceil((rho - _REACH - _MIDDLES[0]) / _SPACING), 1)
-        last = min(math.floor((rho + _REACH - _MIDDLES[0]) / _SPACING), len(_MIDDLES) - 2)
-        edge[k], strength[k] = rho, 0.0
-        if first > last:
+        first[k] = max(math.ceil((rho - _REACH - _MIDDLES[0]) / _SPACING), 1)
+        last[k] = min(math.floor((rho + _REACH - _MIDDLES[0]) / _SPACING), _SLOPES - 2)
+        edge[k], rise[k] = rho, 0
+    _sample_rays(image, x, y, radius, first, places, parts, corners, values)
+    for k in range(RAYS):
+        if first[k] > last[k]:
             continue
-        radii = _RADII[first - 1 : last + 2 + 2 * _STEP]
-        dx, dy = radius * _HARMONICS[1, k], radius * _HARMONICS[2, k]
-        _sample_ray(image, x, y, dx, dy, radii, places, parts, values)
-        best, top = 1, values[1 + 2 * _STEP] - values[1]
-        for j in range(2, last - first + 2):
-            slope = values[j + 2 * _STEP] - values[j]
+        best, top = 1, values[1 + 2 * _STEP, k] - values[1, k]
+        for j in range(2, last[k] - first[k] + 2):
+            slope = values[j + 2 * _STEP, k] - values[j, k]
             best, top = (j, slope) if slope > top else (best, top)
-        left = values[best - 1 + 2 * _STEP] - values[best - 1]
-        right = values[best + 1 + 2 * _STEP] - values[best + 1]
+        left = values[best - 1 + 2 * _STEP, k] - values[best - 1, k]
+        right = values[best + 1 + 2 * _STEP, k] - values[best + 1, k]
         bend = min(left - 2.0 * top + right, -1e-3)
         beside = min(max(0.5 * (left - right) / bend, -0.5), 0.5)
-        edge[k] = _MIDDLES[first - 1 + best] + _SPACING * beside
-        strength[k] = max(top, 0.0)
+        edge[k] = _MIDDLES[0] + _SPACING * (first[k] - 1 + best + beside)
+        rise[k] = round(max(top, 0.0))
 
 
 @compiled
-def _sample_ray(
+def _sample_rays(
     image: GreyArray,
     x: float,
     y: float,
-    dx: float,
-    dy: float,
-    radii: FloatArray,
-    places: IndexArray,
+    radius: float,
+    first: _IntArray,
+    places: _IntArray,
     parts: FloatArray,
+    corners: GreyArray,
     values: FloatArray,
 ) -> None:
-    """Fill in bilinear grey values along a ray; beyond the border the last pixels repeat.
+    """Fill in bilinear grey values along all rays; beyond the border the last pixels repeat.
 
     `places` and `parts` keep the pixels above and left of the samples, and how far these are beyond
-    them: a loop of arithmetic alone is vectorised, one that also reads the image is not.
+    them; `corners` the four pixels around: loops of arithmetic alone are vectorised, one that also
+    reads the image is not.
     """
-    height, width = image.shape
-    last_x, last_y = width - 1, height - 1
-    for j in range(len(radii)):
-        column = _clamp(x + radii[j] * dx, float(last_x))
-        row = _clamp(y + radii[j] * dy, float(last_y))
-        left, top = min(int(column), last_x - 1), min(int(row), last_y - 1)
-        places[j] = top * width + left
-        parts[0, j], parts[1, j] = column - left, row - top
+    width, last_x, last_y = np.int32(image.shape[1]), image.shape[1] - 1, image.shape[0] - 1
+    for j in range(_NEAR):
+        place, right, below = places[j], parts[0, j], parts[1, j]
+        for k in range(RAYS):
+            rho = radius * (_RADII[0] + _SPACING * (first[k] - 1 + j))
+            column = _clamp(x + rho * _HARMONICS[1, k], float(last_x))
+            row = _clamp(y + rho * _HARMONICS[2, k], float(last_y))
+            left = min(np.int32(column), np.int32(last_x - 1))
+            top = min(np.int32(row), np.int32(last_y - 1))
+            place[k] = np.int32(np.int32(top * width) + left)
+            right[k], below[k] = column - left, row - top
     pixels = image.reshape(-1)
-    for j in range(len(radii)):
-        above = np.uintp(places[j])
-        below = above + np.uintp(width)
-        upper_left, upper_right = float(pixels[above]), float(pixels[above + np.uintp(1)])
-        lower_left, lower_right = float(pixels[below]), float(pixels[below + np.uintp(1)])
-        upper = upper_left + parts[0, j] * (upper_right - upper_left)
-        lower = lower_left + parts[0, j] * (lower_right - lower_left)
-        values[j] = upper + parts[1, j] * (lower - upper)
+    for j in range(_NEAR):
+        for k in range(RAYS):
+            above = np.uintp(np.uint32(places[j, k]))
+            below = above + np.uintp(image.shape[1])
+            corners[0, j, k], corners[1, j, k] = pixels[above], pixels[above + np.uintp(1)]
+            corners[2, j, k], corners[3, j, k] = pixels[below], pixels[below + np.uintp(1)]
+    for j in range(_NEAR):
+        upper_left, upper_right = corners[0, j], corners[1, j]
+        lower_left, lower_right = corners[2, j], corners[3, j]
+        value, right, below = values[j], parts[0, j], parts[1, j]
+        for k in range(RAYS):
+            upper = upper_left[k] + right[k] * (np.float64(upper_right[k]) - upper_left[k])
+            lower = lower_left[k] + right[k] * (np.float64(lower_right[k]) - lower_left[k])
+            value[k] = upper + below[k] * (lower - upper)
 
 
 @inlined
@@ -223,101 +311,3 @@ def _clamp(value: float, most: float) -> float:
     if value > most:
         return most
     return value
-
-
-@compiled
-def _fit_curve(
-    edge: FloatArray,
-    strength: FloatArray,
-    harmonics: FloatArray,
-    summands: FloatArray,
-    widths: FloatArray,
-    residuals: FloatArray,
-    curve: FloatArray,
-) -> None:
-    """Fit the harmonics of a curve to edges on rays; strong edges near it count most.
-
-    Least squares, reweighted with min(strength / median, 1) / (1 + (residual / width)²)² for each
-    of the widths (Geman and McClure's function). They become narrower, so that the first curves are
-    drawn by all edges, and the last by those of the ring alone.
-    """
-    strong, weight, sums = np.empty_like(edge), np.empty_like(edge), np.empty(_PAIRS + _TERMS)
-    lower, typical = np.empty((_TERMS, _TERMS)), _median(strength[: len(edge)]) + 1e-6
-    for k in range(len(edge)):
-        strong[k] = _clamp(strength[k] / typical, 1.0)
-    curve[0] = _median(edge)
-    curve[1:] = 0.0
-    _subtract(edge, harmonics, curve, residuals)
-    for width in widths:
-        for k in range(len(edge)):
-            far = residuals[k] / width
-            near = 1.0 / (1.0 + far * far)
-            weight[k] = strong[k] * near * near
-        _add_up(weight, edge, summands, sums)
-        _solve(sums, lower, curve)
-        _subtract(edge, harmonics, curve, residuals)
-
-
-@compiled
-def _subtract(
-    edge: FloatArray, harmonics: FloatArray, curve: FloatArray, residuals: FloatArray
-) -> None:
-    """Fill in how far edges are from a curve."""
-    a, b, c, d, e = curve[0], curve[1], curve[2], curve[3], curve[4]
-    for k in range(len(edge)):
-        first_order = a + b * harmonics[1, k] + c * harmonics[2, k]
-        residuals[k] = edge[k] - first_order - d * harmonics[3, k] - e * harmonics[4, k]
-
-
-@compiled
-def _add_up(weight: FloatArray, edge: FloatArray, summands: FloatArray, sums: FloatArray) -> None:
-    """Fill in the normal equations: the lower triangle row by row, then the right-hand side."""
-    sums[:] = 0.0
-    for k in range(len(edge)):
-        weighted = weight[k] * edge[k]
-        for i in range(_PAIRS):
-            sums[i] += weight[k] * summands[k, i]
-        for i in range(_PAIRS, _PAIRS + _TERMS):
-            sums[i] += weighted * summands[k, i]
-
-
-@compiled
-def _solve(sums: FloatArray, lower: FloatArray, out: FloatArray) -> None:
-    """Solve positive definite equations by Cholesky's decomposition, with reciprocal diagonal.
-
-    By hand because a call of LAPACK for five unknowns costs several times as much.
-    """
-    place = 0
-    for i in range(_TERMS):
-        for j in range(i + 1):
-            value = sums[place] + (_RIDGE if i == j else 0.0)
-            for k in range(j):
-                value -= lower[i, k] * lower[j, k]
-            lower[i, j] = 1.0 / math.sqrt(value) if i == j else value * lower[j, j]
-            place += 1
-    for i in range(_TERMS):
-        value = sums[_PAIRS + i]
-        for k in range(i):
-            value -= lower[i, k] * out[k]
-        out[i] = value * lower[i, i]
-    for i in range(_TERMS - 1, -1, -1):
-        value = out[i]
-        for k in range(i + 1, _TERMS):
-            value -= lower[k, i] * out[k]
-        out[i] = value * lower[i, i]
-
-
-@compiled
-def _median(values: FloatArray) -> float:
-    """Return the median of an even number of values, counting how many are less than each.
-
-    For so few, n² comparisons in vector units are faster than sorting.
-    """
-    below, above = -np.inf, -np.inf
-    for i in range(len(values)):
-        less = 0
-        for k in range(len(values)):
-            less += values[k] < values[i]
-        below = max(below, values[i]) if 2 * less < len(values) else below
-        above = max(above, values[i]) if 2 * less <= len(values) else above
-    return 0.5 * (below + above)

@@ -14,7 +14,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.conic import Ellipse
 from kgcp.geometry.ellipse_fit import fit_ellipses
-from kgcp.measurement.search.edge_tracking import RAYS, RAYS_RAD, track_edges
+from kgcp.measurement.search.edge_tracking import RAYS_RAD, track_edges
 from kgcp.measurement.search.pyramid import Pyramid, factor_of
 from kgcp.measurement.search.ring_check import check_peaks
 from kgcp.measurement.search.ring_filter import PEAK_RADIUS_PX, find_peaks
@@ -133,9 +133,11 @@ def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     Those that agree with a clearer one are dropped. The unit of the edges is the seed's radius, the
     origin its centre.
     """
-    edges, inlying = np.empty((len(seeds), RAYS)), np.empty((len(seeds), RAYS), dtype=np.bool_)
-    places = seeds.centres_px, seeds.radii_px
-    track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, *places, edges, inlying)
+    images, places = (
+        (pyramid.frame, pyramid.reduced, pyramid.levels),
+        (seeds.centres_px, seeds.radii_px),
+    )
+    edges, inlying = track_edges(*images, *places)
     ellipses, shares = np.empty((len(seeds), 5)), np.empty(len(seeds))
     fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, ellipses, shares)
     good = np.flatnonzero(shares)

@@ -293,15 +293,26 @@ def _are_lit_alike(values: GreyArray) -> bool:
 
     `values` (3, 24) are the samples of ring, core and surround.
     """
-    differences, depths = np.empty(_ALL, np.int64), np.empty(_ALL, np.int64)
+    differences, depths = np.empty(_ALL, np.int16), np.empty(_ALL, np.int16)
     for k in range(_ALL):
-        core, surround = np.int64(values[1, k]), np.int64(values[2, k])
+        core, surround = np.int16(values[1, k]), np.int16(values[2, k])
         differences[k] = core - surround
-        depths[k] = min(core, surround) - np.int64(values[0, k])
-    differences.sort()
-    depths.sort()
-    spread = np.min(differences[_ALL // 2 :] - differences[: _ALL - _ALL // 2])
-    return bool(spread - 1 < _MOST_APART * depths[2 * _ALL // 3])  # 1: rounding
+        depths[k] = min(core, surround) - np.int16(values[0, k])
+    depth = np.int16(0)
+    for k in range(_ALL):
+        smaller = np.uint8(0)
+        for j in range(_ALL):
+            smaller += np.uint8(depths[j] < depths[k])
+        depth = max(depth, depths[k] if smaller <= 2 * _ALL // 3 else np.int16(0))
+    apart = np.int16(math.ceil(1 + _MOST_APART * depth))  # 1: rounding
+    for k in range(_ALL):
+        alike = np.uint8(0)
+        for j in range(_ALL):
+            off = np.int16(differences[j] - differences[k])
+            alike += np.uint8((off >= 0) & (off < apart))
+        if alike > _ALL // 2:
+            return True
+    return False
 
 
 @compiled

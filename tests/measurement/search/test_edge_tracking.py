@@ -64,7 +64,7 @@ def track_plainly(
         left, top, right = slopes[k, best - 1 : best + 2]
         beside = 0.5 * (left - right) / min(left - 2.0 * top + right, -1e-3)
         edge[k] = middles[best] + 0.04 * np.clip(beside, -0.5, 0.5)
-        strength[k] = max(top, 0.0)
+        strength[k] = np.rint(max(top, 0.0))
     residuals = edge - robust_curve(edge, strength, HARMONICS, (0.07, 0.05))
     inlying = (np.abs(residuals) < 0.07) & (strength > 0.0)
     return edge, inlying & (inlying.sum() >= 0.55 * RAYS)
@@ -91,8 +91,7 @@ def frame_of_ellipses(seed: int) -> tuple[GreyArray, FloatArray, FloatArray]:
 def test_edges_are_those_of_the_plain_version(seed: int) -> None:
     grey, centres, radii = frame_of_ellipses(seed)
     pyramid = build_pyramid(grey)
-    edges, inlying = np.empty((40, RAYS)), np.empty((40, RAYS), dtype=np.bool_)
-    track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, centres, radii, edges, inlying)
+    edges, inlying = track_edges(pyramid.frame, pyramid.reduced, pyramid.levels, centres, radii)
     tracked = 0
     for i in range(40):
         plain = track_plainly(grey, float(centres[i, 0]), float(centres[i, 1]), float(radii[i]))
