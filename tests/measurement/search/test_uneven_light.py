@@ -10,7 +10,7 @@ import pytest
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.search.template_match import match_templates
 from kgcp.measurement.search.templates import ANGLES, ANGLES_RAD, SHIFTS, templates_of
-from kgcp.measurement.search.uneven_light import evened_patch
+from kgcp.measurement.search.uneven_light import _around, evened_patch
 from kgcp.targets.layout import Ring, Target
 
 TURN = 17
@@ -58,3 +58,16 @@ def test_small_rings_are_taken_to_be_in_even_light(target: Target) -> None:
     patch = patch_of(target.ring, half_in_shade())
     assert match_templates(patch, target.ring, 8.5).is_clear
     assert not match_templates(patch, target.ring, 7.5).is_clear
+
+
+@pytest.mark.parametrize(("rank", "half"), [(7, 10), (5, 5), (0, 3)])
+def test_levels_are_those_of_a_rank_among_neighbours_smoothed(rank: int, half: int) -> None:
+    circles = np.random.default_rng(half).integers(0, 9, (2, ANGLES)).astype(float)
+    turned = [np.roll(circles, step, axis=1) for step in range(-half, half + 1)]
+    ranked = np.sort(turned, axis=0)[rank]
+    weights = np.exp(-0.5 * (np.arange(-8, 9) / 3.0) ** 2)
+    smoothed = sum(
+        weight * np.roll(ranked, step, axis=1)
+        for weight, step in zip(weights, range(-8, 9), strict=True)
+    )
+    np.testing.assert_allclose(_around(circles, rank, half), smoothed / weights.sum(), atol=1e-12)
