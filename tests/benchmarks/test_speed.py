@@ -24,7 +24,9 @@ def test_ratios_are_those_of_the_sums() -> None:
     costs = Costs("some", "with", frames)
     assert costs.search == pytest.approx(0.02 / 0.08)
     assert costs.whole == pytest.approx(1.0 + 0.08 / 0.08)
-    assert cost_line(costs).split() == ["some", "with", "2", "2.0", "40.0", "0.25", "2.00"]
+    assert costs.typical == pytest.approx(1.0 + (0.03 / 0.02 + 0.05 / 0.06) / 2)
+    words = ["some", "with", "2", "2.0", "40.0", "0.25", "2.00", "2.17"]
+    assert cost_line(costs).split() == words
 
 
 def test_a_spread_has_the_first_and_the_last_frame(source: Source) -> None:
