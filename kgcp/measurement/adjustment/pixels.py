@@ -51,6 +51,7 @@ class Sample:
 
     problem: FitProblem
     index: IndexArray  # (n,): the pixels, in the flattened window
+    pixels: FloatArray  # (2, n): where they are in the raw image
     is_thinned: bool  # whether more pixels would have been useful
     levels: FloatArray  # (n,)
     rays: FloatArray  # (6, n): as in `Window`
@@ -127,14 +128,15 @@ def _sample(
 ) -> Sample:
     problem = seen.problem
     window, clip = problem.window, problem.censoring
-    rays = np.take(window.rays, index, axis=1)
+    rays, pixels = np.take(window.rays, index, axis=1), window.pixels(index)
     return Sample(
         problem=problem,
         index=index,
+        pixels=pixels,
         is_thinned=is_thinned,
         levels=window.levels[index],
         rays=rays,
-        photometry=_photometric_model(seen, pose, light, index),
+        photometry=_photometric_model(seen, pose, light, index, pixels),
         censoring=Censoring(clip.high, clip.low, clip.at_high[index], clip.at_low[index]),
         incidence=_edge_incidence(seen, pose, rays, index),
     )
@@ -212,10 +214,10 @@ def _fill_in_pixels(
 
 
 def _photometric_model(
-    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray
+    seen: SeenPlate, pose: Pose, light: Light | None, index: IndexArray, pixels: FloatArray
 ) -> PhotometricModel:
     problem, window = seen.problem, seen.problem.window
-    offsets = (window.pixels(index) - problem.centre_px[:, None]) / problem.outer_radius_px
+    offsets = (pixels - problem.centre_px[:, None]) / problem.outer_radius_px
     if problem.sharpening_px == 0.0 or light is None:
         return PhotometricModel(offsets, problem.tone, None)
     is_small = problem.outer_radius_px < _SMALL_PX

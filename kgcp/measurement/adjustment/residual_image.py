@@ -93,7 +93,7 @@ def residual_image_of(
     white_share = None
     if parameters.field is not None:
         white_share = np.full(len(share), np.nan)
-        white_share[sample.index] = 1.0 + parameters.field.added(window.pixels(sample.index))[1]
+        white_share[sample.index] = 1.0 + parameters.field.added(sample.pixels)[1]
         white_share /= np.nanmax(white_share)
 
     def of_pixels(values: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ from kgcp.measurement.adjustment.normal_equations import Unknowns, normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.edge_terms import skew_rows
 from kgcp.measurement.image_model.photometry import SKEW_PARAMS
+from kgcp.measurement.image_model.ray_plate import views_of
 
 _SKEW_SD_PX3 = 1.0  # skewness 0.6 of a spread of 1.2 px
 # χ² of four degrees of freedom: the 98 targets of six flights of `benchmarks.accuracy` without skew
@@ -37,9 +38,8 @@ def needs_skew(fit: TargetFit) -> bool:
 def _by_skew(fit: TargetFit) -> FloatArray:
     """Return the derivatives (4, n) of the grey values by the skew; the others are known."""
     sample, parameters = fit.sample, fit.parameters
-    rows = skew_rows(
-        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
-    )
+    views = views_of(parameters.matrix, sample.rays)
+    rows = skew_rows(views, parameters.blur.total_covariance, sample.incidence)
     return sample.photometry.level_changes(fit.prediction.share, parameters.light, rows)
 
 

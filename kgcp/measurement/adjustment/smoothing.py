@@ -23,6 +23,7 @@ from kgcp.measurement.adjustment.normal_equations import normal_matrix
 from kgcp.measurement.adjustment.solver import TargetFit
 from kgcp.measurement.image_model.edge_terms import smoothing_row
 from kgcp.measurement.image_model.photometry import Tone
+from kgcp.measurement.image_model.ray_plate import views_of
 from kgcp.measurement.records import ContourSmoothing, Measurement
 
 # Of eight flights by other programs, smoothing had means of −0.07 to 0.09 px² with scatters of 0 to
@@ -65,11 +66,10 @@ def contour_smoothing(fit: TargetFit, inflation: float) -> ContourSmoothing | No
 def _by_smoothing(fit: TargetFit) -> FloatArray:
     """Return the derivative (n,) of the grey values by smoothing along contours."""
     sample, parameters, share = fit.sample, fit.parameters, fit.prediction.share
-    row = smoothing_row(
-        parameters.matrix, sample.rays, parameters.blur.total_covariance, sample.incidence
-    )
-    field, pixels = parameters.field, sample.problem.window.pixels(sample.index)
-    added = None if field is None else field.added(pixels)
+    views = views_of(parameters.matrix, sample.rays)
+    row = smoothing_row(views, parameters.blur.total_covariance, sample.incidence)
+    field = parameters.field
+    added = None if field is None else field.added(sample.pixels)
     changes = sample.photometry.level_changes(share, parameters.light, row[None], added)
     return np.asarray(changes[0])
 

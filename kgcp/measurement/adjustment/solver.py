@@ -112,17 +112,16 @@ def _with_edge_terms(
     value, jacobian, field = share.value, share.jacobian, parameters.field
     covariance = parameters.blur.total_covariance
     if parameters.has_skew:
-        rows = skew_rows(parameters.matrix, sample.rays, covariance, sample.incidence)
+        rows = skew_rows(share.views, covariance, sample.incidence)
         value = value + parameters.vector[Param.SKEW_XXX :] @ rows
         jacobian = np.vstack((jacobian, rows)) if len(jacobian) else jacobian
     if field is None:
-        return WhiteShare(share.points_m, value, jacobian), None
-    pixels = sample.problem.window.pixels(sample.index)
-    added, gradient = field.added_with_gradient(pixels)
-    spread = spread_share_gradient(parameters.matrix, sample.rays, covariance, sample.incidence)
+        return WhiteShare(share.views, value, jacobian), None
+    added, gradient = field.added_with_gradient(sample.pixels)
+    spread = spread_share_gradient(share.views, covariance, sample.incidence)
     contrast = np.maximum(1.0 + added[1] - added[0], _LEAST_CONTRAST)
     value = value + np.sum(gradient * spread, axis=0) / contrast
-    return WhiteShare(share.points_m, value, jacobian), added
+    return WhiteShare(share.views, value, jacobian), added
 
 
 def approach(sample: Sample, start: Parameters, unknowns: Unknowns) -> TargetFit:
@@ -273,14 +272,13 @@ def minimise(
             break
         gain, total = total - trial_total, trial_total
         parameters, prediction, current = candidate, attempt, trial
-        if attempt_jacobian is not jacobian:
-            jacobian = attempt_jacobian
-            if stops_at_new_jacobian:
-                break
+        is_new, jacobian = attempt_jacobian is not jacobian, attempt_jacobian
+        is_last = is_new and stops_at_new_jacobian
+        if is_last or gain < least_gain or abs(gain - promised) < _AS_PROMISED:
+            break
+        if is_new:
             equations = equations_of(parameters, jacobian, current)
         damping = max(0.1 * damping, 1e-9)
-        if gain < least_gain or abs(gain - promised) < _AS_PROMISED:
-            break
     return TargetFit(sample, parameters, prediction, jacobian, sd, current, unknowns)
 
 

@@ -18,9 +18,8 @@ from kgcp.measurement.image_model.blurred_discs import render
 from kgcp.measurement.image_model.ray_plate import (
     PLATE_ROWS,
     SLOPE_ROWS,
-    VIEW_ROWS,
     carry_slopes,
-    meet_plate,
+    views_of,
 )
 
 
@@ -28,12 +27,17 @@ from kgcp.measurement.image_model.ray_plate import (
 class WhiteShare:
     """White share of n pixels and its derivatives."""
 
-    points_m: FloatArray  # (2, n): where the pixels' rays meet the plate
+    views: FloatArray  # (15, n): of the pixels, by `meet_plate`
     value: FloatArray  # (n,): 0: ink, 1: plate
     # (11, n): with respect to translation [m], rotation vector [rad] (left perturbation in the
     # camera frame), blur (xx + yy)/2, (xx − yy)/2, xy [px²] and streak x, y [px]; (0, n) by
     # `white_share_only`
     jacobian: FloatArray
+
+    @property
+    def points_m(self) -> FloatArray:
+        """Where the pixels' rays meet the plate (2, n)."""
+        return self.views[:2]
 
 
 def white_share(
@@ -53,7 +57,7 @@ def white_share(
     views, on_plate = _rendered(pose, rays, blur, incidence, PLATE_ROWS)
     slopes = np.empty((SLOPE_ROWS, rays.shape[1]))
     carry_slopes(pose, views, on_plate, slopes)
-    return WhiteShare(views[:2], on_plate[0], slopes)
+    return WhiteShare(views, on_plate[0], slopes)
 
 
 def white_share_only(
@@ -61,15 +65,14 @@ def white_share_only(
 ) -> WhiteShare:
     """Return the white share of every pixel without derivatives, at less than half the cost."""
     views, on_plate = _rendered(pose, rays, blur, incidence, 1)
-    return WhiteShare(views[:2], on_plate[0], np.empty((0, rays.shape[1])))
+    return WhiteShare(views, on_plate[0], np.empty((0, rays.shape[1])))
 
 
 def _rendered(
     pose: FloatArray, rays: FloatArray, blur: FloatArray, incidence: EdgeIncidence, rows: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return views (15, n) and what is seen (rows, n)."""
-    views, on_plate = np.empty((VIEW_ROWS, rays.shape[1])), np.zeros((rows, rays.shape[1]))
-    meet_plate(pose, rays, views)
+    views, on_plate = views_of(pose, rays), np.zeros((rows, rays.shape[1]))
     on_plate[0] = incidence.background
     render(views, blur, incidence.circles, incidence.starts, incidence.members, on_plate)
     return views, on_plate

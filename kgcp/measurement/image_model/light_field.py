@@ -100,29 +100,38 @@ def _add_grid(
 ) -> None:
     """Add what one grid adds to ink and plate, and the gradient of its contrast: seen (4, n).
 
-    Sums along a row of knots come first, so that each of them is multiplied out once.
+    Sums down the columns of knots come first: pixels that follow each other in a row of one cell
+    share them.
     """
     (x0, y0), (columns, rows) = corner, counts
-    along_x, along_y = np.empty(3), np.empty(3)
-    slopes_x, slopes_y = np.empty(3), np.empty(3)
+    along, slopes, sums = np.empty(3), np.empty(3), np.empty((3, 3))
+    last, last_y, first_of_row, down = -1, math.nan, 0, 0.0
     for i in range(pixels.shape[1]):
         column, across = _cell(pixels[0, i], x0, spacing, columns)
-        row, down = _cell(pixels[1, i], y0, spacing, rows)
-        _fill_spline(across, along_x)
-        _fill_spline(down, along_y)
-        _fill_slopes(across, spacing, slopes_x)
-        _fill_slopes(down, spacing, slopes_y)
-        for r in range(3):
-            ink, plate, right = 0.0, 0.0, 0.0
+        if pixels[1, i] != last_y:
+            last_y = pixels[1, i]
+            row, down = _cell(last_y, y0, spacing, rows)
+            first_of_row, last = row * columns, -1
+        if first_of_row + column != last:
+            last = first_of_row + column
+            _fill_spline(down, along)
+            _fill_slopes(down, spacing, slopes)
             for c in range(3):
-                k = (row + r) * columns + column + c
-                ink += along_x[c] * values[0, k]
-                plate += along_x[c] * values[1, k]
-                right += slopes_x[c] * (values[1, k] - values[0, k])
-            seen[0, i] += along_y[r] * ink
-            seen[1, i] += along_y[r] * plate
-            seen[2, i] += along_y[r] * right
-            seen[3, i] += slopes_y[r] * (plate - ink)
+                ink, plate, below = 0.0, 0.0, 0.0
+                for r in range(3):
+                    k = last + c + r * columns
+                    ink += along[r] * values[0, k]
+                    plate += along[r] * values[1, k]
+                    below += slopes[r] * (values[1, k] - values[0, k])
+                sums[0, c], sums[1, c], sums[2, c] = ink, plate, below
+        left, right = 0.5 * (1.0 - across) * (1.0 - across), 0.5 * across * across
+        middle = 1.0 - left - right
+        seen[0, i] += left * sums[0, 0] + middle * sums[0, 1] + right * sums[0, 2]
+        seen[1, i] += left * sums[1, 0] + middle * sums[1, 1] + right * sums[1, 2]
+        rising = (across - 1.0) * (sums[1, 0] - sums[0, 0])
+        rising += (1.0 - 2.0 * across) * (sums[1, 1] - sums[0, 1])
+        seen[2, i] += (rising + across * (sums[1, 2] - sums[0, 2])) / spacing
+        seen[3, i] += left * sums[2, 0] + middle * sums[2, 1] + right * sums[2, 2]
 
 
 @inlined

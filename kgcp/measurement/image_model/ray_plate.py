@@ -5,12 +5,21 @@ Loops go over all pixels for few numbers at a time: so the vector units take sev
 
 from __future__ import annotations
 
+import numpy as np
+
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray
 
 VIEW_ROWS = 15
 PLATE_ROWS = 9
 SLOPE_ROWS = 11
+
+
+def views_of(pose: FloatArray, rays: FloatArray) -> FloatArray:
+    """Return what `meet_plate` fills in: views (15, n) of pixels by their rays."""
+    views = np.empty((VIEW_ROWS, rays.shape[1]))
+    meet_plate(pose, rays, views)
+    return views
 
 
 @compiled

@@ -24,6 +24,7 @@ from kgcp.measurement.image_model.plate import (
     plate_points,
 )
 from kgcp.measurement.image_model.quadrature import Quadrature
+from kgcp.measurement.image_model.ray_plate import views_of
 from kgcp.targets.layout import Ring
 
 CAMERA = Camera(1100, 800, 2300.0, 2310.0, 560.3, 391.8, k1=-0.06, k2=0.05, p1=-4e-4, p2=6e-4)
@@ -170,7 +171,7 @@ def test_smoothing_along_contours_is_half_the_second_derivative_along_them() -> 
     ahead[edge] += step * tangents
     behind[edge] -= step * tangents
     second = (share_at(ahead) + share_at(behind) - 2.0 * middle)[edge] / step**2
-    row = smoothing_row(POSE.matrix, rays, sharp.total_covariance, incidence)[edge]
+    row = smoothing_row(views_of(POSE.matrix, rays), sharp.total_covariance, incidence)[edge]
     assert edge.sum() > 100
     assert np.abs(second).max() > 0.02
     assert np.sqrt(np.mean((row - 0.5 * second) ** 2)) < 0.06 * np.sqrt(np.mean(row**2))

@@ -10,6 +10,7 @@ from scipy.special import ndtr
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.blur import EdgeIncidence
 from kgcp.measurement.image_model.edge_terms import skew_rows, spread_share_gradient
+from kgcp.measurement.image_model.ray_plate import views_of
 
 Light = Callable[[FloatArray, FloatArray], FloatArray]
 _RADIUS_PX = 8.0
@@ -21,10 +22,10 @@ def _around_the_edge(out_px: FloatArray, count: int) -> tuple[FloatArray, FloatA
     return np.outer(out_px, np.cos(angles)).ravel(), np.outer(out_px, np.sin(angles)).ravel()
 
 
-def _rays(x: FloatArray, y: FloatArray) -> FloatArray:
+def _views(x: FloatArray, y: FloatArray) -> FloatArray:
     rays = np.zeros((6, len(x)))
     rays[0], rays[1], rays[2], rays[5] = x, y, 1.0, 1.0
-    return rays
+    return views_of(_POSE, rays)
 
 
 def _incidence(count: int) -> EdgeIncidence:
@@ -64,7 +65,7 @@ def test_third_moments_displace_edges_as_two_gaussians_do() -> None:
     variance = share * (1.0 - share) * shift_px**2
     cumulant = variance * (1.0 - 2.0 * share) * shift_px
     spread = (each[0, 0] + variance, each[1, 1], 0.0)
-    rows = skew_rows(_POSE, _rays(x, y), spread, _incidence(len(x)))
+    rows = skew_rows(_views(x, y), spread, _incidence(len(x)))
     # what is odd in x is the skew's; all else is the spread's variance
     opposite = np.array([np.argmin((x + a) ** 2 + (y - b) ** 2) for a, b in zip(x, y, strict=True)])
     odd = 0.5 * (truth - truth[opposite])
@@ -90,7 +91,7 @@ def test_light_across_an_edge_is_blurred_with_it() -> None:
     blurred_light = 1.0 - (1.0 - light_left) * ndtr(z)
     density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / blurred_px
     gradient = np.outer(normal, -(1.0 - light_left) * density)
-    spread = spread_share_gradient(_POSE, _rays(x, y), (0.9, 0.6, 0.15), _incidence(len(x)))
+    spread = spread_share_gradient(_views(x, y), (0.9, 0.6, 0.15), _incidence(len(x)))
     truth = _blurred_disc(x, y, covariance, light)
     product = blurred_light * _blurred_disc(x, y, covariance)
     missed = truth - (product + np.sum(gradient * spread, axis=0))
