@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
+from scipy.linalg.lapack import dpotrf, dtrtri, dtrtrs
 
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled, inlined
@@ -23,10 +23,25 @@ from kgcp.measurement.image_model.noise import Misfit
 
 
 class AtKnots(NamedTuple):
-    """The knots (n, j) that every pixel depends on, ascending, and by how much each (n, j)."""
+    """The knots that pixels depend on, cell by cell: all pixels of a cell have the same."""
 
-    knots: IndexArray
-    weights: FloatArray
+    order: IndexArray  # (n,): the pixels
+    starts: IndexArray  # (c + 1,): those of cell i are order[starts[i]:starts[i + 1]]
+    knots: IndexArray  # (c, j): of every cell
+    weights: FloatArray  # (n, j): by how much pixels depend on them, in that order
+
+    @staticmethod
+    def of(knots: IndexArray, weights: FloatArray) -> AtKnots:
+        """Put the pixels of each cell together.
+
+        Of every pixel, the knots (n, j) and their weights (n, j) are given. The first and the last
+        knot tell the others.
+        """
+        ends = knots[:, 0], knots[:, -1]
+        order = np.lexsort(ends)
+        is_new = np.any([np.diff(end[order]) != 0 for end in ends], axis=0)
+        starts = np.concatenate(([0], np.flatnonzero(is_new) + 1, [len(order)]))
+        return AtKnots(order, starts, knots[order[starts[:-1]]], weights[order])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,9 +105,10 @@ class LevelEquations:
 
     def variances(self) -> FloatArray:
         """Return the variances (q,) of the levels; all other parameters are unknown, too."""
-        inverse, _ = dpotri(self.root, lower=1)
+        inverse, _ = dtrtri(self.root, lower=1)
         by_others = np.linalg.lstsq(self.normal, self.projected, rcond=1e-12)[0]
-        return np.asarray(np.diag(inverse) + np.sum(self.projected * by_others, axis=0))
+        own = np.einsum("ij,ij->j", inverse, inverse)  # C⁻¹ = L⁻ᵀ L⁻¹
+        return np.asarray(own + np.sum(self.projected * by_others, axis=0))
 
 
 def eliminate_levels(
@@ -145,19 +161,34 @@ def gather(at_knots: AtKnots, by_level: FloatArray, values: FloatArray, count: i
 
 @compiled
 def _gather(
-    knots: IndexArray, weights: FloatArray, by_level: FloatArray, values: FloatArray, count: int
+    order: IndexArray,
+    starts: IndexArray,
+    knots: IndexArray,
+    weights: FloatArray,
+    by_level: FloatArray,
+    values: FloatArray,
+    count: int,
 ) -> FloatArray:
-    total = np.zeros(2 * count)
-    for i in range(len(knots)):
-        for j in range(knots.shape[1]):
-            weighted = weights[i, j] * values[i]
-            total[knots[i, j]] += weighted * by_level[0, i]
-            total[count + knots[i, j]] += weighted * by_level[1, i]
+    reach = knots.shape[1]
+    total, of_ink, of_plate = np.zeros(2 * count), np.empty(reach), np.empty(reach)
+    for cell in range(len(knots)):
+        of_ink[:], of_plate[:] = 0.0, 0.0
+        for m in range(starts[cell], starts[cell + 1]):
+            i = order[m]
+            by_ink, by_plate = values[i] * by_level[0, i], values[i] * by_level[1, i]
+            for j in range(reach):
+                of_ink[j] += weights[m, j] * by_ink
+                of_plate[j] += weights[m, j] * by_plate
+        for j in range(reach):
+            total[knots[cell, j]] += of_ink[j]
+            total[count + knots[cell, j]] += of_plate[j]
     return total
 
 
 @compiled
 def _products(
+    order: IndexArray,
+    starts: IndexArray,
     knots: IndexArray,
     weights: FloatArray,
     by_level: FloatArray,
@@ -167,50 +198,25 @@ def _products(
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Return the levels' own normal matrix, the mixed one (p, q), and the values that are used.
 
-    Of the levels' own matrix only the upper triangle is filled in. Pixels are visited cell by cell:
-    those of a cell have the same knots, so that their contributions are summed before they are
-    added to the large matrices.
+    Of the levels' own matrix only the upper triangle is filled in. A cell's pixels are summed up by
+    one product of small matrices.
     """
     reach, rows = knots.shape[1], scaled.shape[0]
-    used, number = _used(knots, weights, count)
-    q, width = len(used), 3 * reach + 2 * rows
+    used, number = _used(starts, knots, weights, count)
+    q, width, most = len(used), 3 * reach + 2 * rows, np.max(starts[1:] - starts[:-1])
     own, mixed = np.zeros((2 * q, 2 * q)), np.zeros((q, 2 * rows))
-    by_row = scaled.T.copy()
-    order = _by_cell(knots[:, reach - 1], count)
-    cell, first, second = np.zeros((reach, width)), np.empty(width), np.empty(width)
-    m = 0
-    while m < len(order):
-        i = order[m]
-        _fill_products(weights[i], by_level[:, i], weight[i], by_row[i], first)
-        in_cell = m + 1 < len(order) and _is_same(knots[i], knots[order[m + 1]])
-        if in_cell:  # two at a time: half as much to write
-            i2 = order[m + 1]
-            _fill_products(weights[i2], by_level[:, i2], weight[i2], by_row[i2], second)
-            for j in range(reach):
-                share, share2 = weights[i, j], weights[i2, j]
-                for k in range(width):
-                    cell[j, k] += share * first[k] + share2 * second[k]
-        else:
-            for j in range(reach):
-                share = weights[i, j]
-                for k in range(width):
-                    cell[j, k] += share * first[k]
-        m += 2 if in_cell else 1
-        if m == len(order) or not _is_same(knots[i], knots[order[m]]):
-            _add_cell(cell, knots[i], number, own, mixed)
-            cell[:] = 0.0
+    products, of_cell = np.empty((most, width)), np.empty((reach, width))
+    for cell in range(len(knots)):
+        first, end = starts[cell], starts[cell + 1]
+        for m in range(first, end):
+            i = order[m]
+            _fill_products(weights[m], by_level[:, i], weight[i], scaled[:, i], products[m - first])
+        np.dot(weights[first:end].T, products[: end - first], of_cell)
+        _add_cell(of_cell, knots[cell], number, own, mixed)
     by_level_and_row = np.empty((rows, 2 * q))
     for p in range(rows):
         by_level_and_row[p, :q], by_level_and_row[p, q:] = mixed[:, p], mixed[:, rows + p]
     return own, by_level_and_row, np.append(used, used + count)
-
-
-@inlined
-def _is_same(knots: IndexArray, others: IndexArray) -> bool:
-    is_same = True
-    for j in range(len(knots)):
-        is_same &= knots[j] == others[j]
-    return is_same
 
 
 @inlined
@@ -228,21 +234,6 @@ def _fill_products(
         out[k], out[reach + k], out[2 * reach + k] = ii * shares[k], ip * shares[k], pp * shares[k]
     for p in range(rows):
         out[3 * reach + p], out[3 * reach + rows + p] = of_ink * by_row[p], of_plate * by_row[p]
-
-
-@compiled
-def _by_cell(last_knots: IndexArray, count: int) -> IndexArray:
-    """Return the pixels in the order of their last knots (n,), which cells of a grid have alone."""
-    places = np.zeros(count + 1, np.intp)
-    for knot in last_knots:
-        places[knot + 1] += 1
-    for k in range(count):
-        places[k + 1] += places[k]
-    order = np.empty(len(last_knots), np.intp)
-    for i in range(len(last_knots)):
-        order[places[last_knots[i]]] = i
-        places[last_knots[i]] += 1
-    return order
 
 
 @compiled
@@ -267,13 +258,17 @@ def _add_cell(
 
 
 @compiled
-def _used(knots: IndexArray, weights: FloatArray, count: int) -> tuple[IndexArray, IndexArray]:
+def _used(
+    starts: IndexArray, knots: IndexArray, weights: FloatArray, count: int
+) -> tuple[IndexArray, IndexArray]:
     """Return the knots (q,) that pixels use, and of every knot its number among them."""
     number = np.full(count, -1, np.intp)
-    for i in range(len(knots)):
+    for cell in range(len(knots)):
         for j in range(knots.shape[1]):
-            if weights[i, j] > 0.0:
-                number[knots[i, j]] = 0
+            for m in range(starts[cell], starts[cell + 1]):
+                if weights[m, j] > 0.0:
+                    number[knots[cell, j]] = 0
+                    break
     used = np.flatnonzero(number == 0)
     number[used] = np.arange(len(used))
     return used, number
@@ -281,6 +276,8 @@ def _used(knots: IndexArray, weights: FloatArray, count: int) -> tuple[IndexArra
 
 @compiled
 def _take_over(
+    order: IndexArray,
+    starts: IndexArray,
     knots: IndexArray,
     weights: FloatArray,
     by_level: FloatArray,
@@ -288,16 +285,20 @@ def _take_over(
     rows: FloatArray,
 ) -> None:
     count = by_knot.shape[0] // 2
-    for i in range(len(knots)):
-        for j in range(knots.shape[1]):
-            k = knots[i, j]
-            ink, plate = weights[i, j] * by_level[0, i], weights[i, j] * by_level[1, i]
-            for p in range(rows.shape[0]):
-                rows[p, i] -= ink * by_knot[k, p] + plate * by_knot[count + k, p]
+    for cell in range(len(knots)):
+        for m in range(starts[cell], starts[cell + 1]):
+            i = order[m]
+            for j in range(knots.shape[1]):
+                k = knots[cell, j]
+                ink, plate = weights[m, j] * by_level[0, i], weights[m, j] * by_level[1, i]
+                for p in range(rows.shape[0]):
+                    rows[p, i] -= ink * by_knot[k, p] + plate * by_knot[count + k, p]
 
 
 @compiled
 def _by_arc(
+    order: IndexArray,
+    starts: IndexArray,
     knots: IndexArray,
     weights: FloatArray,
     by_level: FloatArray,
@@ -308,10 +309,13 @@ def _by_arc(
 ) -> FloatArray:
     """Return the normal matrices (arcs, 6, 2 k) of the pose and the levels, of every arc."""
     parts = np.zeros((arc.max() + 1, 6, 2 * count))
-    for i in range(len(knots)):
-        for j in range(knots.shape[1]):
-            k, w = knots[i, j], weights[i, j] * weight[i]
-            for p in range(6):
-                parts[arc[i], p, k] += w * by_level[0, i] * of_pose[i, p]
-                parts[arc[i], p, count + k] += w * by_level[1, i] * of_pose[i, p]
+    for cell in range(len(knots)):
+        for m in range(starts[cell], starts[cell + 1]):
+            i = order[m]
+            part = parts[arc[i]]
+            for j in range(knots.shape[1]):
+                k, w = knots[cell, j], weights[m, j] * weight[i]
+                for p in range(6):
+                    part[p, k] += w * by_level[0, i] * of_pose[i, p]
+                    part[p, count + k] += w * by_level[1, i] * of_pose[i, p]
     return parts

@@ -108,13 +108,13 @@ def excess_of_cells(fit: TargetFit) -> float:
     """Return the mean square of the residuals' sums over cells; 1 if residuals are independent."""
     sample, light = fit.sample, fit.parameters.light
     field = even_field(sample.problem)
-    knots, weights = field.knots.weights(sample.problem.window.pixels(sample.index))
-    finest = AtKnots(knots[:, -SPAN * SPAN :], weights[:, -SPAN * SPAN :])
+    knots, weights = field.knots.weights(sample.pixels)
+    finest = AtKnots.of(knots[:, -SPAN * SPAN :], weights[:, -SPAN * SPAN :])
     contrast = light.white - light.black
     by_level = contrast * fit.jacobian[[int(Param.BLACK), int(Param.WHITE)]] / fit.sd
     count = field.values.shape[1]
     sums = gather(finest, by_level, fit.misfit.score, count)
-    squares = AtKnots(finest.knots, finest.weights**2)
+    squares = finest._replace(weights=finest.weights**2)
     power = gather(squares, by_level**2, fit.misfit.weight, count)
     telling = power > _TELLING_POWER * power.max()
     return float(np.mean(sums[telling] ** 2 / power[telling]))
@@ -202,7 +202,7 @@ def _evened(problem: FitProblem, parameters: Parameters) -> FitProblem:
 def _adjust_on(sample: Sample, parameters: Parameters, unknowns: Unknowns) -> TargetFit:
     """Adjust on a sample; noise, and the prior of the levels, come from the phase before."""
     field = _field_of(parameters)
-    at_knots = AtKnots(*field.knots.weights(sample.problem.window.pixels(sample.index)))
+    at_knots = AtKnots.of(*field.knots.weights(sample.pixels))
     linear = linearise(sample, parameters)
     for phase in range(_PHASES):
         sd = noise_of(sample, linear[0], is_even=False).sd
@@ -241,10 +241,14 @@ def _minimise(
     linear: tuple[PredictedImage, FloatArray] | None = None,
 ) -> TargetFit:
     """Minimise the negative log-likelihood with all priors; the fit has the last equations."""
+    latest: _WithLevels | None = None
+    latest_misfit: Misfit | None = None
 
     def equations_of(parameters: Parameters, jacobian: FloatArray, current: Misfit) -> _WithLevels:
+        nonlocal latest, latest_misfit
         equations = _equations(sample, parameters, jacobian, sd, unknowns, current, at_knots)
-        return _WithLevels(equations, unknowns)
+        latest, latest_misfit = _WithLevels(equations, unknowns), current
+        return latest
 
     fit = minimise(
         sample,
@@ -257,8 +261,9 @@ def _minimise(
         linear=linear,
         equations_of=equations_of,
     )
-    last = equations_of(fit.parameters, fit.jacobian, fit.misfit)
-    return replace(fit, level_equations=last.reduced)
+    if latest is None or latest_misfit is not fit.misfit:  # a step has followed
+        latest = equations_of(fit.parameters, fit.jacobian, fit.misfit)
+    return replace(fit, level_equations=latest.reduced)
 
 
 def _field_of(parameters: Parameters) -> LightField:
@@ -285,8 +290,7 @@ def _equations(
     scaled = scaled_rows(jacobian, unknowns.free, sd)
     precision = unknowns.free_precision
     if len(field.edges):
-        pixels = sample.problem.window.pixels(sample.index)
-        scaled = np.vstack((scaled, field.edge_rows(pixels, by_level)))
+        scaled = np.vstack((scaled, field.edge_rows(sample.pixels, by_level)))
         precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
     normal = normal_matrix(scaled, current, replace(unknowns, free_precision=precision))
     return eliminate_levels(scaled, normal, at_knots, by_level, current, field.precision)

@@ -39,7 +39,10 @@ class Problem:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     rng = np.random.default_rng(5)
-    knots = np.sort([rng.choice(FIRST_UNUSED, REACH, replace=False) for _ in range(PIXELS)], axis=1)
+    # the first and the last knot tell the others, which may lie anywhere between them
+    between = [(first + 1, last - 1) for first in range(4) for last in range(first + 3, 10)]
+    cells = np.array([(a - 1, *sorted((a, b)), b + 1) for a, b in between])
+    knots = cells[rng.integers(len(cells), size=PIXELS)]
     weights = rng.dirichlet(np.ones(REACH), PIXELS)
     scaled, by_level = rng.normal(size=(OTHERS, PIXELS)), rng.normal(size=(2, PIXELS))
     misfit = Misfit(0.0, rng.normal(size=PIXELS), rng.uniform(0.1, 1.0, PIXELS))
@@ -49,7 +52,7 @@ def problem() -> Problem:
     of_levels, of_others = rng.uniform(0.5, 5.0, (2, KNOTS)), rng.uniform(0.5, 2.0, OTHERS)
     normal = (scaled * misfit.weight) @ scaled.T + np.diag(of_others)
     equations = eliminate_levels(
-        scaled, normal, AtKnots(knots, weights), by_level, misfit, of_levels
+        scaled, normal, AtKnots.of(knots, weights), by_level, misfit, of_levels
     )
     values = rng.normal(size=(2, KNOTS))
     values[:, FIRST_UNUSED:] = 0.0
