@@ -57,9 +57,7 @@ class LevelEquations:
     # (q,): the values that some pixel depends on: of ink at all knots, then of plate
     used: IndexArray
     root: FloatArray  # (q, q): Cholesky factor of C, the lower triangle
-    # (p, q): b, and B C⁻¹
-    mixed: FloatArray
-    projected: FloatArray
+    half_mixed: FloatArray  # (q, p): L⁻¹ Bᵀ, with C = L Lᵀ
     precision: FloatArray  # (q,): of the levels' prior
 
     def gradient_of_levels(self, score: FloatArray, values: FloatArray) -> FloatArray:
@@ -68,7 +66,7 @@ class LevelEquations:
         return np.asarray(gradient - self.precision * values.ravel()[self.used])
 
     def half_solved(self, gradient: FloatArray) -> FloatArray:
-        """Return L⁻¹ times a gradient (q,), with C = L Lᵀ."""
+        """Return L⁻¹ times a gradient (q,)."""
         return solved(self.root, gradient)
 
     def step_of_levels(self, half: FloatArray, step: FloatArray) -> FloatArray:
@@ -77,13 +75,18 @@ class LevelEquations:
         `half` is their gradient, `half_solved`.
         """
         values = np.zeros(2 * self.count)
-        values[self.used] = solved(self.root, half, is_transposed=True) - step @ self.projected
+        rest = half - self.half_mixed @ step
+        values[self.used] = solved(self.root, rest, is_transposed=True)
         return values.reshape(2, -1)
+
+    def projected(self) -> FloatArray:
+        """Return B C⁻¹ (p, q): how the levels move with all else."""
+        return solved(self.root, self.half_mixed, is_transposed=True).T
 
     def rows(self) -> FloatArray:
         """Return the Jacobian (p, n) less what the levels take over of it."""
         rows, by_knot = self.scaled.copy(), np.zeros((2 * self.count, len(self.scaled)))
-        by_knot[self.used] = self.projected.T
+        by_knot[self.used] = self.projected().T
         _take_over(*self.at_knots, self.by_level, by_knot, rows)
         return rows
 
@@ -106,9 +109,10 @@ class LevelEquations:
     def variances(self) -> FloatArray:
         """Return the variances (q,) of the levels; all other parameters are unknown, too."""
         inverse, _ = dtrtri(self.root, lower=1)
-        by_others = np.linalg.lstsq(self.normal, self.projected, rcond=1e-12)[0]
+        projected = self.projected()
+        by_others = np.linalg.lstsq(self.normal, projected, rcond=1e-12)[0]
         own = np.einsum("ij,ij->j", inverse, inverse)  # C⁻¹ = L⁻ᵀ L⁻¹
-        return np.asarray(own + np.sum(self.projected * by_others, axis=0))
+        return np.asarray(own + np.sum(projected * by_others, axis=0))
 
 
 def eliminate_levels(
@@ -133,17 +137,16 @@ def eliminate_levels(
     root, failure = dpotrf(own.T, lower=1, clean=0, overwrite_a=1)
     if failure:
         raise Rejection(Reason.POOR_FIT, "singular equations of levels")
-    projected = solved(root, solved(root, mixed.T), is_transposed=True).T
+    half_mixed = solved(root, mixed.T)
     return LevelEquations(
         scaled=scaled,
-        normal=normal - projected @ mixed.T,
+        normal=normal - half_mixed.T @ half_mixed,
         at_knots=at_knots,
         by_level=by_level,
         count=count,
         used=used,
         root=root,
-        mixed=mixed,
-        projected=projected,
+        half_mixed=half_mixed,
         precision=known,
     )
 
@@ -286,13 +289,14 @@ def _take_over(
 ) -> None:
     count = by_knot.shape[0] // 2
     for cell in range(len(knots)):
-        for m in range(starts[cell], starts[cell + 1]):
+        first, end = starts[cell], starts[cell + 1]
+        of_ink = np.dot(weights[first:end], by_knot[knots[cell]])
+        of_plate = np.dot(weights[first:end], by_knot[count + knots[cell]])
+        for m in range(first, end):
             i = order[m]
-            for j in range(knots.shape[1]):
-                k = knots[cell, j]
-                ink, plate = weights[m, j] * by_level[0, i], weights[m, j] * by_level[1, i]
-                for p in range(rows.shape[0]):
-                    rows[p, i] -= ink * by_knot[k, p] + plate * by_knot[count + k, p]
+            for p in range(rows.shape[0]):
+                ink, plate = of_ink[m - first, p], of_plate[m - first, p]
+                rows[p, i] -= by_level[0, i] * ink + by_level[1, i] * plate
 
 
 @compiled

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.problem import FitProblem
@@ -190,8 +191,9 @@ def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:
     for angle in math.pi * np.arange(_TURNS) / _TURNS:
         gain, rises = np.zeros(_OFFSETS - 2), np.empty((2, _OFFSETS - 2))
         for k in (0, 1):
-            along = math.cos(angle) * offsets[k][0] + math.sin(angle) * offsets[k][1]
-            rises[k], explained = _steps(along, values[k], bins)
+            sums = np.zeros((2, len(bins) - 1))
+            _sum_across(offsets[k], values[k], math.cos(angle), math.sin(angle), radius_px, sums)
+            rises[k], explained = _steps(*sums)
             gain += explained / noise[k]
         place = int(gain.argmax())
         if gain[place] > best:
@@ -204,11 +206,34 @@ def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:
     return edge if _LEAST_BY_INK < by_ink < _MOST_BY_INK else None
 
 
-def _steps(
-    along: FloatArray, values: FloatArray, bins: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the step of the mean at every inner border of bins, and what it explains."""
-    count, total = np.histogram(along, bins)[0], np.histogram(along, bins, weights=values)[0]
+@compiled
+def _sum_across(
+    offsets: FloatArray,
+    values: FloatArray,
+    cosine: float,
+    sine: float,
+    reach: float,
+    sums: FloatArray,
+) -> None:
+    """Count places (2, n), and sum up their values, in bins from −reach to reach along a direction.
+
+    `sums` (2, bins) receives numbers and sums.
+    """
+    count = sums.shape[1]
+    per_bin = 0.5 * count / reach
+    for i in range(len(values)):
+        along = cosine * offsets[0, i] + sine * offsets[1, i]
+        k = int(np.floor((along + reach) * per_bin))
+        if 0 <= k < count:
+            sums[0, k] += 1.0
+            sums[1, k] += values[i]
+
+
+def _steps(count: FloatArray, total: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the step of the mean at every inner border of bins, and what it explains.
+
+    Of each bin (b,), the number of values and their sum are given.
+    """
     below, sum_below = np.cumsum(count)[:-1], np.cumsum(total)[:-1]
     above, sum_above = count.sum() - below, total.sum() - sum_below
     usable = np.minimum(below, above) >= _FEWEST_PIXELS

@@ -60,6 +60,9 @@ from kgcp.measurement.image_model.photometry import (
 # 0.027 instead of 0.020 %.
 _ROUNDS, _PHASES, _STEPS = 2, 3, 8
 _LEAST_GAIN = 0.05  # of log-likelihood
+# Of log-likelihood, by which the other pose is worse after two steps: one of 240 was worse by 1600
+# then, and the better one at last.
+_HOPELESS = 5000.0
 # Of the contrast. With 0.01 one plate of forty with a highlight ended beside the minimum.
 _LARGE_CHANGE = 0.002
 _LIKE_A_TILT = 0.07  # as in `normal_equations`
@@ -159,6 +162,7 @@ def fit_levels(
         first.sd,
         first.unknowns,
         _equations_of(first).at_knots,
+        hopeless_total=first.total + _HOPELESS,
     )
     return (second, first) if second.total < first.total else (first, second)
 
@@ -239,6 +243,7 @@ def _minimise(
     unknowns: Unknowns,
     at_knots: AtKnots,
     linear: tuple[PredictedImage, FloatArray] | None = None,
+    hopeless_total: float = math.inf,
 ) -> TargetFit:
     """Minimise the negative log-likelihood with all priors; the fit has the last equations."""
     latest: _WithLevels | None = None
@@ -259,6 +264,7 @@ def _minimise(
         least_gain=_LEAST_GAIN,
         large_change=_LARGE_CHANGE,
         linear=linear,
+        hopeless_total=hopeless_total,
         equations_of=equations_of,
     )
     if latest is None or latest_misfit is not fit.misfit:  # a step has followed
@@ -313,8 +319,8 @@ class _WithLevels:
         pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
         pull_of_edges = (EDGE_PRECISION * (EDGE_MEAN - field.edges)).ravel()
         gradient = reduced.scaled @ current.score + np.append(pull, pull_of_edges)
-        gradient -= reduced.projected @ of_levels
         alone = reduced.half_solved(of_levels)
+        gradient -= reduced.half_mixed.T @ alone
         damped = _damped(reduced.normal, parameters, damping)
         solution, promised = solve_damped(damped, gradient, 0.5 * float(alone @ alone))
         values = reduced.step_of_levels(alone, solution)

@@ -38,6 +38,7 @@ _SETTLED_BLUR, _SETTLED_STREAK = 0.02, 0.01
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
+_STEPS_OF_HOPE = 2
 _NEGLIGIBLE = 1e-6
 _AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
@@ -235,6 +236,7 @@ def minimise(
     linear: tuple[PredictedImage, FloatArray] | None = None,
     large_change: float = _LARGE_CHANGE,
     stops_at_new_jacobian: bool = False,
+    hopeless_total: float = math.inf,
     equations_of: EquationsOf | None = None,
 ) -> TargetFit:
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
@@ -243,8 +245,8 @@ def minimise(
     and the equations with it, is computed again only while steps change the grey values by more
     than the share `large_change` of the contrast: near the minimum it hardly changes, and it takes
     most of the time. With `stops_at_new_jacobian`, the step after which it is computed again is the
-    last one. `equations_of` makes the equations at some parameters; None: those of pose, blur and
-    light.
+    last one; so is the second step, or a later one, that leaves more than `hopeless_total`.
+    `equations_of` makes the equations at some parameters; None: those of pose, blur and light.
     """
     damping, light = _DAMPING, parameters.light
     contrast = max(light.white - light.black, sample.problem.window.levels_per_count)
@@ -273,8 +275,10 @@ def minimise(
         gain, total = total - trial_total, trial_total
         parameters, prediction, current = candidate, attempt, trial
         is_new, jacobian = attempt_jacobian is not jacobian, attempt_jacobian
-        is_last = is_new and stops_at_new_jacobian
-        if is_last or gain < least_gain or abs(gain - promised) < _AS_PROMISED:
+        is_hopeless = number + 1 >= _STEPS_OF_HOPE and total > hopeless_total
+        if is_hopeless or (is_new and stops_at_new_jacobian):
+            break
+        if gain < least_gain or abs(gain - promised) < _AS_PROMISED:
             break
         if is_new:
             equations = equations_of(parameters, jacobian, current)
