@@ -7,13 +7,22 @@ import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
-from kgcp.io.tables.columns import INTEGER, NUMBER, NUMBERS, TEXT, Column, Row, matrix_cell, row_of
+from kgcp.io.tables.columns import (
+    INTEGER,
+    NUMBER,
+    NUMBERS,
+    TEXT,
+    Column,
+    Row,
+    matrix_cell,
+    row_of,
+    sd_cell,
+)
 from kgcp.measurement.discs.photograph import PhotoDiscs, PhotoMiss
 from kgcp.measurement.discs.records import ellipse_of_moments
 from kgcp.network.calibration_records import CameraCalibration, PointModel
@@ -67,59 +76,37 @@ def _angle_deg(vector: FloatArray) -> float:
     return math.degrees(ellipse_of_moments(vector).angle_rad)
 
 
-def _sd(cov: FloatArray | None, axis: int) -> float | None:
-    return None if cov is None else math.sqrt(cov[axis, axis])
-
-
-def _coordinate(axis: int, disc: FieldDisc) -> float:
-    return float(disc.adjusted[axis])
-
-
-def _sd_coordinate(axis: int, disc: FieldDisc) -> float | None:
-    return _sd(disc.cov, axis)
-
-
-def _change(axis: int, disc: FieldDisc) -> float:
-    return float(disc.adjusted[axis] - disc.nominal[axis])
-
-
-def _shift(axis: int, row: PhotoRow) -> float | None:
-    return None if row.pose is None else float(row.pose.translation_m[axis])
-
-
 OBSERVATION_COLUMNS: tuple[Column[ObservedDisc], ...] = (
     Column("photo", TEXT, lambda disc: disc.photo),
     Column("point", TEXT, lambda disc: disc.point),
     Column("named_by", TEXT, lambda disc: disc.named_by),
-    Column("x_px", NUMBER, lambda disc: float(disc.vector[0])),
-    Column("y_px", NUMBER, lambda disc: float(disc.vector[1])),
-    Column("sd_x_px", NUMBER, lambda disc: math.sqrt(disc.cov[0, 0])),
-    Column("sd_y_px", NUMBER, lambda disc: math.sqrt(disc.cov[1, 1])),
+    *Column[ObservedDisc].of_vector(("x_px", "y_px"), lambda disc: disc.vector),
+    *Column[ObservedDisc].of_sds(("sd_x_px", "sd_y_px"), lambda disc: disc.cov),
     Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
     Column("a_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).a),
     Column("b_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).b),
     Column("angle_deg", NUMBER, lambda disc: _angle_deg(disc.vector)),
     Column("status", TEXT, lambda disc: "used" if disc.is_used else "rejected"),
-    Column("residual_x_px", NUMBER, lambda disc: float(disc.residual[0])),
-    Column("residual_y_px", NUMBER, lambda disc: float(disc.residual[1])),
+    *Column[ObservedDisc].of_vector(("residual_x_px", "residual_y_px"), lambda disc: disc.residual),
     Column("redundancy", NUMBER, lambda disc: disc.redundancy),
     Column("weight", NUMBER, lambda disc: disc.weight),
-    Column("ecc_x_px", NUMBER, lambda disc: float(disc.perspective[0])),
-    Column("ecc_y_px", NUMBER, lambda disc: float(disc.perspective[1])),
-    Column("ecc_lens_x_px", NUMBER, lambda disc: float(disc.in_marker[0])),
-    Column("ecc_lens_y_px", NUMBER, lambda disc: float(disc.in_marker[1])),
-    Column("inside", NUMBER, lambda disc: float(disc.appearance[0])),
-    Column("outside", NUMBER, lambda disc: float(disc.appearance[1])),
-    Column("blur_px", NUMBER, lambda disc: float(disc.appearance[2])),
-    Column("clipped", NUMBER, lambda disc: float(disc.appearance[3])),
+    *Column[ObservedDisc].of_vector(("ecc_x_px", "ecc_y_px"), lambda disc: disc.perspective),
+    *Column[ObservedDisc].of_vector(
+        ("ecc_lens_x_px", "ecc_lens_y_px"), lambda disc: disc.in_marker
+    ),
+    *Column[ObservedDisc].of_vector(
+        ("inside", "outside", "blur_px", "clipped"), lambda disc: disc.appearance
+    ),
 )
 
 FIELD_COLUMNS: tuple[Column[FieldDisc], ...] = (
     Column("point", TEXT, lambda disc: disc.name),
-    *(Column(f"{a}_m", NUMBER, partial(_coordinate, i)) for i, a in enumerate("xyz")),
-    *(Column(f"sd_{a}_m", NUMBER, partial(_sd_coordinate, i)) for i, a in enumerate("xyz")),
+    *Column[FieldDisc].of_vector(("x_m", "y_m", "z_m"), lambda disc: disc.adjusted),
+    *Column[FieldDisc].of_sds(("sd_x_m", "sd_y_m", "sd_z_m"), lambda disc: disc.cov),
     Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
-    *(Column(f"change_{a}_m", NUMBER, partial(_change, i)) for i, a in enumerate("xyz")),
+    *Column[FieldDisc].of_vector(
+        ("change_x_m", "change_y_m", "change_z_m"), lambda disc: disc.adjusted - disc.nominal
+    ),
     Column("rays", INTEGER, lambda disc: disc.rays),
 )
 
@@ -132,7 +119,9 @@ PHOTO_COLUMNS: tuple[Column[PhotoRow], ...] = (
     Column("discs_used", INTEGER, lambda row: row.used),
     Column("rms_px", NUMBER, lambda row: row.rms_px),
     Column("tilt_deg", NUMBER, lambda row: row.tilt_deg),
-    *(Column(f"t{a}_m", NUMBER, partial(_shift, i)) for i, a in enumerate("xyz")),
+    *Column[PhotoRow].of_vector(
+        ("tx_m", "ty_m", "tz_m"), lambda row: row.pose.translation_m if row.pose else None
+    ),
     Column("rotation", NUMBERS, lambda row: matrix_cell(row.pose.rotation) if row.pose else None),
     Column("pose_cov", NUMBERS, lambda row: matrix_cell(row.cov)),
 )
@@ -189,7 +178,7 @@ def field_csv(discs: list[FieldDisc]) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z", "sd_x", "sd_y", "sd_z"])
     for disc in discs:
-        sds = ["" if (sd := _sd(disc.cov, axis)) is None else f"{sd:.9f}" for axis in range(3)]
+        sds = ["" if (sd := sd_cell(disc.cov, axis)) is None else f"{sd:.9f}" for axis in range(3)]
         writer.writerow([disc.name, *(f"{value:.9f}" for value in disc.adjusted), *sds])
     return stream.getvalue()
 

@@ -6,7 +6,7 @@ What each column means is said once, in docs/tables.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -45,6 +45,32 @@ class Column(Generic[Record]):
     name: str
     type: ColumnType
     get: Callable[[Record], object]
+
+    @classmethod
+    def of_vector(
+        cls, names: Sequence[str], get: Callable[[Record], Sequence[float] | FloatArray | None]
+    ) -> tuple[Column[Record], ...]:
+        """Return a column for each element of a vector, null where a record has none."""
+
+        def element(index: int) -> Column[Record]:
+            def cell(record: Record) -> float | None:
+                vector = get(record)
+                return None if vector is None else float(vector[index])
+
+            return cls(names[index], NUMBER, cell)
+
+        return tuple(map(element, range(len(names))))
+
+    @classmethod
+    def of_sds(
+        cls, names: Sequence[str], get: Callable[[Record], FloatArray | None]
+    ) -> tuple[Column[Record], ...]:
+        """Return a column for the standard deviation along each of a covariance's first axes."""
+
+        def deviation(axis: int) -> Column[Record]:
+            return cls(names[axis], NUMBER, lambda record: sd_cell(get(record), axis))
+
+        return tuple(map(deviation, range(len(names))))
 
 
 def row_of(columns: Iterable[Column[Record]], record: Record) -> Row:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from kgcp.io.files.atomic import write_bytes
-from kgcp.io.tables.columns import BOOLEAN, NUMBER, TEXT, TIME, Column, row_of, sd_cell, time_cell
+from kgcp.io.tables.columns import BOOLEAN, TEXT, TIME, Column, row_of, time_cell
 from kgcp.io.tables.parquet import write_table
 from kgcp.quality.advice import advice, rms_m
 from kgcp.quality.consistency import Consistency, Discrepancy
@@ -20,15 +20,11 @@ CONSISTENCY_COLUMNS: tuple[Column[Discrepancy], ...] = (
     Column("frame", TEXT, lambda found: found.frame),
     Column("target", TEXT, lambda found: found.target),
     Column("time", TIME, lambda found: time_cell(found.time_s)),
-    Column("along_m", NUMBER, lambda found: float(found.offset_m[0])),
-    Column("across_m", NUMBER, lambda found: float(found.offset_m[1])),
-    Column("up_m", NUMBER, lambda found: float(found.offset_m[2])),
-    Column("sd_along_m", NUMBER, lambda found: sd_cell(found.cov_m2, 0)),
-    Column("sd_across_m", NUMBER, lambda found: sd_cell(found.cov_m2, 1)),
-    Column("sd_up_m", NUMBER, lambda found: sd_cell(found.cov_m2, 2)),
-    Column("residual_along_m", NUMBER, lambda found: float(found.residual_m[0])),
-    Column("residual_across_m", NUMBER, lambda found: float(found.residual_m[1])),
-    Column("residual_up_m", NUMBER, lambda found: float(found.residual_m[2])),
+    *Column[Discrepancy].of_vector([f"{axis}_m" for axis in _AXES], lambda found: found.offset_m),
+    *Column[Discrepancy].of_sds([f"sd_{axis}_m" for axis in _AXES], lambda found: found.cov_m2),
+    *Column[Discrepancy].of_vector(
+        [f"residual_{axis}_m" for axis in _AXES], lambda found: found.residual_m
+    ),
     Column("outlier", BOOLEAN, lambda found: found.is_outlier),
 )
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -33,7 +33,6 @@ from kgcp.io.tables.columns import (
     finite_cell,
     matrix_cell,
     row_of,
-    sd_cell,
     time_cell,
 )
 from kgcp.io.tables.learnt_imaging import LEARNT_IMAGING, learnt_from_text
@@ -63,7 +62,7 @@ _MOST_PX = 1e6  # of the place of a target
 _LEAST_M, _MOST_M = 1e-3, 1e6  # of a distance
 _Part = TypeVar("_Part")
 _Record = tuple[FrameResult, Outcome, Shape]
-_Get = Callable[[_Record], object]
+_Get = Callable[[_Record], Any]
 
 
 def _frame(get: Callable[[FrameResult], object]) -> _Get:
@@ -106,10 +105,6 @@ def _alternative(get: Callable[[Alternative], object]) -> _Get:
     return _part(lambda seen: seen.alternative, get)
 
 
-def _eccentricity(seen: Measurement) -> FloatArray | None:
-    return seen.eccentricity_px
-
-
 def _image(seen: Measurement) -> CircleImage | None:
     return seen.image
 
@@ -133,20 +128,17 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("candidates", INTEGER, _outcome(lambda _: 0, lambda miss: miss.candidates)),
     Column("guided", BOOLEAN, _outcome(lambda seen: seen.is_guided, lambda _: False)),
     Column("scale_used", TEXT, _outcome(lambda seen: seen.ring, lambda _: "")),
-    Column("x_px", NUMBER, _measured(lambda seen: float(seen.centre_px[0]))),
-    Column("y_px", NUMBER, _measured(lambda seen: float(seen.centre_px[1]))),
-    Column("sd_x_px", NUMBER, _uncertainty(lambda sds: sd_cell(sds.centre_cov_px2, 0))),
-    Column("sd_y_px", NUMBER, _uncertainty(lambda sds: sd_cell(sds.centre_cov_px2, 1))),
+    *Column[_Record].of_vector(("x_px", "y_px"), _measured(lambda seen: seen.centre_px)),
+    *Column[_Record].of_sds(("sd_x_px", "sd_y_px"), _uncertainty(lambda sds: sds.centre_cov_px2)),
     Column("cov_xy_px2", NUMBER, _uncertainty(lambda sds: float(sds.centre_cov_px2[0, 1]))),
     Column("distance_m", NUMBER, _measured(lambda seen: seen.pose.distance_m)),
     Column("sd_distance_m", NUMBER, _uncertainty(lambda sds: sds.sd_distance_m)),
-    Column("tx_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[0]))),
-    Column("ty_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[1]))),
-    Column("tz_m", NUMBER, _measured(lambda seen: float(seen.pose.translation_m[2]))),
-    Column("qw", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[0])),
-    Column("qx", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[1])),
-    Column("qy", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[2])),
-    Column("qz", NUMBER, _measured(lambda seen: _quaternion(seen.pose)[3])),
+    *Column[_Record].of_vector(
+        ("tx_m", "ty_m", "tz_m"), _measured(lambda seen: seen.pose.translation_m)
+    ),
+    *Column[_Record].of_vector(
+        ("qw", "qx", "qy", "qz"), _measured(lambda seen: _quaternion(seen.pose))
+    ),
     Column("roll_deg", NUMBER, _measured(lambda seen: seen.pose.roll_deg)),
     Column("pitch_deg", NUMBER, _measured(lambda seen: seen.pose.pitch_deg)),
     Column("heading_deg", NUMBER, _measured(lambda seen: seen.heading_deg)),
@@ -154,16 +146,17 @@ DETECTION_COLUMNS: tuple[Column[_Record], ...] = (
     Column("sd_pitch_deg", NUMBER, _uncertainty(lambda sds: sds.sd_pitch_deg)),
     Column("sd_heading_deg", NUMBER, _uncertainty(lambda sds: sds.sd_heading_deg)),
     Column("pose_cov", NUMBERS, _uncertainty(lambda sds: matrix_cell(sds.pose_cov))),
-    Column("alt_qw", NUMBER, _alternative(lambda other: _quaternion(other.pose)[0])),
-    Column("alt_qx", NUMBER, _alternative(lambda other: _quaternion(other.pose)[1])),
-    Column("alt_qy", NUMBER, _alternative(lambda other: _quaternion(other.pose)[2])),
-    Column("alt_qz", NUMBER, _alternative(lambda other: _quaternion(other.pose)[3])),
+    *Column[_Record].of_vector(
+        ("alt_qw", "alt_qx", "alt_qy", "alt_qz"),
+        _alternative(lambda other: _quaternion(other.pose)),
+    ),
     Column("ambiguity", NUMBER, _alternative(lambda other: other.ambiguity)),
     Column("sd_common_distance_m", NUMBER, _common(lambda common: common.sd_distance_m)),
     Column("sd_common_direction_mrad", NUMBER, _common(lambda common: common.sd_direction_mrad)),
     Column("common_pose_cov", NUMBERS, _common(lambda common: matrix_cell(common.pose_cov))),
-    Column("ecc_x_px", NUMBER, _part(_eccentricity, lambda off: float(off[0]))),
-    Column("ecc_y_px", NUMBER, _part(_eccentricity, lambda off: float(off[1]))),
+    *Column[_Record].of_vector(
+        ("ecc_x_px", "ecc_y_px"), _measured(lambda seen: seen.eccentricity_px)
+    ),
     Column("moments", NUMBERS, _part(_image, lambda image: matrix_cell(image.moments))),
     Column("moments_cov", NUMBERS, _part(_image, lambda image: matrix_cell(image.cov))),
     Column(

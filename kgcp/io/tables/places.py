@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -36,59 +34,35 @@ class PlaceResidual:
     row: int
 
 
-def _position(axis: int, placed: PlacedTarget) -> float:
-    return float(placed.position_map[axis])
-
-
-def _sd_position(axis: int, placed: PlacedTarget) -> float:
-    return float(placed.sds[axis])
-
-
-def _normal(axis: int, placed: PlacedTarget) -> float:
-    return float(placed.normal[axis])
-
-
-def _other_normal(axis: int, placed: PlacedTarget) -> float | None:
-    return None if placed.other_normal is None else float(placed.other_normal[axis])
-
-
-def _off(axis: int, placed: PlacedTarget) -> float | None:
-    residual = placed.check.residual_m
-    return None if residual is None else float(residual[axis])
-
-
-def _sd_off(axis: int, placed: PlacedTarget) -> float | None:
-    cov = placed.check.cov_m2
-    return None if cov is None else math.sqrt(cov[axis, axis])
-
-
 PLACE_COLUMNS: tuple[Column[PlacedTarget], ...] = (
     Column("target", TEXT, lambda placed: placed.target),
     Column("shape", TEXT, lambda placed: placed.shape.value),
-    *(Column(a, NUMBER, partial(_position, i)) for i, a in enumerate(_AXES)),
-    *(Column(f"sd_{a}", NUMBER, partial(_sd_position, i)) for i, a in enumerate(_AXES)),
-    *(Column(f"normal_{a}", NUMBER, partial(_normal, i)) for i, a in enumerate(_AXES)),
+    *Column[PlacedTarget].of_vector(_AXES, lambda placed: placed.position_map),
+    *Column[PlacedTarget].of_vector([f"sd_{a}" for a in _AXES], lambda placed: placed.sds),
+    *Column[PlacedTarget].of_vector([f"normal_{a}" for a in _AXES], lambda placed: placed.normal),
     Column("sd_normal_deg", NUMBER, lambda placed: placed.sd_normal_deg),
     Column("tilt_deg", NUMBER, lambda placed: placed.tilt_deg),
     Column("diameter_m", NUMBER, lambda placed: placed.diameter_m),
     Column("sd_diameter_m", NUMBER, lambda placed: placed.sd_diameter_m),
     Column("cov", NUMBERS, lambda placed: matrix_cell(placed.cov)),
     Column("common_cov", NUMBERS, lambda placed: matrix_cell(placed.common_cov)),
-    *(Column(f"alt_normal_{a}", NUMBER, partial(_other_normal, i)) for i, a in enumerate(_AXES)),
+    *Column[PlacedTarget].of_vector(
+        [f"alt_normal_{a}" for a in _AXES], lambda placed: placed.other_normal
+    ),
     Column("ambiguity", NUMBER, lambda placed: placed.ambiguity),
     Column("frames", INTEGER, lambda placed: len(placed.frames)),
     Column("frames_used", INTEGER, lambda placed: int(np.count_nonzero(placed.is_used))),
     Column("variance_factor", NUMBER, lambda placed: placed.variance_factor),
     Column("worst_frame", TEXT, lambda placed: placed.worst_frame),
-    *(Column(f"residual_{a}_m", NUMBER, partial(_off, i)) for i, a in enumerate(_AXES)),
-    *(Column(f"sd_residual_{a}_m", NUMBER, partial(_sd_off, i)) for i, a in enumerate(_AXES)),
+    *Column[PlacedTarget].of_vector(
+        [f"residual_{a}_m" for a in _AXES], lambda placed: placed.check.residual_m
+    ),
+    *Column[PlacedTarget].of_sds(
+        [f"sd_residual_{a}_m" for a in _AXES], lambda placed: placed.check.cov_m2
+    ),
     Column("diameter_residual_m", NUMBER, lambda placed: placed.check.diameter_residual_m),
     Column("sd_diameter_residual_m", NUMBER, lambda placed: placed.check.sd_diameter_residual_m),
 )
-
-
-def _moment(index: int, residual: PlaceResidual) -> float:
-    return float(residual.placed.residuals[residual.row, index])
 
 
 PLACE_RESIDUAL_COLUMNS: tuple[Column[PlaceResidual], ...] = (
@@ -96,7 +70,10 @@ PLACE_RESIDUAL_COLUMNS: tuple[Column[PlaceResidual], ...] = (
     Column("frame", TEXT, lambda residual: residual.placed.frames[residual.row]),
     Column("used", BOOLEAN, lambda residual: bool(residual.placed.is_used[residual.row])),
     Column("chi2", NUMBER, lambda residual: float(residual.placed.chi2[residual.row])),
-    *(Column(f"residual_{name}", NUMBER, partial(_moment, i)) for i, name in enumerate(_MOMENTS)),
+    *Column[PlaceResidual].of_vector(
+        [f"residual_{name}" for name in _MOMENTS],
+        lambda residual: residual.placed.residuals[residual.row],
+    ),
 )
 
 

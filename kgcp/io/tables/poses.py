@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -72,18 +71,6 @@ def on_map(poses: Sequence[FramePose], local_frame: LocalFrame) -> list[MapPose]
     return rows
 
 
-def _position(axis: int, row: MapPose) -> float | None:
-    return None if row.position_map is None else float(row.position_map[axis])
-
-
-def _angle(axis: int, row: MapPose) -> float | None:
-    return None if row.opk_deg is None else float(row.opk_deg[axis])
-
-
-def _sd_position(axis: int, row: MapPose) -> float | None:
-    return None if row.cov is None else math.sqrt(row.cov[axis, axis])
-
-
 def _rejected(row: MapPose) -> str:
     pose = row.frame_pose
     return "" if pose.pose is None else " ".join(n for n in pose.targets if n not in pose.used)
@@ -106,9 +93,9 @@ POSE_COLUMNS: tuple[Column[MapPose], ...] = (
     Column("frame", TEXT, lambda row: row.frame_pose.frame),
     Column("method", TEXT, _method),
     Column("reason", TEXT, lambda row: row.frame_pose.reason),
-    *(Column(a, NUMBER, partial(_position, i)) for i, a in enumerate(_AXES)),
-    *(Column(a, NUMBER, partial(_angle, i)) for i, a in enumerate(_ANGLES)),
-    *(Column(f"sd_{a}", NUMBER, partial(_sd_position, i)) for i, a in enumerate(_AXES)),
+    *Column[MapPose].of_vector(_AXES, lambda row: row.position_map),
+    *Column[MapPose].of_vector(_ANGLES, lambda row: row.opk_deg),
+    *Column[MapPose].of_sds([f"sd_{axis}" for axis in _AXES], lambda row: row.cov),
     Column("sd_angle_deg", NUMBER, lambda row: row.sd_angle_deg),
     Column("cov", NUMBERS, lambda row: matrix_cell(row.cov)),
     Column("targets", INTEGER, lambda row: len(row.frame_pose.targets)),
