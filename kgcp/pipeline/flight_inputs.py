@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -236,7 +237,8 @@ class FlightInputs:
         ]
         if self.reference_poses is not None and len(self.reference_poses.frames):
             places.append((self.reference_poses.position_map, "the reference poses"))
-        doubts = self._read(lambda: self._doubts_of_areas(crs, places)) or []
+        checks = (check_place(crs, position, where) for position, where in places)
+        doubts = self._read(lambda: [*chain.from_iterable(checks)]) or []
         if places and not doubts and not self.problems:
             position, where = places[0]
             few = position[:: max(1, len(position) // _PLACES), :2]
@@ -245,29 +247,24 @@ class FlightInputs:
             doubts += check_camera_position(self.headers, crs, ground, where)
         return doubts
 
-    @staticmethod
-    def _doubts_of_areas(crs: str, places: Sequence[tuple[FloatArray, str]]) -> list[Doubt]:
-        return [doubt for position, where in places for doubt in check_place(crs, position, where)]
-
-    def _doubts_of_times(self) -> list[Doubt]:
+    def _doubts_of_times(self) -> Iterator[Doubt]:
         times = self.times_s
-        doubts: list[Doubt] = []
         if self.trajectory is not None and self.flight.vehicle is not None:
             offset_s = self.flight.vehicle.settings.time_offset_s
             frame_s = np.array([times[frame] for frame in sorted(times)])
-            doubts += check_overlap(frame_s, self.trajectory.time_s, offset_s)
+            yield from check_overlap(frame_s, self.trajectory.time_s, offset_s)
         if self.flight.vehicle is not None:
             is_by_header = self.detected_s is None and self.flight.times_file is None
             frames = [header.frame for header in self.headers] if is_by_header else self.frames
-            doubts += check_completeness(frames, times)
+            yield from check_completeness(frames, times)
         if self.flight.times_file is not None:
             both = [
                 (times[header.frame], header.time_s)
                 for header in self.headers
                 if header.time_s is not None and header.frame in times
             ]
-            doubts += check_exif_times(*zip(*both, strict=True)) if both else ()
-        return doubts
+            if both:
+                yield from check_exif_times(*zip(*both, strict=True))
 
     def _read(self, read: Callable[[], _Input]) -> _Input | None:
         try:

@@ -61,7 +61,7 @@ def stated(flight: GroundFlight, off_m: FloatArray | float = 0.0) -> dict[str, T
 def check(
     sightings: list[Sighting], positions: dict[str, TargetPosition], camera: Camera = CAMERA
 ) -> tuple[Doubt, ...]:
-    return check_static_targets(sightings, positions, camera)
+    return tuple(check_static_targets(sightings, positions, camera))
 
 
 def shifted(pose: Pose, off_m: FloatArray) -> Pose:

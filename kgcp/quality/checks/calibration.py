@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from kgcp.geometry.camera import Camera
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 
@@ -12,63 +14,54 @@ _SQUARE = 0.9  # no sensor has pixels less square
 _SIZE_TOLERANCE = 0.12  # how far off the centre a principal point may be, in frame sizes
 
 
-def check_camera(camera: Camera, *, is_guessed: bool = False) -> tuple[Doubt, ...]:
+def check_camera(camera: Camera, *, is_guessed: bool = False) -> Iterator[Doubt]:
     """Tell focal lengths in millimetres, principal points of other frames, and mere guesses."""
-    guess = mild(
-        Cause.GUESSED_CAMERA,
-        f"the camera is a guess from EXIF (fx = {camera.fx:g} px), not a calibration: distances may"
-        " be wrong by some per cent",
-        "give a calibration under [camera], and delete guessed and the sd_ keys of the guess",
-        {"fx_px": camera.fx},
-    )
-    return (
-        *_check_focal_length(camera),
-        *_check_principal_point(camera),
-        *((guess,) if is_guessed else ()),
-    )
+    yield from _check_focal_length(camera)
+    yield from _check_principal_point(camera)
+    if is_guessed:
+        yield mild(
+            Cause.GUESSED_CAMERA,
+            f"the camera is a guess from EXIF (fx = {camera.fx:g} px), not a calibration: distances"
+            " may be wrong by some per cent",
+            "give a calibration under [camera], and delete guessed and the sd_ keys of the guess",
+            {"fx_px": camera.fx},
+        )
 
 
-def _check_focal_length(camera: Camera) -> tuple[Doubt, ...]:
+def _check_focal_length(camera: Camera) -> Iterator[Doubt]:
     share = min(camera.fx, camera.fy) / max(camera.width, camera.height)
     figures = {"fx_px": camera.fx, "fy_px": camera.fy}
     if share < _WIDEST:
-        return (
-            grave(
-                Cause.FOCAL_LENGTH,
-                f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too short for frames of"
-                f" {camera.width} px: is this in millimetres?",
-                "divide the focal length in mm by the size of a pixel in mm",
-                figures,
-            ),
+        yield grave(
+            Cause.FOCAL_LENGTH,
+            f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too short for frames of"
+            f" {camera.width} px: is this in millimetres?",
+            "divide the focal length in mm by the size of a pixel in mm",
+            figures,
         )
-    if max(camera.fx, camera.fy) / min(camera.width, camera.height) > _LONGEST:
-        return (
-            grave(
-                Cause.FOCAL_LENGTH,
-                f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too long for frames of"
-                f" {camera.width} px: is this in micrometres?",
-                "give the focal length in pixels",
-                figures,
-            ),
+    elif max(camera.fx, camera.fy) / min(camera.width, camera.height) > _LONGEST:
+        yield grave(
+            Cause.FOCAL_LENGTH,
+            f"fx = {camera.fx:g}, fy = {camera.fy:g} px is too long for frames of"
+            f" {camera.width} px: is this in micrometres?",
+            "give the focal length in pixels",
+            figures,
         )
-    if min(camera.fx, camera.fy) < _SQUARE * max(camera.fx, camera.fy):
-        return (
-            mild(
-                Cause.FOCAL_LENGTH,
-                f"fx = {camera.fx:g} and fy = {camera.fy:g} px differ as those of no sensor with"
-                " square pixels",
-                "look both up in the calibration",
-                figures,
-            ),
+    elif min(camera.fx, camera.fy) < _SQUARE * max(camera.fx, camera.fy):
+        yield mild(
+            Cause.FOCAL_LENGTH,
+            f"fx = {camera.fx:g} and fy = {camera.fy:g} px differ as those of no sensor with"
+            " square pixels",
+            "look both up in the calibration",
+            figures,
         )
-    return ()
 
 
-def _check_principal_point(camera: Camera) -> tuple[Doubt, ...]:
+def _check_principal_point(camera: Camera) -> Iterator[Doubt]:
     low, high = _MIDDLE
     x, y = camera.cx / camera.width, camera.cy / camera.height
     if low <= x <= high and low <= y <= high:
-        return ()
+        return
     figures = {"cx_px": camera.cx, "cy_px": camera.cy}
     sentence = (
         f"the principal point ({camera.cx:g}, {camera.cy:g}) px is not in the middle third of a"
@@ -76,15 +69,14 @@ def _check_principal_point(camera: Camera) -> tuple[Doubt, ...]:
     )
     for scale, word in ((2.0, "double"), (0.5, "half"), (4.0, "four times the"), (0.25, "quarter")):
         if max(abs(x / scale - 0.5), abs(y / scale - 0.5)) < _SIZE_TOLERANCE:
-            return (
-                grave(
-                    Cause.CALIBRATION_SIZE,
-                    f"{sentence}, but in the middle of one of {word} size",
-                    "give the calibration of frames of this size, or scale fx, fy, cx, cy by"
-                    f" {1.0 / scale:g}",
-                    {**figures, "scale": scale},
-                ),
+            yield grave(
+                Cause.CALIBRATION_SIZE,
+                f"{sentence}, but in the middle of one of {word} size",
+                "give the calibration of frames of this size, or scale fx, fy, cx, cy by"
+                f" {1.0 / scale:g}",
+                {**figures, "scale": scale},
             )
+            return
     is_exchanged = all(
         abs(value - 0.5) < _SIZE_TOLERANCE
         for value in (camera.cy / camera.width, camera.cx / camera.height)
@@ -98,4 +90,4 @@ def _check_principal_point(camera: Camera) -> tuple[Doubt, ...]:
         )
     else:
         remedy = "look cx and cy up in the calibration, in pixels from the top-left pixel"
-    return (grave(Cause.PRINCIPAL_POINT, sentence, remedy, figures),)
+    yield grave(Cause.PRINCIPAL_POINT, sentence, remedy, figures)

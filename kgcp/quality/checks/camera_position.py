@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,7 +19,7 @@ _MIN_ALTITUDE_M = 3.0
 
 def check_camera_position(
     headers: Sequence[FrameHeader], crs: str, ground_lonlat: FloatArray, where: str
-) -> tuple[Doubt, ...]:
+) -> Iterator[Doubt]:
     """Compare the frames' GPS positions with places (n, 2) on the ground, longitude first [deg].
 
     Parameters
@@ -36,13 +36,13 @@ def check_camera_position(
         dtype=np.float64,
     ).reshape(-1, 2)
     if not len(camera) or not len(ground_lonlat):
-        return ()
+        return
     place = np.median(camera, axis=0)
     ground = np.median(ground_lonlat, axis=0)
     extent_m = float(np.linalg.norm(_metres(np.ptp(ground_lonlat, axis=0), ground)))
     off_m = float(np.linalg.norm(_metres(place - ground, ground)))
     if off_m <= _FAR_M + extent_m:
-        return ()
+        return
     figures = {"distance_m": off_m}
     sentence = (
         f"the frames' GPS says {place_text(crs, *place.tolist()).partition(';')[0]}, but {where}"
@@ -51,25 +51,22 @@ def check_camera_position(
     )
     swapped = float(np.linalg.norm(_metres(place - ground[::-1], place)))
     if swapped <= _FAR_M + extent_m:
-        return (
-            grave(
-                Cause.AXES_SWAPPED,
-                f"{sentence}: with longitude and latitude exchanged it fits",
-                "put the longitude into x and the latitude into y",
-                figures,
-            ),
-        )
-    return (
-        grave(
-            Cause.CAMERA_POSITION,
-            sentence,
-            "check crs and [vehicle] trajectory: zone, hemisphere and order of x and y",
+        yield grave(
+            Cause.AXES_SWAPPED,
+            f"{sentence}: with longitude and latitude exchanged it fits",
+            "put the longitude into x and the latitude into y",
             figures,
-        ),
+        )
+        return
+    yield grave(
+        Cause.CAMERA_POSITION,
+        sentence,
+        "check crs and [vehicle] trajectory: zone, hemisphere and order of x and y",
+        figures,
     )
 
 
-def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> tuple[Doubt, ...]:
+def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> Iterator[Doubt]:
     """Compare altitudes above take-off (n,) with measured heights above the plate (n,) [m].
 
     Measured heights of half or double size come from diameters that are radii, or from a
@@ -77,7 +74,7 @@ def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> tuple[
     """
     known = (altitude_m > _MIN_ALTITUDE_M) & (height_above_m > 0.0)
     if np.count_nonzero(known) < 3:
-        return ()
+        return
     ratio = float(np.median(height_above_m[known] / altitude_m[known]))
     figures = {"ratio": ratio}
     sentence = (
@@ -89,16 +86,15 @@ def check_altitude(altitude_m: FloatArray, height_above_m: FloatArray) -> tuple[
         (2.0, "diameters seem to be twice too large", "check the diameters in [[target]]"),
     ):
         if abs(ratio / factor - 1.0) < _RATIO_TOLERANCE:
-            return (mild(Cause.DIAMETERS, f"{sentence}: {words}", remedy, figures),)
+            yield mild(Cause.DIAMETERS, f"{sentence}: {words}", remedy, figures)
+            return
     if 1.0 / 3.0 < ratio < 3.0:
-        return ()  # a hill between take-off and vehicle
-    return (
-        grave(
-            Cause.DISTANCE_SCALE,
-            sentence,
-            "check diameters in [[target]] and fx, fy in [camera], and their units",
-            figures,
-        ),
+        return  # a hill between take-off and vehicle
+    yield grave(
+        Cause.DISTANCE_SCALE,
+        sentence,
+        "check diameters in [[target]] and fx, fy in [camera], and their units",
+        figures,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -60,7 +60,7 @@ def clock_shifts_s() -> list[tuple[float, str]]:
 
 def check_overlap(
     frame_s: FloatArray, trajectory_s: FloatArray, time_offset_s: float
-) -> tuple[Doubt, ...]:
+) -> Iterator[Doubt]:
     """Tell frames (n,) outside of a trajectory (m,) in time; try what would bring them inside.
 
     Both in Unix UTC [s]; `time_offset_s` is that of flight.toml.
@@ -70,7 +70,7 @@ def check_overlap(
     outside = float(np.mean((times < first) | (times > last))) if len(times) else 0.0
     doubt = grave if outside > _MOSTLY else mild  # a logger may have been started late
     if outside <= _MOST_OUTSIDE:
-        return ()
+        return
     count = round(outside * len(times))
     figures = {"frames_outside": float(count), "frames": float(len(times))}
     offset = f", time_offset_s = {time_offset_s:g}" if time_offset_s else ""
@@ -80,82 +80,81 @@ def check_overlap(
     )
     remedy = gps_count_remedy(float(times.min()), first)
     if remedy is not None:
-        return (grave(Cause.CLOCK, sentence, remedy, figures),)
+        yield grave(Cause.CLOCK, sentence, remedy, figures)
+        return
     for shift_s, words in clock_shifts_s():
         if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
-            return (
-                doubt(
-                    Cause.CLOCK,
-                    f"{sentence}: {words}; {_shifted(shift_s)} all would lie inside",
-                    "give [vehicle] time_system, correct the times file, or set [vehicle]"
-                    f" time_offset_s = {time_offset_s + shift_s:g}",
-                    {**figures, "shift_s": shift_s},
-                ),
+            yield doubt(
+                Cause.CLOCK,
+                f"{sentence}: {words}; {_shifted(shift_s)} all would lie inside",
+                "give [vehicle] time_system, correct the times file, or set [vehicle]"
+                f" time_offset_s = {time_offset_s + shift_s:g}",
+                {**figures, "shift_s": shift_s},
             )
+            return
     days = _whole_days(times, first, last)
     if days is not None:
         is_week = days % 7 == 0
         words = f"{abs(days)} days" + (f", {abs(days) // 7} GPS weeks," if is_week else "")
-        return (
-            grave(
-                Cause.CLOCK,
-                f"{sentence}: they are {words} apart",
-                "check the date and GPS week of both files: [vehicle] date names the first day of"
-                " a trajectory in seconds of the week",
-                {**figures, "shift_s": days * _DAY_S},
-            ),
+        yield grave(
+            Cause.CLOCK,
+            f"{sentence}: they are {words} apart",
+            "check the date and GPS week of both files: [vehicle] date names the first day of"
+            " a trajectory in seconds of the week",
+            {**figures, "shift_s": days * _DAY_S},
         )
-    remedy = "give the trajectory of this flight, or correct [vehicle] time_offset_s, time_system"
-    nothing = grave(Cause.NO_OVERLAP, sentence, remedy, figures)
-    # of those partly inside: blocks are flown for longer than vehicles drive
-    return (nothing,) if outside == 1.0 else ()
+    elif outside == 1.0:  # blocks partly inside are flown for longer than vehicles drive
+        yield grave(
+            Cause.NO_OVERLAP,
+            sentence,
+            "give the trajectory of this flight, or correct [vehicle] time_offset_s, time_system",
+            figures,
+        )
 
 
-def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> tuple[Doubt, ...]:
+def check_completeness(frames: Sequence[str], times_s: Mapping[str, float]) -> Iterator[Doubt]:
     """Tell frames without a time: the vehicle's place in them is not known."""
     untimed = [frame for frame in frames if frame not in times_s]
     if not untimed:
-        return ()
+        return
     figures = {"frames_without_time": float(len(untimed)), "frames": float(len(frames))}
     sentence = f"{len(untimed)} of {len(frames)} frames have no time, such as {untimed[0]}"
     remedy = "give [frames] times with one line per frame, named as below the frames folder"
     doubt = grave if len(untimed) == len(frames) else mild
-    return (doubt(Cause.NO_TIMES, sentence, remedy, figures),)
+    yield doubt(Cause.NO_TIMES, sentence, remedy, figures)
 
 
-def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> tuple[Doubt, ...]:
+def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> Iterator[Doubt]:
     """Compare the times of frames with those that their EXIF has, both Unix UTC [s], in pairs.
 
     A camera's clock is often set by hand and drifts. Only a steady difference of leap seconds,
     hours or weeks tells something.
     """
     if len(times_s) < 3:
-        return ()
+        return
     difference = np.asarray(times_s) - np.asarray(exif_s)
     middle = float(np.median(difference))
     spread = float(np.median(np.abs(difference - middle)))
     if spread > _STEADY_S:
-        return (
-            mild(
-                Cause.FRAME_ORDER,
-                f"the frames' times and those of their EXIF differ by {difference.min():.1f} …"
-                f" {difference.max():.1f} s: the times may belong to other frames",
-                "check that every line of the times file has the time of the frame it names",
-                {"spread_s": spread},
-            ),
+        yield mild(
+            Cause.FRAME_ORDER,
+            f"the frames' times and those of their EXIF differ by {difference.min():.1f} …"
+            f" {difference.max():.1f} s: the times may belong to other frames",
+            "check that every line of the times file has the time of the frame it names",
+            {"spread_s": spread},
         )
+        return
     interval = float(np.median(np.abs(np.diff(exif_s))))
     for step, word in ((1, "next"), (-1, "previous")):
         moved = np.roll(np.asarray(exif_s), -step)[1:-1] - np.asarray(times_s)[1:-1]
         if abs(middle) > 0.5 * interval and np.median(np.abs(moved)) < _SAME_SHARE * interval:
-            return (
-                mild(
-                    Cause.FRAME_ORDER,
-                    f"the frames' times are those that the EXIF of the {word} frame has",
-                    "check that every line of the times file has the time of the frame it names",
-                    {"difference_s": middle},
-                ),
+            yield mild(
+                Cause.FRAME_ORDER,
+                f"the frames' times are those that the EXIF of the {word} frame has",
+                "check that every line of the times file has the time of the frame it names",
+                {"difference_s": middle},
             )
+            return
     likely = [
         words
         for shift_s, words in clock_shifts_s()
@@ -163,17 +162,15 @@ def check_exif_times(times_s: Sequence[float], exif_s: Sequence[float]) -> tuple
         < (_LEAP_TOLERANCE_S if abs(shift_s) < _HOUR_TOLERANCE_S else _HOUR_TOLERANCE_S)
     ]
     if not likely:
-        return ()
+        return
     words = likely[0].replace("the trajectory's times seem", "EXIF times seem")
     words = words.replace("the frames' times seem", "those of the times file seem")
-    return (
-        mild(
-            Cause.CLOCK,
-            f"the frames' times are {_seconds(abs(middle))} {'after' if middle > 0 else 'before'}"
-            f" those of their EXIF: {words}",
-            "check which clock is right; correct the times file, or set [vehicle] time_offset_s",
-            {"difference_s": middle},
-        ),
+    yield mild(
+        Cause.CLOCK,
+        f"the frames' times are {_seconds(abs(middle))} {'after' if middle > 0 else 'before'}"
+        f" those of their EXIF: {words}",
+        "check which clock is right; correct the times file, or set [vehicle] time_offset_s",
+        {"difference_s": middle},
     )
 
 

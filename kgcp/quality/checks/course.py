@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,14 +64,14 @@ def course_of(vehicle: Vehicle, attitude_deg: FloatArray) -> Course | None:
     return Course(np.degrees(np.arctan2(east, north))[moves], attitude_deg[::step][moves])
 
 
-def check_attitude(course: Course | None) -> tuple[Doubt, ...]:
+def check_attitude(course: Course | None) -> Iterator[Doubt]:
     """Compare headings with the course, and roll and pitch with a level road.
 
     Where they do not fit, the usual other conventions are tried, and the one that fits is named.
     """
-    if course is None:
-        return ()
-    return (*_check_heading(course), *_check_level(course))
+    if course is not None:
+        yield from _check_heading(course)
+        yield from _check_level(course)
 
 
 Reading = tuple[str, str, Callable[[FloatArray], FloatArray]]
@@ -109,23 +109,22 @@ _ANTICLOCKWISE_FROM_EAST = 1
 _RADIANS = 3, 4
 
 
-def _check_heading(course: Course) -> tuple[Doubt, ...]:
+def _check_heading(course: Course) -> Iterator[Doubt]:
     """Compare headings with the course; where they differ, name the readings that fit."""
     heading = course.attitude_deg[:, 2]
     off = course.median_off_deg
     if off <= _LARGEST_DEG:
-        return ()
+        return
     figures = {"median_off_deg": off, "epochs": float(len(heading))}
     if not np.any(heading):
-        return (
-            grave(
-                Cause.HEADING,
-                "headings are 0 at all epochs, but the vehicle drives in other directions",
-                'give a trajectory with attitude, or [vehicle] attitude = "course" with'
-                " sd_attitude_deg",
-                figures,
-            ),
+        yield grave(
+            Cause.HEADING,
+            "headings are 0 at all epochs, but the vehicle drives in other directions",
+            'give a trajectory with attitude, or [vehicle] attitude = "course" with'
+            " sd_attitude_deg",
+            figures,
         )
+        return
     sentence = f"headings are {off:.0f}° from the course over ground while driving (median)"
     small = bool(np.all(np.abs(_wrapped(heading)) <= 2.0 * math.pi + 0.01))
     fits = []
@@ -141,41 +140,36 @@ def _check_heading(course: Course) -> tuple[Doubt, ...]:
         enough = 2.0 * min((fit[0] for fit in fits), default=0.0) + 1.0
         fits.sort(key=lambda fit: (fit[0] > enough, fit[1]))
     if not fits:
-        return (
-            grave(
-                Cause.HEADING,
-                f"{sentence}, and no other reading of the angles fits",
-                "check the columns roll_deg, pitch_deg, heading_deg and the order of x and y",
-                figures,
-            ),
+        yield grave(
+            Cause.HEADING,
+            f"{sentence}, and no other reading of the angles fits",
+            "check the columns roll_deg, pitch_deg, heading_deg and the order of x and y",
+            figures,
         )
+        return
     left, index, words, remedy = fits[0]
     code = Cause.ANGLE_UNIT if index in (*_RADIANS, 5) else Cause.HEADING
     others = "".join(f", or {fit[2]}" for fit in fits[1:3])
     if index == _ANTICLOCKWISE_FROM_EAST:
         remedy += ", unless x and y of the trajectory are exchanged"
-    return (
-        grave(
-            code,
-            f"{sentence}: they seem to be {words}{others}",
-            remedy,
-            {**figures, "left_deg": left},
-        ),
+    yield grave(
+        code,
+        f"{sentence}: they seem to be {words}{others}",
+        remedy,
+        {**figures, "left_deg": left},
     )
 
 
-def _check_level(course: Course) -> tuple[Doubt, ...]:
+def _check_level(course: Course) -> Iterator[Doubt]:
     roll, pitch = np.median(course.attitude_deg[:, :2], axis=0).tolist()
     if max(abs(roll), abs(pitch)) < _STEEP_DEG:
-        return ()
+        return
     words = "roll is about 180°: its z axis points up" if abs(roll) > 145.0 else "it lies on a side"
-    return (
-        grave(
-            Cause.ATTITUDE,
-            f"the vehicle's roll is {roll:.0f}° and its pitch {pitch:.0f}° (medians): {words}",
-            "give the attitude of axes x forward, y right, z down, rolled from north, east, down",
-            {"roll_deg": roll, "pitch_deg": pitch},
-        ),
+    yield grave(
+        Cause.ATTITUDE,
+        f"the vehicle's roll is {roll:.0f}° and its pitch {pitch:.0f}° (medians): {words}",
+        "give the attitude of axes x forward, y right, z down, rolled from north, east, down",
+        {"roll_deg": roll, "pitch_deg": pitch},
     )
 
 

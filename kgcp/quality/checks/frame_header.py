@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,20 +37,18 @@ class FrameHeader:
     altitude_m: float | None = None  # above the take-off point
 
 
-def check_frames(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+def check_frames(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Doubt]:
     """Compare sizes, makers and focal lengths of the frames with each other and the camera."""
-    return (
-        *_check_sizes(headers, camera),
-        *_check_cameras(headers),
-        *_check_focal_length(headers, camera),
-    )
+    yield from _check_sizes(headers, camera)
+    yield from _check_cameras(headers)
+    yield from _check_focal_length(headers, camera)
 
 
-def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Doubt]:
     sizes = Counter(header.size_px for header in headers if header.size_px is not None)
     wrong = sizes.total() - sizes[camera.width, camera.height]
     if not wrong:
-        return ()
+        return
     (width, height), _ = next(
         item for item in sizes.most_common() if item[0] != (camera.width, camera.height)
     )
@@ -73,10 +71,10 @@ def _check_sizes(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt,
     else:
         remedy = "give the calibration of these frames, or take frames of other cameras out"
     doubt = grave if 10 * wrong > sizes.total() else mild
-    return (doubt(Cause.FRAME_SIZE, sentence, remedy, figures),)
+    yield doubt(Cause.FRAME_SIZE, sentence, remedy, figures)
 
 
-def _check_cameras(headers: Sequence[FrameHeader]) -> tuple[Doubt, ...]:
+def _check_cameras(headers: Sequence[FrameHeader]) -> Iterator[Doubt]:
     zooms = _zooms_mm(headers)
     cameras = Counter(
         (header.camera, None if header.focal_mm is None else zooms[header.focal_mm])
@@ -84,21 +82,19 @@ def _check_cameras(headers: Sequence[FrameHeader]) -> tuple[Doubt, ...]:
         if header.camera or header.focal_mm is not None
     )
     if len(cameras) < 2:
-        return ()
+        return
     (first, _), (second, count) = cameras.most_common(2)
     name = next(
         header.frame
         for header in headers
         if (header.camera, None if header.focal_mm is None else zooms[header.focal_mm]) == second
     )
-    return (
-        grave(
-            Cause.TWO_CAMERAS,
-            f"the frames are of {len(cameras)} cameras or focal lengths: most of {_named(first)},"
-            f" but {count} of {_named(second)}, such as {name}",
-            "make a flight folder of its own for each camera and zoom",
-            {"cameras": float(len(cameras)), "frames": float(count)},
-        ),
+    yield grave(
+        Cause.TWO_CAMERAS,
+        f"the frames are of {len(cameras)} cameras or focal lengths: most of {_named(first)},"
+        f" but {count} of {_named(second)}, such as {name}",
+        "make a flight folder of its own for each camera and zoom",
+        {"cameras": float(len(cameras)), "frames": float(count)},
     )
 
 
@@ -118,10 +114,10 @@ def _named(camera: tuple[str, float | None]) -> str:
     return f"{name or 'an unnamed camera'}{'' if focal_mm is None else f' with {focal_mm:g} mm'}"
 
 
-def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> tuple[Doubt, ...]:
+def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> Iterator[Doubt]:
     known = [header.focal_35_mm for header in headers if header.focal_35_mm is not None]
     if not known:
-        return ()
+        return
     focal_35_mm = float(np.median(known))
     sizes = max(camera.width, camera.height), math.hypot(camera.width, camera.height)
     expected = [
@@ -129,7 +125,7 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> tuple
     ]
     ratio = camera.mean_focal_px / math.sqrt(expected[0] * expected[1])
     if 1.0 / _FOCAL_TOLERANCE < ratio < _FOCAL_TOLERANCE:
-        return ()
+        return
     figures = {"exif_focal_35_mm": focal_35_mm, "expected_fx_px": expected[0], "ratio": ratio}
     sentence = (
         f"the frames' EXIF has a focal length of {focal_35_mm:g} mm (35 mm equivalent), that is fx"
@@ -137,13 +133,12 @@ def _check_focal_length(headers: Sequence[FrameHeader], camera: Camera) -> tuple
     )
     for factor, word in ((2.0, "double"), (0.5, "half")):
         if 1.0 / _SIZE_TOLERANCE < ratio / factor < _SIZE_TOLERANCE:
-            return (
-                grave(
-                    Cause.CALIBRATION_SIZE,
-                    f"{sentence}, {factor:g} times as much",
-                    f"give the calibration of frames of {camera.width} x {camera.height} px: this"
-                    f" one seems to be of {word} size",
-                    figures,
-                ),
+            yield grave(
+                Cause.CALIBRATION_SIZE,
+                f"{sentence}, {factor:g} times as much",
+                f"give the calibration of frames of {camera.width} x {camera.height} px: this"
+                f" one seems to be of {word} size",
+                figures,
             )
-    return (mild(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures),)
+            return
+    yield mild(Cause.FOCAL_LENGTH, sentence, "give fx and fy of this camera and zoom", figures)

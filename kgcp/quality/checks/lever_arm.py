@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from kgcp.quality.checks.doubt import Cause, Doubt, mild
 from kgcp.settings import VehicleSettings
@@ -11,30 +12,25 @@ _DEEPEST_M = 1.0  # below the trajectory point: an antenna on a mast beside the 
 _LONGEST_M = 10.0
 
 
-def check_lever_arm(settings: VehicleSettings) -> tuple[Doubt, ...]:
+def check_lever_arm(settings: VehicleSettings) -> Iterator[Doubt]:
     """Tell a target below the vehicle, or beyond its length."""
     forward, right, down = settings.lever_arm_m
     figures = {"forward_m": forward, "right_m": right, "down_m": down}
     if math.hypot(forward, right, down) > _LONGEST_M:
-        return (
-            mild(
-                Cause.LEVER_ARM,
-                f"the lever arm is {math.hypot(forward, right, down):.1f} m long",
-                "give it in metres, as forward, right, down",
-                figures,
-            ),
+        yield mild(
+            Cause.LEVER_ARM,
+            f"the lever arm is {math.hypot(forward, right, down):.1f} m long",
+            "give it in metres, as forward, right, down",
+            figures,
         )
-    if down > _DEEPEST_M:
-        return (
-            mild(
-                Cause.LEVER_ARM,
-                f"the lever arm puts the target {down:.2f} m below the trajectory point",
-                f"if the plate lies higher, give lever_arm_m[2] = {-down:g}: its third number"
-                " counts down",
-                figures,
-            ),
+    elif down > _DEEPEST_M:
+        yield mild(
+            Cause.LEVER_ARM,
+            f"the lever arm puts the target {down:.2f} m below the trajectory point",
+            f"if the plate lies higher, give lever_arm_m[2] = {-down:g}: its third number"
+            " counts down",
+            figures,
         )
-    return ()
 
 
 def lever_arm_text(settings: VehicleSettings) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -55,25 +55,22 @@ def measured_doubts(
     return ranked(doubts)
 
 
-def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> list[Doubt]:
+def _of_encounters(encounters: Encounters, consistency: Consistency | None) -> Iterator[Doubt]:
     is_correctable = consistency is not None and is_explained(consistency)
     causes = causes_of(encounters, is_correctable=is_correctable)
     if causes:
-        return [*causes]
-    doubts = [*check_mount(encounters), *check_lone_frames(encounters)]
+        yield from causes
+        return
+    yield from check_mount(encounters)
+    yield from check_lone_frames(encounters)
     if consistency is not None and is_correctable:
-        doubts += [
-            mild(Cause.CORRECTION, sentence, remedy)
-            for sentence, remedy in corrections(consistency)
-        ]
+        for sentence, remedy in corrections(consistency):
+            yield mild(Cause.CORRECTION, sentence, remedy)
     elif encounters.misfit > MISFIT:
-        doubts.append(unexplained(encounters))
-    return doubts
+        yield unexplained(encounters)
 
 
-def _of_altitude(
-    sightings: Sequence[Sighting], headers: Sequence[FrameHeader]
-) -> tuple[Doubt, ...]:
+def _of_altitude(sightings: Sequence[Sighting], headers: Sequence[FrameHeader]) -> Iterator[Doubt]:
     altitudes = {
         header.frame: header.altitude_m for header in headers if header.altitude_m is not None
     }
@@ -82,7 +79,6 @@ def _of_altitude(
         for sighting in sightings
         if sighting.frame in altitudes and sighting.pose is not None
     ]
-    if not pairs:
-        return ()
-    altitude_m, height_m = np.array(pairs).T
-    return check_altitude(altitude_m, np.abs(height_m))
+    if pairs:
+        altitude_m, height_m = np.array(pairs).T
+        yield from check_altitude(altitude_m, np.abs(height_m))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -17,29 +18,27 @@ _STEADY_DEG = 8.0
 _RIGHT_ANGLE_DEG = 5.0  # closer to a multiple of 90°, that is what is meant
 
 
-def check_mount(encounters: Encounters) -> tuple[Doubt, ...]:
+def check_mount(encounters: Encounters) -> Iterator[Doubt]:
     """Compare the plate's direction with that of the vehicle and `mount_deg`."""
     mount_deg = encounters.vehicle.settings.mount_deg
     off = _plate_turns_deg(encounters, mount_deg)
     off = off[np.isfinite(off)]
     if not len(off):
-        return ()
+        return
     turns = np.exp(1j * np.radians(off))
     middle = math.degrees(float(np.angle(turns.mean())))
     spread = float(np.median(np.abs((off - middle + 180.0) % 360.0 - 180.0)))
     if abs(middle) < _LARGEST_DEG or spread > _STEADY_DEG:
-        return ()
+        return
     seen = (mount_deg + middle + 180.0) % 360.0 - 180.0
     nearest = 90.0 * round(seen / 90.0)
     told = nearest if abs(seen - nearest) < _RIGHT_ANGLE_DEG else round(seen, 1)
-    return (
-        mild(
-            Cause.MOUNT,
-            f"by images and reference poses the plate is turned by {minus(f'{seen:.1f}')}° ±"
-            f" {spread:.1f}° on the vehicle, but mount_deg is {mount_deg:g}",
-            f"set [vehicle] mount_deg = {told:g}, unless headings are wrong",
-            {"mount_deg": seen, "spread_deg": spread},
-        ),
+    yield mild(
+        Cause.MOUNT,
+        f"by images and reference poses the plate is turned by {minus(f'{seen:.1f}')}° ±"
+        f" {spread:.1f}° on the vehicle, but mount_deg is {mount_deg:g}",
+        f"set [vehicle] mount_deg = {told:g}, unless headings are wrong",
+        {"mount_deg": seen, "spread_deg": spread},
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,27 +86,25 @@ def unexplained(encounters: Encounters) -> Doubt:
     )
 
 
-def check_lone_frames(encounters: Encounters) -> tuple[Doubt, ...]:
+def check_lone_frames(encounters: Encounters) -> Iterator[Doubt]:
     """Tell single frames that disagree where the others agree."""
     square = np.sum(encounters.offset_m**2, axis=1)
     known = np.isfinite(square)
     if not known.any():
-        return ()
+        return
     limit = max(_LONE_M**2, _FAR * float(np.median(square[known])))
     far = known & (square > limit) & (square > _FAR * encounters.variance_m2)
     count, total = int(np.count_nonzero(far)), int(np.count_nonzero(known))
     if not count or 2 * count >= total:
-        return ()
+        return
     worst = float(np.sqrt(square[far].max()))
-    return (
-        mild(
-            Cause.SINGLE_FRAMES,
-            f"in {count} of {total} frames vehicle and camera put the target up to {worst:.1f} m"
-            f" apart, in the others {encounters.apart_m:.2f} m (median)",
-            "check the times of these frames and their reference poses: consistency.parquet names"
-            " them as outliers",
-            {"frames": float(count), "worst_m": worst},
-        ),
+    yield mild(
+        Cause.SINGLE_FRAMES,
+        f"in {count} of {total} frames vehicle and camera put the target up to {worst:.1f} m"
+        f" apart, in the others {encounters.apart_m:.2f} m (median)",
+        "check the times of these frames and their reference poses: consistency.parquet names"
+        " them as outliers",
+        {"frames": float(count), "worst_m": worst},
     )
 
 

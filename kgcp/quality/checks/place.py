@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -18,7 +18,7 @@ _LONG_NAME = 75
 _ZONE = 1e6  # zone numbers stand before eastings of six digits: 32 689586
 
 
-def check_place(crs: str, position_map: FloatArray, where: str) -> tuple[Doubt, ...]:
+def check_place(crs: str, position_map: FloatArray, where: str) -> Iterator[Doubt]:
     """Compare map positions (n, 2 or 3) with the area in which their CRS is used.
 
     Parameters
@@ -32,7 +32,7 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> tuple[Doubt, 
     outside = _outside(area, crs, xy)
     looks_radian = is_angular and bool(np.all(np.abs(xy) <= _CIRCLE))
     if outside <= _FAR_DEG and not looks_radian:
-        return ()
+        return
     x, y = xy.tolist()
     longitude, latitude = longitude_latitude(crs, xy[None])[0].tolist()
     figures = {"x": x, "y": y, "longitude_deg": longitude, "latitude_deg": latitude}
@@ -42,9 +42,10 @@ def check_place(crs: str, position_map: FloatArray, where: str) -> tuple[Doubt, 
     guess = (_angular_guess if is_angular else _projected_guess)(area, crs, xy)
     if guess is None:
         remedy = "give the CRS of the coordinates, x = easting or longitude first"
-        return (grave(Cause.CRS, sentence, remedy, figures),)
-    code, words, remedy = guess
-    return (grave(code, f"{sentence}: {words}", remedy, figures),)
+        yield grave(Cause.CRS, sentence, remedy, figures)
+    else:
+        code, words, remedy = guess
+        yield grave(code, f"{sentence}: {words}", remedy, figures)
 
 
 def place_text(crs: str, longitude_deg: float, latitude_deg: float) -> str:

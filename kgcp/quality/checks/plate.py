@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild
 from kgcp.targets.layout import Ring, Target
@@ -17,12 +17,11 @@ _INNER_RATIO = 0.4, 0.7
 _MOST_WHITE = 0.33  # of the ring's area, in dots
 
 
-def check_plates(targets: Sequence[AnyTarget]) -> tuple[Doubt, ...]:
+def check_plates(targets: Sequence[AnyTarget]) -> Iterator[Doubt]:
     """Tell diameters that are in other units than metres, and layouts that are hard to find."""
-    doubts: list[Doubt] = []
     for target in targets:
         if isinstance(target, Target):
-            doubts += _check_layout(target.ring)
+            yield from _check_layout(target.ring)
         diameter = target.outer_diameter_m
         if _SMALLEST_M < diameter < _LARGEST_M:
             continue
@@ -33,18 +32,15 @@ def check_plates(targets: Sequence[AnyTarget]) -> tuple[Doubt, ...]:
             if low <= diameter * unit_m <= high
         ]
         hint = f" ({', '.join(units)})" if units else ""
-        doubts.append(
-            grave(
-                Cause.DIAMETERS,
-                f"target {target.name!r} has an outer diameter of {diameter:g} m{hint}",
-                "give all diameters in metres",
-                {"outer_diameter_m": diameter},
-            )
+        yield grave(
+            Cause.DIAMETERS,
+            f"target {target.name!r} has an outer diameter of {diameter:g} m{hint}",
+            "give all diameters in metres",
+            {"outer_diameter_m": diameter},
         )
-    return tuple(doubts)
 
 
-def _check_layout(ring: Ring) -> tuple[Doubt, ...]:
+def _check_layout(ring: Ring) -> Iterator[Doubt]:
     ratio = ring.inner_ratio
     ring_m2 = ring.outer_diameter_m**2 - ring.inner_diameter_m**2
     white = len(ring.code_deg) * ring.dot_diameter_m**2 / ring_m2
@@ -59,5 +55,5 @@ def _check_layout(ring: Ring) -> tuple[Doubt, ...]:
     elif white > _MOST_WHITE:
         problem = f"the dots of {ring.name!r} take {white:.0%} of the ring, and many are not found"
     else:
-        return ()
-    return (mild(Cause.LAYOUT, problem, remedy, figures),)
+        return
+    yield mild(Cause.LAYOUT, problem, remedy, figures)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -16,35 +16,33 @@ _FAR_M = 6000.0  # from the nearest camera to the vehicle, higher than aircraft 
 _FEW = 1000  # epochs of a trajectory that tell its height
 
 
-def check_reference(poses: ReferencePoses, target_positions: TargetPositions) -> tuple[Doubt, ...]:
+def check_reference(poses: ReferencePoses, target_positions: TargetPositions) -> Iterator[Doubt]:
     """Tell reference poses far from the vehicle, or below it."""
     vehicle = target_positions.vehicle
     if vehicle is None or not len(poses.frames):
-        return ()
+        return
     ground = vehicle.motion.position_m
     off_m = _distance(poses.position_map, vehicle, ground)
     if off_m > _FAR_M:
-        return (_far(poses, vehicle, ground, off_m),)
+        yield _far(poses, vehicle, ground, off_m)
+        return
     frame = vehicle.local_frame
     cameras = frame.geodetic_deg(frame.enu_from_map(poses.position_map))
     road = frame.geodetic_deg(ground[:: max(1, len(ground) // _FEW)])
     above_m = float(np.median(cameras[:, 2]) - np.median(road[:, 2]))
     if above_m < 0.0:
-        return (
-            grave(
-                Cause.HEIGHTS,
-                f"the reference poses put the camera {-above_m:.1f} m below the vehicle (medians)",
-                "give both in heights of one kind: ellipsoidal ones, or a compound crs that names"
-                " the geoid; [reference] crs and [vehicle] crs may differ",
-                {"camera_above_vehicle_m": above_m},
-            ),
+        yield grave(
+            Cause.HEIGHTS,
+            f"the reference poses put the camera {-above_m:.1f} m below the vehicle (medians)",
+            "give both in heights of one kind: ellipsoidal ones, or a compound crs that names"
+            " the geoid; [reference] crs and [vehicle] crs may differ",
+            {"camera_above_vehicle_m": above_m},
         )
-    return ()
 
 
 def check_visibility(
     posed: Sequence[str], frames: Sequence[str], expected_radii_px: FloatArray | None
-) -> tuple[Doubt, ...]:
+) -> Iterator[Doubt]:
     """Tell poses that belong to no frame, or that see the target in none.
 
     Parameters
@@ -55,23 +53,18 @@ def check_visibility(
         Of the target in the frames that should show it; None: not known.
     """
     if posed and not set(posed) & set(frames):
-        return (
-            grave(
-                Cause.REFERENCE,
-                f"the reference poses name none of the frames: {posed[0]!r}, but the frames are"
-                f" named like {frames[0]!r}",
-                "name the poses as the frames, relative to the frames folder",
-            ),
+        yield grave(
+            Cause.REFERENCE,
+            f"the reference poses name none of the frames: {posed[0]!r}, but the frames are"
+            f" named like {frames[0]!r}",
+            "name the poses as the frames, relative to the frames folder",
         )
-    if expected_radii_px is not None and not len(expected_radii_px):
-        return (
-            grave(
-                Cause.REFERENCE,
-                "by reference poses and trajectory the target is in no frame",
-                "check unit, order and signs of omega, phi, kappa, and the times of the frames",
-            ),
+    elif expected_radii_px is not None and not len(expected_radii_px):
+        yield grave(
+            Cause.REFERENCE,
+            "by reference poses and trajectory the target is in no frame",
+            "check unit, order and signs of omega, phi, kappa, and the times of the frames",
         )
-    return ()
 
 
 def _far(poses: ReferencePoses, vehicle: Vehicle, ground: FloatArray, off_m: float) -> Doubt:

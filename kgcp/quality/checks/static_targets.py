@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
@@ -39,7 +39,7 @@ class _Pair:
 
 def check_static_targets(
     sightings: Sequence[Sighting], positions: Mapping[str, TargetPosition], camera: Camera
-) -> tuple[Doubt, ...]:
+) -> Iterator[Doubt]:
     """Compare the distances between static targets in every frame with those of their positions.
 
     A factor that all distances have in common, of prints or focal length, is taken out, if enough
@@ -52,12 +52,13 @@ def check_static_targets(
     """
     pairs = _pairs(sightings, positions, camera)
     if not pairs:
-        return ()
+        return
     scale = _common_scale(pairs)
     if not _is_of_all(pairs, scale):
         scale = 1.0
     if abs(math.log(scale)) > _MOST_SCALE:
-        return (_of_scale(scale),)
+        yield _of_scale(scale)
+        return
     wrong = {pair for pair in pairs if abs(_off_m(pair, scale)) > _CONTRADICTION * pair.sd_m}
     by_names: dict[tuple[str, str], list[_Pair]] = defaultdict(list)
     for pair in pairs:
@@ -70,8 +71,9 @@ def check_static_targets(
         and len(frames) >= _LEAST_SHARE * len(by_names[names])
     }
     if contradicting:
-        return (_of_targets(by_names, bad, contradicting, scale),)
-    return _of_frames(pairs, wrong)
+        yield _of_targets(by_names, bad, contradicting, scale)
+    else:
+        yield from _of_frames(pairs, wrong)
 
 
 def _pairs(
@@ -194,7 +196,7 @@ def _of_targets(
     )
 
 
-def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> tuple[Doubt, ...]:
+def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator[Doubt]:
     """Return the doubt about targets in single frames that contradict most others there."""
     seen, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for pair in pairs:
@@ -203,16 +205,14 @@ def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> tuple[Doubt
             against[pair.frame, name] += pair in wrong
     lone = [key for key, count in against.items() if count >= 2 and 2 * count > seen[key]]
     if not lone:
-        return ()
+        return
     words = ", ".join(f"{name} in {frame}" for frame, name in lone[:_NAMED_FRAMES])
     more = f" and {len(lone) - _NAMED_FRAMES} more" if len(lone) > _NAMED_FRAMES else ""
-    return (
-        mild(
-            Cause.SINGLE_FRAMES,
-            f"static targets: {words}{more} contradict their distances to most others",
-            "look at them with 'kgcp detect --overlay', and leave them out (--exclude)",
-            {"measurements": float(len(lone))},
-        ),
+    yield mild(
+        Cause.SINGLE_FRAMES,
+        f"static targets: {words}{more} contradict their distances to most others",
+        "look at them with 'kgcp detect --overlay', and leave them out (--exclude)",
+        {"measurements": float(len(lone))},
     )
 
 

@@ -13,10 +13,10 @@ FRAMES_S: FloatArray = START_S + 5.0 + 1.5 * np.arange(24.0)
 
 
 def test_frames_within_the_trajectory_raise_no_doubt() -> None:
-    assert check_overlap(FRAMES_S, TRAJECTORY_S, 0.0) == ()
-    assert check_overlap(FRAMES_S + 6.0, TRAJECTORY_S, 0.0) == ()  # the last 2 of 24 are outside
-    assert check_overlap(FRAMES_S - 18.0, TRAJECTORY_S, 18.0) == ()
-    assert check_overlap(np.array([]), TRAJECTORY_S, 0.0) == ()
+    assert not [*check_overlap(FRAMES_S, TRAJECTORY_S, 0.0)]
+    assert not [*check_overlap(FRAMES_S + 6.0, TRAJECTORY_S, 0.0)]  # the last 2 of 24 are outside
+    assert not [*check_overlap(FRAMES_S - 18.0, TRAJECTORY_S, 18.0)]
+    assert not [*check_overlap(np.array([]), TRAJECTORY_S, 0.0)]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_frames_of_another_drive_are_told() -> None:
     assert (doubt.code, doubt.is_grave) == (Cause.NO_OVERLAP, True)
     assert "24 of 24 frames" in doubt.sentence
     long = START_S + 5.0 + 1.5 * np.arange(-100.0, 100.0)
-    assert check_overlap(long, TRAJECTORY_S, 0.0) == ()  # the vehicle drove for a part of it
+    assert not [*check_overlap(long, TRAJECTORY_S, 0.0)]  # the vehicle drove for a part of it
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_exif_tells_another_clock(ahead_s: float, words: str) -> None:
 
 def test_clocks_of_cameras_are_off_and_that_is_no_doubt() -> None:
     for ahead_s in (0.0, 0.4, 5.0, -61.0, 1000.0):
-        assert check_exif_times([*(FRAMES_S + ahead_s)], [*FRAMES_S]) == ()
+        assert not [*check_exif_times([*(FRAMES_S + ahead_s)], [*FRAMES_S])]
 
 
 def test_times_of_other_frames_are_told() -> None:

@@ -35,7 +35,7 @@ def target(outer_m: float = 0.9, inner_ratio: float = 0.5, white_share: float = 
 def test_layouts_that_are_hard_to_find_are_told(
     inner_ratio: float, white_share: float, words: str
 ) -> None:
-    doubts = check_plates([target(inner_ratio=inner_ratio, white_share=white_share)])
+    doubts = [*check_plates([target(inner_ratio=inner_ratio, white_share=white_share)])]
     assert [doubt.code for doubt in doubts] == [Cause.LAYOUT] * bool(words)
     assert all(words in doubt.sentence and not doubt.is_grave for doubt in doubts)
 
@@ -51,6 +51,6 @@ def test_layouts_that_are_hard_to_find_are_told(
     ],
 )
 def test_diameters_in_other_units_are_told(outer_m: float, words: str) -> None:
-    doubts = check_plates([target(outer_m)])
+    doubts = [*check_plates([target(outer_m)])]
     assert [doubt.code for doubt in doubts] == [Cause.DIAMETERS] * bool(words)
     assert all(words in doubt.sentence and doubt.is_grave for doubt in doubts)
