@@ -11,6 +11,7 @@ import numpy as np
 
 from kgcp.errors import KgcpError
 from kgcp.io.files.atomic import write_bytes
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.flight import read_target_tables
 from kgcp.io.flight.folder import FLIGHT_TOML, FolderContents, survey_folder
@@ -194,19 +195,13 @@ def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
 
 
 def _times_by_name(time_s: Mapping[str, float]) -> _Times:
-    rows = [f"{_cell(frame)},{format_time(moment)}" for frame, moment in time_s.items()]
+    rows = [(frame, format_time(moment)) for frame, moment in time_s.items()]
     return _Times(
         time_s,
         (DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names"),),
         (InitFinding("times", f"{_span(time_s)}, from the frames' names, as {_FRAMES_CSV}"),),
-        frames_csv="\n".join(["frame,time", *rows]) + "\n",
+        frames_csv=csv_text(("frame", "time"), rows),
     )
-
-
-def _cell(text: str) -> str:
-    """Return a cell of a CSV file, in quotes where it has a comma or quotes."""
-    doubled = text.replace('"', '""')
-    return f'"{doubled}"' if "," in text or doubled != text else text
 
 
 def _times_by_exif(

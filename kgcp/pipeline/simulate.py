@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import io
 import json
@@ -23,6 +22,7 @@ from PIL.TiffImagePlugin import IFDRational
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Camera
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.target_table import target_lines
 from kgcp.pipeline.execution.executor import open_pool
@@ -287,10 +287,7 @@ def write_texts(plan: FlightPlan, folder: Path) -> None:
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table with its columns' names."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
+    path.write_text(csv_text(columns, rows), encoding="utf-8", newline="")
 
 
 def _vehicle_rows(plan: FlightPlan) -> Iterator[Sequence[str]]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from itertools import combinations
 
 from kgcp.errors import KgcpError
 from kgcp.georef.camera_priors import opk_covs, opk_deg
 from kgcp.io.exporters.points import DEGREE_DECIMALS, MapPoints, covariance_cells, decimals
+from kgcp.io.files.csv_text import csv_text
 
 _PARAMETERS = ("x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
 COLUMNS = (
@@ -53,15 +52,13 @@ def files(points: MapPoints) -> Mapping[str, str]:
             " with a trajectory, and [vehicle] level_sd_deg and [camera] plumb_sd_deg or reference"
             " poses that tell the two poses of a circle apart; or leave this format out"
         )
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows = []
     every = zip(points.priors, opk_deg(points.priors), opk_covs(points.priors), strict=True)
     for prior, opk, cov in every:
         angles = (decimals(angle, DEGREE_DECIMALS) for angle in opk)
         xyz = points.xyz(prior.position_map)
-        writer.writerow((prior.frame, *xyz, *angles, *covariance_cells(cov, 6, 9), points.crs))
+        rows.append((prior.frame, *xyz, *angles, *covariance_cells(cov, 6, 9), points.crs))
     return {
-        "camera_priors/camera_priors.csv": stream.getvalue(),
+        "camera_priors/camera_priors.csv": csv_text(COLUMNS, rows),
         "camera_priors/HOWTO.txt": _HOWTO.format(crs=points.crs, heights=points.heights),
     }

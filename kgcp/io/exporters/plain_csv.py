@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 
 from kgcp.io.exporters.points import METRE_DECIMALS, MapPoints, covariance_cells, decimals, pixel
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.time_text import format_time
 
 COLUMNS = (
@@ -22,28 +21,25 @@ covariances in m² along these axes; (0, 0) px is the centre of the top-left pix
 
 def files(points: MapPoints) -> Mapping[str, str]:
     """Return `kgcps.csv`."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for point in points.gcps:
-        writer.writerow(
-            (
-                *(point.id, point.frame, point.target),
-                "" if point.time_s is None else format_time(point.time_s),
-                *points.xyz(point.position_map),
-                *covariance_cells(point.cov_m2, 3, 6),
-                *pixel(point),
-                *covariance_cells(point.centre_cov_px2, 2, 6),
-                decimals(point.distance_m, METRE_DECIMALS),
-                _text(point.sd_distance_m),
-                _text(point.sd_common_distance_m),
-                *covariance_cells(point.cov_common_m2, 3, 6),
-                "check" if point.is_checkpoint else "control",
-                "" if point.flag is None else point.flag.value,
-                points.crs,
-            )
+    rows = [
+        (
+            *(point.id, point.frame, point.target),
+            "" if point.time_s is None else format_time(point.time_s),
+            *points.xyz(point.position_map),
+            *covariance_cells(point.cov_m2, 3, 6),
+            *pixel(point),
+            *covariance_cells(point.centre_cov_px2, 2, 6),
+            decimals(point.distance_m, METRE_DECIMALS),
+            _text(point.sd_distance_m),
+            _text(point.sd_common_distance_m),
+            *covariance_cells(point.cov_common_m2, 3, 6),
+            "check" if point.is_checkpoint else "control",
+            "" if point.flag is None else point.flag.value,
+            points.crs,
         )
-    return {"kgcps.csv": stream.getvalue()}
+        for point in points.gcps
+    ]
+    return {"kgcps.csv": csv_text(COLUMNS, rows)}
 
 
 def _text(value: float | None) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.tables.columns import (
     INTEGER,
     NUMBER,
@@ -174,13 +173,11 @@ def field_discs(calibration: CameraCalibration) -> list[FieldDisc]:
 
 def field_csv(discs: list[FieldDisc]) -> str:
     """Return the field as text: name, x, y, z and their deviations [m]."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["name", "x", "y", "z", "sd_x", "sd_y", "sd_z"])
+    rows = []
     for disc in discs:
         sds = ["" if (sd := sd_cell(disc.cov, axis)) is None else f"{sd:.9f}" for axis in range(3)]
-        writer.writerow([disc.name, *(f"{value:.9f}" for value in disc.adjusted), *sds])
-    return stream.getvalue()
+        rows.append([disc.name, *(f"{value:.9f}" for value in disc.adjusted), *sds])
+    return csv_text(["name", "x", "y", "z", "sd_x", "sd_y", "sd_z"], rows)
 
 
 def photo_rows(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -86,16 +85,13 @@ def residual_rows(placed: Sequence[PlacedTarget]) -> Iterator[Row]:
 
 def places_csv(placed: Sequence[PlacedTarget]) -> str:
     """Return places as text, in the columns of a list of points of other programs."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     normal = [f"normal_{a}" for a in _AXES]
-    writer.writerow(
-        ["name", *_AXES, *(f"sd_{a}" for a in _AXES), "diameter_m", "sd_diameter_m", *normal]
-    )
+    columns = ["name", *_AXES, *(f"sd_{a}" for a in _AXES), "diameter_m", "sd_diameter_m", *normal]
+    rows = []
     for target in placed:
         position = (f"{value:.9f}" for value in target.position_map.tolist())
         sds = (f"{value:.6f}" for value in target.sds[:3].tolist())
         size = (f"{target.diameter_m:.6f}", f"{target.sd_diameter_m:.6f}")
         along = (f"{value:.7f}" for value in target.normal.tolist())
-        writer.writerow([target.target, *position, *sds, *size, *along])
-    return stream.getvalue()
+        rows.append([target.target, *position, *sds, *size, *along])
+    return csv_text(columns, rows)

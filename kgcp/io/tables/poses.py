@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import CAMERA_FROM_PHOTO, opk_from_rotation
 from kgcp.georef.local_frame import LocalFrame
+from kgcp.io.files.csv_text import csv_text
 from kgcp.io.tables.columns import (
     BOOLEAN,
     INTEGER,
@@ -180,19 +179,18 @@ def pose_csv_cells(
 
 def poses_csv(rows: Sequence[MapPose], *, is_geographic: bool) -> str:
     """Return the oriented frames in the columns of reference poses."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(POSE_CSV_HEADER)
-    for row in rows:
-        if row.position_map is None or row.opk_deg is None or row.cov is None:
-            continue
-        frame = row.frame_pose.frame
-        writer.writerow(
-            pose_csv_cells(
-                frame, row.position_map, row.opk_deg, row.cov, is_geographic=is_geographic
-            )
+    cells = [
+        pose_csv_cells(
+            row.frame_pose.frame,
+            row.position_map,
+            row.opk_deg,
+            row.cov,
+            is_geographic=is_geographic,
         )
-    return stream.getvalue()
+        for row in rows
+        if row.position_map is not None and row.opk_deg is not None and row.cov is not None
+    ]
+    return csv_text(POSE_CSV_HEADER, cells)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,12 +205,10 @@ class OwnFramePose:
 
 def own_frame_poses_csv(rows: Iterable[OwnFramePose], more: Sequence[str]) -> str:
     """Return poses in the columns of reference poses, with `focal_scale` and some more columns."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*POSE_CSV_HEADER, "focal_scale", *more])
+    table = []
     for row in rows:
         pose = row.pose
         opk_deg = opk_from_rotation((pose.world_from_camera @ CAMERA_FROM_PHOTO)[None])[0]
         cells = pose_csv_cells(row.frame, pose.centre_m, opk_deg, row.cov)
-        writer.writerow([*cells, f"{pose.focal_scale:.6f}", *row.more])
-    return stream.getvalue()
+        table.append([*cells, f"{pose.focal_scale:.6f}", *row.more])
+    return csv_text([*POSE_CSV_HEADER, "focal_scale", *more], table)
