@@ -42,24 +42,13 @@ class MarkedPlace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameOrientation:
-    """The exterior orientation of one frame, as far as predictions need it.
+    """The exterior orientation of one frame, as far as predictions need it."""
 
-    Attributes
-    ----------
-    centre_m : (3,) array
-        Projection centre in the ENU frame [m].
-    enu_from_camera : (3, 3) array
-        Camera axes in the ENU frame, as columns.
-    cov : (6, 6) array or None
-        Of centre [m] and left rotation vector [rad], ENU axes; None: not stated.
-    source : str
-        Who says so, in few words.
-    """
-
-    centre_m: FloatArray
-    enu_from_camera: FloatArray
+    centre_m: FloatArray  # (3,): projection centre in the ENU frame [m]
+    enu_from_camera: FloatArray  # (3, 3): camera axes in the ENU frame, as columns
+    # (6, 6): of centre [m] and left rotation vector [rad], ENU axes; None: not stated
     cov: FloatArray | None
-    source: str
+    source: str  # who says so, in few words
 
     @property
     def sd_angle_deg(self) -> float:

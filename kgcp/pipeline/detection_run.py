@@ -84,11 +84,6 @@ class FirstSizes:
     ----------
     frames : int
         Of the flight. A short one is looked at to its end.
-
-    Attributes
-    ----------
-    wrong : str or None
-        Size of the first `FRAMES` frames, and that of the camera; None: not all are wrong.
     """
 
     FRAMES = 20
@@ -96,6 +91,7 @@ class FirstSizes:
     def __init__(self, frames: int) -> None:
         self._seen = 0 if frames > self.FRAMES else self.FRAMES
         self._details: set[str] = set()
+        # size of the first `FRAMES` frames, and that of the camera; None: not all are wrong
         self.wrong: str | None = None
 
     def add(self, result: FrameResult) -> None:
@@ -119,17 +115,6 @@ class DetectionRun:
     ----------
     journal : Journal
         Where results are kept, and may be.
-
-    Attributes
-    ----------
-    tracks : FrameTracks
-        Of the results so far.
-    kept : int
-        Frames whose first look the journal had.
-    frame_sizes : dict of int
-        Bytes of the file of every frame; None: missing.
-    learnt : LearntImaging or None
-        What `learn` has found of the camera.
     """
 
     def __init__(
@@ -144,16 +129,17 @@ class DetectionRun:
         self._pool, self._listener = pool, listener
         self._rows = {frame_input.frame: row for row, frame_input in enumerate(inputs)}
         stamps = [*stamps_of(job.frames_folder, [frame_input.frame for frame_input in inputs])]
-        self.frame_sizes = {
+        self.frame_sizes = {  # bytes of the file of every frame; None: missing
             frame_input.frame: None if stamp is None else stamp[0]
             for frame_input, stamp in zip(inputs, stamps, strict=True)
         }
         self._stamps = stamps
         self._keys = [""] * len(inputs)  # empty of frames that were not looked at yet
         self._stage, self._done, self._total = "", 0, 0
+        # of the results so far
         self.tracks = FrameTracks(job.all_targets, [frame_input.frame for frame_input in inputs])
-        self.kept = 0
-        self.learnt: LearntImaging | None = None
+        self.kept = 0  # frames whose first look the journal had
+        self.learnt: LearntImaging | None = None  # what `learn` has found of the camera
         self._deciding_frames: set[str] = set()  # that have decided the base of the tone curve
         self._preferences: Mapping[Place, float] = {}
 

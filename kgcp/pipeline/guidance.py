@@ -38,26 +38,15 @@ _NO_TARGET = {
 
 
 class FrameTracks:
-    """What all frames must know of each other for a second look: few numbers of every frame.
-
-    Attributes
-    ----------
-    time_s : (n,) array
-        Mid-exposures [s]; NaN: not known.
-    states : mapping of str to (n, 3) array
-        By the target's name, as in `Track`.
-    is_readable : (n,) array of bool
-        Whether there is an image.
-    found : int
-        Frames in which any target was measured.
-    """
+    """What all frames must know of each other for a second look: few numbers of every frame."""
 
     def __init__(self, targets: Sequence[AnyTarget], frames: Sequence[str]) -> None:
         self.frames = frames
-        self.time_s = np.full(len(frames), math.nan)
+        self.time_s = np.full(len(frames), math.nan)  # mid-exposures [s]; NaN: not known
+        # (n, 3) by the target's name, as in `Track`
         self.states = {target.name: np.full((len(frames), 3), math.nan) for target in targets}
-        self.is_readable = np.zeros(len(frames), dtype=np.bool_)
-        self.found = 0
+        self.is_readable = np.zeros(len(frames), dtype=np.bool_)  # whether there is an image
+        self.found = 0  # frames in which any target was measured
         self._is_found = np.zeros(len(frames), dtype=np.bool_)
 
     def add(self, row: int, result: FrameResult) -> None:

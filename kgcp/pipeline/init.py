@@ -56,24 +56,13 @@ _EXAMPLE_TARGET = (
 
 @dataclass(frozen=True, slots=True)
 class FlightDraft:
-    """A flight.toml that is not yet written, and the reasons for it.
-
-    Attributes
-    ----------
-    toml_text : str
-        The file.
-    frames_csv : str or None
-        Times of the frames, where their names have them; None: another file has, or none.
-    findings : tuple of InitFinding
-        What the folder tells, and where it stands.
-    gaps : tuple of Gap
-        What it does not tell, and what to do about it.
-    """
+    """A flight.toml that is not yet written, and the reasons for it."""
 
     toml_text: str
+    # times of the frames, where their names have them; None: another file has, or none
     frames_csv: str | None
-    findings: tuple[InitFinding, ...]
-    gaps: tuple[Gap, ...]
+    findings: tuple[InitFinding, ...]  # what the folder tells, and where it stands
+    gaps: tuple[Gap, ...]  # what it does not tell, and what to do about it
 
 
 def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraft:

@@ -37,24 +37,12 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class InitOptions:
-    """What the user says, beside what lies in the folder; None or empty: nothing.
+    """What the user says, beside what lies in the folder; None or empty: nothing."""
 
-    Attributes
-    ----------
-    targets_file : Path or None
-        A flight.toml, or the targets.toml of `kgcp target`.
-    codes : tuple of str
-        Directions of the dots of targets, separated by commas [deg]; they need `diameter_m`.
-    diameter_m : float or None
-        Their outer diameter [m].
-    lever_arm_m : tuple of float or None
-        Trajectory point → target centre: forward, right, down [m].
-    crs : str or None
-        Of the flight, for pyproj.
-    """
-
-    targets_file: Path | None = None
+    targets_file: Path | None = None  # a flight.toml, or the targets.toml of `kgcp target`
+    # directions of the dots of targets, separated by commas [deg]; they need `diameter_m`
     codes: tuple[str, ...] = ()
-    diameter_m: float | None = None
+    diameter_m: float | None = None  # their outer diameter [m]
+    # trajectory point → target centre: forward, right, down [m]
     lever_arm_m: tuple[float, float, float] | None = None
-    crs: str | None = None
+    crs: str | None = None  # of the flight, for pyproj

@@ -34,17 +34,10 @@ class MergedGcps:
     Frames are called by the flight's name and their path below its frames folder, `north/1.jpg`.
     Ids of moving points begin with the flight's name; a static target that several flights have
     seen is one point.
-
-    Attributes
-    ----------
-    parts : tuple of GcpSet
-        Of the flights.
-    crs : str
-        Of all coordinates.
     """
 
-    parts: tuple[GcpSet, ...]
-    crs: str
+    parts: tuple[GcpSet, ...]  # of the flights
+    crs: str  # of all coordinates
     gcps: tuple[Gcp, ...]
     skipped: tuple[SkippedSighting, ...]
     camera_priors: tuple[CameraPrior, ...]

@@ -114,16 +114,10 @@ class DetectionSummary:
 
 
 class Stopwatch:
-    """How long the stages of the work take.
-
-    Attributes
-    ----------
-    stages_s : dict of float
-        Seconds by the stage's name.
-    """
+    """How long the stages of the work take."""
 
     def __init__(self) -> None:
-        self.stages_s: dict[str, float] = defaultdict(float)
+        self.stages_s: dict[str, float] = defaultdict(float)  # by the stage's name
         self._start_s = time.perf_counter()
 
     @contextmanager

@@ -43,19 +43,11 @@ class CalibrationGrade(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FieldDeviation:
-    """How far discs are from where they are meant to be, shift, turn and scale taken out.
+    """How far discs are from where they are meant to be, shift, turn and scale taken out."""
 
-    Attributes
-    ----------
-    in_plane_m, height_m : float
-        RMS along the field's axes x and y, and along z.
-    in_plane_ratio, height_ratio : float
-        RMS over what is stated to be possible.
-    """
-
-    in_plane_m: float
-    height_m: float
-    in_plane_ratio: float
+    in_plane_m: float  # RMS along the field's axes x and y
+    height_m: float  # RMS along z
+    in_plane_ratio: float  # RMS over what is stated to be possible
     height_ratio: float
 
     @property

@@ -26,20 +26,13 @@ _OUTLYING = 3.0  # robust deviations
 
 @dataclass(frozen=True, slots=True)
 class DiscLight:
-    """How much the light changes the levels of discs and ground within photographs.
+    """How much the light changes the levels of discs and ground within photographs."""
 
-    Attributes
-    ----------
-    dark, bright : float
-        Standard deviation over a photograph of what changes smoothly, RMS of the photographs; of
-        full scale. Burnt photographs do not count if they are fewer than half.
-    clipped : float
-        Median share of clipped pixels in these; NaN: not known.
-    """
-
+    # standard deviation over a photograph of what changes smoothly, RMS of the photographs; of full
+    # scale. Burnt photographs do not count if they are fewer than half.
     dark: float
     bright: float
-    clipped: float
+    clipped: float  # median share of clipped pixels in these; NaN: not known
 
     @property
     def doubt(self) -> str:

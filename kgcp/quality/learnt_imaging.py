@@ -48,43 +48,25 @@ _MIN_MEASUREMENTS = 3  # measurements at a grey value
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearntImaging:
-    """What a flight says of its camera.
+    """What a flight says of its camera."""
 
-    Attributes
-    ----------
-    base : ToneBase or None
-        The base of the tone curve that makes all measurements together likelier; None if they do
-        not agree, because the curve is near neither.
-    advantages : mapping of ToneBase to float
-        Sums of the log-likelihoods by which frames prefer a base, each at most 30.
-    measurements : int
-        Those made over both bases, in the frames that decided.
-    overruled, kept_own_base : int
-        Measurements that by themselves prefer another base: how many take the base of all, and how
-        many keep their own because they are much likelier over it.
-    grey : (n,) array
-        Grey values, 0…1 of their range.
-    light : (3, n) array
-        Light of these grey values, 1 = that of sRGB at full scale: percentiles 16, 50, 84 of the
-        measurements. NaN where fewer than three have such grey values.
-    sharpening : (3,) array
-        The same of the strength of the unsharp mask.
-    noise : (m, 2) array
-        Grey value and standard deviation of ink and plate of every measurement.
-    smoothing : CameraSmoothing
-        Along contours.
-    """
-
+    # the base of the tone curve that makes all measurements together likelier; None if they do not
+    # agree, because the curve is near neither
     base: ToneBase | None
+    # sums of the log-likelihoods by which frames prefer a base, each at most 30
     advantages: Mapping[ToneBase, float]
-    measurements: int
+    measurements: int  # those made over both bases, in the frames that decided
+    # measurements that by themselves prefer another base: how many take the base of all, and how
+    # many keep their own because they are much likelier over it
     overruled: int
     kept_own_base: int
-    grey: FloatArray
+    grey: FloatArray  # (n,): grey values, 0…1 of their range
+    # (3, n): light of these grey values, 1 = that of sRGB at full scale: percentiles 16, 50, 84 of
+    # the measurements; NaN where fewer than three have such grey values
     light: FloatArray
-    sharpening: FloatArray
-    noise: FloatArray
-    smoothing: CameraSmoothing
+    sharpening: FloatArray  # (3,): the same of the strength of the unsharp mask
+    noise: FloatArray  # (m, 2): grey value and standard deviation of ink and plate of every one
+    smoothing: CameraSmoothing  # along contours
 
 
 def clearly_agreed_base(results: Iterable[FrameResult]) -> ToneBase | None:

@@ -27,25 +27,14 @@ _FEWEST_SUB_PIXELS, _MOST_SUB_PIXELS = 4, 10  # per pixel and axis
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDisc:
-    """A disc, or a ring, in the frame of its field.
+    """A disc, or a ring, in the frame of its field."""
 
-    Attributes
-    ----------
-    position_m : (3,) tuple of float
-        Of its centre [m].
-    diameter_m, inner_diameter_m : float
-        Of the disc, and of a hole in it; 0: none [m].
-    normal : (3,) tuple of float
-        Unit vector square to it; the field's own z axis by default, which points into the board.
-    code : DiscCode or None
-        Sectors of ink around it.
-    """
-
-    position_m: tuple[float, float, float]
+    position_m: tuple[float, float, float]  # of its centre [m]
     diameter_m: float
-    inner_diameter_m: float = 0.0
+    inner_diameter_m: float = 0.0  # of a hole in it; 0: none
+    # unit vector square to it; the field's own z axis by default, which points into the board
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    code: DiscCode | None = None
+    code: DiscCode | None = None  # sectors of ink around it
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,29 +56,17 @@ class DiscCode:
 
 @dataclass(frozen=True, slots=True)
 class FieldScene:
-    """A field under its light.
-
-    Attributes
-    ----------
-    discs : tuple of SimulatedDisc
-    ground, ink : float
-        Radiance of the board and of the discs on it at the frame's middle, 0…1; discs may be
-        brighter than the ground.
-    gradient : (2,) tuple of float
-        Relative change of the light along x and y of the image [1/px].
-    board_m : (4,) tuple of float or None
-        Edges of the board in the field's plane z = 0: x and y of one corner and of the opposite
-        one [m]; None: the ground is everywhere.
-    surround : float
-        Radiance beyond the board.
-    """
+    """A field under its light."""
 
     discs: tuple[SimulatedDisc, ...]
+    # radiance of the board and of the discs on it at the frame's middle, 0…1; discs may be brighter
     ground: float = 0.8
     ink: float = 0.06
-    gradient: tuple[float, float] = (0.0, 0.0)
+    gradient: tuple[float, float] = (0.0, 0.0)  # change of light along x and y, relative [1/px]
+    # edges of the board in the field's plane z = 0: x and y of one corner and of the opposite one
+    # [m]; None: the ground is everywhere
     board_m: tuple[float, float, float, float] | None = None
-    surround: float = 0.3
+    surround: float = 0.3  # radiance beyond the board
 
     def light(self, camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Return the light at columns x (m,) and rows y (n,), relative to the frame's middle."""

@@ -30,37 +30,19 @@ _OPTICS, _SENSOR = Optics(0.7), Sensor()
 
 @dataclass(frozen=True, slots=True)
 class FieldSession:
-    """What is photographed, with what, and how often.
+    """What is photographed, with what, and how often."""
 
-    Attributes
-    ----------
-    camera : Camera
-        The truth that a calibration is to find.
-    field : Field or PointField
-        What is meant to be. The discs are off by `point_sds_m`, at random.
-    photographs : int
-    optics : Optics
-    sensor : Sensor
-    gain : float
-        Exposure relative to the one at which radiance 1 fills the well.
-    fall : float
-        By how much the light falls off across half the frame's width, in random directions.
-    has_edges : bool
-        Whether the board ends; the ground is everywhere if not, which is rendered sooner, and
-        around fields of points, which have no board.
-    phone : Phone or None
-        What makes a photograph of the light; None: the sensor alone.
-    """
-
-    camera: Camera
-    field: AnyField
+    camera: Camera  # the truth that a calibration is to find
+    field: AnyField  # what is meant to be: the discs are off by `point_sds_m`, at random
     photographs: int = 14
     optics: Optics = _OPTICS
     sensor: Sensor = _SENSOR
-    gain: float = 1.0
-    fall: float = 0.15
+    gain: float = 1.0  # exposure relative to the one at which radiance 1 fills the well
+    fall: float = 0.15  # of the light across half the frame's width, in random directions
+    # whether the board ends; the ground is everywhere if not, which is rendered sooner, and around
+    # fields of points, which have no board
     has_edges: bool = True
-    phone: Phone | None = None
+    phone: Phone | None = None  # makes a photograph of the light; None: the sensor alone
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,17 +44,10 @@ class PrintedPlate:
 
 @dataclass(frozen=True, slots=True)
 class PlainPlate:
-    """A plain target with its border, both of one radiance each.
+    """A plain target with its border, both of one radiance each."""
 
-    Attributes
-    ----------
-    target : PlainTarget
-        Without a `border_m`, it lies on the ground as it is.
-    bright, dark : float
-        Radiances under the frame's light, 0…1.
-    """
-
-    target: PlainTarget
+    target: PlainTarget  # without a `border_m`, it lies on the ground as it is
+    # radiances under the frame's light, 0…1
     bright: float = 0.85
     dark: float = 0.06
 

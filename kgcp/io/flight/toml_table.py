@@ -36,18 +36,13 @@ _CONTROLS = ("Cc", "Zl", "Zp")  # Unicode's: control characters, ends of lines a
 class TomlTable:
     """One table of a file, of which all keys are known.
 
-    Attributes
-    ----------
-    where : str
-        The file and the table, for messages: `flight.toml: [camera]`.
-
     Raises
     ------
     KgcpError
         On making one, for a key that is not known; it names the nearest known key.
     """
 
-    where: str
+    where: str  # the file and the table, for messages: `flight.toml: [camera]`
     values: Mapping[str, object]
     known: Sequence[str]
 

@@ -25,18 +25,10 @@ _KNOWN = ("s3", "gs", "gcs")
 
 @dataclass(frozen=True, slots=True)
 class StoredFolder:
-    """A folder of an object store.
+    """A folder of an object store."""
 
-    Attributes
-    ----------
-    url : str
-        As the user gave it: `s3://bucket/flights/7?region=eu-central-1`.
-    below : str
-        Path below that, with `/`; empty: the folder itself.
-    """
-
-    url: str
-    below: str = ""
+    url: str  # as the user gave it: `s3://bucket/flights/7?region=eu-central-1`
+    below: str = ""  # path below that, with `/`; empty: the folder itself
 
     def __truediv__(self, name: str) -> StoredFolder:
         """Return what has this name in the folder."""

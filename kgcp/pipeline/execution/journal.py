@@ -129,13 +129,6 @@ class Journal(Generic[Result]):
     is_new : bool
         Whether to discard what is there.
 
-    Attributes
-    ----------
-    changes : tuple of str
-        Inputs that have changed since the journal was written, which was emptied therefore.
-    seconds : float
-        Spent here, for the run's record.
-
     Raises
     ------
     KgcpError
@@ -154,7 +147,8 @@ class Journal(Generic[Result]):
         self._path = path
         self._kinds = kinds
         self._due_s = time.monotonic() + _SHORTEST_S
-        self.seconds = 0.0
+        self.seconds = 0.0  # spent here, for the run's record
+        # inputs that have changed since the journal was written, which was emptied therefore
         self.changes: tuple[str, ...] = ()
         self._is_left = False
         self._writer = _locked(path)
