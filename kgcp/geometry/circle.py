@@ -183,10 +183,8 @@ def pose_on_plane(plane: CirclePlane, radius_m: float, towards_x: FloatArray) ->
 
     Parameters
     ----------
-    plane : CirclePlane
-        Where its circle lies.
     radius_m : float
-        Radius of that circle [m].
+        Radius of the circle in the plane [m].
     towards_x : (2,) array
         Normalised image point on the target's positive x axis.
     """

@@ -119,8 +119,6 @@ def build_gcps(
     ----------
     sightings : sequence of Sighting
         In the frames' order.
-    target_positions : TargetPositions
-        Of the flight's targets.
     camera : Camera
         For the rolling shutter.
 

@@ -94,8 +94,6 @@ def make_gcps(
     ----------
     detections : Path, optional
         What `detect_flight` wrote; by default in the flight's results folder.
-    selection : Selection
-        Which points are wanted.
     crs : str, optional
         Of the points, for pyproj; by default the flight's.
 
@@ -185,8 +183,6 @@ def export_gcps(
 
     Parameters
     ----------
-    gcp_set : GcpSet
-        By `make_gcps`.
     formats : sequence of str
         Names as in `kgcp export-gcp --list-formats`.
     folder : Path, optional

@@ -31,12 +31,8 @@ def measure_frame(
     grey : (height, width) array of uint8 or uint16
         The raw frame: not undistorted, not rotated, of the camera's size. Pixel (0, 0) is the
         centre of the top-left pixel.
-    camera : Camera
-        Its interior orientation.
     targets : sequence of Target
         All that may be seen.
-    settings : DetectSettings
-        Of search and measurement.
 
     Returns
     -------

@@ -156,8 +156,6 @@ def write_simulated_flight(
         The folder to be; it must not exist, or be empty.
     jobs : int
         Worker processes; 1 works in this one. The files do not depend on it.
-    on_frame : callable
-        Called after each frame.
 
     Raises
     ------

@@ -147,8 +147,6 @@ def study_bias(
     ----------
     attempts : sequence of Attempt
         One per frame and target; targets never measured are left out.
-    method : Method
-        Of the measurement.
 
     Raises
     ------

@@ -17,6 +17,7 @@ from kgcp.geometry.circle_image import Circles3D, circle_images, eccentricity
 
 _ANGLES_DEG = np.arange(0.0, 76.0, 2.5)
 _MARGIN = 0.04  # of the frame's width, that discs stay inside it
+_COLUMNS = 13  # of places over the frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +87,7 @@ def eccentricity_over_angle(camera: Camera, radius_px: float) -> tuple[FloatArra
     return _ANGLES_DEG, np.linalg.norm(split.perspective_px, axis=1)
 
 
-def displacement_over_frame(
-    camera: Camera, radius_px: float, columns: int = 13
-) -> tuple[FloatArray, FloatArray]:
+def displacement_over_frame(camera: Camera, radius_px: float) -> tuple[FloatArray, FloatArray]:
     """Return places (n, 2) and by how much distortion moves discs' centroids there (n, 2) [px].
 
     Discs are square to the optical axis; places that distortion cannot reach are left out.
@@ -97,12 +96,10 @@ def displacement_over_frame(
     ----------
     radius_px : float
         Of their images in the middle of the frame.
-    columns : int
-        Of places.
     """
-    rows = max(2, round(columns * camera.height / camera.width))
+    rows = max(2, round(_COLUMNS * camera.height / camera.width))
     margin = _MARGIN * camera.width
-    x = np.linspace(margin, camera.width - 1.0 - margin, columns)
+    x = np.linspace(margin, camera.width - 1.0 - margin, _COLUMNS)
     y = np.linspace(margin, camera.height - 1.0 - margin, rows)
     normalised = camera.undistort(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     normalised = normalised[np.isfinite(normalised).all(axis=1)]

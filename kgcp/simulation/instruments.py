@@ -68,8 +68,6 @@ def adjust_reference(
 
     Parameters
     ----------
-    frames : tuple of str
-        Names of the frames.
     cameras : tuple of CameraState
         Their true exterior orientations.
     """

@@ -106,11 +106,6 @@ def read_frame_header(path: Path, frame: str) -> FrameHeader:
     """Read what the header of a frame says, without decoding its pixels.
 
     Whatever is damaged or absent is None; nothing is raised.
-
-    Parameters
-    ----------
-    frame : str
-        Its name in the flight.
     """
     if not is_file(path):
         return FrameHeader(frame)

@@ -48,8 +48,6 @@ def require_current(path: Path, table: pd.DataFrame, flight: Flight) -> None:
     ----------
     path : Path
         The table's file, whose metadata say what it was made from.
-    table : DataFrame
-        Its rows.
 
     Raises
     ------

@@ -254,12 +254,8 @@ class SupervisedProcessPool(ThreadPoolExecutor):
 
     Parameters
     ----------
-    jobs : int
-        Processes.
     limit_s : float
         Time for one call [s].
-    preparation : Preparation, optional
-        Of each process.
     """
 
     def __init__(self, jobs: int, limit_s: float, preparation: Preparation | None = None) -> None:
