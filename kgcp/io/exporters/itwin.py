@@ -76,7 +76,9 @@ def files(points: MapPoints) -> Mapping[str, str]:
 def _block(points: MapPoints) -> str:
     root = ET.Element("BlocksExchange", version="2.1")
     system = ET.SubElement(ET.SubElement(root, "SpatialReferenceSystems"), "SRS")
-    for tag, text in (("Id", "0"), ("Name", points.crs), ("Definition", _definition(points))):
+    is_code = _CODE.fullmatch(points.crs)  # else well-known text 1
+    definition = points.crs if is_code else well_known_text(points, _FOLDER, "iTwin Capture")
+    for tag, text in (("Id", "0"), ("Name", points.crs), ("Definition", definition)):
         add_text(system, tag, text)
     block = ET.SubElement(root, "Block")
     add_text(block, "Name", "kgcp")
@@ -137,10 +139,3 @@ def _add_control_point(
 def _add_xy(parent: ET.Element, x: str, y: str) -> None:
     add_text(parent, "x", x)
     add_text(parent, "y", y)
-
-
-def _definition(points: MapPoints) -> str:
-    """Return the code, or well-known text 1."""
-    if _CODE.fullmatch(points.crs):
-        return points.crs
-    return well_known_text(points, _FOLDER, "iTwin Capture")

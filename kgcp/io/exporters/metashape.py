@@ -13,7 +13,6 @@ from pathlib import PurePosixPath
 from xml.etree import ElementTree as ET
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior, opk_covs, opk_deg
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.points import (
@@ -176,7 +175,9 @@ def _scale_bars(gcps: Iterable[Gcp], names: Mapping[str, str], label: Mapping[st
 def _markers_xml(points: MapPoints, names: Mapping[str, str], label: Mapping[str, str]) -> str:
     document = ET.Element("document", version="1.2.0")
     chunk = ET.SubElement(document, "chunk")
-    _add_sensor(ET.SubElement(chunk, "sensors"), points.camera)
+    sensor = ET.SubElement(ET.SubElement(chunk, "sensors"), "sensor", id="0", type="frame")
+    width, height = str(points.camera.width), str(points.camera.height)
+    ET.SubElement(sensor, "resolution", width=width, height=height)
     cameras = ET.SubElement(chunk, "cameras")
     camera_ids = {frame: str(number) for number, frame in enumerate(by_frame(points.gcps))}
     for frame, camera_id in camera_ids.items():
@@ -195,8 +196,3 @@ def _markers_xml(points: MapPoints, names: Mapping[str, str], label: Mapping[str
             camera_id = camera_ids[point.frame]
             ET.SubElement(rays, "location", camera_id=camera_id, pinned="true", x=x, y=y)
     return xml_text(document)
-
-
-def _add_sensor(sensors: ET.Element, camera: Camera) -> None:
-    sensor = ET.SubElement(sensors, "sensor", id="0", type="frame")
-    ET.SubElement(sensor, "resolution", width=str(camera.width), height=str(camera.height))

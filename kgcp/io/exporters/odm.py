@@ -89,13 +89,10 @@ def _gcp_list(points: MapPoints) -> str:
     for point in points.controls:
         xyz = points.xyz(point.position_map, height_factor=height_factor)
         while owners.setdefault(xyz, point.id) != point.id:
-            xyz = (xyz[0], xyz[1], _next_above(xyz[2]))  # ODM would merge the two points
+            above = float(xyz[2]) + 10.0**-METRE_DECIMALS  # ODM would merge the two points
+            xyz = (xyz[0], xyz[1], decimals(above, METRE_DECIMALS))
         lines.append(" ".join((*xyz, *pixel(point), names[point.frame], label[point.id])))
     return "\n".join(lines) + "\n"
-
-
-def _next_above(text: str) -> str:
-    return f"{float(text) + 10.0**-METRE_DECIMALS:.{METRE_DECIMALS}f}"
 
 
 def _geo(points: MapPoints) -> str:
