@@ -317,12 +317,15 @@ def _print_json(
 ) -> None:
     import json
 
+    from kgcp.quality.advice import advice
+
     written, left_out, older = files
+    found = [part.consistency for part in parts if part.consistency is not None]
     summary = {
         "kgcps": len(whole.gcps),
         "checkpoints": sum(point.is_checkpoint for point in whole.gcps),
         "skipped": dict(_reasons(whole)),
-        "advice": [line for part in parts for line in _advice(part.consistency)],
+        "advice": [line for consistency in found for line in advice(consistency)],
         "doubts": [doubt_json(doubt) for part in parts for doubt in part.doubts],
         "files": [*map(named, written)],
         "left_out": left_out,
@@ -385,9 +388,3 @@ def _report_consistency(found: Consistency) -> None:
         f" {along:.3f} m along, {across:.3f} m across, {up:.3f} m up (RMS), {outliers} outliers",
         err=True,
     )
-
-
-def _advice(found: Consistency | None) -> tuple[str, ...]:
-    from kgcp.quality.advice import advice
-
-    return () if found is None else advice(found)

@@ -153,7 +153,14 @@ def detect_flight(
     with Journal(path, _dependencies(job), (FrameResult,), is_new=is_new) as journal:
         with (
             _kept_frames(out, settings, options) as kept,
-            _open_pool(options, job.frames_folder) as pool,
+            open_pool(
+                options.jobs,
+                options.frame_timeout_s,
+                options.scheduler,
+                job.frames_folder,
+                _STAGE_CALLERS if options.is_profiled else (),
+                compilation(),
+            ) as pool,
         ):
             job = replace(job, kept_frames=kept)
             run = DetectionRun(job, task.inputs, journal, pool, listener or NoProgress())
@@ -230,19 +237,6 @@ def _job_of(task: _DetectionTask) -> DetectionJob:
         task.settings,
         keeps_dropped=options.overlay is not None and options.all_candidates,
         plain_targets=flight.plain_targets,
-    )
-
-
-def _open_pool(
-    options: RunOptions, frames_folder: Path | StoredFolder
-) -> AbstractContextManager[WorkerPool]:
-    return open_pool(
-        options.jobs,
-        options.frame_timeout_s,
-        options.scheduler,
-        frames_folder,
-        _STAGE_CALLERS if options.is_profiled else (),
-        compilation(),
     )
 
 

@@ -246,12 +246,10 @@ class DetectionRun:
                 named = {name: one for name, one in by_target.items() if one.is_visible(camera)}
                 if named:
                     visible[row] = named
-        keys = {
-            row: _key_of_second_look(
-                self._keys[row], visible.get(row, {}), plain.get(row, {}), self._job.tone_base
-            )
-            for row in sorted({*visible, *plain})
-        }
+        keys = {}
+        for row in sorted({*visible, *plain}):
+            predicted = visible.get(row, {}), plain.get(row, {})
+            keys[row] = f"again-{fingerprint(self._keys[row], *predicted, self._job.tone_base)}"
         todo = []
         for row, key in keys.items():
             kept = self._journal.get(key)
@@ -414,15 +412,6 @@ class DetectionRun:
 def _bits_reversed(number: int) -> int:
     """Return a number's 32 bits in reverse order: multiples of large powers of 2 come first."""
     return int(f"{number:032b}"[::-1], 2)
-
-
-def _key_of_second_look(
-    first: str,
-    predictions: Mapping[str, Prediction],
-    plain: Mapping[str, PlainPrediction],
-    tone_base: ToneBase | None,
-) -> str:
-    return f"again-{fingerprint(first, predictions, plain, tone_base)}"
 
 
 def _name_of(key: str) -> str:

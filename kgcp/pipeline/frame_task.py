@@ -113,7 +113,11 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             exif = read_exif(path)
             grey = read_grey(path, job.camera)
         examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
-        plain = _look_for_plain(grey, job, frame_input, examination.outcomes)
+        measured = [each for each in examination.outcomes if isinstance(each, Measurement)]
+        plain = [
+            look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
+            for target in job.plain_targets
+        ]
         outcomes = tuple(completed(job, outcome) for outcome in (*examination.outcomes, *plain))
         if job.kept_frames is not None and any(isinstance(outcome, Miss) for outcome in outcomes):
             job.kept_frames.keep(frame_input.frame, grey)
@@ -142,16 +146,6 @@ def _frame_time(
         path = job.frames_folder / frame_input.frame
         time_s = _mid_exposure_s(time_s, exif.exposure, reference, path) if is_readable else None
     return time_s, TimeSource.NONE if time_s is None else time_source
-
-
-def _look_for_plain(
-    grey: GreyArray, job: DetectionJob, frame_input: FrameInput, outcomes: Sequence[Outcome]
-) -> tuple[Outcome, ...]:
-    measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
-    return tuple(
-        look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
-        for target in job.plain_targets
-    )
 
 
 @single_threaded()

@@ -26,7 +26,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.formats.marks import HandMark
 from kgcp.measurement.guided import Prediction
-from kgcp.measurement.records import FrameResult, Measurement, Miss, Outcome, is_unreadable
+from kgcp.measurement.records import FrameResult, Measurement, Miss, is_unreadable
 from kgcp.network.ground.frame_poses import orient_frames, print_scale_sd
 from kgcp.targets.plain import AnyTarget
 
@@ -153,7 +153,8 @@ def plain_by_results(
     sightings: list[Sighting] = []
     for row, result in enumerate(results):
         tracks.add(row, result)
-        names = {outcome.target for outcome in result.outcomes if _lacks_prediction(outcome)}
+        misses = [outcome for outcome in result.outcomes if isinstance(outcome, Miss)]
+        names = {miss.target for miss in misses if miss.reason is Reason.NO_PREDICTION}
         names = {name for name in names if (row, name) not in tried}
         if names:
             rows[result.frame], lacking[row] = row, names
@@ -206,10 +207,6 @@ def _by_own_targets(
                 flight.plain_targets, orientation, positions, flight.camera
             )
     return made
-
-
-def _lacks_prediction(outcome: Outcome) -> bool:
-    return isinstance(outcome, Miss) and outcome.reason is Reason.NO_PREDICTION
 
 
 def with_predictions(

@@ -59,7 +59,11 @@ def merge_gcps(parts: Sequence[GcpSet]) -> MergedGcps:
     """
     _check_names(parts)
     _check_crs(parts)
-    gcps = tuple(point for part in parts for point in _renamed(part))
+    gcps = tuple(
+        replace(point, frame=_frame(part, point.frame))
+        for part in parts
+        for point in with_flight_name(part.gcps, part.flight.name)
+    )
     _check_static(gcps)
     return MergedGcps(
         tuple(parts),
@@ -74,11 +78,6 @@ def merge_gcps(parts: Sequence[GcpSet]) -> MergedGcps:
             for prior in part.camera_priors
         ),
     )
-
-
-def _renamed(part: GcpSet) -> tuple[Gcp, ...]:
-    named = with_flight_name(part.gcps, part.flight.name)
-    return tuple(replace(point, frame=_frame(part, point.frame)) for point in named)
 
 
 def _frame(part: GcpSet, frame: str) -> str:

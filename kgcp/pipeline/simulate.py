@@ -39,7 +39,6 @@ from kgcp.simulation.flight import (
     grow_ground,
     render_frame,
 )
-from kgcp.simulation.ground import Ground
 
 Result = TypeVar("Result")
 
@@ -265,10 +264,7 @@ def _write_frame(plan: FlightPlan, folder: Path, index: int) -> None:
     (folder / frame_name(plan.settings, index)).write_bytes(encoded)
 
 
-@functools.lru_cache(maxsize=1)
-def _ground(seed: int) -> Ground:
-    """Return the ground of a flight, which is large: once per process."""
-    return grow_ground(seed)
+_ground = functools.lru_cache(maxsize=1)(grow_ground)  # of a flight: large, once per process
 
 
 def write_texts(plan: FlightPlan, folder: Path) -> None:

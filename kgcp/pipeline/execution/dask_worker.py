@@ -69,9 +69,7 @@ def _require_same_versions(context: JobContext) -> None:
         )
 
 
-@cache
-def _own_versions() -> Mapping[str, str]:
-    return versions()
+_own_versions = cache(versions)
 
 
 def _address() -> str:
