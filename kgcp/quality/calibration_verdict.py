@@ -229,7 +229,8 @@ def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> li
         reasons.append(f"the focal length is known to {100.0 * share:.1f} % only")
     if {"cx", "cy"} & set(calibration.undetermined):
         reasons.append("the principal point is not determined")
-    if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > _far_off(numbers):
+    far_off_px = 10.0 * _OPERATOR_RATIO * numbers.operator_sd_px
+    if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > far_off_px:
         reasons.append("the lens looks like a fisheye, which kgcp's camera is not")
     return reasons
 
@@ -238,10 +239,6 @@ def _more_photographs(numbers: CalibrationNumbers) -> str:
     if numbers.places == numbers.views:
         return "Take 12 photographs or more."
     return f"Take photographs from 12 places or more: a burst counts once ({numbers.photographs})."
-
-
-def _far_off(numbers: CalibrationNumbers) -> float:
-    return 10.0 * _OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
@@ -262,7 +259,8 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list
         doubts.append(f"all photographs look from within {numbers.normals_deg:.0f}°")
     off = calibration.radius_scale - 1.0
     if _has_other_discs(calibration):
-        doubts.append(f"discs are {100.0 * abs(off):.0f} % {_larger(off)} than stated")
+        other = "larger" if off > 0.0 else "smaller"
+        doubts.append(f"discs are {100.0 * abs(off):.0f} % {other} than stated")
     if others := _of_other_discs(calibration):
         named = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if others[3:] else "")
         doubts.append(
@@ -300,10 +298,6 @@ def _of_other_discs(calibration: CameraCalibration) -> list[str]:
     scales = calibration.radius_scales
     off = np.abs(scales / np.nanmedian(scales) - 1.0)
     return [calibration.views[k].photo for k in np.flatnonzero(off > _OTHER_FIELD_SHARE).tolist()]
-
-
-def _larger(off: float) -> str:
-    return "larger" if off > 0.0 else "smaller"
 
 
 def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tuple[str, ...]:

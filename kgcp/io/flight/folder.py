@@ -136,15 +136,11 @@ def _kinds_of(path: Path) -> _Kinds:
     if path.suffix.lower() not in _DATA_SUFFIXES:
         return ()
     file = ForeignFile(path, "")
+    recognisers = (_kinds_of_log, _kinds_of_table, _kinds_of_adjustment)
     try:
-        return _kinds_by_content(file)
+        return next((kinds for recognise in recognisers if (kinds := recognise(file))), ())
     except (KgcpError, RecursionError):  # unreadable, or damaged: who needs it will say so
         return ()
-
-
-def _kinds_by_content(file: ForeignFile) -> _Kinds:
-    recognisers = (_kinds_of_log, _kinds_of_table, _kinds_of_adjustment)
-    return next((kinds for recognise in recognisers if (kinds := recognise(file))), ())
 
 
 def _kinds_of_log(file: ForeignFile) -> _Kinds:

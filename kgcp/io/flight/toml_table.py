@@ -81,7 +81,9 @@ class TomlTable:
     def name(self, key: str) -> str:
         """Return a name: one line that can be shown in any table or page."""
         value = self.text(key)
-        if len(value) > _LONGEST_NAME or any(map(_is_control, value)):
+        if len(value) > _LONGEST_NAME or any(
+            unicodedata.category(character) in _CONTROLS for character in value
+        ):
             problem = f"{value[:20]!r} is not a name"
             remedy = (
                 f"give at most {_LONGEST_NAME} characters on one line, without control characters"
@@ -226,7 +228,3 @@ class TomlTable:
     def _wrong_type(self, key: str, value: object, wanted: str) -> KgcpError:
         kind = _TYPE_NAMES.get(type(value), "a date or time")
         return self.error(key, f"is {kind}", f"give {wanted}")
-
-
-def _is_control(character: str) -> bool:
-    return unicodedata.category(character) in _CONTROLS

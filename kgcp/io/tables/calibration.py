@@ -71,10 +71,6 @@ class PhotoRow:
     tilt_deg: float | None
 
 
-def _angle_deg(vector: FloatArray) -> float:
-    return math.degrees(ellipse_of_moments(vector).angle_rad)
-
-
 OBSERVATION_COLUMNS: tuple[Column[ObservedDisc], ...] = (
     Column("photo", TEXT, lambda disc: disc.photo),
     Column("point", TEXT, lambda disc: disc.point),
@@ -84,7 +80,9 @@ OBSERVATION_COLUMNS: tuple[Column[ObservedDisc], ...] = (
     Column("cov", NUMBERS, lambda disc: matrix_cell(disc.cov)),
     Column("a_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).a),
     Column("b_px", NUMBER, lambda disc: ellipse_of_moments(disc.vector).b),
-    Column("angle_deg", NUMBER, lambda disc: _angle_deg(disc.vector)),
+    Column(
+        "angle_deg", NUMBER, lambda disc: math.degrees(ellipse_of_moments(disc.vector).angle_rad)
+    ),
     Column("status", TEXT, lambda disc: "used" if disc.is_used else "rejected"),
     *Column[ObservedDisc].of_vector(("residual_x_px", "residual_y_px"), lambda disc: disc.residual),
     Column("redundancy", NUMBER, lambda disc: disc.redundancy),

@@ -72,7 +72,7 @@ def detections_provenance(
     values = detection_inputs(flight)
     by_part: dict[str, dict[str, object]] = defaultdict(dict)
     for key, value in values.items():
-        by_part[_part_of(key)][key] = value
+        by_part["targets" if key.startswith(TARGET_TABLE) else "camera"][key] = value
     parts = {
         **by_part,
         "times": digested_times(flight, frame_sizes, times),
@@ -221,10 +221,6 @@ def digested_times(
         known = (frame, otherwise if time_s is None else round(1e6 * time_s))
         digested.append(known if rotation is None else (*known, astuple(rotation)))
     return digested
-
-
-def _part_of(key: str) -> str:
-    return "targets" if key.startswith(TARGET_TABLE) else "camera"
 
 
 def _program_and_flight(flight: Flight) -> dict[str, str]:

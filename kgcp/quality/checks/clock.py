@@ -84,9 +84,10 @@ def check_overlap(
         return
     for shift_s, words in clock_shifts_s():
         if np.mean((times + shift_s >= first) & (times + shift_s <= last)) > 1.0 - 0.02:
+            which = "later" if shift_s > 0.0 else "earlier"
             yield doubt(
                 Cause.CLOCK,
-                f"{sentence}: {words}; {_shifted(shift_s)} all would lie inside",
+                f"{sentence}: {words}; {_seconds(abs(shift_s))} {which} all would lie inside",
                 "give [vehicle] time_system, correct the times file, or set [vehicle]"
                 f" time_offset_s = {time_offset_s + shift_s:g}",
                 {**figures, "shift_s": shift_s},
@@ -181,10 +182,6 @@ def _whole_days(times: FloatArray, first: float, last: float) -> int | None:
         return None
     moved = times + days * _DAY_S
     return days if np.mean((moved >= first) & (moved <= last)) > 1.0 - 0.02 else None
-
-
-def _shifted(shift_s: float) -> str:
-    return f"{_seconds(abs(shift_s))} {'later' if shift_s > 0.0 else 'earlier'}"
 
 
 def time_span(times_s: FloatArray) -> str:

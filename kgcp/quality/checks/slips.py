@@ -48,8 +48,12 @@ def slips(encounters: Encounters) -> Iterator[Slip]:
     """Yield the slips that may have been made in a flight, the likelier first."""
     yield from _of_diameters()
     yield from _of_lever_arm(encounters)
-    yield from _of_headings()
-    yield from _of_clocks(encounters)
+    for words, remedy, convert in READINGS:
+        code = Cause.ANGLE_UNIT if "radians" in words or "gon" in words else Cause.HEADING
+        yield Slip(code, "attitude", f"headings seem to be {words}", remedy, _with_heading(convert))
+    for shift_s, words in clock_shifts_s():
+        if encounters.is_covered(encounters.time_s + shift_s):
+            yield clock_slip(shift_s, words)
     yield from _of_camera(encounters.camera)
     yield from _of_frame_order()
     yield from _of_reference()
@@ -108,12 +112,6 @@ def _arm_slip(words: str, arm: FloatArray) -> Slip:
     )
 
 
-def _of_headings() -> Iterator[Slip]:
-    for words, remedy, convert in READINGS:
-        code = Cause.ANGLE_UNIT if "radians" in words or "gon" in words else Cause.HEADING
-        yield Slip(code, "attitude", f"headings seem to be {words}", remedy, _with_heading(convert))
-
-
 def _with_heading(
     convert: Callable[[FloatArray], FloatArray],
 ) -> Callable[[Encounters], Encounters]:
@@ -123,12 +121,6 @@ def _with_heading(
         return replace(encounters, attitude_deg=attitude)
 
     return undone
-
-
-def _of_clocks(encounters: Encounters) -> Iterator[Slip]:
-    for shift_s, words in clock_shifts_s():
-        if encounters.is_covered(encounters.time_s + shift_s):
-            yield clock_slip(shift_s, words)
 
 
 def clock_slip(shift_s: float, words: str) -> Slip:

@@ -27,7 +27,10 @@ _TERMS = {
 def matches(file: ForeignFile) -> bool:
     """Whether the content is an object of cameras with a projection_type, or a reconstruction."""
     if isinstance(file.document, list):
-        return bool(file.document) and all(_has_cameras(item) for item in file.document)
+        return bool(file.document) and all(
+            isinstance(item, dict) and "cameras" in item and "shots" in item
+            for item in file.document
+        )
     if not isinstance(file.document, dict):
         return False
     values = list(file.document.values())
@@ -46,10 +49,6 @@ def entries(file: ForeignFile) -> tuple[Entry, ...]:
         Entry(name, _size(camera), partial(_camera, camera), is_relative=True)
         for name, camera in found.items()
     )
-
-
-def _has_cameras(item: object) -> bool:
-    return isinstance(item, dict) and "cameras" in item and "shots" in item
 
 
 def _size(camera: NamedValues) -> tuple[int, int] | None:
