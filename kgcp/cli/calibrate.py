@@ -103,7 +103,6 @@ FORMATS = ("opencv", "ros", "metashape", "colmap", "opensfm", "pix4d", "opf", "m
 @click.option(
     "--jobs",
     type=click.IntRange(0, 256),
-    default=None,
     help="Number of worker processes; 0 runs in this process.  [default: the usable cores]",
 )
 @restart_option

@@ -41,7 +41,6 @@ _DEFAULTS = DetectSettings()
 @click.option(
     "--jobs",
     type=click.IntRange(0, 256),
-    default=None,
     help="Number of worker processes; 0 runs in this process, not isolated from decoder crashes."
     "  [default: the usable cores, or all threads of the scheduler's workers]",
 )

@@ -68,7 +68,6 @@ def _list_formats(context: click.Context, _: click.Parameter, asked: bool) -> No
 @click.option(
     "--crs",
     metavar="CRS",
-    default=None,
     help="CRS of the points, for example EPSG:25832.  [default: the flight's]",
 )
 @click.option(

@@ -70,7 +70,6 @@ out_place_option = click.option(
     "--out",
     metavar="FOLDER",
     callback=_place,
-    default=None,
     help="Folder for the results, local or in an object store.  [default: FLIGHT/kgcp]",
 )
 
@@ -78,7 +77,6 @@ detections_option = click.option(
     "--detections",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    default=None,
     help="Table written by 'kgcp detect'.  [default: detections.parquet in the results' folder]",
 )
 

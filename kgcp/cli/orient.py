@@ -53,7 +53,6 @@ _FEW_FRAMES = 3  # that are named
     "device_file",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    default=None,
     help="Orient frames by an EO device that they show, relative to it; FILE, device.toml, has its"
     " points.",
 )

@@ -29,14 +29,12 @@ def _names(
     "--targets",
     metavar="NAMES",
     callback=_names,
-    default=None,
     help="Targets to place, separated by commas.  [default: all with position_m]",
 )
 @click.option(
     "--poses",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    default=None,
     help="Poses of the camera, in any format of [reference].  [default: that of flight.toml]",
 )
 @click.option(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,15 @@ from kgcp.cli.options import flight_argument
 if TYPE_CHECKING:
     from kgcp.simulation.outlook import Conditions, Outlook
     from kgcp.targets.plain import AnyTarget
+
+
+def _condition(
+    flag: str, name: str, unit: str, default: float, words: str
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return an option for one of the `Conditions`."""
+    return click.option(
+        flag, name, metavar=unit, type=float, default=default, show_default=True, help=words
+    )
 
 
 @click.command()
@@ -26,60 +35,26 @@ if TYPE_CHECKING:
     multiple=True,
     help="Height of the camera above the target [m]; may be repeated.  [default: usual heights]",
 )
-@click.option(
-    "--exposure",
-    "exposure_s",
-    metavar="S",
-    type=float,
-    default=0.001,
-    show_default=True,
-    help="Exposure time [s].",
-)
-@click.option(
+@_condition("--exposure", "exposure_s", "S", 0.001, "Exposure time [s].")
+@_condition(
     "--blur",
     "blur_px",
-    metavar="PX",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Largest acceptable motion of the image during the exposure [px].",
+    "PX",
+    1.0,
+    "Largest acceptable motion of the image during the exposure [px].",
 )
-@click.option(
-    "--psf",
-    "psf_px",
-    metavar="PX",
-    type=float,
-    default=0.7,
-    show_default=True,
-    help="Blur of lens and sensor: σ of the point spread function [px].",
+@_condition(
+    "--psf", "psf_px", "PX", 0.7, "Blur of lens and sensor: σ of the point spread function [px]."
 )
-@click.option(
+@_condition(
     "--accuracy",
     "accuracy_percent",
-    metavar="PERCENT",
-    type=float,
-    default=0.05,
-    show_default=True,
-    help="Required standard deviation of a single distance [% of the distance].",
+    "PERCENT",
+    0.05,
+    "Required standard deviation of a single distance [% of the distance].",
 )
-@click.option(
-    "--speed",
-    "speed_mps",
-    metavar="M/S",
-    type=float,
-    default=10.0,
-    show_default=True,
-    help="Speed of the camera over the target [m/s].",
-)
-@click.option(
-    "--interval",
-    "interval_s",
-    metavar="S",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Time between frames [s].",
-)
+@_condition("--speed", "speed_mps", "M/S", 10.0, "Speed of the camera over the target [m/s].")
+@_condition("--interval", "interval_s", "S", 1.0, "Time between frames [s].")
 @click.option(
     "--plot",
     metavar="FILE",

@@ -45,7 +45,6 @@ PRESET_NAMES = (
 @click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
-    default=None,
     help="Number of frames.  [default: the preset's; 14 photographs of a field]",
 )
 @click.option(
@@ -114,7 +113,6 @@ PRESET_NAMES = (
 @click.option(
     "--jobs",
     type=click.IntRange(1, 256),
-    default=None,
     help="Worker processes.  [default: the usable cores]",
 )
 @json_option

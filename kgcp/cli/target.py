@@ -108,7 +108,6 @@ PAPERS = ("fit", "A4", "A3", "A2", "A1", "A0")
     "--out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    default=None,
     help="Folder for the files.  [default: FLIGHT/kgcp/targets, or targets without FLIGHT]",
 )
 @json_option
