@@ -27,7 +27,7 @@ from kgcp.pipeline.calibration.results import light_of
 from kgcp.pipeline.calibration.run import CalibrationOptions, calibrate_photos, find_photos
 from kgcp.pipeline.detect import NoProgress
 from kgcp.quality.calibration_verdict import calibration_numbers
-from kgcp.simulation.field_session import FieldSession, field_photographs, printed_points
+from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 from kgcp.targets.fields.layout import Field, FieldPolarity, GridKind, Mark
 
@@ -187,7 +187,8 @@ def write_photographs(case: Case, folder: Path, seed: int) -> None:
     """Render a session into a folder."""
     rng = np.random.default_rng([18, seed])
     printed = printed_points(case.session, rng)
-    for number, taken in enumerate(field_photographs(case.session, printed, rng)):
+    for number in range(case.session.photographs):
+        taken = field_photograph(case.session, printed, number, rng)
         name = folder / f"photo{number:02}.{'jpg' if case.quality else 'png'}"
         flags = [cv2.IMWRITE_JPEG_QUALITY, case.quality] if case.quality else []
         cv2.imwrite(str(name), taken.grey, flags)

@@ -22,7 +22,7 @@ import numpy as np
 
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.field_file import read_field
-from kgcp.simulation.field_session import FieldSession, field_photographs, printed_points
+from kgcp.simulation.field_session import FieldSession, field_photograph, printed_points
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
 _FIELD = "asymmetric:8x25:20mm:14mm"  # 200 discs that show which way is up
@@ -37,7 +37,8 @@ def write_photographs(folder: Path, count: int) -> None:
     session = FieldSession(_CAMERA, field, count, Optics(0.8), sensor, 0.9, has_edges=False)
     rng = np.random.default_rng(12)
     points = printed_points(session, rng)
-    for number, taken in enumerate(field_photographs(session, points, rng)):
+    for number in range(session.photographs):
+        taken = field_photograph(session, points, number, rng)
         cv2.imwrite(str(folder / f"photo{number:02}.jpg"), taken.grey)
 
 

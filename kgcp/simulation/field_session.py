@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,14 +56,6 @@ def printed_points(session: FieldSession, rng: np.random.Generator) -> FloatArra
     """Return where the discs are on the board (m, 3), in the field's frame [m]."""
     meant = session.field.points_m()
     return np.asarray(meant + session.field.point_sds_m() * rng.standard_normal(meant.shape))
-
-
-def field_photographs(
-    session: FieldSession, points_m: FloatArray, rng: np.random.Generator
-) -> Iterator[FieldPhotograph]:
-    """Photograph a field whose discs are at `points_m` (m, 3) from all sides, one after another."""
-    for number in range(session.photographs):
-        yield field_photograph(session, points_m, number, rng)
 
 
 def field_photograph(

@@ -14,7 +14,7 @@ from kgcp.simulation.imaging import Optics
 from kgcp.simulation.light_field import PlateLight
 from kgcp.simulation.plane_raster import PixelWindow, PlaneRaster, outline_box
 from kgcp.simulation.regions import ConvexPolygon, DiscRegion, Region
-from kgcp.targets.layout import Ring, Target
+from kgcp.targets.layout import Target
 from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 _SUB_PIXELS_ACROSS = 1000  # of a window: memory and time are bounded, small targets get most
@@ -33,13 +33,10 @@ class PrintedPlate:
     def print_layers(self) -> Iterator[tuple[Region, float]]:
         """Yield what is printed on the plate, shapes and radiances, in painting order."""
         for ring in self.target.rings:
-            yield from self._ring_layers(ring)
-
-    def _ring_layers(self, ring: Ring) -> Iterator[tuple[Region, float]]:
-        yield DiscRegion((0.0, 0.0), 0.5 * ring.outer_diameter_m), self.black
-        yield DiscRegion((0.0, 0.0), 0.5 * ring.inner_diameter_m), self.white
-        for x, y in ring.dot_centres_m():
-            yield DiscRegion((float(x), float(y)), 0.5 * ring.dot_diameter_m), self.white
+            yield DiscRegion((0.0, 0.0), 0.5 * ring.outer_diameter_m), self.black
+            yield DiscRegion((0.0, 0.0), 0.5 * ring.inner_diameter_m), self.white
+            for x, y in ring.dot_centres_m():
+                yield DiscRegion((float(x), float(y)), 0.5 * ring.dot_diameter_m), self.white
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -50,11 +51,8 @@ class Annulus:
     centre_m: tuple[float, float]
     radius_m: float
     width_m: float
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Zero: the curvatures of the two edges have opposite signs and nearly cancel."""
-        return 0.0
+    # the curvatures of the two edges have opposite signs and nearly cancel
+    curvature_per_m: ClassVar[float] = 0.0
 
     def hull(self) -> FloatArray:
         """Return points (n, 2) whose convex hull holds the shape [m]."""
@@ -79,16 +77,12 @@ class ConvexPolygon:
     """A convex polygon: the intersection of half-planes."""
 
     vertices_m: tuple[tuple[float, float], ...]  # in the order from +x to +y [m]
+    curvature_per_m: ClassVar[float] = 0.0  # the edges are straight
 
     @property
     def reach_m(self) -> float:
         """Largest distance of a vertex from the plane's origin [m]."""
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Zero: the edges are straight."""
-        return 0.0
 
     def hull(self) -> FloatArray:
         """Return points (n, 2) all along the edges [m]: distortion bends long ones."""
@@ -127,11 +121,8 @@ class AnnularSector:
     outer_m: float
     start_rad: float
     end_rad: float
-
-    @property
-    def curvature_per_m(self) -> float:
-        """Zero: the curvatures of the arcs have opposite signs and nearly cancel."""
-        return 0.0
+    # the curvatures of the arcs have opposite signs and nearly cancel
+    curvature_per_m: ClassVar[float] = 0.0
 
     def hull(self) -> FloatArray:
         """Return points (n, 2) whose convex hull holds the shape [m]."""
