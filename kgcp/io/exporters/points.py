@@ -17,6 +17,7 @@ from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.geometry.camera import Camera
 from kgcp.georef.camera_priors import CameraPrior
+from kgcp.georef.crs import is_geographic
 from kgcp.georef.gcp import Gcp
 from kgcp.io.exporters.weights import MARK_FLOOR_PX
 
@@ -73,7 +74,7 @@ class MapPoints:
 
     def xyz(self, position_map: FloatArray, *, height_factor: float = 1.0) -> tuple[str, str, str]:
         """Return map coordinates as text, to 0.1 µm; z times `height_factor`."""
-        decimals = DEGREE_DECIMALS if _is_geographic(self.crs) else METRE_DECIMALS
+        decimals = DEGREE_DECIMALS if is_geographic(self.crs) else METRE_DECIMALS
         x, y, z = position_map
         return f"{x:.{decimals}f}", f"{y:.{decimals}f}", f"{z * height_factor:.{METRE_DECIMALS}f}"
 
@@ -95,11 +96,6 @@ def _parsed(crs: str) -> CRS:
     while parsed.is_bound and parsed.source_crs is not None:
         parsed = parsed.source_crs
     return parsed
-
-
-@lru_cache(maxsize=8)
-def _is_geographic(crs: str) -> bool:
-    return bool(_parsed(crs).is_geographic)
 
 
 @lru_cache(maxsize=8)

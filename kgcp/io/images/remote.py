@@ -223,20 +223,6 @@ def stamps_of(
         yield None if info is None else (info.size, info.mtime_ns or 0)
 
 
-def sizes_of(folder: Path | StoredFolder, names: Sequence[str]) -> dict[str, int | None]:
-    """Return the sizes of files by their names; None: missing.
-
-    Raises
-    ------
-    KgcpError
-        If a store cannot be read.
-    """
-    stamps = stamps_of(folder, names)
-    return {
-        name: None if stamp is None else stamp[0] for name, stamp in zip(names, stamps, strict=True)
-    }
-
-
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
         status = path.stat()

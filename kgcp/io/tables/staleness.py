@@ -18,7 +18,7 @@ from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.io.images.frames import is_chosen, list_frames
-from kgcp.io.images.remote import sizes_of
+from kgcp.io.images.remote import stamps_of
 from kgcp.io.tables.provenance import (
     TARGET_TABLE,
     detection_inputs,
@@ -220,6 +220,7 @@ def _changed_frames(
     if new:
         yield f"{len(new)} new frames ({new[0]}, …)" if len(new) > 1 else f"a new frame ({new[0]})"
     elif "frames" in digests and len(today) == len(known):
-        sizes = sizes_of(flight.frames_folder, today)
+        stamps = zip(today, stamps_of(flight.frames_folder, today), strict=True)
+        sizes = {frame: None if stamp is None else stamp[0] for frame, stamp in stamps}
         if digest(sizes) != digests["frames"]:
             yield "files of frames"
