@@ -21,9 +21,9 @@ from PIL.TiffImagePlugin import IFDRational
 
 from kgcp.errors import KgcpError
 from kgcp.geometry.arrays import FloatArray, GreyArray
-from kgcp.geometry.camera import Camera
 from kgcp.io.files.csv_text import csv_text
 from kgcp.io.files.time_text import format_time
+from kgcp.io.flight.camera_file import camera_lines
 from kgcp.io.flight.target_table import target_lines
 from kgcp.pipeline.execution.executor import open_pool
 from kgcp.pipeline.execution.resilient_map import TaskFailure
@@ -41,8 +41,6 @@ from kgcp.simulation.flight import (
 )
 
 Result = TypeVar("Result")
-
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 _PNG_COMPRESSION = 3  # noise does not compress: more effort costs time and saves nothing
 _EXPOSURE_AT_GAIN_1_S = Fraction(1, 1250)
@@ -65,33 +63,22 @@ _TRUTH_COLUMNS = (
 
 def flight_toml(plan: FlightPlan) -> str:
     """Return flight.toml by docs/flight_toml.md."""
+    readout_s = plan.settings.camera.readout_s
     lines = [
         f"name = {json.dumps(plan.settings.name)}",
         f"crs = {json.dumps(CRS)}  # x, y: easting, northing [m]; z: ellipsoidal height [m]",
         "\n[frames]",
         'folder = "frames"',
         'times = "frames.csv"',
-        *_camera_lines(plan.settings.camera),
+        "",
+        *camera_lines(plan.settings.camera),
+        *([f"readout_s = {readout_s!r}"] if readout_s else []),
         *target_lines(TARGET_PLATE.target),
         *_vehicle_lines(plan.vehicle),
         "\n[reference]",
         'poses = "reference.csv"',
     ]
     return "\n".join(lines) + "\n"
-
-
-def _camera_lines(camera: Camera) -> Iterator[str]:
-    yield "\n[camera]"
-    yield f"width = {camera.width}"
-    yield f"height = {camera.height}"
-    for key in ("fx", "fy", "cx", "cy"):
-        yield f"{key} = {getattr(camera, key)!r}"
-    for key in _DISTORTION:
-        if value := getattr(camera, key):
-            yield f"{key} = {value!r}"
-    yield f"response = {json.dumps(camera.response.value)}"
-    if camera.readout_s:
-        yield f"readout_s = {camera.readout_s!r}"
 
 
 def _vehicle_lines(vehicle: VehicleSettings) -> Iterator[str]:

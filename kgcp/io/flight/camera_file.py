@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, CalibrationCovariance
@@ -20,15 +22,8 @@ def camera_toml(camera: Camera, covariance: CalibrationCovariance | None) -> str
         '#     file = "camera.toml"',
         '#     format = "kgcp"',
         "",
-        "[camera]",
-        f"width = {camera.width}",
-        f"height = {camera.height}",
+        *camera_lines(camera),
     ]
-    for name in CALIBRATION_PARAMETERS:
-        value = float(getattr(camera, name))
-        if name in CALIBRATION_PARAMETERS[:4] or value != 0.0:
-            lines.append(f"{name} = {value!r}")
-    lines.append(f'response = "{camera.response.value}"')
     if covariance is None:
         return "\n".join(lines) + "\n"
     estimated = np.flatnonzero(covariance.cov.any(axis=1)).tolist()
@@ -38,3 +33,15 @@ def camera_toml(camera: Camera, covariance: CalibrationCovariance | None) -> str
         lines.append(f"    {', '.join(map(repr, row))},")
     lines.append("]")
     return "\n".join(lines) + "\n"
+
+
+def camera_lines(camera: Camera) -> Iterator[str]:
+    """Yield the table [camera]: size, parameters, those of distortion unless 0, and response."""
+    yield "[camera]"
+    yield f"width = {camera.width}"
+    yield f"height = {camera.height}"
+    for name in CALIBRATION_PARAMETERS:
+        value = float(getattr(camera, name))
+        if name in CALIBRATION_PARAMETERS[:4] or value != 0.0:
+            yield f"{name} = {value!r}"
+    yield f'response = "{camera.response.value}"'
