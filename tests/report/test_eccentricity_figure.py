@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kgcp.geometry.camera import Camera
-from kgcp.report.eccentricity_figure import draw_eccentricity
+from kgcp.report.calibration.figures import draw_eccentricity
 
 
 def test_figure_is_drawn_the_same_each_time() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -10,11 +12,14 @@ from kgcp.geometry.calibration import CALIBRATION_PARAMETERS, image_by_calibrati
 from kgcp.geometry.camera import Camera
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.quality.calibration_verdict import CalibrationNumbers
+from kgcp.quality.eccentricity import displacement_over_frame, eccentricity_over_angle
 from kgcp.quality.frame_rays import CameraDifference
-from kgcp.report.eccentricity_figure import draw_eccentricity
-from kgcp.report.style import BLUE, GREY, VERMILION, Picture, picture, sheet
+from kgcp.report.style import BLUE, GREEN, GREY, VERMILION, Picture, picture, sheet
 
 _ARROW_SHARE = 0.04  # of the frame's width, that a typical residual is drawn long
+_LONGEST_SHARE = 0.07  # of the frame's width, that the longest displacement is drawn long
+_NOTHING_PX = 1e-6
+_COLOURS = (BLUE, VERMILION, GREEN)
 _RADII = 60
 _SHAPE_IN = 5.0  # width of a frame or field in a figure
 _MM = 1e3
@@ -155,7 +160,48 @@ def _field(calibration: CameraCalibration) -> Picture:
         return picture(figure)
 
 
-def _arrows(axes: Axes, places: FloatArray, vectors: FloatArray, scale: float, colour: str) -> None:
+def draw_eccentricity(camera: Camera, radii_px: Sequence[float]) -> Picture:
+    """Draw eccentricity by perspective over the angle, and distortion in the marker over the frame.
+
+    Parameters
+    ----------
+    radii_px : sequence of float
+        Of discs' images, at most three; the last one for the frame.
+    """
+    with sheet(7.6) as figure:
+        above, below = figure.subplots(2, 1, height_ratios=(1.0, 1.3))
+        for radius_px, colour in zip(radii_px, _COLOURS, strict=False):
+            angles_deg, px = eccentricity_over_angle(camera, radius_px)
+            above.plot(angles_deg, px, color=colour, label=f"R = {radius_px:.0f} px")
+        above.set_xlabel("angle between normal and viewing ray [deg]")
+        above.set_ylabel("eccentricity [px]")
+        above.set_ylim(bottom=0.0)
+        above.legend()
+        _draw_displacement(below, camera, radii_px[-1])
+        return picture(figure)
+
+
+def _draw_displacement(axes: Axes, camera: Camera, radius_px: float) -> None:
+    places, shifts = displacement_over_frame(camera, radius_px)
+    largest = float(np.linalg.norm(shifts, axis=1).max())
+    scale = largest / (_LONGEST_SHARE * camera.width)
+    if largest > _NOTHING_PX:
+        _arrows(axes, places, shifts, scale, BLUE, width=0.004)
+    axes.plot(*places.T, ".", color=GREY, markersize=3.0)
+    _frame(axes, camera.width, camera.height)
+    axes.grid(visible=False)
+    axes.set_xlabel(f"distortion within discs of R = {radius_px:.0f} px: longest {largest:.3f} px")
+
+
+def _arrows(
+    axes: Axes,
+    places: FloatArray,
+    vectors: FloatArray,
+    scale: float,
+    colour: str,
+    *,
+    width: float = 0.002,
+) -> None:
     axes.quiver(
         *places.T,
         *vectors.T,
@@ -163,7 +209,7 @@ def _arrows(axes: Axes, places: FloatArray, vectors: FloatArray, scale: float, c
         angles="xy",
         scale_units="xy",
         scale=scale,
-        width=0.002,
+        width=width,
     )
 
 
