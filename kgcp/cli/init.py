@@ -99,18 +99,11 @@ def _quoted(flight: Path) -> str:
 
 def _print_json(draft: FlightDraft, written: list[Path]) -> None:
     import json
+    from dataclasses import asdict
 
     page = {
-        "found": [{"heading": each.heading, "text": each.text} for each in draft.findings],
-        "missing": [
-            {
-                "heading": each.heading,
-                "text": each.text,
-                "remedy": each.remedy,
-                "is_assumed": each.is_assumed,
-            }
-            for each in draft.gaps
-        ],
+        "found": [asdict(finding) for finding in draft.findings],
+        "missing": [asdict(gap) for gap in draft.gaps],
         "files": [str(path) for path in written],
     }
     click.echo(json.dumps(page))
