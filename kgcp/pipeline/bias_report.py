@@ -37,8 +37,7 @@ from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.advice import advice
 from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
-from kgcp.quality.checks.measured import measured_doubts
-from kgcp.quality.consistency import Consistency, study_consistency
+from kgcp.quality.consistency import Consistency
 from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.report.bias.camera_figure import learnt_camera, learnt_sentence
 from kgcp.report.bias.figures import (
@@ -239,17 +238,7 @@ def bias_study(flight: Flight, detections: Path | str | None = None) -> FlightBi
             settings.method,
         )
     sightings = [attempt.sighting for attempt in attempts if attempt.sighting is not None]
-    poses, positions = data.reference_poses, data.target_positions
-    consistency = study_consistency(sightings, positions, poses, flight.camera)
-    doubts = measured_doubts(
-        inputs.plausibility,
-        sightings,
-        positions,
-        poses,
-        flight.camera,
-        inputs.headers,
-        consistency,
-    )
+    consistency, doubts = inputs.compared(sightings)
     provenance = derived_provenance(flight, table, {}, has_reference=True)
     return FlightBias(
         flight=flight,

@@ -31,8 +31,7 @@ from kgcp.pipeline.execution.threads import single_threaded
 from kgcp.pipeline.flight_inputs import FlightInputs, naming_causes
 from kgcp.pipeline.workspace import DETECTIONS, results_folder
 from kgcp.quality.checks.doubt import Doubt
-from kgcp.quality.checks.measured import measured_doubts
-from kgcp.quality.consistency import Consistency, study_consistency
+from kgcp.quality.consistency import Consistency
 
 _DEFAULT_SELECTION = Selection()
 
@@ -114,19 +113,7 @@ def make_gcps(
     gcps, unwanted = select(placed, sightings, local_frame, flight.camera, selection)
     if placed and not gcps:
         raise KgcpError(explain_none_left(placed, unwanted, selection))
-    poses = data.reference_poses if data.has_reference else None
-    consistency = None
-    if poses is not None:
-        consistency = study_consistency(sightings, target_positions, poses, flight.camera)
-    doubts = measured_doubts(
-        inputs.plausibility,
-        sightings,
-        target_positions,
-        poses,
-        flight.camera,
-        inputs.headers,
-        consistency,
-    )
+    consistency, doubts = inputs.compared(sightings)
     if crs is not None and gcps:
         transform = CrsTransform.to(crs, local_frame, np.asarray(gcps[0].position_map))
         gcps, local_frame = transform_gcps(gcps, transform), transform.target

@@ -16,7 +16,7 @@ from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.georef.crs import longitude_latitude
 from kgcp.georef.prediction import reference_states
-from kgcp.georef.sighting import Attempt
+from kgcp.georef.sighting import Attempt, Sighting
 from kgcp.georef.target_positions import TargetPositions
 from kgcp.georef.trajectory import Trajectory
 from kgcp.io.flight.data import FlightData
@@ -30,9 +30,11 @@ from kgcp.quality.checks.course import Course, check_attitude, course_of
 from kgcp.quality.checks.doubt import Cause, Doubt, grave, mild, ranked
 from kgcp.quality.checks.frame_header import FrameHeader, check_frames
 from kgcp.quality.checks.lever_arm import check_lever_arm
+from kgcp.quality.checks.measured import measured_doubts
 from kgcp.quality.checks.place import check_place
 from kgcp.quality.checks.plate import check_plates
 from kgcp.quality.checks.reference import check_reference, check_visibility
+from kgcp.quality.consistency import Consistency, study_consistency
 
 SAMPLED_FRAMES = 100
 """Headers that are read where a command has other work to do."""
@@ -222,6 +224,21 @@ class FlightInputs:
         if _has_wrong_places(doubts):
             return doubts  # what cannot be read then is the consequence
         return ranked((*self.problems, *doubts))
+
+    def compared(
+        self, sightings: Sequence[Sighting]
+    ) -> tuple[Consistency | None, tuple[Doubt, ...]]:
+        """Return how well vehicle and camera agree, None: not known, and all doubts, ranked."""
+        data, camera = self.data, self.flight.camera
+        positions = data.target_positions
+        poses = data.reference_poses if data.has_reference else None
+        agreement = None
+        if poses is not None:
+            agreement = study_consistency(sightings, positions, poses, camera)
+        doubts = measured_doubts(
+            self.plausibility, sightings, positions, poses, camera, self.headers, agreement
+        )
+        return agreement, doubts
 
     def _doubts_of_places(self) -> list[Doubt]:
         crs = self.flight.crs
