@@ -39,26 +39,15 @@ from kgcp.quality.bias_study import BiasStudy, study_bias
 from kgcp.quality.checks.doubt import Doubt
 from kgcp.quality.consistency import Consistency
 from kgcp.quality.learnt_imaging import LearntImaging
-from kgcp.report.bias.camera_figure import learnt_camera, learnt_sentence
-from kgcp.report.bias.figures import (
-    change_by_reexposure,
-    detection_rate,
-    error_against_distance,
-    error_against_exposure,
-    error_in_time,
-    error_over_image,
-    flight_map,
-    one_edge_against_two,
-    standardised_histogram,
-)
+from kgcp.report.bias.figures import draw_figures
 from kgcp.report.bias.numbers import SPREAD, BiasNumbers, bias_numbers, evenly
 from kgcp.report.bias.origin import agreement, facts, headline
 from kgcp.report.bias.page import Content, render_page
 from kgcp.report.bias.reexposure import Reexposed, measure_again
 from kgcp.report.bias.summary import Json, finite, summary_of
 from kgcp.report.bias.verdict import Verdict, assess
+from kgcp.report.bias.wording import learnt_sentence
 from kgcp.report.ring_picture import RingView, draw_closeup
-from kgcp.report.style import Picture
 from kgcp.settings import DetectSettings
 from kgcp.targets.layout import Target
 from kgcp.targets.plain import AnyTarget
@@ -201,7 +190,7 @@ class FlightBias:
             numbers=numbers,
             verdict=verdict,
             learnt="" if self.learnt is None else learnt_sentence(self.learnt),
-            pictures=_pictures(numbers, self.flight, reexposed, self.learnt),
+            pictures=draw_figures(numbers, self.flight.camera, reexposed, self.learnt),
             rows=[bias_row(pair, self.study.method) for pair in numbers.compared],
             closeups=closeups,
             reexposed=reexposed,
@@ -292,28 +281,3 @@ def _ring_view(camera: Camera, target: AnyTarget, pose: Pose, centre_px: FloatAr
     radius_px = 0.5 * float(np.ptp(circles[0], axis=0).max())
     centre = camera.project(pose.transform(np.zeros((1, 3))))
     return RingView(centre_px, radius_px, (*circles, centre))
-
-
-def _pictures(
-    numbers: BiasNumbers,
-    flight: Flight,
-    reexposed: list[Reexposed],
-    learnt: LearntImaging | None,
-) -> Mapping[str, Picture]:
-    pictures = {"error": error_against_distance(numbers)}
-    if learnt is not None:
-        pictures["camera"] = learnt_camera(learnt)
-    if numbers.expected_visible:
-        pictures["rate"] = detection_rate(numbers)
-    if numbers.influences:
-        pictures["exposure"] = error_against_exposure(numbers)
-    if numbers.edges is not None and numbers.is_displaced:
-        pictures["edges"] = one_edge_against_two(numbers, numbers.edges)
-    if reexposed:
-        pictures["reexposure"] = change_by_reexposure(reexposed)
-    if numbers.standardised is not None:
-        pictures["standardised"] = standardised_histogram(numbers)
-    pictures["time"] = error_in_time(numbers)
-    pictures["image"] = error_over_image(numbers, flight.camera)
-    pictures["map"] = flight_map(numbers)
-    return pictures

@@ -1,8 +1,9 @@
-"""Figures of the bias report: residuals, detection rates, and what exposure does."""
+"""Figures of the bias report: residuals, detection rates, what exposure does, and the camera."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +12,8 @@ from matplotlib.figure import Figure
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
+from kgcp.measurement.image_model.srgb import srgb_decoded
+from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.quality.statistics import Slope, moving_statistics
 from kgcp.report.bias.numbers import BiasNumbers, DetectionRate, EdgeNumbers, Influence
 from kgcp.report.bias.reexposure import Reexposed
@@ -20,7 +23,35 @@ WINDOW_M = 10.0  # of the paper's Figure 9
 _SIGNED = "PuOr"  # orange and violet: distinct to all kinds of colour vision
 _BINS = [0.5 * step - 5.25 for step in range(22)]
 
+_FULL_SCALE = 255.0  # of grey values
+_GREY_BINS, _FEWEST_OF_BIN = 8, 3
 _CONFIDENCE = 1.96  # standard deviations: 95 %
+
+
+def draw_figures(
+    numbers: BiasNumbers,
+    camera: Camera,
+    reexposed: Sequence[Reexposed],
+    learnt: LearntImaging | None,
+) -> Mapping[str, Picture]:
+    """Return the figures that the numbers have something for, by their names."""
+    pictures = {"error": error_against_distance(numbers)}
+    if learnt is not None:
+        pictures["camera"] = learnt_camera(learnt)
+    if numbers.expected_visible:
+        pictures["rate"] = detection_rate(numbers)
+    if numbers.influences:
+        pictures["exposure"] = error_against_exposure(numbers)
+    if numbers.edges is not None and numbers.is_displaced:
+        pictures["edges"] = one_edge_against_two(numbers, numbers.edges)
+    if reexposed:
+        pictures["reexposure"] = change_by_reexposure(reexposed)
+    if numbers.standardised is not None:
+        pictures["standardised"] = standardised_histogram(numbers)
+    pictures["time"] = error_in_time(numbers)
+    pictures["image"] = error_over_image(numbers, camera)
+    pictures["map"] = flight_map(numbers)
+    return pictures
 
 
 def error_against_distance(numbers: BiasNumbers) -> Picture:
@@ -322,3 +353,37 @@ def _changes(axes: Axes, kept: Sequence[Reexposed], colour: str, label: str) -> 
         x, y, yerr=sd, fmt="o", color=colour, ecolor=colour, elinewidth=1.0, capsize=3, label=label
     )
     return Points(axes, np.array([result.row for result in kept], dtype=np.intp), x, y)
+
+
+def learnt_camera(learnt: LearntImaging) -> Picture:
+    """Draw light against grey value, and the noise of grey values, both with their scatter."""
+    with sheet(6.2) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        _draw_curve(upper, learnt)
+        _draw_noise(lower, learnt)
+        lower.set_xlabel("grey value, of 255")
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        return picture(figure)
+
+
+def _draw_curve(axes: Axes, learnt: LearntImaging) -> None:
+    grey, (low, middle, high) = _FULL_SCALE * learnt.grey, learnt.light
+    axes.plot(grey, srgb_decoded(learnt.grey), "--", color=GREY, linewidth=1.4, label="sRGB")
+    axes.fill_between(grey, low, high, color=VERMILION, alpha=0.25, linewidth=0.0, label="± 1 sd")
+    axes.plot(grey, middle, color=VERMILION, linewidth=2.0, label="learnt")
+    axes.set_ylabel("light")
+
+
+def _draw_noise(axes: Axes, learnt: LearntImaging) -> None:
+    grey, sd = (_FULL_SCALE * learnt.noise).T
+    axes.plot(grey, sd, ".", color=BLUE, alpha=0.6)
+    edges = np.linspace(0.0, _FULL_SCALE, _GREY_BINS + 1)
+    middles, medians = [], []
+    for first, last in pairwise(edges):
+        within = (grey >= first) & (grey < last)
+        if within.sum() >= _FEWEST_OF_BIN:
+            middles.append(0.5 * (first + last))
+            medians.append(float(np.median(sd[within])))
+    axes.plot(middles, medians, color=VERMILION, linewidth=2.0)
+    axes.set_ylabel("noise, grey values")
+    axes.set_ylim(bottom=0.0)

@@ -1,9 +1,11 @@
-"""Sentences about the numbers of the bias report."""
+"""Sentences about the numbers of the bias report, and about the camera."""
 
 from __future__ import annotations
 
+from kgcp.measurement.records import ToneBase
 from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
+from kgcp.quality.learnt_imaging import LearntImaging
 from kgcp.quality.number_text import amount, minus
 from kgcp.report.bias.numbers import BiasNumbers
 
@@ -13,6 +15,7 @@ LABELS = {
     "edge_curvature_px2": "curved edges",
 } | {quantity.name: quantity.label for quantity in QUANTITIES}
 """Names of the regression's terms in print."""
+_NOT_AGREED = "Single measurements do not agree on what the curve is near to: each keeps its own."
 _PER = {quantity.name: quantity.per for quantity in QUANTITIES}
 
 
@@ -99,3 +102,26 @@ def exposure_sentence(regression: Regression) -> str:
         return f"No exposure term is significant; together they explain {share}."
     clear = [LABELS[term.name] for term in regression.exposure_terms if term.is_significant]
     return f"The error follows the exposure ({', '.join(clear)}), which explains {share}."
+
+
+def learnt_sentence(learnt: LearntImaging) -> str:
+    """Say what was learnt, and how much it has changed."""
+    low, middle, high = learnt.sharpening.tolist()
+    about = _NOT_AGREED if learnt.base is None else _about_tone(learnt, learnt.base)
+    smoothing = learnt.smoothing
+    return (
+        f"{about} Strength of the camera's sharpening: {middle:.2f} ({low:.2f} to {high:.2f})."
+        f" Smoothing along contours: {minus(f'{smoothing.mean_px2:.3f}')} px² ±"
+        f" {smoothing.sd_mean_px2:.3f}; single measurements scatter by {smoothing.scatter_px2:.3f}."
+    )
+
+
+def _about_tone(learnt: LearntImaging, base: ToneBase) -> str:
+    """Say from how many measurements a tone curve was learnt, and which of them disagree."""
+    count = f"{learnt.measurements} measurement{'' if learnt.measurements == 1 else 's'}"
+    parts = [f"The tone curve departs from {base.value}, learnt from {count}"]
+    if learnt.overruled:
+        parts.append(f"{learnt.overruled} alone would suggest another base")
+    if learnt.kept_own_base:
+        parts.append(f"{learnt.kept_own_base} kept another base, which fits far better")
+    return f"{'; '.join(parts)}."
