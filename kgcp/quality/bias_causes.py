@@ -63,10 +63,6 @@ class Regression:
     exposure_probability: float | None
     systematic_m: FloatArray  # (n,): what all terms but those of exposure make [m]
 
-    def term(self, name: str) -> Term | None:
-        """Return the term of a name."""
-        return next((term for term in self.terms if term.name == name), None)
-
     @property
     def exposure_terms(self) -> tuple[Term, ...]:
         """The terms of exposure."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kgcp.geometry.arrays import FloatArray
-from kgcp.quality.bias_causes import Regression, regress
+from kgcp.quality.bias_causes import Regression, Term, regress
 from kgcp.quality.bias_study import BiasStudy, edge_distances
 from kgcp.quality.exposure_effects import QUANTITIES, DistanceResiduals, in_time
 from kgcp.quality.robust_gls import ErrorModel
@@ -35,9 +35,13 @@ def by(study: BiasStudy, edges: int | None = None) -> Regression:
     return regression
 
 
+def term_of(found: Regression, name: str) -> Term | None:
+    return next((term for term in found.terms if term.name == name), None)
+
+
 def errors(found: Regression, **truth: float) -> list[float]:
     """Errors of terms over their deviations."""
-    terms = [(found.term(name), value) for name, value in truth.items()]
+    terms = [(term_of(found, name), value) for name, value in truth.items()]
     return [(term.value - value) / term.sd for term, value in terms if term is not None]
 
 
@@ -47,7 +51,7 @@ def test_injected_errors_come_back_within_their_deviations(fly: Fly) -> None:
     for seed in SEEDS:
         found = by(fly(seed, Method.PAPER, SCALE, OFFSET_M))
         scaled.append(errors(found, scale=SCALE, offset_m=OFFSET_M, edge_shift_px=1.0))
-        shift = found.term("edge_shift_px")
+        shift = term_of(found, "edge_shift_px")
         assert shift is not None
         assert shift.is_significant
         assert found.exposure_share > 0.9
@@ -69,7 +73,7 @@ def test_with_both_edges_nothing_follows_the_exposure(fly: Fly) -> None:
 def test_what_both_methods_say_of_one_and_two_edges_agrees(fly: Fly) -> None:
     for edges, expected in ((1, 1.0), (2, 0.0)):
         for method in Method:
-            shift = by(fly(3, method), edges).term("edge_shift_px")
+            shift = term_of(by(fly(3, method), edges), "edge_shift_px")
             assert shift is not None
             assert shift.value == pytest.approx(expected, abs=4.0 * shift.sd)
 
@@ -101,7 +105,7 @@ def test_blur_of_curved_edges_is_told_from_scale_and_offset() -> None:
     residual = 0.5 * distance**3 / 1000.0**2 + 0.005 * rng.standard_normal(300)  # R: 1000 / D
     found = regress(plain(distance, residual, 0.005))
     assert found is not None
-    curved = found.term("edge_curvature_px2")
+    curved = term_of(found, "edge_curvature_px2")
     assert curved is not None
     assert curved.value == pytest.approx(0.5, abs=3.0 * curved.sd)
     assert found.exposure_terms == ()
@@ -118,11 +122,11 @@ def test_of_quantities_that_look_alike_the_less_believed_is_given_up() -> None:
     found = regress(plain(distance, residual, 0.01, **alike))
     assert found is not None
     assert found.tangled == ("white",)
-    time = found.term("exposure_time_s")
+    time = term_of(found, "exposure_time_s")
     assert time is not None
     assert time.is_significant
     assert time.value == pytest.approx(0.03, abs=3.0 * time.sd)  # px per doubling
-    assert found.term("iso") is None
+    assert term_of(found, "iso") is None
     assert found.exposure_share > 0.8
     assert found.exposure_probability is not None
     assert found.exposure_probability < 1e-6
@@ -154,6 +158,6 @@ def test_frames_without_a_quantity_have_no_part_and_rare_quantities_none_at_all(
     found = regress(plain(distance, residual, 0.01, white=white, blur_px=blur))
     assert found is not None
     assert found.used.sum() == 57
-    assert found.term("white") is not None
-    assert found.term("blur_px") is None
+    assert term_of(found, "white") is not None
+    assert term_of(found, "blur_px") is None
     assert found.systematic_m.shape == (60,)
