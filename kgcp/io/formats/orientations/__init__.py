@@ -12,9 +12,9 @@ from pathlib import Path
 
 from kgcp.geometry.attitude import ReferencePoses
 from kgcp.io.files.sniff import ForeignFile
+from kgcp.io.formats.frame_names import frames_of
 from kgcp.io.formats.orientations import colmap, csv, metashape, odm, opensfm, opf, pix4d
 from kgcp.io.formats.orientations.georeference import on_the_map
-from kgcp.io.formats.orientations.names import frames_of
 from kgcp.io.formats.orientations.records import OrientationFileOptions, SourcePoses
 from kgcp.io.formats.registry import Registry
 
