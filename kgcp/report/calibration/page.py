@@ -13,7 +13,6 @@ from kgcp.geometry.circle_image import Circles3D
 from kgcp.io.tables.calibration import PhotoRow
 from kgcp.network.calibration_records import CameraCalibration
 from kgcp.quality.calibration_verdict import (
-    CalibrationGrade,
     CalibrationNumbers,
     CalibrationVerdict,
     change_if_neglected,
@@ -24,11 +23,6 @@ from kgcp.quality.number_text import minus
 from kgcp.report.html_page import embedded_pictures, page_template
 
 _PIXELS = 4  # the first parameters are lengths in pixels
-_CLASSES = {
-    CalibrationGrade.GOOD: "good",
-    CalibrationGrade.LOOK: "look",
-    CalibrationGrade.UNUSABLE: "unusable",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +73,7 @@ def render_calibration(page: CalibrationPage) -> str:
         calibration=page.calibration,
         numbers=page.numbers,
         verdict=page.verdict,
-        verdict_class=_CLASSES[page.verdict.grade],
+        verdict_class=page.verdict.grade.name.lower(),
         parameters=parameter_rows(page.calibration),
         correlations=_correlations(page.calibration),
         eccentricity=_eccentricity(page.calibration),
