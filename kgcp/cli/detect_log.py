@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
+from kgcp.quality.number_text import counted
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
@@ -194,11 +196,6 @@ def report_stages(summary: DetectionSummary, before_s: float, total_s: float) ->
         if seconds >= _SHORTEST_STAGE_S:
             click.echo(f"{seconds:10.3f} s  {stage}", err=True)
     click.echo(f"{total_s:10.3f} s  in all", err=True)
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a count with its noun, in the plural where it must be."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _report_in_words(summary: DetectionSummary, seconds: float, frames_per_s: float) -> None:

@@ -249,6 +249,7 @@ def _report(
     import warnings
 
     from kgcp.errors import KgcpWarning
+    from kgcp.quality.number_text import counted
     from kgcp.targets.code_design import LEAST_DISTANCE, least_apart
 
     apart = least_apart([target.ring for target in dict.fromkeys((*targets, *known))])
@@ -261,8 +262,8 @@ def _report(
         click.echo(json.dumps({"targets": described, "dots_apart": apart, "files": paths}))
     for target in targets:
         code = ", ".join(f"{angle:g}" for angle in target.ring.code_deg)
-        count = sheets_of[target.name]
-        click.echo(f"{target.name}: code [{code}], {count} sheet{'s'[: count > 1]}", err=True)
+        sheets = counted(sheets_of[target.name], "sheet")
+        click.echo(f"{target.name}: code [{code}], {sheets}", err=True)
     click.echo(f"codes are at least {apart:.1f} dots apart, rotated or mirrored", err=True)
     if apart < LEAST_DISTANCE:
         warnings.warn(

@@ -1,8 +1,13 @@
-"""Numbers in print: signs, and as many digits as their standard deviations deserve."""
+"""Numbers in print: signs, plurals, and as many digits as their standard deviations deserve."""
 
 from __future__ import annotations
 
 import math
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, in the plural where it must be."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def minus(number: str) -> str:

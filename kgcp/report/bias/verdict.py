@@ -9,6 +9,7 @@ from enum import IntEnum
 from statistics import median
 
 from kgcp.quality.bias_causes import Term
+from kgcp.quality.number_text import counted
 from kgcp.report.bias.numbers import BiasNumbers, RangeRow
 from kgcp.report.bias.reexposure import GAINS, Reexposed
 from kgcp.report.bias.wording import (
@@ -99,8 +100,7 @@ def assess(numbers: BiasNumbers, reexposed: Sequence[Reexposed] = ()) -> Verdict
 def _accuracy(numbers: BiasNumbers) -> Finding:
     count = numbers.total.percent.count
     parts = [f"{_rms(row)} {row.label} ({row.percent.count})" for row in numbers.halves]
-    frames = "frame" if count == 1 else "frames"
-    text = f"Distance error (RMS) over {count} {frames}: {'; '.join(parts)}."
+    text = f"Distance error (RMS) over {counted(count, 'frame')}: {'; '.join(parts)}."
     if numbers.total.percent.rms > LIMITS.unusable_rms_percent:
         return Finding(
             FlightGrade.UNUSABLE,
@@ -231,19 +231,15 @@ def _losses(numbers: BiasNumbers) -> Iterator[Finding]:
     parts = []
     if misplaced:
         parts.append(
-            f"{misplaced} {_plural('measurement', misplaced)} not where the target must be,"
+            f"{counted(misplaced, 'measurement')} not where the target must be,"
             " left out of the statistics"
         )
     if outliers:
         parts.append(
-            f"{outliers} {_plural('outlier', outliers)}, more than five standard"
+            f"{counted(outliers, 'outlier')}, more than five standard"
             " deviations off the regression and left out of it"
         )
     yield Finding(grade, f"{'; '.join(parts)}.", "worst")
-
-
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
 
 
 def _detection(numbers: BiasNumbers) -> Iterator[Finding]:

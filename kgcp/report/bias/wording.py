@@ -6,7 +6,7 @@ from kgcp.measurement.records import ToneBase
 from kgcp.quality.bias_causes import Regression, Term
 from kgcp.quality.exposure_effects import QUANTITIES
 from kgcp.quality.learnt_imaging import LearntImaging
-from kgcp.quality.number_text import amount, minus
+from kgcp.quality.number_text import amount, counted, minus
 from kgcp.report.bias.numbers import BiasNumbers
 
 LABELS = {
@@ -118,7 +118,7 @@ def learnt_sentence(learnt: LearntImaging) -> str:
 
 def _about_tone(learnt: LearntImaging, base: ToneBase) -> str:
     """Say from how many measurements a tone curve was learnt, and which of them disagree."""
-    count = f"{learnt.measurements} measurement{'' if learnt.measurements == 1 else 's'}"
+    count = counted(learnt.measurements, "measurement")
     parts = [f"The tone curve departs from {base.value}, learnt from {count}"]
     if learnt.overruled:
         parts.append(f"{learnt.overruled} alone would suggest another base")
