@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -16,14 +16,14 @@ from kgcp.io.files.time_text import format_time
 from kgcp.io.flight.flight import read_target_tables
 from kgcp.io.flight.folder import FLIGHT_TOML, FolderContents, survey_folder
 from kgcp.io.flight.target_table import target_lines
-from kgcp.io.flight.toml_draft import MISSING, DraftKey, DraftTable, DraftText
+from kgcp.io.flight.toml_draft import MISSING, DraftKey, DraftText
 from kgcp.io.formats.frame_times import read_times
 from kgcp.io.formats.name_times import times_of_names
 from kgcp.io.formats.point_table import PointTable
 from kgcp.io.images.exif import read_frame_header
 from kgcp.pipeline.init_camera import camera_section
-from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Section
-from kgcp.pipeline.init_vehicle import crs_key, vehicle_section
+from kgcp.pipeline.init_records import Gap, InitFinding, InitOptions, Part, Section
+from kgcp.pipeline.init_vehicle import crs_parts, vehicle_section
 from kgcp.quality.checks.clock import time_span
 from kgcp.quality.checks.frame_header import FrameHeader
 from kgcp.targets.code_design import new_targets
@@ -78,26 +78,23 @@ def draft_flight(folder: Path, options: InitOptions = _NO_OPTIONS) -> FlightDraf
     headers = [
         read_frame_header(contents.frames_folder / frame, frame) for frame in contents.frames
     ]
-    frames, times_s, frames_csv = _frames_section(contents, headers)
-    vehicle = vehicle_section(contents, times_s, options)
+    times = _times(contents, headers)
+    frames = Section.of("[frames]", (*_of_frames(contents), *times.parts))
+    vehicle = vehicle_section(contents, times.time_s, options)
     targets, surveyed = _targets_section(contents, options)
-    crs, crs_findings, crs_gaps = crs_key(contents, headers, surveyed, options)
-    top = DraftTable("", (DraftKey("name", _name_of(folder)), crs))
-    sections = (
-        frames,
-        camera_section(contents, headers),
-        targets,
-        Section((), crs_findings, crs_gaps),
-        vehicle,
-        _reference_section(contents),
-    )
-    blocks = (top, *(block for section in sections for block in section.blocks))
+    crs = crs_parts(contents, headers, surveyed, options)
+    top = Section.of("", (DraftKey("name", _name_of(folder)), *crs))
+    camera = camera_section(contents, headers)
+    reference = Section.of("[reference]", _of_reference(contents))
+    written = (top, frames, camera, targets, vehicle, reference)
+    told = (frames, camera, targets, top, vehicle, reference)
+    blocks = (block for section in written for block in section.blocks)
     lines = [*_HEAD, *(line for block in blocks for line in block.lines())]
     return FlightDraft(
         "\n".join(lines) + "\n",
-        frames_csv,
-        tuple(finding for section in sections for finding in section.findings),
-        tuple(gap for section in sections for gap in section.gaps),
+        times.frames_csv,
+        tuple(finding for section in told for finding in section.findings),
+        tuple(gap for section in told for gap in section.gaps),
     )
 
 
@@ -133,18 +130,12 @@ def _name_of(folder: Path) -> str:
     return name.strip()[:100] or "flight"
 
 
-def _frames_section(
-    contents: FolderContents, headers: Sequence[FrameHeader]
-) -> tuple[Section, Mapping[str, float], str | None]:
-    """Return [frames], the frames' times [s], and a table of times where their names have them."""
+def _of_frames(contents: FolderContents) -> Iterator[Part]:
     suffixes = Counter(PurePosixPath(frame).suffix.lower() for frame in contents.frames)
     kinds = ", ".join(f"{count} {suffix}" for suffix, count in suffixes.most_common())
     folder = contents.relative(contents.frames_folder)
-    found = InitFinding("frames", f"{kinds} in {'this folder' if folder == '.' else f'{folder}/'}")
-    times = _times(contents, headers)
-    keys = (DraftKey("folder", folder, kinds), *times.keys)
-    section = Section((DraftTable("[frames]", keys),), (found, *times.findings), times.gaps)
-    return section, times.time_s, times.frames_csv
+    yield DraftKey("folder", folder, kinds)
+    yield InitFinding("frames", f"{kinds} in {'this folder' if folder == '.' else f'{folder}/'}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,10 +143,8 @@ class _Times:
     """Where the frames' times come from."""
 
     time_s: Mapping[str, float]  # Unix UTC [s]
-    keys: tuple[DraftKey, ...]
-    findings: tuple[InitFinding, ...]
-    gaps: tuple[Gap, ...] = ()
-    frames_csv: str | None = None
+    parts: tuple[Part, ...]
+    frames_csv: str | None = None  # a table of the times where the frames' names have them
 
 
 def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
@@ -172,52 +161,32 @@ def _times(contents: FolderContents, headers: Sequence[FrameHeader]) -> _Times:
         if time_s:
             lacking = len(contents.frames) - len(time_s)
             gap = Gap("times", f"{lacking} frames are not in {name}", "complete it, or remove them")
-            return _Times(
-                time_s,
-                (DraftKey("times", name, f"{len(time_s)} of {len(contents.frames)} frames"),),
-                (InitFinding("times", f"{_span(time_s)}, from {name}"),),
-                (gap,) if lacking else (),
-            )
+            key = DraftKey("times", name, f"{len(time_s)} of {len(contents.frames)} frames")
+            found = InitFinding("times", f"{_span(time_s)}, from {name}")
+            return _Times(time_s, (key, found, *((gap,) if lacking else ())))
     if (by_name := times_of_names(contents.frames)) is not None:
-        return _times_by_name(by_name)
-    return _times_by_exif(contents, headers, tuple(refused))
-
-
-def _times_by_name(time_s: Mapping[str, float]) -> _Times:
-    rows = [(frame, format_time(moment)) for frame, moment in time_s.items()]
-    return _Times(
-        time_s,
-        (DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names"),),
-        (InitFinding("times", f"{_span(time_s)}, from the frames' names, as {_FRAMES_CSV}"),),
-        frames_csv=csv_text(("frame", "time"), rows),
-    )
-
-
-def _times_by_exif(
-    contents: FolderContents, headers: Sequence[FrameHeader], refused: tuple[Gap, ...]
-) -> _Times:
-    key = DraftKey("times", None, "without it: EXIF", '"frames.csv"')
+        rows = [(frame, format_time(moment)) for frame, moment in by_name.items()]
+        key = DraftKey("times", _FRAMES_CSV, "made by kgcp init of the frames' names")
+        text = f"{_span(by_name)}, from the frames' names, as {_FRAMES_CSV}"
+        csv = csv_text(("frame", "time"), rows)
+        return _Times(by_name, (key, InitFinding("times", text)), csv)
     time_s = {each.frame: each.time_s for each in headers if each.time_s is not None}
-    is_moving = bool(contents.trajectories)
-    if time_s:
-        gap = Gap(
-            "times",
-            "EXIF is rarely good to a millisecond, in which a vehicle moves a centimetre",
-            "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time",
-            is_assumed=True,
-        )
-        return _Times(
-            time_s,
-            (key,),
-            (InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)"),),
-            (*refused, *((gap,) if is_moving else ())),
-        )
-    why = "neither a file nor EXIF has the frames' times with their zone"
-    if not is_moving:
-        found = InitFinding("times", f"none: {why}; static targets need none")
-        return _Times({}, (key,), (found,), refused)
+    parts = _of_exif_times(time_s, is_moving=bool(contents.trajectories))
+    return _Times(time_s, (*refused, *parts))
+
+
+def _of_exif_times(time_s: Mapping[str, float], *, is_moving: bool) -> Iterator[Part]:
     remedy = "give the camera's Timestamp.MRK, or frames.csv with the columns frame and time"
-    return _Times({}, (replace(key, is_missing=True),), (), (*refused, Gap("times", why, remedy)))
+    is_missing = is_moving and not time_s
+    yield DraftKey("times", None, "without it: EXIF", '"frames.csv"', is_missing=is_missing)
+    why = "neither a file nor EXIF has the frames' times with their zone"
+    if time_s:
+        yield InitFinding("times", f"{_span(time_s)}, from EXIF ({len(time_s)} frames)")
+        why = "EXIF is rarely good to a millisecond, in which a vehicle moves a centimetre"
+    elif not is_moving:
+        yield InitFinding("times", f"none: {why}; static targets need none")
+    if is_moving:
+        yield Gap("times", why, remedy, is_assumed=bool(time_s))
 
 
 def _span(time_s: Mapping[str, float]) -> str:
@@ -306,13 +275,10 @@ def _places(
     return places, tuple(used)
 
 
-def _reference_section(contents: FolderContents) -> Section:
-    if not contents.references:
-        key = DraftKey("poses", None, "the camera's poses of an adjustment", '"reference.csv"')
-        return Section((DraftTable("[reference]", (key,)),), (), ())
-    name = contents.relative(contents.references[0])
-    return Section(
-        (DraftTable("[reference]", (DraftKey("poses", name),)),),
-        (InitFinding("reference", f"poses of the camera, from {name}"),),
-        (),
-    )
+def _of_reference(contents: FolderContents) -> Iterator[Part]:
+    if contents.references:
+        name = contents.relative(contents.references[0])
+        yield DraftKey("poses", name)
+        yield InitFinding("reference", f"poses of the camera, from {name}")
+    else:
+        yield DraftKey("poses", None, "the camera's poses of an adjustment", '"reference.csv"')

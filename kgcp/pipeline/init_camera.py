@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from kgcp.errors import KgcpError
 from kgcp.geometry.camera import Camera
 from kgcp.io.flight.folder import FolderContents
-from kgcp.io.flight.toml_draft import DraftKey, DraftTable
+from kgcp.io.flight.toml_draft import DraftKey
 from kgcp.io.formats.calibrations import read_calibration
 from kgcp.pipeline.init_records import Gap, InitFinding, Section
 from kgcp.quality.checks.frame_header import FrameHeader
@@ -64,9 +64,8 @@ def _by_file(contents: FolderContents, size: tuple[int, int]) -> Section | None:
         )
         others = [contents.relative(other) for other in contents.calibrations if other != path]
         beside = f" (not used: {', '.join(others)})" if others else ""
-        return _section(
-            keys, "", (InitFinding("camera", f"{_shown(camera)}, from {name}{beside}"),)
-        )
+        found = InitFinding("camera", f"{_shown(camera)}, from {name}{beside}")
+        return Section.of("[camera]", (*keys, found))
     return None
 
 
@@ -85,7 +84,8 @@ def _by_dewarp_data(
         camera = read_calibration(contents.frames_folder / header.frame, size, "dji")
     except KgcpError:  # no DewarpData, or of an image that is dewarped already
         return None
-    found = f"{_shown(camera)}, from the DewarpData of {header.frame}"
+    text = f"{_shown(camera)}, from the DewarpData of {header.frame}"
+    found = InitFinding("camera", _named(header, text))
     note = f"DJI's calibration of this camera: the DewarpData of {header.frame}."
     sd_px = round(_SD_FACTORY * camera.mean_focal_px, 1)
     keys = (
@@ -102,7 +102,7 @@ def _by_dewarp_data(
         "correct sd_fx and sd_fy in [camera], or use a calibration of this flight",
         is_assumed=True,
     )
-    return _section(keys, note, (InitFinding("camera", _named(header, found)),), (gap,))
+    return Section.of("[camera]", (*keys, found, gap), note)
 
 
 def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> Section | None:
@@ -126,20 +126,16 @@ def _by_focal_length(headers: Sequence[FrameHeader], size: tuple[int, int]) -> S
         _RESPONSE,
         _SHUTTER,
     )
-    return _section(
-        keys,
-        f"GUESS from the {source}. A calibration is needed for true distances.",
-        (InitFinding("camera", _named(header, f"{_shown(camera)}, guessed from the {source}")),),
-        (
-            Gap(
-                "camera",
-                "the focal length of EXIF, without distortion; a calibration is needed for"
-                " distances better than some per cent",
-                f"{_REMEDY}, and delete guessed and the sd_ lines",
-                is_assumed=True,
-            ),
-        ),
+    found = InitFinding("camera", _named(header, f"{_shown(camera)}, guessed from the {source}"))
+    gap = Gap(
+        "camera",
+        "the focal length of EXIF, without distortion; a calibration is needed for distances better"
+        " than some per cent",
+        f"{_REMEDY}, and delete guessed and the sd_ lines",
+        is_assumed=True,
     )
+    note = f"GUESS from the {source}. A calibration is needed for true distances."
+    return Section.of("[camera]", (*keys, found, gap), note)
 
 
 def _guessed_px(header: FrameHeader) -> tuple[FrameHeader, float, str] | None:
@@ -175,7 +171,8 @@ def _no_camera(size: tuple[int, int] | None, why: str) -> Section:
         _SHUTTER,
     )
     found = (InitFinding("camera", f"{size[0]} x {size[1]} px"),) if size else ()
-    return _section(keys, 'Or: file = "camera.yml"', found, (Gap("camera", why, _REMEDY),))
+    parts = (*keys, *found, Gap("camera", why, _REMEDY))
+    return Section.of("[camera]", parts, 'Or: file = "camera.yml"')
 
 
 def _unknown(*examples: tuple[str, str]) -> tuple[DraftKey, ...]:
@@ -194,15 +191,6 @@ def _parameter_keys(camera: Camera) -> tuple[DraftKey, ...]:
     values = {key: float(f"{getattr(camera, key):.{_DIGITS}g}") for key in _PARAMETERS}
     kept = {key: value for key, value in values.items() if value or key in _PARAMETERS[:4]}
     return tuple(DraftKey(key, value) for key, value in kept.items())
-
-
-def _section(
-    keys: tuple[DraftKey, ...],
-    note: str,
-    findings: tuple[InitFinding, ...],
-    gaps: tuple[Gap, ...] = (),
-) -> Section:
-    return Section((DraftTable("[camera]", keys, note),), findings, gaps)
 
 
 def _named(header: FrameHeader, text: str) -> str:

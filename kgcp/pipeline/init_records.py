@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from kgcp.io.flight.toml_draft import DraftTable, DraftText
+from kgcp.io.flight.toml_draft import DraftKey, DraftTable, DraftText
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,10 @@ class Gap:
     is_assumed: bool = False  # flight.toml has a value for it, which nothing confirms
 
 
+Part = DraftKey | InitFinding | Gap
+"""One line of a table, or a reason for its lines."""
+
+
 @dataclass(frozen=True, slots=True)
 class Section:
     """A part of flight.toml, with the reasons for it."""
@@ -33,6 +38,17 @@ class Section:
     blocks: tuple[DraftTable | DraftText, ...]
     findings: tuple[InitFinding, ...]
     gaps: tuple[Gap, ...]
+
+    @classmethod
+    def of(cls, heading: str, parts: Iterable[Part], note: str = "") -> Section:
+        """Sort the parts of one table, each kind in its order."""
+        parts = tuple(parts)
+        keys = tuple(part for part in parts if isinstance(part, DraftKey))
+        return cls(
+            (DraftTable(heading, keys, note),),
+            tuple(part for part in parts if isinstance(part, InitFinding)),
+            tuple(part for part in parts if isinstance(part, Gap)),
+        )
 
 
 @dataclass(frozen=True, slots=True)
