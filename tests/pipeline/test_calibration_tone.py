@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable
+from dataclasses import replace
 from typing import Any, cast
 
 import pytest
 
 from kgcp.errors import KgcpWarning
+from kgcp.measurement.discs.camera_tone import CameraTone
 from kgcp.measurement.discs.photograph import PhotoTask
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.pipeline.calibration.run import _camera_of
 from kgcp.pipeline.execution.executor import WorkerPool
 from kgcp.pipeline.execution.resilient_map import SerialExecutor, TaskFailure
@@ -24,6 +28,32 @@ class LosingPool(WorkerPool):
         assert callable(function)
         for item in items:
             yield item, TaskFailure.CRASHED
+
+
+UNSETTLED = CameraTone(Tone.UNKNOWN, 1.0, is_settled=False)
+
+
+class TellingPool(WorkerPool):
+    """Returns a tone, whatever it is given: one that did not settle where jobs are many."""
+
+    def map(
+        self, function: Callable[..., Any], items: Iterable[Any]
+    ) -> Generator[tuple[Any, Any | TaskFailure]]:
+        assert callable(function)
+        for item in items:
+            yield item, UNSETTLED if self.jobs > 1 else replace(UNSETTLED, is_settled=True)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_tone_that_did_not_settle_is_told(jobs: int) -> None:
+    pool = TellingPool(jobs, SerialExecutor(), (), Counter())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learned = _camera_of(pool, cast("PhotoTask", None), ())
+    assert learned is not None
+    said = ["did not settle" in str(each.message) for each in caught]
+    assert said == [True] * (jobs - 1)
+    assert learned.is_settled is (jobs == 1)
 
 
 def test_a_tone_that_cannot_be_learned_together_is_told() -> None:

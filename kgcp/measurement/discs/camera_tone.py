@@ -8,8 +8,9 @@ disc has its own ellipse, blur and light. What they say together is the prior fo
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
     SHARPENING_PX,
     DiscFit,
+    DiscSample,
     DiscState,
     DiscUnknowns,
     NoFit,
@@ -76,6 +78,7 @@ class CameraTone:
     sharpening_px: float = 0.0  # σ of its unsharp mask; 0: it does not sharpen
     known: ProcessingPrior | None = None
     blur_px: float = 0.0  # median of those that it was learned from; 0: none
+    is_settled: bool = True  # or rounds reached their limit: known no better than it was then
 
 
 def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) -> CameraTone:
@@ -93,17 +96,24 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
     bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
     sds = [fit.sd for fit in fits]
-    best = _likeliest([_with_best_mask(joint, sds) for joint in _worthy(plain, bent)])
+    best = _likeliest(
+        [
+            _with_best_mask(joint, partial(_adjusted_together, sds=sds))
+            for joint in _worthy(plain, bent)
+        ]
+    )
     if best is None:
         return CameraTone(tone, SHARPENING_PX)
-    if tone is Tone.UNKNOWN and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
-        best = _before_compression(best, sds)
+    base = _BENT.get(min(plain, key=lambda joint: joint.loss).tone) if plain else None
+    start = next((joint for joint in bent if joint.tone is base), None)
+    if start is not None and len(fits) >= _FEWEST_DISCS:  # few tell too little of a curve
+        best = _before_compression(best, start)
     blur_px = float(np.median([fit.state.blur.mean_sd_px for fit in best.fits]))
     known = _known_by(best)
     if tone is Tone.UNKNOWN and not best.tone.is_shaped:
         # what an unknown curve may be off stays in the covariances
         return CameraTone(_BENT[best.tone], best.sharpening_px, _without_bends(known), blur_px)
-    return CameraTone(best.tone, best.sharpening_px, known, blur_px)
+    return CameraTone(best.tone, best.sharpening_px, known, blur_px, best.is_settled)
 
 
 def unknowns_of_disc(task: DiscTask, camera: CameraTone) -> DiscUnknowns:
@@ -202,7 +212,7 @@ def _from_first_fits(fits: Sequence[DiscFit], tone: Tone) -> JointFit | None:
         return None
     sharpening = float(np.median([fit.state.vector[Row.SHARPENING] for fit in fits]))
     states = [_state_by(fit, tone, sharpening) for fit in fits]
-    return _adjusted_together(fits, states, tone, SHARPENING_PX, [fit.sd for fit in fits])
+    return _adjusted_together(fits, states, tone, SHARPENING_PX, sds=[fit.sd for fit in fits])
 
 
 def _adjusted_together(
@@ -210,21 +220,49 @@ def _adjusted_together(
     states: Sequence[DiscState],
     tone: Tone,
     sharpening_px: float,
+    *,
     sds: Sequence[FloatArray],
 ) -> JointFit | None:
-    samples = [
-        fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
-    ]
+    samples = _samples_by(fits, states, tone, sharpening_px)
     try:
         return adjust_together(samples, states, tone, sharpening_px, sds)
     except (NoFit, np.linalg.LinAlgError):
         return None
 
 
-def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
+def _adjusted_before_compression(
+    fits: Sequence[DiscFit],
+    states: Sequence[DiscState],
+    tone: Tone,
+    sharpening_px: float,
+    *,
+    steps: Sequence[FloatArray | None],
+    sds: Sequence[FloatArray] | None = None,
+) -> JointFit | None:
+    samples = _samples_by(fits, states, tone, sharpening_px)
+    try:
+        return adjust_before_compression(samples, states, tone, sharpening_px, steps, sds)
+    except (NoFit, np.linalg.LinAlgError):
+        return None
+
+
+def _samples_by(
+    fits: Sequence[DiscFit], states: Sequence[DiscState], tone: Tone, sharpening_px: float
+) -> list[DiscSample]:
+    return [
+        fit.sample.by(tone, sharpening_px, state) for fit, state in zip(fits, states, strict=True)
+    ]
+
+
+def _with_best_mask(joint: JointFit, adjusted: Callable[..., JointFit | None]) -> JointFit:
     """Return discs adjusted by the mask that makes them likeliest.
 
     Its width is tried in steps, and a parabola through the last three gives the rest.
+
+    Parameters
+    ----------
+    adjusted : callable
+        Returns discs adjusted from fits, states, by a curve and by a mask; None if they cannot be.
     """
     sharpening = CAMERA_ROWS.index(Row.SHARPENING)
     sd = float(np.sqrt(np.linalg.inv(joint.precision)[sharpening, sharpening]))
@@ -233,8 +271,7 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
 
     def at(step: float) -> JointFit | None:
         states = [fit.state for fit in joint.fits]
-        mask_px = _MASK_STEP**step * SHARPENING_PX
-        return _adjusted_together(joint.fits, states, joint.tone, mask_px, sds)
+        return adjusted(joint.fits, states, joint.tone, _MASK_STEP**step * SHARPENING_PX)
 
     # anew, since the pixels beside the modelled ones are masked by what is known by now
     tried = {0: at(0) or joint}
@@ -259,25 +296,34 @@ def _with_best_mask(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
     return between if between is not None and between.loss < middle else tried[best]
 
 
-def _before_compression(joint: JointFit, sds: Sequence[FloatArray]) -> JointFit:
-    """Adjust discs anew to what they were before JPEG compressed them, if it did.
+def _before_compression(joint: JointFit, bent: JointFit) -> JointFit:
+    """Adjust discs anew to what JPEG left of the coefficients, if it compressed them.
 
     It may have hidden what bends the curve. A plain one is bent if that is significant now.
+
+    Parameters
+    ----------
+    joint : JointFit
+        By the curve that makes the compressed values likeliest.
+    bent : JointFit
+        By the likeliest plain curve, bent, and a mask of the usual width. By what compression
+        leaves, bent curves of small discs are equally likely, whereas the plain ones differ by 100
+        and more. A line cannot be bent to film's curve: centres would be off by 0.006 px.
     """
     photos = {id(photo): photo for photo in (fit.sample.window.photo for fit in joint.fits)}
     steps_of = {key: quantisation_steps(photo) for key, photo in photos.items()}
     steps = [steps_of[id(fit.sample.window.photo)] for fit in joint.fits]
     if all(each is None for each in steps):
         return joint
-    states, tone = [fit.state for fit in joint.fits], _BENT.get(joint.tone, joint.tone)
-    bent = _adjusted_together(joint.fits, states, tone, joint.sharpening_px, sds)
-    try:
-        before = None if bent is None else adjust_before_compression(bent, steps)
-    except (NoFit, np.linalg.LinAlgError):
+    adjusted = partial(_adjusted_before_compression, steps=steps)
+    states = [fit.state for fit in bent.fits]
+    first = adjusted(bent.fits, states, bent.tone, bent.sharpening_px)
+    if first is None:
         return joint
-    if before is None or not (joint.tone.is_shaped or _is_bent(before)):
+    best = _with_best_mask(first, partial(adjusted, sds=[fit.sd for fit in first.fits]))
+    if not (joint.tone.is_shaped or _is_bent(best)):
         return joint
-    return before
+    return replace(best, is_settled=first.is_settled)
 
 
 def _is_bent(joint: JointFit) -> bool:

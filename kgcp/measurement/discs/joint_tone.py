@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import nnls
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
+from kgcp.measurement.adjustment.normal_equations import weighted_products
 from kgcp.measurement.discs.disc_levels import COUNT
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -25,13 +27,15 @@ from kgcp.measurement.discs.fit_disc import (
     misfit_by,
     noise_at,
 )
-from kgcp.measurement.image_model.compression import levels_before
+from kgcp.measurement.discs.tone_curve import WAVES, wave_limits
+from kgcp.measurement.image_model.compression import CompressedPixels
+from kgcp.measurement.image_model.noise import Misfit, misfit
 from kgcp.measurement.image_model.photometry import Tone
 
 _STEPS, _NOISE_ROUNDS = 25, 2
-# Until nothing that is shared moves more in one round. Forty discs of R 5 px by film's curve need
-# 29 rounds at quality 75, of which the last four move it by 0.013 at most.
-_COMPRESSION_ROUNDS, _SETTLED = 25, 0.003
+# Noise before compression is estimated until it changes by less than this share in one round, and
+# nothing that is shared moves more. Discs of R 5 px by film's curve need 7 to 14 rounds.
+_COMPRESSION_ROUNDS, _SETTLED_NOISE, _SETTLED = 40, 0.05, 0.003
 _ENOUGH = 0.1  # of log-likelihood, promised by a step
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e3
 _SHARED = np.array(CAMERA_ROWS)
@@ -48,6 +52,7 @@ class JointFit:
     precision: FloatArray  # (4, 4): of what they share, in the order of `CAMERA_ROWS`
     scores: FloatArray  # (k, 4): of each disc, by what is shared; they add up to the prior's
     informations: FloatArray  # (k, 4, 4): their expected covariances
+    is_settled: bool = True  # whether noise and curve stopped changing before the rounds ended
 
     @property
     def shared(self) -> FloatArray:
@@ -93,50 +98,117 @@ def adjust_together(
         own_sds = [noise_at(*pair).sd for pair in zip(samples, states, strict=True)]
         fits = _minimised(samples, states, free, usual, own_sds)
         states = [fit.state for fit in fits]
-    return _joint(fits, sharpening_px, sds)
+    loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
+    loss += _penalty(fits[0].state.vector[_SHARED], usual)
+    return _joint(fits, sharpening_px, loss, is_settled=True)
 
 
-def adjust_before_compression(joint: JointFit, steps: Sequence[FloatArray | None]) -> JointFit:
-    """Adjust discs of compressed photographs to what they were before (Dempster, Laird & Rubin).
-
-    In turns, the values before compression are what the model and the coefficients let expect,
-    and the model is adjusted to them.
+def adjust_before_compression(
+    samples: Sequence[DiscSample],
+    states: Sequence[DiscState],
+    tone: Tone,
+    sharpening_px: float,
+    steps: Sequence[FloatArray | None],
+    sds: Sequence[FloatArray] | None = None,
+) -> JointFit:
+    """Adjust discs of compressed photographs to what is left of their coefficients.
 
     Parameters
     ----------
-    joint : JointFit
-        The same discs adjusted to the compressed values.
+    samples, states, tone, sharpening_px
+        As for `adjust_together`.
     steps : sequence of (8, 8) arrays
         Of each disc's photograph, by `quantisation_steps`; None: it was not compressed.
+    sds : sequence of (n,) arrays, optional
+        Noise of each disc's pixels before compression; by default, it is estimated in rounds. Only
+        losses by the same noise can be compared.
 
     Raises
     ------
     NoFit, numpy.linalg.LinAlgError
         If the equations cannot be solved.
     """
-    free, usual = _unknowns(joint.tone, joint.sharpening_px), ProcessingPrior.usual()
-    fits = list(joint.fits)
+    free, usual = _unknowns(tone, sharpening_px), ProcessingPrior.usual()
+    pixels = [pixels_before_compression(*pair) for pair in zip(samples, steps, strict=True)]
+    if sds is not None:
+        fits = _minimised(samples, states, free, usual, sds, pixels)
+        return _joint(fits, sharpening_px, _total(fits, usual), is_settled=True)
+    noise, before = [noise_at(*pair).sd for pair in zip(samples, states, strict=True)], None
+    is_settled = False
     for _ in range(_COMPRESSION_ROUNDS):
-        before = fits[0].state.vector[_SHARED]
-        samples, sds, left_sds = [], [], []
-        for fit, step in zip(fits, steps, strict=True):
-            sample, lost = fit.sample, np.zeros(1)
-            if step is not None:
-                places, photo = sample.pixels.places_px, sample.window.photo
-                levels, lost = levels_before(photo, places, fit.levels, fit.sd, step)
-                sample = replace(sample, levels=levels)
-            samples.append(sample)
-            left_sds.append(noise_at(sample, fit.state).sd)
-            sds.append(np.sqrt(left_sds[-1] ** 2 + lost))
-        fits = _minimised(samples, [fit.state for fit in fits], free, usual, sds)
-        if np.abs(fits[0].state.vector[_SHARED] - before).max() < _SETTLED:
+        fits = _minimised(samples, states, free, usual, noise, pixels)
+        states, shared = [fit.state for fit in fits], fits[0].state.vector[_SHARED]
+        noise_before = noise
+        noise = [noise_before_compression(*pair) for pair in zip(fits, pixels, strict=True)]
+        change = max(
+            abs(float(now.sum() / then.sum()) - 1.0)
+            for now, then in zip(noise, noise_before, strict=True)
+        )
+        has_moved = before is None or np.abs(shared - before).max() > _SETTLED
+        is_settled, before = change < _SETTLED_NOISE and not has_moved, shared
+        if is_settled:
             break
-    # what is lost tells nothing (the missing information of Orchard & Woodbury)
-    telling = [
-        disc_fit_at(fit.sample, fit.state, fit.free, fit.sd**2 / left_sd)
-        for fit, left_sd in zip(fits, left_sds, strict=True)
-    ]
-    return _joint(fits, joint.sharpening_px, sds, telling)
+    return _joint(fits, sharpening_px, _total(fits, usual), is_settled=is_settled)
+
+
+def pixels_before_compression(
+    sample: DiscSample, steps: FloatArray | None
+) -> CompressedPixels | None:
+    """Return what compression left of a disc's pixels; None where there was none.
+
+    Parameters
+    ----------
+    steps : (8, 8) array
+        Of its photograph, by `quantisation_steps`; None: it was not compressed.
+    """
+    if steps is None:
+        return None
+    return CompressedPixels.of(sample.window.photo, sample.pixels.places_px, steps)
+
+
+def compressed_fit_at(
+    sample: DiscSample,
+    state: DiscState,
+    free: DiscUnknowns,
+    sd: FloatArray,
+    pixels: CompressedPixels | None,
+) -> DiscFit:
+    """Linearise at a state, with noise (n,) from before the photograph was compressed.
+
+    Misfit and scaled Jacobian are those of the coefficients, then of pixels that tell for
+    themselves.
+    """
+    fit = disc_fit_at(sample, state, free, sd)
+    if pixels is None:
+        return fit
+    alone, clips = pixels.alone, sample.censoring
+    clips = replace(clips, at_high=clips.at_high[alone], at_low=clips.at_low[alone])
+    of_blocks = pixels.misfit(fit.levels, sd)
+    of_alone = misfit(sample.levels[alone], fit.levels[alone], sd[alone], clips)
+    both = Misfit(
+        of_blocks.total + of_alone.total,
+        np.concatenate((of_blocks.score, of_alone.score)),
+        np.concatenate((of_blocks.weight, of_alone.weight)),
+    )
+    rows = fit.jacobian[free.rows]
+    by_coefficients = pixels.coefficients(rows) / pixels.deviations(sd)
+    scaled = np.hstack((by_coefficients, rows[:, alone] / sd[alone]))
+    normal = weighted_products(scaled, both.weight, np.zeros(len(free.rows)))
+    normal += free.precision[np.ix_(free.rows, free.rows)]
+    return replace(fit, misfit=both, scaled=scaled, normal=normal)
+
+
+def noise_before_compression(fit: DiscFit, pixels: CompressedPixels | None) -> FloatArray:
+    """Return the noise (n,) as level that pixels of a fit have had before compression.
+
+    It is that of the values to be expected, and what they may be off (Dempster, Laird & Rubin,
+    "Maximum likelihood from incomplete data via the EM algorithm", 1977).
+    """
+    if pixels is None:
+        return noise_at(fit.sample, fit.state).sd
+    levels, variance = pixels.levels_before(fit.sample.levels, fit.levels, fit.sd)
+    left = noise_at(replace(fit.sample, levels=levels), fit.state).sd
+    return np.asarray(np.sqrt(left**2 + variance))
 
 
 def _unknowns(tone: Tone, sharpening_px: float) -> DiscUnknowns:
@@ -147,32 +219,20 @@ def _unknowns(tone: Tone, sharpening_px: float) -> DiscUnknowns:
 
 
 def _joint(
-    fits: Sequence[DiscFit],
-    sharpening_px: float,
-    sds: Sequence[FloatArray],
-    telling: Sequence[DiscFit] | None = None,
+    fits: Sequence[DiscFit], sharpening_px: float, loss: float, *, is_settled: bool
 ) -> JointFit:
-    """Collect discs that are adjusted together.
-
-    Parameters
-    ----------
-    sds : sequence of (n,) arrays
-        Noise by which the loss is stated.
-    telling : sequence of DiscFit
-        The same by the noise that their information is stated by; by default, the one they have.
-    """
+    """Collect discs that are adjusted together."""
     free, usual = fits[0].free, ProcessingPrior.usual()
     own = np.isin(_SHARED, free.rows)
     reduced = _reduced(fits, 0.0)
     count = len(CAMERA_ROWS)
     scores, informations = np.zeros((len(fits), count)), np.zeros((len(fits), count, count))
     scores[:, own] = reduced.gradients
-    normals = reduced.normals if telling is None else _reduced(telling, 0.0).normals
-    informations[np.ix_(np.arange(len(fits)), own, own)] = normals
-    loss = sum(misfit_by(fit, sd) for fit, sd in zip(fits, sds, strict=True))
-    loss += _penalty(fits[0].state.vector[_SHARED], usual)
+    informations[np.ix_(np.arange(len(fits)), own, own)] = reduced.normals
     precision = usual.precision + informations.sum(axis=0)
-    return JointFit(free.tone, sharpening_px, tuple(fits), loss, precision, scores, informations)
+    return JointFit(
+        free.tone, sharpening_px, tuple(fits), loss, precision, scores, informations, is_settled
+    )
 
 
 def _minimised(
@@ -181,17 +241,24 @@ def _minimised(
     free: DiscUnknowns,
     usual: ProcessingPrior,
     sds: Sequence[FloatArray],
+    pixels: Sequence[CompressedPixels | None] | None = None,
 ) -> list[DiscFit]:
     """Take damped Gauss-Newton steps of all discs together.
 
     After each, every disc takes a step of its own with what is shared held fast: tone curve, blur
     and levels make a narrow, bent valley, and a step of all parameters at once ends on its slope.
+
+    Parameters
+    ----------
+    pixels : sequence of CompressedPixels, optional
+        What compression left of each disc's; None: there was none.
     """
+    pixels = [None] * len(samples) if pixels is None else pixels
 
     def at(places: Sequence[DiscState]) -> list[DiscFit]:
         return [
-            disc_fit_at(sample, state, sample.unknowns(free), sd)
-            for sample, state, sd in zip(samples, places, sds, strict=True)
+            compressed_fit_at(sample, state, sample.unknowns(free), sd, left)
+            for sample, state, sd, left in zip(samples, places, sds, pixels, strict=True)
         ]
 
     fits, damping = at(states), _DAMPING
@@ -254,6 +321,36 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
     return made
 
 
+def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: Tone) -> FloatArray:
+    """Return the step (4,) of what is shared that gains most of all that keep the curve plausible.
+
+    Cut off afterwards, steps would end where they first meet a limit, wherever along it the best
+    curve is. It is the least distance from the free step in the metric of the normal equations
+    (Lawson & Hanson, "Solving least squares problems", 1974, chapter 23: LDP).
+
+    Parameters
+    ----------
+    step : (4,) array
+        That gains most of all, in the order of `CAMERA_ROWS`.
+    normal : (4, 4) array
+        Of the normal equations that it solves.
+    now : (4,) array
+        What the step starts from.
+    tone : Tone
+        A bent curve.
+    """
+    of_waves, least = wave_limits(tone)
+    short = least - of_waves @ (now + step)[:WAVES]
+    if short.max() <= 0.0:
+        return step
+    root = np.linalg.cholesky(normal)
+    rows = np.pad(of_waves, ((0, 0), (0, len(step) - WAVES)))
+    across = np.linalg.solve(root, rows.T)
+    multipliers, _ = nnls(np.vstack((across, short)), np.append(np.zeros(len(step)), 1.0))
+    back = np.linalg.solve(root.T, across @ multipliers)
+    return step + np.asarray(back) / (1.0 - float(short @ multipliers))
+
+
 def _steps(
     fits: Sequence[DiscFit], usual: ProcessingPrior, damping: float
 ) -> tuple[list[FloatArray], float]:
@@ -265,10 +362,14 @@ def _steps(
     try:
         reduced = _reduced(fits, damping)
         gradient = precision @ off + sum(reduced.gradients)
-        shared = np.linalg.solve(precision + sum(reduced.normals), gradient)
+        normal = precision + sum(reduced.normals)
+        shared = np.linalg.solve(normal, gradient)
+        if free.tone.is_shaped:
+            now = fits[0].state.vector[_SHARED]
+            shared = within_limits(shared, normal, now, free.tone)
     except np.linalg.LinAlgError:
         raise NoFit from None
-    promised, steps = 0.5 * float(gradient @ shared), []
+    promised, steps = float(gradient @ shared - 0.5 * shared @ normal @ shared), []
     for inverse, between, own_gradient in zip(
         reduced.inverse_others, reduced.between, reduced.own_gradients, strict=True
     ):

@@ -70,8 +70,12 @@ def plausible(waves: FloatArray, tone: Tone) -> FloatArray:
     from the ground onto a disc is as much brighter near its edge.
     """
     waves = waves.copy()
-    waves[0] = max(waves[0], _LEAST_GAMMA[0 if tone.is_srgb else 1])
+    waves[0] = max(waves[0], _least_gamma(tone))
     return steep_enough(waves)
+
+
+def _least_gamma(tone: Tone) -> float:
+    return _LEAST_GAMMA[0 if tone.is_srgb else 1]
 
 
 def steep_enough(waves: FloatArray) -> FloatArray:
@@ -83,6 +87,15 @@ def steep_enough(waves: FloatArray) -> FloatArray:
     steepest_fall = -float((waves @ _slopes_of_waves()).min())
     room = 1.0 - _LEAST_SLOPE
     return waves * (room / steepest_fall) if steepest_fall > room else waves
+
+
+def wave_limits(tone: Tone) -> tuple[FloatArray, FloatArray]:
+    """Return what `plausible` asks of amplitudes: rows (m, 3) whose products are at least (m,)."""
+    slopes = _slopes_of_waves().T
+    rows = np.vstack((slopes, (1.0, 0.0, 0.0)))
+    least = np.full(len(rows), _LEAST_SLOPE - 1.0)
+    least[-1] = _least_gamma(tone)
+    return rows, least
 
 
 @cache

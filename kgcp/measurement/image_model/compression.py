@@ -3,20 +3,22 @@
 JPEG rounds the cosine transform of every block of 8 × 8 pixels to multiples of 64 steps. At the
 edge of a disc, most of what tells the tone curve from the blur is below half a step and is gone.
 Taken for noise, that bends the curve. So a coefficient only says that it was within half a step
-of what is left of it (interval censoring), and values are estimated from that and from the model.
+of what is left of it (interval censoring): that is what the model is compared with.
 The steps are read from the photograph itself: its coefficients are their multiples.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
+from kgcp.measurement.image_model.noise import OUTLIER_SIGMAS, Misfit
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
@@ -35,6 +37,7 @@ _LEAST_DETERMINED = 6  # steps of 64, …
 _LEAST_SHARE = 0.55
 _LEAST_SD_COUNTS = 0.3  # quantisation of grey values alone
 _IMPOSSIBLE = 1e-8  # probability of an interval, below which only its nearer end counts
+_LEAST_WEIGHT = 1e-9
 
 
 def quantisation_steps(grey: GreyArray) -> FloatArray | None:
@@ -81,60 +84,127 @@ def _step_of(size: FloatArray) -> float:
     return float(steps[best]) if shown[best] > _PERIODIC * left else math.nan
 
 
-def levels_before(
-    grey: GreyArray, places_px: FloatArray, model: FloatArray, sd: FloatArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return what is expected of levels before they were compressed.
+@dataclass(frozen=True, slots=True, eq=False)
+class CompressedPixels:
+    """Some pixels of a compressed photograph, of whose blocks the coefficients tell."""
 
-    Parameters
-    ----------
-    grey : (height, width) array of uint8
-        The photograph.
-    places_px : (2, n) array
-        Pixels that are modelled.
-    model, sd : (n,) arrays
-        Their levels, 0…1, and the standard deviation of their noise.
-    steps : (8, 8) array
-        As of `quantisation_steps`.
+    # (k,): which of the pixels are in blocks that are whole and not clipped
+    in_blocks: IndexArray
+    places: IndexArray  # (k,): where in the flat blocks
+    alone: IndexArray  # (n - k,): the others, which tell for themselves
+    observed: FloatArray  # (b, 8, 8): grey values of the blocks
+    low: FloatArray  # (b, 8, 8): between which the coefficients were
+    high: FloatArray
 
-    Returns
-    -------
-    levels : (n,) array
-        As observed where a block is cut by the photograph's border, or clipped.
-    variance : (n,) array
-        By which they may be off.
-    """
-    x, y = places_px.astype(np.intp)
-    height, width = (side // _SIDE * _SIDE for side in grey.shape)
-    levels, variance = grey[y, x] / _WHITE, np.zeros(len(x))
-    within = (x < width) & (y < height)
-    if not within.any():
-        return levels, variance
-    x, y = x[within], y[within]
-    x0, y0 = x.min() // _SIDE * _SIDE, y.min() // _SIDE * _SIDE
-    x1, y1 = (x.max() // _SIDE + 1) * _SIDE, (y.max() // _SIDE + 1) * _SIDE
-    observed = grey[y0:y1, x0:x1].astype(np.float64)
-    modelled, noise = observed.copy(), np.zeros_like(observed)
-    modelled[y - y0, x - x0] = np.clip(model[within], 0.0, 1.0) * _WHITE
-    noise[y - y0, x - x0] = (sd[within] * _WHITE) ** 2
-    blocks = _blocks(observed)
-    exact = (blocks.min(axis=(2, 3)) > 0.0) & (blocks.max(axis=(2, 3)) < _WHITE)
-    of_block = np.sqrt(np.maximum(_blocks(noise).mean(axis=(2, 3)), _LEAST_SD_COUNTS**2))
-    middle = np.rint(_transformed(blocks) / steps) * steps
-    expected, left = _within(_transformed(_blocks(modelled)), of_block, middle, 0.5 * steps)
-    before = np.where(exact[..., None, None], _restored(expected), blocks)
-    lost = np.where(exact, left.mean(axis=(2, 3)), 0.0)
-    levels[within] = _whole(before)[y - y0, x - x0] / _WHITE
-    variance[within] = lost[(y - y0) // _SIDE, (x - x0) // _SIDE] / _WHITE**2
-    return levels, variance
+    @classmethod
+    def of(cls, grey: GreyArray, places_px: FloatArray, steps: FloatArray) -> CompressedPixels:
+        """Collect the blocks of pixels.
+
+        Parameters
+        ----------
+        grey : (height, width) array of uint8
+            The photograph.
+        places_px : (2, n) array
+            Pixels that are modelled.
+        steps : (8, 8) array
+            As of `quantisation_steps`.
+        """
+        x, y = places_px.astype(np.intp)
+        height, width = (side // _SIDE * _SIDE for side in grey.shape)
+        number = y // _SIDE * (width // _SIDE) + x // _SIDE
+        within = (x < width) & (y < height)
+        which = np.unique(number[within])
+        rows, columns = np.divmod(which, max(width // _SIDE, 1))
+        down, across = np.mgrid[:_SIDE, :_SIDE]
+        every = grey[
+            (_SIDE * rows)[:, None, None] + down, (_SIDE * columns)[:, None, None] + across
+        ].astype(np.float64)
+        exact = (every.min(axis=(1, 2)) > 0.0) & (every.max(axis=(1, 2)) < _WHITE)
+        place = np.full(height * width // _SIDE**2, -1)
+        place[which[exact]] = np.arange(np.count_nonzero(exact))
+        block = np.full(len(x), -1)
+        block[within] = place[number[within]]
+        in_blocks = np.flatnonzero(block >= 0)
+        flat = _SIDE**2 * block + _SIDE * (y % _SIDE) + x % _SIDE
+        middle = np.rint(_transformed(every[exact]) / steps) * steps
+        return cls(
+            in_blocks,
+            flat[in_blocks],
+            np.flatnonzero(block < 0),
+            every[exact],
+            middle - 0.5 * steps,
+            middle + 0.5 * steps,
+        )
+
+    def misfit(self, model: FloatArray, sd: FloatArray) -> Misfit:
+        """Compare the coefficients with modelled levels (n,) under noise (n,).
+
+        Score and weight are by coefficient (64 b,), in units of `deviations`. As of grey values
+        (`kgcp.measurement.image_model.noise`), the loss of what is farther than 3.5 standard
+        deviations grows as the logarithm.
+        """
+        mean, deviation = self._expected(model, sd)
+        return Misfit(*_misfit(*(each.ravel() for each in (mean, deviation, self.low, self.high))))
+
+    def deviations(self, sd: FloatArray) -> FloatArray:
+        """Return the standard deviations (64 b,) of coefficients under noise (n,) of the levels.
+
+        What is not modelled, ground beyond the pixels, has as much noise as they have.
+        """
+        variance = (_WHITE * sd[self.in_blocks]) ** 2
+        every = np.full(self.observed.size, np.median(variance) if len(variance) else 0.0)
+        every[self.places] = variance
+        square = _COSINES * _COSINES
+        made = square @ every.reshape(self.observed.shape) @ square.T
+        return np.asarray(np.sqrt(np.maximum(made, _LEAST_SD_COUNTS**2))).ravel()
+
+    def coefficients(self, rows: FloatArray) -> FloatArray:
+        """Return what changes (p, n) of the levels change coefficients by (p, 64 b)."""
+        changes = np.zeros((len(rows), self.observed.size))
+        changes[:, self.places] = _WHITE * rows[:, self.in_blocks]
+        made = changes.reshape(-1, _SIDE**2) @ _COSINES_OF_BLOCK.T  # quicker than by small matrices
+        return np.asarray(made.reshape(len(rows), -1))
+
+    def levels_before(
+        self, levels: FloatArray, model: FloatArray, sd: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what is expected of levels before they were compressed.
+
+        Parameters
+        ----------
+        levels : (n,) array
+            As observed, 0…1.
+        model, sd : (n,) arrays
+            As modelled, and the standard deviation of their noise.
+
+        Returns
+        -------
+        levels : (n,) array
+            As observed where a block is cut by the photograph's border, or clipped.
+        variance : (n,) array
+            By which they may be off.
+        """
+        mean, deviation = self._expected(model, sd)
+        expected, left = _within(mean, deviation, self.low, self.high)
+        square = _COSINES * _COSINES
+        before, variance = levels.copy(), np.zeros(len(levels))
+        before[self.in_blocks] = _restored(expected).ravel()[self.places] / _WHITE
+        variance[self.in_blocks] = (square.T @ left @ square).ravel()[self.places] / _WHITE**2
+        return before, variance
+
+    def _expected(self, model: FloatArray, sd: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return means and deviations (b, 8, 8) of coefficients, by the model."""
+        values = self.observed.ravel().copy()
+        values[self.places] = _WHITE * np.clip(model[self.in_blocks], 0.0, 1.0)
+        mean = _transformed(values.reshape(self.observed.shape))
+        return mean, self.deviations(sd).reshape(mean.shape)
 
 
 def _within(
-    mean: FloatArray, sd: FloatArray, middle: FloatArray, half: FloatArray
+    mean: FloatArray, sd: FloatArray, bottom: FloatArray, top: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of normal variables within intervals (rows, columns, 8, 8)."""
-    sd = sd[..., None, None]
-    low, high = (middle - half - mean) / sd, (middle + half - mean) / sd
+    """Return mean and variance of normal variables within intervals."""
+    low, high = (bottom - mean) / sd, (top - mean) / sd
     below = low > 0.0  # of two tails, their difference is exact only of the smaller ones
     probability = ndtr(np.where(below, -low, high)) - ndtr(np.where(below, -high, low))
     possible: BoolArray = probability > _IMPOSSIBLE
@@ -143,7 +213,26 @@ def _within(
     expected = np.where(possible, mean + sd * off, mean)
     share = 1.0 + low * density[0] - high * density[1] - off * off
     variance = np.where(possible, np.clip(share, 0.0, 1.0), 0.0) * sd**2
-    return np.clip(expected, middle - half, middle + half), variance
+    return np.clip(expected, bottom, top), variance
+
+
+def _misfit(
+    mean: FloatArray, sd: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return the negative log-likelihood of intervals, and its derivatives as `Misfit` has them."""
+    middle, half = (0.5 * (low + high) - mean) / sd, 0.5 * (high - low) / sd
+    sign, nearest = np.where(middle < 0.0, -1.0, 1.0), np.abs(middle) - half
+    beyond = np.maximum(nearest / OUTLIER_SIGMAS, 1.0)  # 1: not an outlier
+    near = np.minimum(nearest, OUTLIER_SIGMAS)
+    far = near + 2.0 * half
+    probability = ndtr(-near) - ndtr(-far)
+    at_near, at_far = _normal(near) / probability, _normal(far) / probability
+    score = at_near - at_far
+    # an interval much wider than the noise, of which the mean is well within, tells nothing
+    weight = np.maximum(score * score + far * at_far - near * at_near, _LEAST_WEIGHT)
+    weight = np.where(beyond > 1.0, score / (OUTLIER_SIGMAS * beyond**2), weight)
+    loss = score * OUTLIER_SIGMAS * np.log(beyond) - np.log(probability)
+    return float(loss.sum()), sign * score / beyond, weight
 
 
 def _normal(x: FloatArray) -> FloatArray:
@@ -159,6 +248,7 @@ def _cosines() -> FloatArray:
 
 
 _COSINES = _cosines()
+_COSINES_OF_BLOCK = np.kron(_COSINES, _COSINES)  # (64, 64)
 
 
 def _transformed(blocks: FloatArray) -> FloatArray:
@@ -174,9 +264,3 @@ def _blocks(grey: NDArray[_Pixel]) -> NDArray[_Pixel]:
     """Return the blocks (rows, columns, 8, 8) of a picture of whole ones."""
     rows, columns = (side // _SIDE for side in grey.shape)
     return grey.reshape(rows, _SIDE, columns, _SIDE).swapaxes(1, 2)
-
-
-def _whole(blocks: FloatArray) -> FloatArray:
-    """Return the picture of blocks (rows, columns, 8, 8)."""
-    rows, columns = blocks.shape[:2]
-    return blocks.swapaxes(1, 2).reshape(_SIDE * rows, _SIDE * columns)

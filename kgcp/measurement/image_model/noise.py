@@ -18,7 +18,8 @@ import numpy as np
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 
-_OUTLIER_SIGMAS = 3.5
+OUTLIER_SIGMAS = 3.5
+"""Farther from the model than so many standard deviations, a value is an outlier."""
 # Sigmas short of the limit at which a clipped pixel pulls as strongly as an outlier.
 _FARTHEST_CLIPPED = 3.23249
 _MIN_NOISE_COUNTS = 0.3  # quantisation alone: 1/√12 of a grey value
@@ -389,12 +390,12 @@ def _misfit(
             weight[i] = max(curvature, 1e-9)
             continue
         z = (levels[i] - model[i]) / sd[i]
-        square = z * z / (_OUTLIER_SIGMAS * _OUTLIER_SIGMAS)
+        square = z * z / (OUTLIER_SIGMAS * OUTLIER_SIGMAS)
         if square <= 1.0:
             total += 0.5 * z * z
             weight[i] = 1.0
         else:
-            total += 0.5 * _OUTLIER_SIGMAS * _OUTLIER_SIGMAS * (1.0 + math.log(square))
+            total += 0.5 * OUTLIER_SIGMAS * OUTLIER_SIGMAS * (1.0 + math.log(square))
             weight[i] = 1.0 / square
         score[i] = z * weight[i]
     return total, score, weight

@@ -206,6 +206,13 @@ def _camera_of(pool: WorkerPool, task: PhotoTask, photos: Sequence[Photo]) -> Ca
             stacklevel=2,
         )
         return None
+    if learned is not None and not learned.is_settled:
+        warnings.warn(
+            "the photographs are compressed so much that their tone curve did not settle: sizes of"
+            " the discs are less certain than stated; take them with less compression, or as PNG",
+            KgcpWarning,
+            stacklevel=2,
+        )
     return learned
 
 
