@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -249,33 +249,33 @@ def _measured_card(
     )
 
 
-def _values(observation: Measurement, residual_percent: float | None) -> list[str]:
-    """Return the values in few words; those that are not known are left out."""
+def _values(observation: Measurement, residual_percent: float | None) -> Iterator[str]:
+    """Yield the values in few words; those that are not known are left out."""
     appearance, spread = observation.appearance, observation.uncertainty
     x, y = observation.centre_px
     sd = "" if spread is None else f" ± {np.sqrt(np.diag(spread.centre_cov_px2).max()):.3f}"
-    texts = [f"centre ({x:.2f}, {y:.2f}){sd} px", f"radius {appearance.radius_px:.1f} px"]
+    yield f"centre ({x:.2f}, {y:.2f}){sd} px"
+    yield f"radius {appearance.radius_px:.1f} px"
     if observation.ring != observation.target:
-        texts.append(f"by {observation.ring}")
+        yield f"by {observation.ring}"
     if observation.is_guided:
-        texts.append("second look")
+        yield "second look"
     angles = (observation.pose.roll_deg, observation.pose.pitch_deg, observation.heading_deg)
     roll, pitch, heading = (minus(f"{angle:.1f}") for angle in angles)
-    texts.append(f"roll {roll}°, pitch {pitch}°, heading {heading}°")
+    yield f"roll {roll}°, pitch {pitch}°, heading {heading}°"
     if observation.alternative is not None:
         ambiguity = observation.alternative.ambiguity
-        texts.append(f"ambiguity {ambiguity:.{1 if ambiguity < 100.0 else 0}f}")
+        yield f"ambiguity {ambiguity:.{1 if ambiguity < 100.0 else 0}f}"
     if appearance.blur_px is not None:
-        texts.append(f"blur {appearance.blur_px:.2f} px")
+        yield f"blur {appearance.blur_px:.2f} px"
     if appearance.edge_shift_px is not None:
-        texts.append(f"edge shift {minus(f'{appearance.edge_shift_px:.2f}')} px")
-    texts.append(f"levels {appearance.black:.2f} … {appearance.white:.2f}")
-    texts.append(f"clipped {100.0 * appearance.saturated:.0f}\xa0%")
+        yield f"edge shift {minus(f'{appearance.edge_shift_px:.2f}')} px"
+    yield f"levels {appearance.black:.2f} … {appearance.white:.2f}"
+    yield f"clipped {100.0 * appearance.saturated:.0f}\xa0%"
     if math.isfinite(observation.score):
-        texts.append(f"score {observation.score:.2f}")
+        yield f"score {observation.score:.2f}"
     if residual_percent is not None:
-        texts.append(f"residuals {residual_percent:.1f}\xa0%")
-    return texts
+        yield f"residuals {residual_percent:.1f}\xa0%"
 
 
 def _joined(*texts: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -201,38 +202,33 @@ def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
 
 def judge(calibration: CameraCalibration, numbers: CalibrationNumbers) -> CalibrationVerdict:
     """Return the grade of a calibration, the reasons, and advice for a better one."""
-    unusable = _unusable(calibration, numbers)
-    doubts = _doubts(calibration, numbers)
-    grade = (
-        CalibrationGrade.UNUSABLE
-        if unusable
-        else CalibrationGrade.LOOK
-        if doubts
-        else CalibrationGrade.GOOD
-    )
-    return CalibrationVerdict(grade, (*unusable, *doubts), _advice(calibration, numbers))
+    unusable = tuple(_unusable(calibration, numbers))
+    doubts = tuple(_doubts(calibration, numbers))
+    grade = CalibrationGrade.LOOK if doubts else CalibrationGrade.GOOD
+    if unusable:
+        grade = CalibrationGrade.UNUSABLE
+    advice = tuple(_advice(calibration, numbers))
+    return CalibrationVerdict(grade, (*unusable, *doubts), advice)
 
 
-def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
-    reasons = []
+def _unusable(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
     if numbers.views < _LEAST_PLACES:
-        reasons.append(f"{numbers.views} photographs are fewer than {_LEAST_PLACES}")
+        yield f"{numbers.views} photographs are fewer than {_LEAST_PLACES}"
     elif numbers.places < _LEAST_PLACES:
-        reasons.append(f"{numbers.photographs} only, fewer than {_LEAST_PLACES}")
+        yield f"{numbers.photographs} only, fewer than {_LEAST_PLACES}"
     if numbers.discs_used < _LEAST_DISCS * numbers.views:
-        reasons.append("there are fewer than 6 discs per photograph")
+        yield "there are fewer than 6 discs per photograph"
     rejected = 1.0 - numbers.discs_used / numbers.discs
     if rejected > _MOST_REJECTED:
-        reasons.append(f"{100.0 * rejected:.0f} % of the discs do not fit")
+        yield f"{100.0 * rejected:.0f} % of the discs do not fit"
     share = numbers.sd[0] / calibration.camera.fx
     if share > _FOCAL_SHARE:
-        reasons.append(f"the focal length is known to {100.0 * share:.1f} % only")
+        yield f"the focal length is known to {100.0 * share:.1f} % only"
     if {"cx", "cy"} & set(calibration.undetermined):
-        reasons.append("the principal point is not determined")
+        yield "the principal point is not determined"
     far_off_px = 10.0 * _OPERATOR_RATIO * numbers.operator_sd_px
     if numbers.field_of_view_deg > _WIDE_DEG and numbers.rms_px > far_off_px:
-        reasons.append("the lens looks like a fisheye, which kgcp's camera is not")
-    return reasons
+        yield "the lens looks like a fisheye, which kgcp's camera is not"
 
 
 def _more_photographs(numbers: CalibrationNumbers) -> str:
@@ -241,46 +237,44 @@ def _more_photographs(numbers: CalibrationNumbers) -> str:
     return f"Take photographs from 12 places or more: a burst counts once ({numbers.photographs})."
 
 
-def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> list[str]:
-    doubts = []
+def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
     if _fits_badly(numbers):
         ratio = numbers.rms_px / numbers.operator_sd_px
-        doubts.append(
+        yield (
             f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
         )
     if numbers.field is not None and numbers.field.doubt:
-        doubts.append(
+        yield (
             f"the field is not what it is said to be: {numbers.field.doubt}"
             f" ({numbers.rms_fixed_px:.2f} px as stated, {numbers.rms_px:.3f} px in its own shape)"
         )
     if numbers.coverage < _COVERAGE:
-        doubts.append(f"discs cover {100.0 * numbers.coverage:.0f} % of the frame")
+        yield f"discs cover {100.0 * numbers.coverage:.0f} % of the frame"
     if numbers.normals_deg < _NORMALS_DEG:
-        doubts.append(f"all photographs look from within {numbers.normals_deg:.0f}°")
+        yield f"all photographs look from within {numbers.normals_deg:.0f}°"
     off = calibration.radius_scale - 1.0
     if _has_other_discs(calibration):
         other = "larger" if off > 0.0 else "smaller"
-        doubts.append(f"discs are {100.0 * abs(off):.0f} % {other} than stated")
+        yield f"discs are {100.0 * abs(off):.0f} % {other} than stated"
     if others := _of_other_discs(calibration):
         named = ", ".join(others[:3]) + (f" and {len(others) - 3} more" if others[3:] else "")
-        doubts.append(
+        yield (
             f"by their distances, discs have another size in {named} than in most photographs: give"
             " photographs of one field only"
         )
     if calibration.is_turn_unclear:
-        doubts.append(
+        yield (
             "the field looks the same when it is turned, so that its own errors cannot be estimated"
         )
     if calibration.dropped:
         count = len(calibration.dropped)
-        doubts.append(
+        yield (
             "1 photograph does not fit the others"
             if count == 1
             else f"{count} photographs do not fit the others"
         )
     if numbers.light is not None and numbers.light.doubt:
-        doubts.append(numbers.light.doubt)
-    return doubts
+        yield numbers.light.doubt
 
 
 def _fits_badly(numbers: CalibrationNumbers) -> bool:
@@ -300,37 +294,33 @@ def _of_other_discs(calibration: CameraCalibration) -> list[str]:
     return [calibration.views[k].photo for k in np.flatnonzero(off > _OTHER_FIELD_SHARE).tolist()]
 
 
-def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> tuple[str, ...]:
-    advice = []
+def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
     if numbers.normals_deg < 2.0 * _NORMALS_DEG or np.median(numbers.tilts_deg) < _NORMALS_DEG:
-        advice.append("Tilt the field by 25° to 40° about both axes, in all four directions.")
+        yield "Tilt the field by 25° to 40° about both axes, in all four directions."
     turns = np.radians(numbers.turns_deg)
     # share of the directions along one axis: 1 if all photographs are held in the same way
     alike = float(np.abs(np.mean(np.exp(2j * turns))))
     if alike > 0.9:
-        advice.append("Turn the camera by 90° in at least two photographs.")
+        yield "Turn the camera by 90° in at least two photographs."
     if numbers.coverage < _COVERAGE:
-        advice.append("Bring the field into the corners of the frame.")
+        yield "Bring the field into the corners of the frame."
     if calibration.dropped or _fits_badly(numbers):
-        advice.append(
+        yield (
             "Keep zoom, focus and crop the same in all photographs, none turned afterwards, and the"
             " field rigid. If those that do not fit are the only ones to reach the corners, it may"
             " be a lens that no model here describes."
         )
     if numbers.places < 12:
-        advice.append(_more_photographs(numbers))
+        yield _more_photographs(numbers)
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
-        advice.append(f"Not determined by these photographs: {names}; come nearer, and tilt more.")
+        yield f"Not determined by these photographs: {names}; come nearer, and tilt more."
     if _has_other_discs(calibration):
-        advice.append(
+        yield (
             "Measure the diameter and the pitch of the print, on which the camera does not depend;"
             " burnt white displaces edges, too."
         )
     if calibration.is_turn_unclear:
-        advice.append("Give the field a mark: one disc that is hollow, larger or missing.")
+        yield "Give the field a mark: one disc that is hollow, larger or missing."
     if numbers.light is not None and numbers.light.doubt:
-        advice.append(
-            "Give photographs as the camera took them, no negatives, and white not burnt."
-        )
-    return tuple(advice)
+        yield ("Give photographs as the camera took them, no negatives, and white not burnt.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -62,12 +63,11 @@ def position_sentence(placed: PlacedTarget) -> str:
     )
 
 
-def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
-    """Return what to look at before a placed target is used."""
-    doubts = []
+def doubts_of(placed: PlacedTarget) -> Iterator[str]:
+    """Yield what to look at before a placed target is used."""
     rejected = int(np.count_nonzero(~placed.is_used))
     if placed.move is not None:
-        doubts.append(
+        yield (
             f"{placed.target}: {placed.move.as_move}; it is placed by the"
             f" {len(placed.frames) - rejected} of {len(placed.frames)} frames that agree"
         )
@@ -75,22 +75,21 @@ def doubts_of(placed: PlacedTarget) -> tuple[str, ...]:
         frames = f"{rejected} of {len(placed.frames)} frames do"
         if rejected == 1:
             frames = f"1 of {len(placed.frames)} frames does"
-        doubts.append(
+        yield (
             f"{placed.target}: {frames} not fit the others and took no part;"
             f" the worst is {placed.worst_frame}"
         )
     if placed.own_noise_px is not None:
-        doubts.append(
+        yield (
             f"{placed.target}: its images contradict each other by {placed.own_noise_px:.3g} px,"
             " those of other targets do not: it was moved, or something else was taken for it;"
             " its place lies between, and is stated as uncertain as that of a single frame"
         )
     if placed.ambiguity < MIN_AMBIGUITY:
-        doubts.append(
+        yield (
             f"{placed.target}: its mirrored normal fits nearly as well"
             f" (Δχ² {placed.ambiguity:.1f}); see it from more directions"
         )
-    return tuple(doubts)
 
 
 def step_sentence(placement: Placement) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -166,12 +166,11 @@ def field_toml(field: AnyField) -> str:
         f"name = {json.dumps(field.name)}",
         f'polarity = "{field.polarity.value}"',
         f"flat_sd_m = {list(field.flat_sd_m)}",
+        *(point_lines(field) if isinstance(field, PointField) else _grid_lines(field)),
     ]
-    lines += point_lines(field) if isinstance(field, PointField) else _grid_lines(field)
     for bar in field.bars:
         lines += [
-            "",
-            "[[bar]]",
+            "\n[[bar]]",
             f"from = {json.dumps(bar.first)}",
             f"to = {json.dumps(bar.second)}",
             f"length_m = {bar.length_m!r}",
@@ -180,24 +179,21 @@ def field_toml(field: AnyField) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _grid_lines(field: Field) -> list[str]:
-    lines = [f"diameter_m = {field.diameter_m!r}"]
+def _grid_lines(field: Field) -> Iterator[str]:
+    yield f"diameter_m = {field.diameter_m!r}"
     if field.inner_diameter_m:
-        lines.append(f"inner_diameter_m = {field.inner_diameter_m!r}")
-    lines += [
-        "",
-        "[grid]",
-        f'kind = "{field.kind.value}"',
-        f"columns = {field.columns}",
-        f"rows = {field.rows}",
-        f"pitch_m = {field.pitch_m!r}",
-    ]
+        yield f"inner_diameter_m = {field.inner_diameter_m!r}"
+    yield "\n[grid]"
+    yield f'kind = "{field.kind.value}"'
+    yield f"columns = {field.columns}"
+    yield f"rows = {field.rows}"
+    yield f"pitch_m = {field.pitch_m!r}"
     for mark in field.marks:
-        lines += ["", "[[mark]]", f"at = [{mark.column}, {mark.row}]"]
+        yield "\n[[mark]]"
+        yield f"at = [{mark.column}, {mark.row}]"
         if mark.is_missing:
-            lines.append("missing = true")
+            yield "missing = true"
             continue
-        lines.append(f"diameter_m = {mark.diameter_m!r}")
+        yield f"diameter_m = {mark.diameter_m!r}"
         if mark.inner_diameter_m:
-            lines.append(f"inner_diameter_m = {mark.inner_diameter_m!r}")
-    return lines
+            yield f"inner_diameter_m = {mark.inner_diameter_m!r}"

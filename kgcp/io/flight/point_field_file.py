@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,26 +142,21 @@ def _from_row(columns: CsvColumns, row: int, diameter_m: float, inner_m: float) 
     )
 
 
-def point_lines(field: PointField) -> list[str]:
-    """Return the lines of a field.toml that say which discs a field has."""
-    lines: list[str] = []
+def point_lines(field: PointField) -> Iterator[str]:
+    """Yield the lines of a field.toml that say which discs a field has."""
     if field.code is not None:
         ring = [field.code.inner, field.code.outer]
-        lines += ["", "[code]", 'kind = "ring"', f"bits = {field.code.bits}", f"ring = {ring}"]
+        yield from ("\n[code]", 'kind = "ring"', f"bits = {field.code.bits}", f"ring = {ring}")
     for point in field.points:
-        lines += [
-            "",
-            "[[point]]",
-            f"name = {json.dumps(point.name)}",
-            f"position_m = {list(point.position_m)}",
-            f"diameter_m = {point.diameter_m!r}",
-        ]
+        yield "\n[[point]]"
+        yield f"name = {json.dumps(point.name)}"
+        yield f"position_m = {list(point.position_m)}"
+        yield f"diameter_m = {point.diameter_m!r}"
         if point.inner_diameter_m:
-            lines.append(f"inner_diameter_m = {point.inner_diameter_m!r}")
+            yield f"inner_diameter_m = {point.inner_diameter_m!r}"
         if point.normal != _UPRIGHT:
-            lines.append(f"normal = {list(point.normal)}")
+            yield f"normal = {list(point.normal)}"
         if point.sd_m is not None:
-            lines.append(f"sd_m = {list(point.sd_m)}")
+            yield f"sd_m = {list(point.sd_m)}"
         if point.code is not None:
-            lines.append(f"code = {point.code}")
-    return lines
+            yield f"code = {point.code}"

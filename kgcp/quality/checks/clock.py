@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from itertools import product
 
 import numpy as np
 
@@ -23,39 +24,29 @@ _MOST_OUTSIDE = 0.1  # of the frames: some are taken before a logger starts
 _MOSTLY = 0.5
 
 
-def clock_shifts_s() -> list[tuple[float, str]]:
-    """Return what clocks differ by, the likelier first, as seconds and in words.
+def clock_shifts_s() -> Iterator[tuple[float, str]]:
+    """Yield what clocks differ by, the likelier first, as seconds and in words.
 
     A shift is what is to be added to frame times.
     """
-    shifts = []
-    for sign in (-1.0, 1.0):
+    signs = (-1.0, 1.0)
+    for sign in signs:
         ahead = "the frames'" if sign < 0.0 else "the trajectory's"
-        shifts.append((sign * GPS_MINUS_UTC_S, f"{ahead} times seem to be GPS time, not UTC"))
-        shifts.append((sign * TAI_MINUS_UTC_S, f"{ahead} times seem to be TAI, not UTC"))
-        shifts.append(
-            (sign * (TAI_MINUS_UTC_S - GPS_MINUS_UTC_S), f"{ahead} times seem to be TAI, not GPS")
-        )
+        yield sign * GPS_MINUS_UTC_S, f"{ahead} times seem to be GPS time, not UTC"
+        yield sign * TAI_MINUS_UTC_S, f"{ahead} times seem to be TAI, not UTC"
+        tai_minus_gps_s = TAI_MINUS_UTC_S - GPS_MINUS_UTC_S
+        yield sign * tai_minus_gps_s, f"{ahead} times seem to be TAI, not GPS"
     quarters = [*range(4, 57, 4), 22, 14, 18, 23, 26, 38, 42, 46, 51]  # zones of ½ and ¾ hours, too
-    for quarter in quarters:
-        shifts += [
-            (sign * quarter * 0.25 * _HOUR_S, "one of them seems to be local time")
-            for sign in (-1.0, 1.0)
-        ]
-    shifts += [(sign * _DAY_S, "they are of another day") for sign in (-1.0, 1.0)]
-    shifts += [
-        (sign * (hours * _HOUR_S + leap), "one of them seems to be local time, and of GPS")
-        for hours in range(1, 15)
-        for leap in (GPS_MINUS_UTC_S, -GPS_MINUS_UTC_S)
-        for sign in (-1.0, 1.0)
-    ]
-    shifts += [(sign * _WEEK_S, "they are of another GPS week") for sign in (-1.0, 1.0)]
-    shifts += [
-        (sign * rollovers * _ROLLOVER_S, "GPS weeks are counted modulo 1024 in one of them")
-        for rollovers in (1, 2)
-        for sign in (-1.0, 1.0)
-    ]
-    return shifts
+    for quarter, sign in product(quarters, signs):
+        yield sign * quarter * 0.25 * _HOUR_S, "one of them seems to be local time"
+    for sign in signs:
+        yield sign * _DAY_S, "they are of another day"
+    for hours, leap_s, sign in product(range(1, 15), (GPS_MINUS_UTC_S, -GPS_MINUS_UTC_S), signs):
+        yield sign * (hours * _HOUR_S + leap_s), "one of them seems to be local time, and of GPS"
+    for sign in signs:
+        yield sign * _WEEK_S, "they are of another GPS week"
+    for rollovers, sign in product((1, 2), signs):
+        yield sign * rollovers * _ROLLOVER_S, "GPS weeks are counted modulo 1024 in one of them"
 
 
 def check_overlap(

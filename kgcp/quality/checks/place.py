@@ -137,8 +137,7 @@ def _projected_guess(area: AreaOfUse | None, crs: str, xy: FloatArray) -> Guess 
     return None
 
 
-def _geographic_readings(xy: FloatArray) -> list[tuple[tuple[float, float], str]]:
-    readings: list[tuple[tuple[float, float], str]] = []
+def _geographic_readings(xy: FloatArray) -> Iterator[tuple[tuple[float, float], str]]:
     x, y = xy.tolist()
     units: tuple[tuple[FloatArray, Callable[[float], float], str], ...] = (
         (_CIRCLE, lambda angle: float(np.degrees(angle)), "in radians"),
@@ -146,7 +145,6 @@ def _geographic_readings(xy: FloatArray) -> list[tuple[tuple[float, float], str]
     )
     for limit, degrees, unit in units:
         if np.all(np.abs(xy) <= limit):
-            readings.append(((degrees(x), degrees(y)), f"longitude and latitude {unit}"))
+            yield (degrees(x), degrees(y)), f"longitude and latitude {unit}"
         if np.all(np.abs(xy) <= limit[::-1]):
-            readings.append(((degrees(y), degrees(x)), f"latitude and longitude {unit}"))
-    return readings
+            yield (degrees(y), degrees(x)), f"latitude and longitude {unit}"
