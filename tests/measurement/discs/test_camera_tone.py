@@ -8,7 +8,9 @@ import pytest
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.discs.adjust_disc import DiscTask
-from kgcp.measurement.discs.camera_tone import _worthy, learn_tone
+from kgcp.measurement.discs.camera_tone import _with_waves, _worthy, learn_tone
+from kgcp.measurement.discs.disc_levels import COUNT, Row
+from kgcp.measurement.discs.fit_disc import DiscState
 from kgcp.measurement.discs.joint_tone import JointFit
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.image_model.noise import Censoring
@@ -155,3 +157,15 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
     assert camera.known is not None
     assert camera.tone is Tone.UNKNOWN_FROM_LINE
     assert camera.known.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
+
+
+def test_a_state_by_another_curve_shows_the_same_grey_values() -> None:
+    """It is where steps begin anew: levels that stayed would be other grey values."""
+    vector = np.zeros(COUNT)
+    vector[[Row.BLACK, Row.WHITE]] = 0.1, 0.62
+    vector[Row.WAVE_1 : Row.SHARPENING] = 0.2, 0.1, -0.05
+    state, waves = DiscState(vector), np.array((0.0, -0.4, 0.0))
+    made = _with_waves(state, Tone.UNKNOWN, waves)
+    assert made.plateaus(Tone.UNKNOWN) == pytest.approx(state.plateaus(Tone.UNKNOWN), abs=1e-9)
+    assert made.vector[Row.WAVE_1 : Row.SHARPENING].tolist() == waves.tolist()
+    assert made.vector[Row.BLACK] != pytest.approx(0.1, abs=0.01)
