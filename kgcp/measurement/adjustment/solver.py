@@ -38,7 +38,7 @@ _SETTLED_BLUR, _SETTLED_STREAK = 0.02, 0.01
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
 _LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
-_STEPS_OF_HOPE = 2
+_STEPS_BEFORE_HOPELESS = 2
 _NEGLIGIBLE = 1e-6
 _AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
@@ -275,7 +275,7 @@ def minimise(
         gain, total = total - trial_total, trial_total
         parameters, prediction, current = candidate, attempt, trial
         is_new, jacobian = attempt_jacobian is not jacobian, attempt_jacobian
-        is_hopeless = number + 1 >= _STEPS_OF_HOPE and total > hopeless_total
+        is_hopeless = number + 1 >= _STEPS_BEFORE_HOPELESS and total > hopeless_total
         if is_hopeless or (is_new and stops_at_new_jacobian):
             break
         if gain < least_gain or abs(gain - promised) < _AS_PROMISED:
