@@ -323,4 +323,4 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     if calibration.is_turn_unclear:
         yield "Give the field a mark: one disc that is hollow, larger or missing."
     if numbers.light is not None and numbers.light.doubt:
-        yield ("Give photographs as the camera took them, no negatives, and white not burnt.")
+        yield "Give photographs as the camera took them, no negatives, and white not burnt."

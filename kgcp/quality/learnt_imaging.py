@@ -65,7 +65,8 @@ class LearntImaging:
     # the measurements; NaN where fewer than three have such grey values
     light: FloatArray
     sharpening: FloatArray  # (3,): the same of the strength of the unsharp mask
-    noise: FloatArray  # (m, 2): grey value and standard deviation of ink and plate of every one
+    # (m, 2): grey value and standard deviation of ink and plate of every measurement
+    noise: FloatArray
     smoothing: CameraSmoothing  # along contours
 
 

@@ -60,6 +60,7 @@ class FieldScene:
 
     discs: tuple[SimulatedDisc, ...]
     # radiance of the board and of the discs on it at the frame's middle, 0…1; discs may be brighter
+    # than the board
     ground: float = 0.8
     ink: float = 0.06
     gradient: tuple[float, float] = (0.0, 0.0)  # change of light along x and y, relative [1/px]

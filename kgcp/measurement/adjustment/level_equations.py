@@ -34,8 +34,8 @@ class AtKnots(NamedTuple):
     def of(knots: IndexArray, weights: FloatArray) -> AtKnots:
         """Put the pixels of each cell together.
 
-        Of every pixel, the knots (n, j) and their weights (n, j) are given. The first and the last
-        knot tell the others.
+        Of every pixel, the knots (n, j) and their weights (n, j) are given, one pixel at least. The
+        first and the last knot tell the others, as they do on two grids.
         """
         ends = knots[:, 0], knots[:, -1]
         order = np.lexsort(ends)

@@ -322,7 +322,7 @@ def _reduced(fits: Sequence[DiscFit], damping: float) -> _Reduced:
 
 
 def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: Tone) -> FloatArray:
-    """Return the step (4,) of what is shared that gains most of all that keep the curve plausible.
+    """Return the step (k,) of what is shared that gains most of all that keep the curve plausible.
 
     Cut off afterwards, steps would end where they first meet a limit, wherever along it the best
     curve is. It is the least distance from the free step in the metric of the normal equations
@@ -330,15 +330,22 @@ def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: T
 
     Parameters
     ----------
-    step : (4,) array
-        That gains most of all, in the order of `CAMERA_ROWS`.
-    normal : (4, 4) array
+    step : (k,) array
+        That gains most of all, in the order of `CAMERA_ROWS`; the waves come first.
+    normal : (k, k) array
         Of the normal equations that it solves.
-    now : (4,) array
+    now : (k,) array
         What the step starts from.
     tone : Tone
         A bent curve.
+
+    Raises
+    ------
+    NoFit
+        If the step is not finite, or no step along the limits is found.
     """
+    if not np.isfinite(step).all():
+        raise NoFit
     of_waves, least = wave_limits(tone)
     short = least - of_waves @ (now + step)[:WAVES]
     if short.max() <= 0.0:
@@ -346,7 +353,10 @@ def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: T
     root = np.linalg.cholesky(normal)
     rows = np.pad(of_waves, ((0, 0), (0, len(step) - WAVES)))
     across = np.linalg.solve(root, rows.T)
-    multipliers, _ = nnls(np.vstack((across, short)), np.append(np.zeros(len(step)), 1.0))
+    try:
+        multipliers, _ = nnls(np.vstack((across, short)), np.append(np.zeros(len(step)), 1.0))
+    except RuntimeError:  # too many iterations
+        raise NoFit from None
     back = np.linalg.solve(root.T, across @ multipliers)
     return step + np.asarray(back) / (1.0 - float(short @ multipliers))
 
@@ -365,7 +375,7 @@ def _steps(
         normal = precision + sum(reduced.normals)
         shared = np.linalg.solve(normal, gradient)
         if free.tone.is_shaped:
-            now = fits[0].state.vector[_SHARED]
+            now = fits[0].state.vector[_SHARED][own]
             shared = within_limits(shared, normal, now, free.tone)
     except np.linalg.LinAlgError:
         raise NoFit from None

@@ -86,7 +86,7 @@ def _step_of(size: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedPixels:
-    """Some pixels of a compressed photograph, of whose blocks the coefficients tell."""
+    """Some pixels of a compressed photograph, and what is left of their blocks' coefficients."""
 
     # (k,): which of the pixels are in blocks that are whole and not clipped
     in_blocks: IndexArray

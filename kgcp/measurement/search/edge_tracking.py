@@ -271,6 +271,7 @@ def _sample_rays(
 ) -> None:
     """Fill in bilinear grey values along all rays; beyond the border the last pixels repeat.
 
+    The image has two rows and columns at least, as those of a pyramid have.
     `places` and `parts` keep the pixels above and left of the samples, and how far these are beyond
     them; `corners` the four pixels around: loops of arithmetic alone are vectorised, one that also
     reads the image is not.

@@ -8,9 +8,9 @@ Sums of weights times products of these functions are sums of weights times cosi
 to 4θ: cos θ · cos 2θ is half of cos θ + cos 3θ, and so on. So nine sums make the normal matrix, not
 fifteen.
 
-Most places that are tracked are no rings, and a fit takes less time than its parts take to wait
-for each other. Therefore curves stand side by side in all arrays, and each step is one loop over
-some of them, of which the processor takes several at once.
+The operations of a single fit depend on each other, so that the processor mostly waits. Therefore
+curves stand side by side in all arrays, and each step is one loop over many of them, of which the
+processor takes several at once.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def fit_curves(
 
 @inlined
 def _share(strength: float, typical: float) -> float:
-    """Return an edge's weight by its strength; `min` checks for NaN, which keeps off vectors."""
+    """Return an edge's weight by its strength; `min` would check for NaN and prevent vectors."""
     if strength > typical:
         return 1.0
     return strength / (typical + 1e-6)

@@ -133,11 +133,9 @@ def _fit_outlines(pyramid: Pyramid, seeds: Seeds) -> FloatArray:
     Those that agree with a clearer one are dropped. The unit of the edges is the seed's radius, the
     origin its centre.
     """
-    images, places = (
-        (pyramid.frame, pyramid.reduced, pyramid.levels),
-        (seeds.centres_px, seeds.radii_px),
+    edges, inlying = track_edges(
+        pyramid.frame, pyramid.reduced, pyramid.levels, seeds.centres_px, seeds.radii_px
     )
-    edges, inlying = track_edges(*images, *places)
     ellipses, shares = np.empty((len(seeds), 5)), np.empty(len(seeds))
     fit_ellipses(edges, inlying, _DIRECTIONS, _MAX_AXIS_RATIO, ellipses, shares)
     good = np.flatnonzero(shares)

@@ -59,7 +59,7 @@ def evened_patch(patch: FloatArray, ring: Ring, shift: int) -> FloatArray | None
 
 
 def _median(values: FloatArray) -> float:
-    """Return the median of an even number of values, without numpy's looking after others."""
+    """Return the median of an even number of values, faster than numpy, which checks for NaN."""
     half = len(values) // 2
     ordered = np.partition(values, (half - 1, half))
     return 0.5 * float(ordered[half - 1] + ordered[half])

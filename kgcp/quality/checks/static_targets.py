@@ -197,7 +197,7 @@ def _of_targets(
 
 
 def _of_frames(pairs: Sequence[_Pair], wrong: AbstractSet[_Pair]) -> Iterator[Doubt]:
-    """Return the doubt about targets in single frames that contradict most others there."""
+    """Yield the doubt about targets in single frames that contradict most others there."""
     seen, against = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     for pair in pairs:
         for name in pair.names:

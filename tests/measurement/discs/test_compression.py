@@ -14,7 +14,7 @@ from kgcp.measurement.discs import joint_tone
 from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.camera_tone import learn_tone
 from kgcp.measurement.discs.disc_levels import Row
-from kgcp.measurement.discs.fit_disc import DiscFit, DiscState, DiscUnknowns
+from kgcp.measurement.discs.fit_disc import DiscFit, DiscState, DiscUnknowns, NoFit
 from kgcp.measurement.discs.joint_tone import (
     compressed_fit_at,
     pixels_before_compression,
@@ -206,6 +206,11 @@ def test_steps_beyond_a_limit_of_the_curve_gain_most_along_it() -> None:
         best = minimize(off, np.zeros(4), method="SLSQP", constraints=limits, tol=1e-12)
         assert made == pytest.approx(best.x, abs=2e-4)
         assert (rows @ (now + made)[:3] - least).min() > -1e-9
+
+
+def test_a_step_that_is_no_number_is_no_fit() -> None:
+    with pytest.raises(NoFit):
+        within_limits(np.full(4, np.nan), np.eye(4), np.zeros(4), Tone.UNKNOWN)
 
 
 @pytest.mark.parametrize("seed", [0, 2])
