@@ -141,8 +141,8 @@ def _try_target(
                 refusal.outline,
                 refusal.score,
                 is_match=False,
-                reason=refusal.rejection.reason,
-                detail=refusal.rejection.detail,
+                reason=refusal.reason,
+                detail=refusal.detail,
             )
             for refusal in refused
         ]

@@ -154,12 +154,12 @@ def _only_candidate(
         If there is none, or another one.
     """
     accepted: list[_Candidate] = []
-    first: Rejection | None = None
+    first: tuple[Reason, str] | None = None
     for edge in edges[:_MOST_TRIES]:
         try:
             accepted.append(_try_edge(grey, camera, target, prediction, edge))
         except Rejection as rejection:
-            first = first or rejection
+            first = first or (rejection.reason, rejection.detail)
     if accepted and len(edges) > _MOST_TRIES:
         raise Rejection(
             Reason.AMBIGUOUS_PLACE, f"{len(edges)} edges of its size and shape; {prediction}"
@@ -172,7 +172,8 @@ def _only_candidate(
     if accepted:
         return accepted[0]
     if first is not None:
-        raise Rejection(first.reason, f"{first.detail}; {prediction}")
+        reason, detail = first
+        raise Rejection(reason, f"{detail}; {prediction}")
     raise Rejection(Reason.NO_CANDIDATE, str(prediction))
 
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -147,6 +149,28 @@ def test_the_replica_on_another_plate_is_not_this_target(
     assert outcome.outline is not None
     assert outcome.outline.a == pytest.approx(90.0, rel=0.02), "the main ring has failed"
     assert "flight.toml has 0, 43, 78, 180 for A" in outcome.detail
+
+
+@pytest.mark.parametrize("method", Method)
+def test_a_frame_is_not_kept_by_what_was_refused_in_it(
+    method: Method,
+    target: Target,
+    camera: Camera,
+    place_plate: PlacePlate,
+    draw_frame: DrawFrame,
+) -> None:
+    """An exception that is kept keeps all frames of its traceback, and their pixels."""
+    frame = draw_frame((other_plate(target), place_plate((240.0, 180.0), 90.0)))
+    pixels = weakref.ref(frame)
+    gc.collect()
+    gc.disable()
+    try:
+        examination = examine(frame, camera, (target,), DetectSettings(method=method))
+        assert any(each.reason for each in examination.considered)
+        del frame
+        assert pixels() is None
+    finally:
+        gc.enable()
 
 
 def test_an_empty_frame_has_no_candidate(

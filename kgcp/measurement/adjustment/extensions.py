@@ -13,7 +13,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from kgcp.errors import Rejection
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.acceptance import check_code
 from kgcp.measurement.adjustment.appearance import TONE_OF_BASE
@@ -85,7 +85,7 @@ def fit_in_any_light(
     if problem.tone is not Tone.UNKNOWN:
         return FitsByTone(_fit_in_any_light(problem, pose, blur, find_plateaus), None)
     fits: dict[ToneBase, TwoPoses] = {}
-    failures: dict[ToneBase, Rejection] = {}
+    failures: dict[ToneBase, tuple[Reason, str]] = {}
     for each in sorted(ToneBase, key=lambda each: each is not base):  # the given one first
         if base in fits and _is_at_minimum(fits[base].best):
             return FitsByTone(fits[base], None, untried_base=each)
@@ -93,9 +93,9 @@ def fit_in_any_light(
         try:
             fits[each] = _fit_in_any_light(toned, pose, blur, find_plateaus)
         except Rejection as rejection:
-            failures[each] = rejection
+            failures[each] = rejection.reason, rejection.detail
     if not fits:
-        raise failures[ToneBase.LINE]  # whichever came first
+        raise Rejection(*failures[ToneBase.LINE])  # whichever came first
     return _by_likelihood(fits)
 
 

@@ -146,7 +146,7 @@ def fit_problem_of(
         try:
             window = cut_window(grey, seen, contour, _MARGIN_PX, binning)
         except Rejection as rejection:
-            cut = rejection
+            cut = rejection.reason, rejection.detail
             continue
         is_plain = binning > 1 or camera.response is Response.LINEAR
         centre_px = seen.project(pose.translation_m[None])[0]
@@ -171,7 +171,7 @@ def fit_problem_of(
             sharpening_px=0.0 if is_plain else _SHARPENING_PX,
             shutter=shutter,
         )
-    raise cut
+    raise Rejection(*cut)
 
 
 def _measured_count(camera: Camera, target: Target, contour: FloatArray) -> int:

@@ -152,10 +152,9 @@ def fit_levels(
         try:
             first = _adjust_levels(problem, start, unknowns)
             break
-        except Rejection as failure:
-            rejection = failure
-    else:
-        raise rejection
+        except Rejection:
+            if start is starts[-1]:
+                raise
     second = _minimise(
         first.sample,
         first.parameters.at(other),

@@ -106,7 +106,7 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
         lag_deg=match.lag_deg,
     )
     fits: list[EdgeFit] = []
-    rejection = Rejection(Reason.NO_INNER_CIRCLE)
+    detail = ""
     for start in _inner_circles(camera, outer, ring):
         try:
             inner = fit_edge(
@@ -119,9 +119,9 @@ def measure_edges(grey: GreyArray, camera: Camera, match: CodeMatch) -> RingEdge
             )
             fits.append(inner)
         except Rejection as failure:
-            rejection = Rejection(Reason.NO_INNER_CIRCLE, failure.detail)
+            detail = failure.detail
     if not fits:
-        raise rejection
+        raise Rejection(Reason.NO_INNER_CIRCLE, detail)
     return RingEdges(outer, max(fits, key=lambda fit: len(fit.points_px)))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kgcp.errors import Rejection
+from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray
 from kgcp.geometry.conic import Ellipse
@@ -52,7 +52,9 @@ class Refusal:
 
     outline: Ellipse  # of its outer circle [px]
     score: float  # normalised cross-correlation of the whole ring, -1…1
-    rejection: Rejection  # what speaks against it
+    # what speaks against it; not the exception, whose traceback would keep the frame
+    reason: Reason
+    detail: str
 
 
 def find_rings(grey: GreyArray, settings: DetectSettings) -> tuple[Ellipse, ...]:
@@ -120,7 +122,8 @@ def find_code(
         try:
             template_match.check(settings.min_score - _CIRCLE_LOSS)
         except Rejection as rejection:
-            refused.append(Refusal(outline, template_match.score, rejection))
+            reason, detail = rejection.reason, rejection.detail
+            refused.append(Refusal(outline, template_match.score, reason, detail))
             continue
         matches.append(template_match.code_match(ring, outline))
     return tuple(sorted(matches, key=lambda match: -match.score)), tuple(refused)

@@ -97,7 +97,7 @@ def test_a_similar_code_of_the_same_geometry_is_another_target(
         candidates = find_dotted(frame, (outer,), [ring])
         matches, refused = find_code(candidates[ring], ring, DetectSettings())
         assert len(matches) == expected
-        assert [refusal.rejection.reason for refusal in refused] == [Reason.OTHER_CODE][expected:]
+        assert [refusal.reason for refusal in refused] == [Reason.OTHER_CODE][expected:]
 
 
 def test_a_code_without_a_ring_around_it_is_refused(target: Target) -> None:
