@@ -177,8 +177,10 @@ def eccentricity(camera: Camera, circles: Circles3D) -> Eccentricity:
     ideal = _outlines(circles)
     ellipse_centres = _moments(ideal)[1][:, :2]
     projected = circles.centres_m[:, :2] / circles.centres_m[:, 2:]
-    centres, middles = camera.distort(projected), camera.distort(ellipse_centres)
-    centroids = _moments(_distorted(camera, ideal))[1][:, :2]
+    points = np.concatenate((projected[:, None], ellipse_centres[:, None], ideal), axis=1)
+    distorted = _distorted(camera, points)
+    centres, middles = distorted[:, 0], distorted[:, 1]
+    centroids = _moments(distorted[:, 2:])[1][:, :2]
     return Eccentricity(centres, middles - centres, centroids - middles)
 
 

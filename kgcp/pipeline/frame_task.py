@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from kgcp.errors import KgcpError, Reason, Rejection
-from kgcp.geometry.arrays import GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.calibration import CalibrationCovariance
 from kgcp.geometry.camera import Camera, TimeReference
 from kgcp.geometry.circle_image import Circles3D, eccentricity
@@ -66,6 +66,10 @@ class DetectionJob:
         """Those with a code, then those without: the order of a frame's outcomes."""
         return (*self.targets, *self.plain_targets)
 
+    def target_of(self, measurement: Measurement) -> AnyTarget:
+        """Return what was measured."""
+        return next(target for target in self.all_targets if target.name == measurement.target)
+
     def priors(self, frame_input: FrameInput) -> Mapping[str, PlatePrior]:
         """Return what is known of a frame's targets, by their names."""
         known = frame_input.priors
@@ -118,7 +122,7 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
             look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
             for target in job.plain_targets
         ]
-        outcomes = tuple(completed(job, outcome) for outcome in (*examination.outcomes, *plain))
+        outcomes = completed(job, (*examination.outcomes, *plain))
         if job.kept_frames is not None and any(isinstance(outcome, Miss) for outcome in outcomes):
             job.kept_frames.keep(frame_input.frame, grey)
         if job.keeps_dropped:
@@ -245,7 +249,7 @@ def _outcomes_of_second_look(
         if prediction is not None:
             outcome = look_for_plain(grey, job.camera, target, prediction, measured)
             if isinstance(outcome, Measurement):
-                outcome = completed(job, replace(outcome, is_guided=True))
+                (outcome,) = completed(job, [replace(outcome, is_guided=True)])
             plain[target.name] = outcome
     return tuple(
         plain.get(outcome.target, outcome)
@@ -292,8 +296,8 @@ def _coded_outcomes(
             if code_like
             else misses[target.name]
         )
-    for name in misses.keys() & measured.keys():
-        replacements[name] = completed(job, measured[name])
+    found_now = [measured[name] for name in misses if name in measured]
+    replacements |= {outcome.target: outcome for outcome in completed(job, found_now)}
     return tuple(
         replacements.get(outcome.target, outcome) if isinstance(outcome, Miss) else outcome
         for outcome in first_outcomes
@@ -324,20 +328,40 @@ def _mid_exposure_s(
     return time_s + reference.to_middle_s(exposure.exposure_time_s)
 
 
-def completed(job: DetectionJob, outcome: Outcome) -> Outcome:
-    """Return an outcome with what follows from its pose: common uncertainty and eccentricity."""
-    if isinstance(outcome, Miss):
-        return outcome
-    target = next(target for target in job.all_targets if target.name == outcome.target)
-    common = common_uncertainty(job.camera, job.calibration_covariance, target, outcome.pose)
-    if outcome.image is not None:
-        eccentricity_px = outcome.image.moments[:2] - outcome.centre_px
-    else:
-        pose = outcome.pose
-        circle = Circles3D(
-            pose.translation_m[None],
-            pose.rotation[None, :, :2],
-            np.array([0.5 * target.outer_diameter_m]),
+def completed(job: DetectionJob, outcomes: Sequence[Outcome]) -> tuple[Outcome, ...]:
+    """Return outcomes with what follows from their poses: common uncertainty and eccentricity.
+
+    Those of many frames may be given at once, which takes a tenth of the time for each.
+    """
+    measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
+    eccentricities_px = iter(_eccentricities_px(job, measured))
+    return tuple(
+        replace(
+            outcome,
+            common=common_uncertainty(
+                job.camera, job.calibration_covariance, job.target_of(outcome), outcome.pose
+            ),
+            eccentricity_px=next(eccentricities_px),
         )
-        eccentricity_px = eccentricity(job.camera, circle).total_px[0]
-    return replace(outcome, common=common, eccentricity_px=eccentricity_px)
+        if isinstance(outcome, Measurement)
+        else outcome
+        for outcome in outcomes
+    )
+
+
+def _eccentricities_px(job: DetectionJob, measured: Sequence[Measurement]) -> FloatArray:
+    """Return how far the centroids of outer circles are from their centres (n, 2) [px]."""
+    if not measured:
+        return np.empty((0, 2))
+    poses = [measurement.pose for measurement in measured]
+    diameters_m = [job.target_of(measurement).outer_diameter_m for measurement in measured]
+    circles = Circles3D(
+        np.array([pose.translation_m for pose in poses]),
+        np.array([pose.rotation[:, :2] for pose in poses]),
+        0.5 * np.array(diameters_m),
+    )
+    eccentricities_px = eccentricity(job.camera, circles).total_px
+    for i, measurement in enumerate(measured):
+        if measurement.image is not None:  # of a plain target: measured itself
+            eccentricities_px[i] = measurement.image.moments[:2] - measurement.centre_px
+    return eccentricities_px

@@ -120,7 +120,7 @@ def test_an_ellipse_s_centre_is_off_by_the_eccentricity(folder: Path) -> None:
     assert isinstance(measured, Measurement)
     tilt_rad = 0.6
     tilted = Pose(rotation_about(np.array([0.0, tilt_rad, 0.0])), np.array([0.0, 0.0, 5.0]))
-    changed = completed(job, replace(measured, pose=tilted))
+    (changed,) = completed(job, [replace(measured, pose=tilted)])
     assert isinstance(changed, Measurement)
     radius_px = CAMERA.fx * 0.45 / 5.0
     expected = 0.5 * radius_px**2 / CAMERA.fx * np.sin(2.0 * tilt_rad)
@@ -129,3 +129,20 @@ def test_an_ellipse_s_centre_is_off_by_the_eccentricity(folder: Path) -> None:
     assert changed.eccentricity_px[1] == pytest.approx(0.0, abs=1e-9)
     # depth along the plate's x axis is rotation[2, 0] < 0: its side at +x is the nearer one
     assert np.sign(changed.eccentricity_px[0]) == np.sign(-tilted.rotation[2, 0])
+
+
+def test_outcomes_are_completed_together_as_one_by_one(folder: Path) -> None:
+    job = DetectionJob(folder, CAMERA, None, (A, B), DetectSettings())
+    measured, missed = examine_frame(job, FRAME_INPUT).outcomes
+    assert isinstance(measured, Measurement)
+    outcomes = [
+        replace(measured, pose=measured.pose.tilted(tilt_rad)) for tilt_rad in (0.0, 0.2, 0.5)
+    ]
+    together = completed(job, [outcomes[0], missed, *outcomes[1:]])
+    assert together[1] is missed
+    for outcome, alone in zip([together[0], *together[2:]], outcomes, strict=True):
+        (expected,) = completed(job, [alone])
+        assert isinstance(outcome, Measurement)
+        assert isinstance(expected, Measurement)
+        assert outcome.pose is alone.pose
+        assert outcome.eccentricity_px == pytest.approx(expected.eccentricity_px, abs=1e-11)
