@@ -295,14 +295,15 @@ class DetectionRun:
         All of them together say what the tone curve is near to, and those before and after a frame
         which of two normals is the likelier one, as far as the settings ask for either.
         """
+        results = [*self._results_so_far()]
         if self._job.settings.is_learning:
             base = self._job.tone_base
             deciding_frames = None if base is None else self._deciding_frames
-            self.learnt = learn_imaging(self._results_so_far(), base, deciding_frames)
+            self.learnt = learn_imaging(results, base, deciding_frames)
         if self._job.settings.is_guided:
             self._preferences = preferences_of_neighbours(
                 replace(result, outcomes=tuple(map(self._by_imaging, result.outcomes)))
-                for result in map(self._journal.read, self._keys)
+                for result in results
             )
 
     def results(self) -> Iterator[FrameResult]:
