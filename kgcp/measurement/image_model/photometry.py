@@ -21,7 +21,7 @@ from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Response
 from kgcp.measurement.image_model.blurred_plate import WhiteShare
-from kgcp.measurement.image_model.sharpening import Mask, SharpenedRows
+from kgcp.measurement.image_model.sharpening import Mask
 from kgcp.measurement.image_model.srgb import (
     encode_pixels,
     srgb_decoded,
@@ -153,13 +153,14 @@ def light_of_levels(black: float, white: float, tone: Tone) -> Light:
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
-_ALSO_FILTERED = {int(Param.STREAK_X), int(Param.STREAK_Y), *SKEW_PARAMS}  # mostly nothing
+_RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SKEW_PARAMS])
 _SHARE_STEPS = 400
 GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
 _MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
 _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
+_NONE = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -315,32 +316,25 @@ class PhotometricModel:
         `detail` is what is sharpened in the light at full strength, None: nothing; `slope` that of
         the curve to grey values, None: there is none.
         """
-        rows, in_light = [*_FILTERED], light.linear_sharpening if detail is not None else 0.0
+        rows, in_light = [*_FILTERED], (0.0, _NONE)
         if self.tone.is_shaped:
             rows += _TONE_ROWS
         if detail is not None:
             rows.append(Param.LINEAR_SHARPENING)
-        sharpened = SharpenedRows(mask, jacobian, np.array(rows))
-        if in_light:
-            sharpened.sharpen((1.0, 1.0), in_light)
-        if detail is not None:
-            sharpened.replace_last(detail)
+            in_light = light.linear_sharpening, detail
         others = (1.0, 1.0)
         if slope is not None:
-            sharpened.multiply(slope)
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
-        sharpened.sharpen(others, light.sharpening)
-        for row in set(range(len(jacobian))).difference(rows):
-            values = jacobian[row]
-            is_fine = row in _ALSO_FILTERED and values.any()
-            if is_fine and in_light:
-                values += in_light * mask.detail(values, 0.0, 0.0)
-            if slope is not None:
-                values *= slope
-            if is_fine:
-                values += light.sharpening * mask.detail(values, 0.0, 0.0)
-        sharpened.write(jacobian)
+        mask.sharpen_around_curve(
+            jacobian,
+            np.array(rows),
+            _RARE_ROWS,
+            in_light,
+            _NONE if slope is None else slope,
+            others,
+            light.sharpening,
+        )
 
 
 def share_at(level: float, light: Light, tone: Tone) -> float:

@@ -14,7 +14,13 @@ from kgcp.geometry.arrays import FloatArray, IndexArray, SingleArray
 _LAYERS = 16  # room for all rows that are sharpened: a full vector of the processor
 _TAPS = 7  # of the mask: 2.5 σ to either side, if σ is 1.2 px
 
+_NOTHING = np.empty(0)
+
 NumberArray = npt.NDArray[np.int32]
+_Passes = tuple[NumberArray, NumberArray, FloatArray]
+"""What both passes add up, and their weights; see `Mask`."""
+_Stage = tuple[FloatArray, FloatArray, float]
+"""What other pixels add to the two first rows when they are smoothed (n,), and the strength."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,57 +64,60 @@ class Mask:
         others: tuple[float | FloatArray, float | FloatArray],
         strength: float,
     ) -> None:
-        """Sharpen some rows of a Jacobian (…, n) in place; parameters as of `SharpenedRows`."""
-        sharpened = SharpenedRows(self, jacobian, rows)
-        sharpened.sharpen(others, strength)
-        sharpened.write(jacobian)
+        """Sharpen some rows of a Jacobian (…, n) in place.
 
-
-class SharpenedRows:
-    """Some rows of a Jacobian (…, n), while they are sharpened.
-
-    In single precision, which is enough for derivatives, with all rows of a pixel side by side: so
-    vectors of the processor go across rows.
-
-    Parameters
-    ----------
-    rows : (k,) array of int
-        At most 16. The first two are the derivatives by what ink and plate are.
-    """
-
-    def __init__(self, mask: Mask, jacobian: FloatArray, rows: IndexArray) -> None:
-        self._mask, self._rows, self._kernel = mask, rows, mask.kernel.astype(np.float32)
-        self._layers = np.zeros((jacobian.shape[1] + 1, _LAYERS), dtype=np.float32)
-        _stack(jacobian, rows, self._layers)
-
-    def sharpen(
-        self, others: tuple[float | FloatArray, float | FloatArray], strength: float
-    ) -> None:
-        """Add what the mask adds at a strength.
+        In single precision, which is enough for derivatives.
 
         Parameters
         ----------
+        rows : (k,) array of int
+            At most 16. The first two are the derivatives by what ink and plate are.
         others : (2,) tuple
             By how much the pixels that are not modelled change with ink and with plate.
         """
-        mask, layers = self._mask, self._layers
-        between = np.zeros((len(mask.along_rows) + 1, _LAYERS), dtype=np.float32)
-        _smooth_layers(layers, mask.along_rows, self._kernel, between)
-        smooth = np.empty_like(layers)
-        _smooth_layers(between, mask.along_columns, self._kernel, smooth)
-        _add_detail(smooth, others[0] * mask.ink, others[1] * mask.plate, strength, layers)
+        of_others = others[0] * self.ink, others[1] * self.plate
+        unsharpened = self.ink, self.plate, 0.0
+        _sharpen_twice(
+            jacobian, rows, self._passes, unsharpened, _NOTHING, _NOTHING, (*of_others, strength)
+        )
 
-    def multiply(self, slope: FloatArray) -> None:
-        """Multiply all rows by a slope (n,)."""
-        _multiply(self._layers, slope)
+    def sharpen_around_curve(
+        self,
+        jacobian: FloatArray,
+        rows: IndexArray,
+        rare_rows: IndexArray,
+        in_light: tuple[float, FloatArray],
+        slope: FloatArray,
+        others: tuple[float, float],
+        strength: float,
+    ) -> None:
+        """Sharpen in the light, carry to grey values along a curve, and sharpen those.
 
-    def replace_last(self, row: FloatArray) -> None:
-        """Take other values (n,) for the last row."""
-        self._layers[:-1, len(self._rows) - 1] = row
+        All rows of a Jacobian (…, n) are carried in place, but only those named are sharpened.
 
-    def write(self, jacobian: FloatArray) -> None:
-        """Put the rows where they came from."""
-        _unstack(self._layers, self._rows, jacobian)
+        Parameters
+        ----------
+        rows : (k,) array of int
+            As for `sharpen`.
+        rare_rows : (m,) array of int
+            Others that are sharpened where they are not 0 altogether, as mostly they are.
+        in_light : float and (n,) array
+            Strength in the light, and what the mask adds there at full strength: the values of the
+            last of these rows. Empty: none is.
+        slope : (n,) array
+            Of the curve; empty: there is none.
+        others, strength
+            As for `sharpen`, of the grey values.
+        """
+        before, detail = in_light
+        of_others = others[0] * self.ink, others[1] * self.plate
+        first, second = (self.ink, self.plate, before), (*of_others, strength)
+        _sharpen_twice(jacobian, rows, self._passes, first, detail, slope, second)
+        _carry_others(jacobian, rows, rare_rows, self._passes, before, slope, strength)
+
+    @property
+    def _passes(self) -> _Passes:
+        return self.along_rows, self.along_columns, self.kernel
 
 
 def unsharp_mask(
@@ -199,6 +208,82 @@ def _add_smooth(source: FloatArray, at: NumberArray, kernel: FloatArray, out: Fl
         total += far * (source[at[i, 2]] + source[at[i, 4]])
         total += farther * (source[at[i, 1]] + source[at[i, 5]])
         out[i] += total + farthest * (source[at[i, 0]] + source[at[i, 6]])
+
+
+@compiled
+def _sharpen_twice(
+    jacobian: FloatArray,
+    rows: IndexArray,
+    passes: _Passes,
+    before: _Stage,
+    detail: FloatArray,
+    slope: FloatArray,
+    after: _Stage,
+) -> None:
+    """Sharpen rows, replace the last one by `detail`, multiply by `slope`, and sharpen again.
+
+    With all rows of a pixel side by side: so vectors of the processor go across rows.
+    """
+    layers = np.zeros((jacobian.shape[1] + 1, _LAYERS), np.float32)
+    _stack(jacobian, rows, layers)
+    if before[2] != 0.0:
+        _sharpen_layers(layers, passes, before)
+    if len(detail) > 0:
+        for i in range(len(detail)):
+            layers[i, len(rows) - 1] = detail[i]
+    if len(slope) > 0:
+        _multiply(layers, slope)
+    _sharpen_layers(layers, passes, after)
+    _unstack(layers, rows, jacobian)
+
+
+@compiled
+def _carry_others(
+    jacobian: FloatArray,
+    rows: IndexArray,
+    rare_rows: IndexArray,
+    passes: _Passes,
+    in_light: float,
+    slope: FloatArray,
+    strength: float,
+) -> None:
+    """Carry all rows but some along the curve, and sharpen the rare ones, one by one."""
+    is_other, is_rare = np.ones(len(jacobian), np.bool_), np.zeros(len(jacobian), np.bool_)
+    is_other[rows] = False
+    for row in rare_rows:
+        if row < len(jacobian):
+            is_rare[row] = np.any(jacobian[row] != 0.0)
+    for row in np.flatnonzero(is_other):
+        if is_rare[row]:
+            _sharpen_row(jacobian[row], passes, in_light)
+        if len(slope) > 0:
+            for i in range(len(slope)):
+                jacobian[row, i] *= slope[i]
+        if is_rare[row]:
+            _sharpen_row(jacobian[row], passes, strength)
+
+
+@compiled
+def _sharpen_row(values: FloatArray, passes: _Passes, strength: float) -> None:
+    if strength == 0.0:
+        return
+    along_rows, along_columns, kernel = passes
+    smooth = np.zeros(len(values))
+    _add_smooth_twice(values, along_rows, along_columns, kernel, smooth)
+    for i in range(len(values)):
+        values[i] += strength * (values[i] - smooth[i])
+
+
+@compiled
+def _sharpen_layers(layers: SingleArray, passes: _Passes, stage: _Stage) -> None:
+    along_rows, along_columns, kernel = passes
+    ink, plate, strength = stage
+    weights = kernel.astype(np.float32)
+    between = np.zeros((len(along_rows) + 1, _LAYERS), np.float32)
+    _smooth_layers(layers, along_rows, weights, between)
+    smooth = np.empty_like(layers)
+    _smooth_layers(between, along_columns, weights, smooth)
+    _add_detail(smooth, ink, plate, strength, layers)
 
 
 @compiled
