@@ -293,7 +293,8 @@ class DetectionRun:
         """Find out what the frames say of each other; `results` follow it from now on.
 
         All of them together say what the tone curve is near to, and those before and after a frame
-        which of two normals is the likelier one, as far as the settings ask for either.
+        which of two normals is the likelier one, as far as the settings ask for either. What is
+        learnt of smoothing along contours turns normals by far less than neighbours differ.
         """
         results = [*self._results_so_far()]
         if self._job.settings.is_learning:
@@ -302,7 +303,7 @@ class DetectionRun:
             self.learnt = learn_imaging(results, base, deciding_frames)
         if self._job.settings.is_guided:
             self._preferences = preferences_of_neighbours(
-                replace(result, outcomes=tuple(map(self._by_imaging, result.outcomes)))
+                replace(result, outcomes=tuple(map(self._over_common_base, result.outcomes)))
                 for result in results
             )
 
@@ -329,22 +330,22 @@ class DetectionRun:
             yield replace(result, outcomes=tuple(islice(outcomes, len(result.outcomes))))
 
     def _as_learnt(self, frame: str, outcome: Outcome) -> Outcome:
-        """Return an outcome by what is learnt of the camera and from the frames beside it."""
-        learnt = self._by_imaging(outcome)
+        """Return an outcome by what is learnt; the same one if that is nothing."""
+        learnt = self._over_common_base(outcome)
         if isinstance(learnt, Miss):
             return learnt
+        if self.learnt is not None:
+            learnt = with_smoothing(self._job.camera, learnt, self.learnt.smoothing)
         preference = self._preferences.get((frame, learnt.target, learnt.instance))
         if preference is None:
             return learnt
         return with_preference(self._job.camera, learnt, preference)
 
-    def _by_imaging(self, outcome: Outcome) -> Outcome:
-        """Return an outcome by what is learnt of the camera; the same one if that is nothing."""
-        if self.learnt is None or isinstance(outcome, Miss):
+    def _over_common_base(self, outcome: Outcome) -> Outcome:
+        """Return an outcome over the base of the tone curve that all agree on, if they do."""
+        if self.learnt is None or self.learnt.base is None or isinstance(outcome, Miss):
             return outcome
-        base = self.learnt.base
-        measurement = outcome if base is None else over_base(outcome, base)
-        return with_smoothing(self._job.camera, measurement, self.learnt.smoothing)
+        return over_base(outcome, self.learnt.base)
 
     def map_results(
         self, function: Callable[[FrameResult], _Result]

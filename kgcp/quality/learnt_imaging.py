@@ -207,7 +207,7 @@ def _common_curve(images: list[Imaging], grey: FloatArray) -> FloatArray:
     curves = np.array([_light_of_grey(imaging, grey) for imaging in images])
     middle = decoded(grey, Tone.SRGB)
     for _ in range(_ROUNDS):
-        scaled = np.array([_scaled_to(curve, middle) for curve in curves])
+        scaled = _scaled_to(middle, curves)
         is_known = np.sum(np.isfinite(scaled), axis=0) >= _MIN_MEASUREMENTS
         percentiles = np.full((len(_BAND), len(grey)), np.nan)
         percentiles[:, is_known] = np.nanpercentile(scaled[:, is_known], _BAND, axis=0)
@@ -225,10 +225,17 @@ def _light_of_grey(imaging: Imaging, grey: FloatArray) -> FloatArray:
     return np.interp(grey, levels, share, left=np.nan, right=np.nan)
 
 
-def _scaled_to(curve: FloatArray, middle: FloatArray) -> FloatArray:
-    known = np.isfinite(curve)
-    if known.sum() < _MIN_MEASUREMENTS:
-        return np.full(len(curve), np.nan)
-    design = np.stack((curve[known], np.ones(known.sum())), axis=1)
-    factor, offset = np.linalg.lstsq(design, middle[known])[0]
-    return np.asarray(factor * curve + offset)
+def _scaled_to(middle: FloatArray, curves: FloatArray) -> FloatArray:
+    """Return curves (m, n), each by the factor and offset that bring it nearest to the middle (n,).
+
+    All NaN of a curve of which too little is known.
+    """
+    is_known = np.isfinite(curves)
+    count = np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+    x, y = np.where(is_known, curves, 0.0), np.where(is_known, middle, 0.0)
+    mean_x, mean_y = (each.sum(axis=1, keepdims=True) / count for each in (x, y))
+    off_x = np.where(is_known, curves - mean_x, 0.0)
+    spread = np.sum(off_x * off_x, axis=1, keepdims=True)
+    is_told = (count >= _MIN_MEASUREMENTS) & (spread > 0.0)
+    factor = np.sum(off_x * (y - mean_y), axis=1, keepdims=True) / np.where(is_told, spread, np.nan)
+    return np.asarray(mean_y + factor * (curves - mean_x))
