@@ -24,6 +24,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from functools import cache
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -60,7 +61,7 @@ def to_text(value: object) -> str:
 
     Floating-point numbers have as many digits as tell them from all others.
     """
-    return json.dumps(value, default=_plain, separators=(",", ":"))
+    return _ENCODER.encode(value)
 
 
 def from_text(text: str | bytes, kinds: tuple[type[Result], ...]) -> Result:
@@ -85,10 +86,16 @@ def fingerprint(*values: object) -> str:
     return hashlib.sha256(to_text(values).encode()).hexdigest()[:32]
 
 
+@cache
+def _fields_of(record: type[Any]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(record))
+
+
 def _plain(value: object) -> object:
     if is_dataclass(value):
-        cells = {field.name: getattr(value, field.name) for field in fields(value)}
-        return {"record": type(value).__name__, **cells}
+        kind: type[Any] = type(value)
+        names = _fields_of(kind)  # type: ignore[arg-type] # classes are hashable
+        return {"record": kind.__name__, **{name: getattr(value, name) for name in names}}
     if isinstance(value, np.ndarray):
         return {"array": value.tolist()}
     if isinstance(value, np.generic):
@@ -98,6 +105,9 @@ def _plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"{type(value).__name__} has no text")
+
+
+_ENCODER = json.JSONEncoder(default=_plain, separators=(",", ":"))
 
 
 def _record(cells: dict[str, Any]) -> object:
