@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -135,14 +136,20 @@ def unsharp_mask(
         Where all other pixels are between ink, 0, and plate, 1.
     """
     along_rows, along_columns = _gather(index, *shape)
-    steps = np.arange(_TAPS) - _TAPS // 2
-    kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
-    kernel /= kernel.sum()
+    kernel = _gaussian(sigma_px)
     others, plate = np.ones(len(share)), share.copy()
     others[index] = plate[index] = 0.0
     of_others, of_plate = (_filtered(values.reshape(shape), kernel) for values in (others, plate))
     ink = (of_others - of_plate).ravel()[index]
     return Mask(along_rows, along_columns, kernel, ink, of_plate.ravel()[index])
+
+
+@lru_cache(maxsize=8)
+def _gaussian(sigma_px: float) -> FloatArray:
+    """Return the weights (7,) of either pass."""
+    steps = np.arange(_TAPS) - _TAPS // 2
+    kernel = np.exp(-0.5 * (steps / sigma_px) ** 2)
+    return np.asarray(kernel / kernel.sum())
 
 
 def _filtered(image: FloatArray, kernel: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -54,12 +55,16 @@ def unblurred_plate(
     spread : (3,) array
         By `blur_on_plate`.
     """
-    points_m = plate_points(pose, rays)
-    centres_m, radii_m, signs = circles.centres_m, circles.radii_m, circles.signs
-    circle_table = np.vstack((centres_m, radii_m, signs))
-    skips = find_skips(centres_m, radii_m)
-    seen = _see_circles(points_m, circle_table, *skips, measured_count, small_m, reach_m, spread)
+    points_m, tables = plate_points(pose, rays), _tables_of(circles)
+    seen = _see_circles(points_m, *tables, measured_count, small_m, reach_m, spread)
     return UnblurredPlate(points_m, *seen)
+
+
+@lru_cache(maxsize=64)
+def _tables_of(circles: Circles) -> tuple[FloatArray, FloatArray, IndexArray]:
+    """Return centre, radius and sign of all circles (4, c), and what `find_skips` makes of them."""
+    table = np.vstack((circles.centres_m, circles.radii_m, circles.signs))
+    return table, *find_skips(circles.centres_m, circles.radii_m)
 
 
 @compiled
