@@ -104,6 +104,11 @@ def compiled_if_often(function: _Function) -> _Function:
     return cast("_Function", _Spared(function))
 
 
+def interpreted(function: _Function) -> _Function:
+    """Return a compiled function as Python runs it, for calls so few that numba is not loaded."""
+    return cast("_Function", cast("_Compilable", function).interpreted)
+
+
 def summed(function: _Function) -> _Function:
     """Compile as `compiled`; sums may be reordered so that vector units take several terms."""
     return cast("_Function", _Compilable(function, fastmath={"contract", "reassoc"}))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kgcp.geometry.arrays import FloatArray
 
@@ -31,11 +30,15 @@ def rotation_from_opk(opk_deg: FloatArray) -> FloatArray:
 
     R = Rx(ω) Ry(φ) Rz(κ); its camera axes are x right, y up, z backward (docs/conventions.md).
     """
+    from scipy.spatial.transform import Rotation  # 0.2 s that workers do not need
+
     return np.asarray(Rotation.from_euler("XYZ", opk_deg, degrees=True).as_matrix())
 
 
 def opk_from_rotation(map_from_photo: FloatArray) -> FloatArray:
     """Return omega, phi, kappa (n, 3) [deg] of rotations (n, 3, 3); undoes `rotation_from_opk`."""
+    from scipy.spatial.transform import Rotation  # as above
+
     return np.asarray(Rotation.from_matrix(map_from_photo).as_euler("XYZ", degrees=True))
 
 

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from kgcp.geometry._jit import compiled
+from kgcp.geometry._jit import compiled, interpreted
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
 
@@ -43,6 +42,8 @@ class Pose:
     @property
     def quaternion_wxyz(self) -> FloatArray:
         """Unit quaternion (4,) of the rotation, w first and not negative."""
+        from scipy.spatial.transform import Rotation  # 0.2 s that workers do not need
+
         return np.asarray(
             Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
         )
@@ -66,8 +67,7 @@ class Pose:
 
     def moved(self, step: FloatArray) -> Pose:
         """Return the pose after a small step (6,): translation [m], left rotation vector [rad]."""
-        # not `rotation_about`: the program itself would load numba for this alone
-        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
+        turn = _rotation_about_few(step[3:6])
         return Pose(turn @ self.rotation, self.translation_m + step[:3])
 
     def mirrored(self) -> Pose:
@@ -149,6 +149,9 @@ def rotation_about(vector: FloatArray) -> FloatArray:
             [xz - y, yz + x, 1.0 - second * (xx + yy)],
         ]
     )
+
+
+_rotation_about_few = interpreted(rotation_about)  # the program itself takes a turn per frame
 
 
 def image_heading_deg(camera: Camera, pose: Pose) -> float:

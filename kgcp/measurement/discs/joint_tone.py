@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.adjustment.normal_equations import weighted_products
@@ -350,6 +349,8 @@ def within_limits(step: FloatArray, normal: FloatArray, now: FloatArray, tone: T
     short = least - of_waves @ (now + step)[:WAVES]
     if short.max() <= 0.0:
         return step
+    from scipy.optimize import nnls  # 0.1 s that flights do not need
+
     root = np.linalg.cholesky(normal)
     rows = np.pad(of_waves, ((0, 0), (0, len(step) - WAVES)))
     across = np.linalg.solve(root, rows.T)

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from kgcp.geometry.arrays import FloatArray, GreyArray
 from kgcp.geometry.camera import Response
@@ -34,6 +33,7 @@ from kgcp.measurement.discs.covariance import (
     scatter_of,
 )
 from kgcp.measurement.discs.fit_disc import DiscFit, NoFit
+from kgcp.measurement.discs.outlines import tree_of
 from kgcp.measurement.discs.records import (
     Disc,
     DiscMiss,
@@ -223,7 +223,7 @@ def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
         return []
     centres = np.array([each.ellipse.centre for each in outlines])
     radii = np.array([each.ellipse.a for each in outlines])
-    tree, near = cKDTree(centres), []
+    tree, near = tree_of(centres), []
     for i, outline in enumerate(outlines):
         reach = min(_NEIGHBOUR_PX, _NEIGHBOUR_RADII * radii[i]) + radii[i] + radii.max()
         near.append(

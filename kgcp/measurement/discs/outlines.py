@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.geometry.conic import Ellipse
@@ -23,6 +23,9 @@ from kgcp.measurement.discs.records import (
     Polarity,
     ellipse_of_moments,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 # Tuning, as in `blobs`.
 _REACHES = (0.45, 0.25, 0.2)  # of the radius that edges are looked for in, pass by pass, …
@@ -219,6 +222,13 @@ def _ellipse(values: FloatArray) -> Ellipse:
     return ellipse_of_moments(np.array((x, y, *square)))
 
 
+def tree_of(points: FloatArray) -> cKDTree:
+    """Return a search tree of points (n, 2)."""
+    from scipy.spatial import cKDTree  # 0.2 s that flights without plain targets do not need
+
+    return cKDTree(points)
+
+
 def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[int]:
     """Return the candidates, the best of those that follow the same edge, in reading order."""
     best = sorted(candidates.tolist(), key=lambda i: (found.residual_px[i], i))
@@ -228,7 +238,7 @@ def _distinct(found: _Edges, signs: FloatArray, candidates: IndexArray) -> list[
         found.ellipses[best, :2],
         found.ellipses[:, 2:].take((0, 2), axis=1).mean(axis=1),
     )
-    tree, kept, taken = cKDTree(centres), [], np.zeros(len(best), np.bool_)
+    tree, kept, taken = tree_of(centres), [], np.zeros(len(best), np.bool_)
     for place, i in enumerate(best):
         if taken[place]:
             continue
@@ -247,7 +257,7 @@ def _without_ripples(outlines: list[DiscOutline]) -> list[DiscOutline]:
         return []
     centres = np.array([each.ellipse.centre for each in outlines])
     radii = np.array([each.ellipse.mean_radius for each in outlines])
-    tree = cKDTree(centres)
+    tree = tree_of(centres)
 
     def is_ripple(i: int) -> bool:
         """Tell whether an outline is the faint edge that sharpening leaves beside another one."""
@@ -267,7 +277,7 @@ def _nested(outlines: list[DiscOutline]) -> tuple[DiscOutline, ...]:
         return ()
     centres = np.array([each.ellipse.centre for each in outlines])
     radii = np.array([each.ellipse.mean_radius for each in outlines])
-    tree, hole_of = cKDTree(centres), {}
+    tree, hole_of = tree_of(centres), {}
     for i, outline in enumerate(outlines):
         inside = [
             j
