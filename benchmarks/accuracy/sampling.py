@@ -4,7 +4,9 @@ Usage: python -m benchmarks.accuracy.sampling FLIGHT TRUTH [--samples 4] [--jobs
 
 Every frame's plate is drawn again where TRUTH has it, sampled n × n times per pixel, with linear
 response and hardly any noise, and measured. That error is the renderer's. It is subtracted from the
-error in the frame: what is left is the measurement's.
+error in the frame: what is left is the measurement's. z is the RMS of either over the reported
+standard deviations, which know nothing of the renderer; and of the error as measured over these
+deviations together with the RMS of what the renderings of the band are off.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ _BLACK, _WHITE = 10.0, 190.0  # grey values
 _NOISE = 1.0  # standard deviation [grey values]: less than one, and rounding has a pattern
 _REPEATS = 4
 _MARGIN = 1.5  # of the ring's radius
+_BAND_LIMITS_PX = sorted({limit for band in RADIUS_BANDS_PX for limit in band})
 
 
 def sampled_error(camera: Camera, target: Target, row: pd.Series, samples: int) -> float:
@@ -84,9 +87,12 @@ def rendered(
 
 
 def lines(table: pd.DataFrame) -> Iterator[str]:
-    """Yield means and RMS of every band: as measured, of the renderings, and of the difference."""
-    yield "      R px  frames   measured: mean, RMS %   rendering: mean, RMS %   left: mean, RMS %"
-    for low, high in RADIUS_BANDS_PX:
+    """Yield means, RMS and z of every band: measured, of the renderings, of the difference."""
+    yield (
+        "      R px  frames   measured: mean, RMS %   rendering: mean, RMS %   left: mean, RMS %"
+        "          z: measured  left  with renderer"
+    )
+    for low, high in (*RADIUS_BANDS_PX, (0.0, np.inf)):
         band = table[(table["radius_px_true"] >= low) & (table["radius_px_true"] < high)]
         if len(band) < 2:
             continue
@@ -96,7 +102,14 @@ def lines(table: pd.DataFrame) -> Iterator[str]:
             f"{part.mean():+.4f} ± {2.0 * part.std() / np.sqrt(len(part)):.4f} {_rms(part):.4f}"
             for part in parts
         )
-        yield f"{low:6.0f}–{high:<4.0f}{len(band):6d}   {figures}"
+        sd = 100.0 * band["sd_distance_m"] / band["distance_m"]
+        measured, with_renderer = (
+            band["error_percent"] / each for each in (sd, np.hypot(sd, band["renderer_percent"]))
+        )
+        yield (
+            f"{low:6.0f}–{high:<4.0f}{len(band):6d}   {figures}"
+            f"  {_rms(measured):11.2f}  {_rms(left / sd):4.2f}  {_rms(with_renderer):13.2f}"
+        )
 
 
 def _rms(errors: pd.Series) -> float:
@@ -117,6 +130,10 @@ def main(flight: Path, truth: Path, samples: int, jobs: int | None) -> None:
     table["rendering_percent"] = [
         sampled_error(camera, described.targets[0], row, samples) for _, row in table.iterrows()
     ]
+    of_band = pd.cut(table["radius_px_true"], _BAND_LIMITS_PX, right=False)
+    table["renderer_percent"] = table.groupby(of_band, observed=True)[
+        "rendering_percent"
+    ].transform(_rms)
     print(f"{flight}  {samples} × {samples} samples per pixel, means ± 2 standard errors")
     print("\n".join(lines(table)))
 

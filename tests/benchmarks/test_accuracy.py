@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import disturbed, evaluate, presets
+from benchmarks.accuracy import disturbed, evaluate, flights, presets, sampling
 from benchmarks.accuracy.bands import join_truth, summarise, table_lines
 from benchmarks.accuracy.bound import frame_bound
 from kgcp.geometry.camera import Camera
@@ -299,3 +299,26 @@ def test_the_command_prints_its_table(flight: tuple[Path, pd.DataFrame]) -> None
     evaluated = CliRunner().invoke(evaluate.main, arguments, catch_exceptions=False)
     assert "found/present" in evaluated.stdout
     assert "wrong 0" in evaluated.stdout
+
+
+def test_flights_have_a_line_each(flight: tuple[Path, pd.DataFrame]) -> None:
+    folder, _ = flight
+    arguments = [str(folder), "--jobs", "1"]
+    printed = CliRunner().invoke(flights.main, arguments, catch_exceptions=False)
+    title, line = printed.stdout.splitlines()
+    assert "wrong side" in title
+    assert line.split()[:2] == [folder.name, "6/6"]
+    assert line.split()[-1].startswith("0/")
+
+
+def test_errors_of_the_renderer_widen_the_deviations() -> None:
+    truth, rows = random_flight(400, COVARIANCE)
+    truth["radius_px"] = 30.0
+    table = join_truth(rows, truth)
+    table["rendering_percent"] = 0.0
+    table["renderer_percent"] = 100.0 * table["sd_distance_m"] / table["distance_m"]
+    _, *bands = sampling.lines(table)
+    measured, left, with_renderer = map(float, bands[0].split()[-3:])
+    assert 0.9 < measured < 1.1
+    assert left == measured
+    assert with_renderer == pytest.approx(measured / math.sqrt(2.0), abs=0.02)

@@ -29,6 +29,7 @@ from kgcp.measurement.adjustment.solver import TargetFit, noise_of
 from kgcp.measurement.image_model.noise import median_at_edges
 from kgcp.measurement.image_model.photometry import (
     SKEW_PARAMS,
+    Light,
     Tone,
     plateau_levels,
     share_at,
@@ -42,12 +43,13 @@ _ARCS_IN_COMMON = 60.0  # what all directions scatter counts in each like so man
 _ARCS_OF_NOISE = 20.0  # that residuals scatter less than noise counts against so many that do not
 _LEAST_LEFT = 0.25  # of the scatter, after the fit
 _VECTOR = 4  # numbers that the processor takes at once
-# Of a circle's edge as a whole: no print and no pixel is known better. What a camera's processing
-# makes of it goes with how much it sharpens: on simulated plates of R ≥ 26 px, outer edges are
-# displaced in the mean by 0.0001 ± 0.0002 px (111 plates, strength 0), 0.0007 ± 0.0004 (33, 0.5),
-# 0.0030 ± 0.0009 (75, 0.8; mixed) and 0.0025 ± 0.0004 px (36, 1.0; phone). That of bins is of the
+# Of a circle's edge as a whole: no print and no pixel is known better. That of bins is of the
 # frame's pixels: within bins, a tone curve displaces edges.
-_EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX, _PER_SHARPENING_PX = 0.0005, 0.004, 0.003
+_EDGE_FLOOR_PX, _EDGE_FLOOR_OF_BINS_PX = 0.0005, 0.004
+# Where levels vary, they stand in for halos of sharpening: rings of R ≥ 26 px are too small by
+# 0.0060 ± 0.0009 px times its strength (118 plates in five simulated flights and two of another
+# program). In even light it is 0.0023 ± 0.0005 px (67 plates), and arcs show enough of it.
+_PER_SHARPENING_PX = 0.005
 # Variance on small rings, relative to what residuals show of uneven light: where levels vary; and
 # up to so much where they do not, as residuals do not say enough of them
 # (`benchmarks.accuracy.small_rings`, without these factors: z of 1.4 in shade and 1.5 with dirt).
@@ -58,8 +60,10 @@ _ON_SMALL_RINGS, _ON_EVEN_SMALL_RINGS = 1.8, 1.4
 _SKEW_SHARE, _SKEW_SHARE_IN_UNEVEN_LIGHT = 0.18, 0.5
 # … and where edges scatter more than noise makes them, so much of that scatter. It counts only as
 # far as neighbouring residuals agree: in full where arcs scatter 1 + this times as much as
-# independent pixels would make them; …
-_COMMON_SHARE, _ALL_ALONG_ARCS = 0.25, 0.5
+# independent pixels would make them. The long arcs of large rings whose levels vary show all of it:
+# counted again, it made deviations of another program's phone and mixture 1.2 and 1.3 times as
+# large. Smaller rings have too few arcs for that.
+_COMMON_SHARE, _ALL_ALONG_ARCS, _MANY_UNEVEN_ARCS_PX = 0.25, 0.5, 32.0
 _EXTRAPOLATED_SHARE = 0.025  # … and so much of how far they are beyond what is not clipped
 
 
@@ -177,19 +181,27 @@ def common_displacement_px(fit: TargetFit, share_along_arcs: float) -> float:
     clipped only a tail is seen, whose shape is not known exactly.
     """
     problem, light = fit.sample.problem, fit.parameters.light
+    is_even = fit.level_equations is None
     if problem.tone is Tone.OF_BINS:
         floor_px = _EDGE_FLOOR_OF_BINS_PX / problem.window.binning
     else:
-        processed_px = _PER_SHARPENING_PX * (light.sharpening + light.linear_sharpening)
-        floor_px = math.hypot(_EDGE_FLOOR_PX, processed_px)
+        floor_px = _EDGE_FLOOR_PX if is_even else _halo_displacement_px(light)
     floor_px = math.hypot(floor_px, _EXTRAPOLATED_SHARE * _clipped_reach_px(fit))
-    noise = noise_of(fit.sample, fit.prediction, is_even=fit.level_equations is None)
+    if not is_even and problem.outer_radius_px >= _MANY_UNEVEN_ARCS_PX:
+        return floor_px
+    noise = noise_of(fit.sample, fit.prediction, is_even=is_even)
     excess = np.maximum(noise.sd**2 - noise.plateau_sd**2, 0.0)
     at_edges = median_at_edges(excess, fit.prediction.share, 0.3, 0.7, 0.0)
     black, white = plateau_levels(light, problem.tone)
     slope_per_px = (white - black) / (math.sqrt(2.0 * math.pi) * fit.parameters.blur.mean_sd_px)
     scatter_px = math.sqrt(share_along_arcs * at_edges) / slope_per_px
     return max(floor_px, _COMMON_SHARE * scatter_px)
+
+
+def _halo_displacement_px(light: Light) -> float:
+    """Return the standard deviation of edges where levels stand in for halos of sharpening [px]."""
+    strength = light.sharpening + light.linear_sharpening
+    return math.hypot(_EDGE_FLOOR_PX, _PER_SHARPENING_PX * strength)
 
 
 def _clipped_reach_px(fit: TargetFit) -> float:

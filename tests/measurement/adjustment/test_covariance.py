@@ -196,9 +196,26 @@ def with_sharpening(fit: TargetFit, behind: float, before: float) -> TargetFit:
 
 
 @pytest.mark.parametrize(("behind", "before"), [(0.6, 0.0), (0.0, 0.3), (0.7, 0.3)])
-def test_edges_of_cameras_that_sharpen_may_be_displaced_all_round(
+def test_edges_of_cameras_that_sharpen_may_be_displaced_where_levels_vary(
     fit: TargetFit, behind: float, before: float
 ) -> None:
-    """As noise reduction under local tone mapping does: 0.0025 px where strengths are 1.0."""
-    displaced_px = common_displacement_px(with_sharpening(fit, behind, before), 0.0)
-    assert displaced_px == pytest.approx(math.hypot(0.0005, 0.003 * (behind + before)))
+    """In even light, arcs show what processing displaces."""
+    sharpened = with_sharpening(fit, behind, before)
+    assert common_displacement_px(sharpened, 0.0) == 0.0005
+    equations: Any = SimpleNamespace()
+    displaced_px = common_displacement_px(replace(sharpened, level_equations=equations), 0.0)
+    assert displaced_px == pytest.approx(math.hypot(0.0005, 0.005 * (behind + before)))
+
+
+@pytest.mark.parametrize(("radius_px", "is_counted"), [(31.0, True), (33.0, False)])
+def test_scatter_that_many_long_arcs_show_is_not_counted_again(
+    fit: TargetFit, radius_px: float, *, is_counted: bool
+) -> None:
+    sign = np.random.default_rng(5).choice((-1.0, 1.0), len(fit.sd))
+    noisy = with_noisy_edges(fit, sign)
+    problem = replace(fit.sample.problem, outer_radius_px=radius_px)
+    equations: Any = SimpleNamespace()
+    uneven = replace(
+        noisy, sample=replace(noisy.sample, problem=problem), level_equations=equations
+    )
+    assert (common_displacement_px(uneven, 1.0) > 0.005) == is_counted

@@ -1,0 +1,87 @@
+"""One line for each of several simulated flights: what their acceptance asks for.
+
+Usage: python -m benchmarks.accuracy.flights FLIGHT... [--jobs 2]
+
+The truth.csv of a flight lies in its folder or beside it. Columns: found and present; RMS error of
+the distance of rings of R ≥ 26 px and of 13–26 px; its mean with two standard errors of R ≥ 26 px
+[%]; RMS of error over reported standard deviation of distance and centre; share of distances that
+are off by more than three of them; median squared Mahalanobis distance of the pose; and how many
+normals are on the wrong side, of those whose sides differ by more than three standard deviations of
+what attitudes say about them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+import pandas as pd
+
+from benchmarks.accuracy.bands import join_truth, read_truth, summarise
+from benchmarks.accuracy.evaluate import detect
+from kgcp.io.flight.data import FlightData
+from kgcp.io.flight.flight import Flight, read_flight
+from kgcp.pipeline.execution.resilient_map import usable_cores
+from kgcp.pipeline.frame_priors import priors_of_frames
+from kgcp.settings import DetectSettings
+
+_SIGMAS = 3.0
+
+
+def sides_told_apart(flight: Flight, right: pd.DataFrame) -> pd.Series:
+    """Return whether the two normals of measured targets differ by more than what is known allows.
+
+    Mirrored about the viewing ray, they are twice the tilt apart. Where nothing is known, they do
+    not.
+    """
+    frames = list(right["frame"])
+    priors = priors_of_frames(flight, FlightData(flight, frames), frames)
+    sds_deg = []
+    for target, by_target in zip(right["target"], priors, strict=True):
+        prior = by_target.get(target)
+        known = None if prior is None else prior.normal
+        sds_deg.append(np.inf if known is None else known.sd_deg)
+    return 2.0 * right["tilt_deg"] > _SIGMAS * pd.Series(sds_deg, index=right.index)
+
+
+def line_of(name: str, flight: Flight, table: pd.DataFrame) -> str:
+    """Return the line of one flight, of which `table` is that of `join_truth`."""
+    large, middle, *_ = summarise(table)
+    right = table[table["is_right"]]
+    told = right[sides_told_apart(flight, right)]
+    wrong = int((told["on_right_side"] == 0.0).sum())
+    z, centre = (
+        float(np.sqrt(np.mean(np.square(right[each].astype(float)))))
+        for each in ("z_distance", "z_centre")
+    )
+    return (
+        f"{name:16s} {right['frame'].nunique():4d}/{int((table['present'] == 1).sum()):<4d}"
+        f" {large.rms_percent:8.4f} {middle.rms_percent:8.4f}"
+        f"  {large.mean_percent:+.4f} ± {large.mean_2se_percent:.4f}"
+        f" {z:7.2f} {centre:7.2f} {100.0 * (right['z_distance'].abs() > _SIGMAS).mean():6.1f} %"
+        f" {right['mahalanobis2'].median():7.2f} {wrong:4d}/{len(told)}"
+    )
+
+
+@click.command()
+@click.argument("flights", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--jobs", type=click.IntRange(1, 256), default=None)
+def main(flights: tuple[Path, ...], jobs: int | None) -> None:
+    """Print the table."""
+    print(
+        "flight               found   R ≥ 26  13–26 %   mean % ± 2 se   z dist centre"
+        "    > 3 σ  Mahal.²  wrong side"
+    )
+    for folder in flights:
+        beside = folder.parent / "truth.csv"
+        truth = folder / "truth.csv" if (folder / "truth.csv").exists() else beside
+        table = join_truth(
+            detect(folder, DetectSettings(), jobs or usable_cores()), read_truth(truth)
+        )
+        name = folder.name if truth != beside else folder.parent.name
+        print(line_of(name, read_flight(folder), table), flush=True)
+
+
+if __name__ == "__main__":
+    main()
