@@ -36,3 +36,25 @@ def test_both_parts_compile_all_that_a_frame_needs() -> None:
     of_search, of_parts, *missing = done.stdout.split(maxsplit=2)
     assert 10 < int(of_search) < int(of_parts) - 10
     assert not missing
+
+
+def test_workers_load_no_library_that_most_frames_do_without() -> None:
+    """What the server of workers loads delays the first frame, and is in the memory of each."""
+    modules = "kgcp.pipeline.frame_task, kgcp.pipeline.execution.ready_worker"
+    program = f"import sys, {modules}; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert "kgcp.measurement.frame" in loaded
+    assert not loaded & {
+        "matplotlib",
+        "pandas",
+        "pyarrow",
+        "pyproj",
+        "scipy.interpolate",
+        "scipy.ndimage",
+        "scipy.optimize",
+        "scipy.spatial",
+        "scipy.stats",
+    }
