@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.calibrate.bound import centroid_bound
 from benchmarks.pool import ordered_map
-from kgcp.geometry.arrays import FloatArray, GreyArray
+from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
@@ -37,6 +37,7 @@ _GRADIENT = 0.05  # of the light over one radius, at most over …
 _LARGEST_FALL = 0.3  # … the photograph's half width
 _PSF_PX = 0.6
 _LEARNED_FROM = 5  # photographs, the tone curve and the sharpening: as `kgcp calibrate`
+_LEAST_DRAWS = 4  # for standard errors by the scatter between draws
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
 
 
@@ -92,6 +93,7 @@ class Outcome:
     bound_px2: FloatArray  # (2, 2): of a disc in the frame's middle
     along_light_px: FloatArray  # (n,): errors of the centre along the light's gradient
     ms_per_disc: float
+    draw: IndexArray  # (n,): which discs share what was learned of the camera
 
     @property
     def over_bound(self) -> float:
@@ -104,9 +106,23 @@ class Outcome:
         return float(np.mean(self.along_light_px))
 
     @property
+    def over_bound_se(self) -> float:
+        """Standard error of `over_bound`."""
+        squares = np.mean(self.errors[:, :2] ** 2, axis=1) / (0.5 * np.trace(self.bound_px2))
+        return self._se_of_mean(squares) / (2.0 * self.over_bound)
+
+    @property
     def bias_se_px(self) -> float:
-        """Standard error of the bias, as far as discs differ [px]."""
-        return float(np.std(self.along_light_px) / math.sqrt(len(self.along_light_px)))
+        """Standard error of the bias [px]."""
+        return self._se_of_mean(self.along_light_px)
+
+    def _se_of_mean(self, values: FloatArray) -> float:
+        """Return the standard error of a mean of discs (n,): by draws from four on, or by discs."""
+        draws = int(self.draw.max()) + 1
+        groups = self.draw if draws >= _LEAST_DRAWS else np.arange(len(values))
+        sums = np.bincount(groups, values - values.mean())
+        count = np.count_nonzero(np.bincount(groups))
+        return float(np.sqrt(np.sum(sums**2) * count / (count - 1)) / len(values))
 
     @property
     def radius_bias_px(self) -> float:
@@ -118,6 +134,13 @@ class Outcome:
         """RMS of the centre's errors over their stated deviations."""
         variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, :2]
         return float(np.sqrt(np.mean(self.errors[:, :2] ** 2 / variances)))
+
+    @property
+    def z_se(self) -> float:
+        """Standard error of `z`."""
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)[:, :2]
+        squares = np.mean(self.errors[:, :2] ** 2 / variances, axis=1)
+        return self._se_of_mean(squares) / (2.0 * self.z)
 
     @property
     def mahalanobis2(self) -> float:
@@ -172,6 +195,21 @@ def measure(setup: Setup) -> Outcome:
         _bound(setup, sensor, fall),
         np.array(along),
         1e3 * seconds / present,
+        np.zeros(len(errors), dtype=np.intp),
+    )
+
+
+def pooled(outcomes: Sequence[Outcome]) -> Outcome:
+    """Return the discs of several draws of one setup as one outcome."""
+    first = outcomes[0]
+    return replace(
+        first,
+        present=sum(each.present for each in outcomes),
+        errors=np.concatenate([each.errors for each in outcomes]),
+        covariances=np.concatenate([each.covariances for each in outcomes]),
+        along_light_px=np.concatenate([each.along_light_px for each in outcomes]),
+        ms_per_disc=float(np.mean([each.ms_per_disc for each in outcomes])),
+        draw=np.repeat(np.arange(len(outcomes)), [len(each.errors) for each in outcomes]),
     )
 
 
@@ -243,21 +281,23 @@ def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
         for number, polarity in enumerate(Polarity):
             # each polarity with one tilt of the three, another for the next radius
             ratio = ratios[(number + arguments.radii.index(radius)) % len(ratios)]
-            yield Setup(
-                case,
-                polarity,
-                radius,
-                ratio,
-                few if radius < 100.0 else 2,
-                Operator(arguments.operator),
-                arguments.gradient,
-                arguments.seed,
-            )
+            for draw in range(arguments.draws):
+                yield Setup(
+                    case,
+                    polarity,
+                    radius,
+                    ratio,
+                    few if radius < 100.0 else 2,
+                    Operator(arguments.operator),
+                    arguments.gradient,
+                    arguments.seed + draw,
+                )
 
 
 HEAD = (
     f"{'case':21}{'':8}{'R px':>6}{'ratio':>6}{'found':>9}{'bound px':>10}{'/ bound':>9}"
-    f"{'limit':>7}{'bias px':>9} ± {'se':6}{'R bias':>9}{'z':>6}{'Mahal.²':>9}{'ms':>7}"
+    f" ± {'se':4}{'limit':>7}{'bias px':>9} ± {'se':6}{'R bias':>9}{'z':>6} ± {'se':4}"
+    f"{'Mahal.²':>9}{'ms':>7}"
 )
 
 
@@ -272,9 +312,11 @@ def line(outcome: Outcome) -> str:
         return head
     bound = math.sqrt(0.5 * float(np.trace(outcome.bound_px2)))
     return (
-        f"{head}{bound:10.5f}{outcome.over_bound:9.2f}{CASES[setup.case].limit:7.2f}"
+        f"{head}{bound:10.5f}{outcome.over_bound:9.2f} ± {outcome.over_bound_se:.2f}"
+        f"{CASES[setup.case].limit:7.2f}"
         f"{outcome.bias_px:9.4f} ± {outcome.bias_se_px:.4f}{outcome.radius_bias_px:9.4f}"
-        f"{outcome.z:6.2f}{outcome.mahalanobis2:9.2f}{outcome.ms_per_disc:7.1f}"
+        f"{outcome.z:6.2f} ± {outcome.z_se:.2f}"
+        f"{outcome.mahalanobis2:9.2f}{outcome.ms_per_disc:7.1f}"
     )
 
 
@@ -289,15 +331,16 @@ def main() -> None:
     parser.add_argument("--discs", type=int, default=120, help="per line; 40 of R >= 100 px")
     parser.add_argument("--operator", choices=[each.value for each in Operator], default="model")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--draws", type=int, default=1, help="of --discs each, pooled in a line")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     print(HEAD, flush=True)
     todo = list(setups(arguments))
-    pooled = ordered_map(
+    outcomes = ordered_map(
         measure, todo, jobs=arguments.jobs, start=use_one_thread_each, start_arguments=()
     )
-    for outcome in pooled:
-        print(line(outcome), flush=True)
+    while draws := list(itertools.islice(outcomes, arguments.draws)):
+        print(line(pooled(draws)), flush=True)
 
 
 if __name__ == "__main__":

@@ -277,14 +277,9 @@ def _adjusted_part(
     """Return the adjustment of some of the photographs."""
     views = tuple(whole.views[index] for index in part.tolist())
     size = (whole.camera.width, whole.camera.height)
-    estimate = whole.solution.estimate
-    start = replace(
-        estimate,
-        rotations=estimate.rotations[part],
-        translations=estimate.translations[part],
-    )
+    start = whole.solution.estimate.part(part)
     problem = CalibrationProblem(views, whole.field, size, whole.settings)
-    return problem.adjusted(whole.camera, start, unknowns)
+    return problem.bent(problem.adjusted(whole.camera, start, unknowns))
 
 
 if __name__ == "__main__":

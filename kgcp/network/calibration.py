@@ -146,7 +146,7 @@ def _calibrated(problem: CalibrationProblem, start: CameraCalibration | None) ->
     if apart:
         is_apart = np.array([view.photo in apart for view in problem.views])
         chosen = _chosen(*without(problem, state, is_apart))
-    return _result(chosen, tuple(dict.fromkeys((*dropped, *apart))))
+    return _result(_with_bends(chosen), tuple(dict.fromkeys((*dropped, *apart))))
 
 
 def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
@@ -163,6 +163,18 @@ def _chosen(problem: CalibrationProblem, state: AdjustedNetwork) -> _Chosen:
         return _Chosen(problem, fixed, fixed, PointModel.FIXED, is_turn_unclear=True)
     state = with_chosen_parameters(problem, state)
     return _Chosen(problem, state, fixed, points, is_turn_unclear=False)
+
+
+def _with_bends(chosen: _Chosen) -> _Chosen:
+    """Let the field bend from photograph to photograph, if it does.
+
+    Only now: a photograph in which it is bent much more than in others is left out before.
+    """
+    problem = chosen.problem
+    bent = problem.bent(chosen.state)
+    if bent.network.bends is None:
+        return chosen
+    return replace(chosen, state=with_chosen_parameters(problem, bent))
 
 
 def _require_views(views: Sequence[NamedView]) -> None:

@@ -20,10 +20,16 @@ from kgcp.geometry.circle_image import (
 )
 from kgcp.geometry.pose import Pose
 from kgcp.network.adjust import ROBUST, adjust_network
-from kgcp.network.calibration_records import CalibrationSettings, NamedView, PointModel
+from kgcp.network.calibration_records import (
+    CalibrationSettings,
+    NamedView,
+    PointModel,
+    operator_sd_px,
+)
 from kgcp.network.covariance import fitting_covariances, precision
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import (
+    BendPrior,
     CalibrationPrior,
     Estimate,
     Network,
@@ -32,6 +38,7 @@ from kgcp.network.records import (
     ScaleBar,
     Solution,
 )
+from kgcp.network.sheet_bends import bend_displacements, bend_shapes, first_bends, next_bends
 from kgcp.targets.fields.points import AnyField
 
 _CENTRE_SD = 0.1  # of the frame's longer side: how far a principal point may be from the middle
@@ -107,8 +114,12 @@ class CalibrationProblem:
         )
 
     def with_unknowns(self, state: AdjustedNetwork, unknowns: NetworkUnknowns) -> AdjustedNetwork:
-        """Return the adjustment of other unknowns."""
-        return self.adjusted(state.camera, state.estimate, unknowns)
+        """Return the adjustment of other unknowns; bends are those of the state, estimated anew."""
+        bends, points = state.network.bends, state.unknowns.points
+        if bends is None or points is not unknowns.points:
+            return self.adjusted(state.camera, state.estimate, unknowns)
+        cov = state.network.observations.cov
+        return self._settled(state.camera, state.estimate, unknowns, cov, bends)
 
     def with_estimate(self, state: AdjustedNetwork, estimate: Estimate) -> AdjustedNetwork:
         """Return the adjustment from another start."""
@@ -122,12 +133,49 @@ class CalibrationProblem:
         The covariances of the discs are made to fit their residuals, so that priors, which are
         absolute, get the weight that they deserve.
         """
+        return self._settled(camera, estimate.unbent(0), unknowns, self.observations().cov, None)
+
+    def bent(self, state: AdjustedNetwork) -> AdjustedNetwork:
+        """Return the adjustment of a free field that bends, or `state` if it hardly does.
+
+        Bends that displace discs by less than these are measured to may be errors of the operator.
+        With them, the focal length of DICe's rendered boards, which cannot bend, went from -0.8 to
+        -1.4 px off.
+
+        Parameters
+        ----------
+        state : AdjustedNetwork
+            Without bends.
+        """
+        if state.unknowns.points is not PointModel.FREE or not self.field.starts_from_homographies:
+            return state
+        network, solution = state.network, state.solution
+        cov = fitting_covariances(network, solution, self.observations().cov)
+        fitting = replace(network, observations=replace(network.observations, cov=cov))
+        bends = first_bends(fitting, solution, bend_shapes(self.field.points_m()))
+        if bends is None:
+            return state
+        start = state.estimate.unbent(bends.shapes.shape[1])
+        bent = self._settled(state.camera, start, state.unknowns, cov, bends)
+        squares = np.sum(bend_displacements(bent.network, bent.estimate) ** 2, axis=1)
+        is_seen = np.sqrt(squares[bent.solution.is_used].mean()) > operator_sd_px(self.views)
+        return bent if is_seen else state
+
+    def _settled(
+        self,
+        camera: Camera,
+        estimate: Estimate,
+        unknowns: NetworkUnknowns,
+        cov: FloatArray,
+        bends: BendPrior | None,
+    ) -> AdjustedNetwork:
+        """Return the adjustment that starts with some covariances (n, 2, 2) and bends."""
         observed = self.observations()
         if unknowns.is_same_aspect:
             camera = replace(camera, fy=camera.fx)
         terms = unknowns.terms
         model = FrameCameraModel(_without(camera, terms), terms, unknowns.is_same_aspect)
-        cov, before = observed.cov, np.full_like(observed.places, np.inf)
+        before = np.full_like(observed.places, np.inf)
         for _ in range(_SCALINGS):
             offsets = self.eccentricity(camera, estimate, observed).total_px
             offsets = np.where(np.isfinite(offsets), offsets, 0.0)
@@ -137,6 +185,7 @@ class CalibrationProblem:
                 replace(observed, places=observed.places - offsets, cov=cov),
                 self.point_prior(unknowns.points),
                 self.camera_prior(model, camera),
+                bends,
             )
             start = replace(estimate, cameras=model.values_of(camera)[None])
             solution = self._with_kept_centre(network, start)
@@ -145,10 +194,15 @@ class CalibrationProblem:
             next_cov = fitting_covariances(network, solution, observed.cov)
             change = float(np.trace(next_cov.sum(axis=0)) / np.trace(cov.sum(axis=0)))
             is_scaled = 1.0 / _SETTLED_VARIANCE < change < _SETTLED_VARIANCE
+            if bends is not None:
+                next_sd = next_bends(network, solution, bends)
+                change = (next_sd.sd / bends.sd) ** 2
+                is_scaled &= 1.0 / _SETTLED_VARIANCE < change < _SETTLED_VARIANCE
             is_settled = is_scaled and np.abs(offsets - before).max() < _SETTLED_PX
             cov, before = next_cov, offsets
             if is_settled:
                 break
+            bends = next_sd if bends is not None else None
         return AdjustedNetwork(camera, estimate, unknowns, network, solution)
 
     def _with_kept_centre(self, network: Network, start: Estimate) -> Solution:

@@ -22,10 +22,23 @@ class ViewRows:
 
     rows: IndexArray  # (m,): which observations
     columns: IndexArray  # (k,): of the reduced unknowns that take part: camera, then points
-    by_pose: FloatArray  # (2m, 6)
+    by_pose: FloatArray  # (2m, q): by the pose, then by the bends
     by_camera: FloatArray  # (2m, p)
     by_point: FloatArray | None  # (m, 2, 3): each disc by its own point; None: points are fixed
     residuals: FloatArray  # (2m,)
+    # as further rows, in units of their standard deviation: that the field is not bent
+    bend_rows: FloatArray  # (b, q): by pose and bends
+    bend_residuals: FloatArray  # (b,)
+
+    @property
+    def pose_normal(self) -> FloatArray:
+        """The normal matrix (q, q) of pose and bends."""
+        return np.asarray(self.by_pose.T @ self.by_pose + self.bend_rows.T @ self.bend_rows)
+
+    @property
+    def pose_right(self) -> FloatArray:
+        """The right side (q,) of pose and bends."""
+        return np.asarray(self.by_pose.T @ self.residuals + self.bend_rows.T @ self.bend_residuals)
 
     def dense(self) -> FloatArray:
         """Return the derivatives (2m, k) by the reduced unknowns."""
@@ -44,9 +57,9 @@ class ReducedSystem:
 
     normal: FloatArray  # (u, u)
     right: FloatArray  # (u,)
-    pose_normals: FloatArray  # (v, 6, 6)
-    pose_rights: FloatArray  # (v, 6)
-    couplings: tuple[FloatArray, ...]  # per photograph (k, 6)
+    pose_normals: FloatArray  # (v, q, q): poses, then bends
+    pose_rights: FloatArray  # (v, q)
+    couplings: tuple[FloatArray, ...]  # per photograph (k, q)
     columns: tuple[IndexArray, ...]  # per photograph (k,)
 
 
@@ -63,9 +76,19 @@ def computed(network: Network, estimate: Estimate) -> FloatArray:
     return places
 
 
+def bent_points(network: Network, estimate: Estimate) -> FloatArray:
+    """Return where each observed point was in its photograph (n, 3), in the field's frame."""
+    seen = network.observations
+    points = np.asarray(estimate.points[seen.point])
+    if network.bends is not None:
+        shapes = network.bends.shapes[seen.point]
+        points[:, 2] += np.sum(shapes * estimate.bends[seen.view], axis=1)
+    return points
+
+
 def _camera_points(network: Network, estimate: Estimate) -> FloatArray:
     seen = network.observations
-    turned = np.einsum("nij,nj->ni", estimate.rotations[seen.view], estimate.points[seen.point])
+    turned = np.einsum("nij,nj->ni", estimate.rotations[seen.view], bent_points(network, estimate))
     points: FloatArray = turned + estimate.translations[seen.view]
     flat = np.abs(points[:, 2]) < _LEAST_DEPTH * np.linalg.norm(points, axis=1)
     points[flat, 2] = _LEAST_DEPTH
@@ -93,7 +116,11 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
     by_place = image.by_ray @ ray_by_point.reshape(-1, 2, 3)
     by_turn = -by_place @ _cross_matrices(rays - estimate.translations[view_of])
     white = seen.white[used] * np.sqrt(weights[used])[:, None, None]
-    by_pose = white @ np.concatenate((by_place, by_turn), axis=2)
+    by_view = [by_place, by_turn]
+    if network.bends is not None:
+        by_height = by_place @ estimate.rotations[view_of][:, :, 2:]
+        by_view.append(by_height * network.bends.shapes[seen.point[used]][:, None, :])
+    by_pose = white @ np.concatenate(by_view, axis=2)
     by_camera = white @ image.by_parameter
     residuals = white @ (seen.places[used] - image.places)[:, :, None]
     by_point = None
@@ -101,6 +128,7 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
         by_point = white @ by_place @ estimate.rotations[view_of]
     parameters = len(network.model.names)
     first_point = network.cameras.values.size
+    bend_rows, bend_residuals = _bend_rows(network, estimate)
     equations = []
     for view, camera in enumerate(network.view_camera.tolist()):
         own = np.flatnonzero(view_of == view)
@@ -112,13 +140,24 @@ def view_rows(network: Network, estimate: Estimate, weights: FloatArray) -> list
             ViewRows(
                 used[own],
                 columns,
-                by_pose[own].reshape(-1, 6),
+                by_pose[own].reshape(-1, bend_rows.shape[1]),
                 by_camera[own].reshape(-1, parameters),
                 None if by_point is None else by_point[own],
                 residuals[own].ravel(),
+                bend_rows,
+                bend_residuals[view],
             )
         )
     return equations
+
+
+def _bend_rows(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the equations of the bends' prior (b, 6 + b), and each photograph's residuals."""
+    if network.bends is None:
+        return np.zeros((0, 6)), np.zeros((len(network.view_camera), 0))
+    count = network.bend_count
+    rows = np.hstack((np.zeros((count, 6)), np.eye(count))) / network.bends.sd
+    return rows, -estimate.bends / network.bends.sd
 
 
 def _images(
@@ -156,9 +195,8 @@ def reduce_poses(
     diagonal = normal.diagonal().copy()
     pose_normals, pose_rights, couplings = [], [], []
     for view in equations:
-        pose_normal = view.by_pose.T @ view.by_pose
-        pose_normal[np.diag_indices(6)] *= 1.0 + damping
-        pose_right = view.by_pose.T @ view.residuals
+        pose_normal, pose_right = view.pose_normal, view.pose_right
+        pose_normal[np.diag_indices(len(pose_normal))] *= 1.0 + damping
         direct, coupling, direct_right = _unreduced(view)
         back = np.linalg.solve(pose_normal, coupling.T)
         normal[np.ix_(view.columns, view.columns)] += direct - coupling @ back
@@ -179,13 +217,13 @@ def reduce_poses(
 
 
 def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a photograph's normal matrix (k, k), its coupling with the pose (k, 6), and right."""
+    """Return a photograph's normal matrix (k, k), its coupling with the pose (k, q), and right."""
     if view.by_point is None:
         by = view.by_camera
         return by.T @ by, by.T @ view.by_pose, by.T @ view.residuals
     parameters, count = view.by_camera.shape[1], len(view.rows)
     by_camera = view.by_camera.reshape(count, 2, parameters)
-    by_pose = view.by_pose.reshape(count, 2, 6)
+    by_pose = view.by_pose.reshape(count, 2, -1)
     residuals = view.residuals.reshape(count, 2)
     points = view.by_point.transpose(0, 2, 1)
     size = parameters + 3 * count
@@ -198,7 +236,7 @@ def _unreduced(view: ViewRows) -> tuple[FloatArray, FloatArray, FloatArray]:
     index = np.arange(count)
     blocks[index, :, index, :] = points @ view.by_point
     coupling = np.vstack(
-        (view.by_camera.T @ view.by_pose, (points @ by_pose).reshape(3 * count, 6))
+        (view.by_camera.T @ view.by_pose, (points @ by_pose).reshape(3 * count, -1))
     )
     right = np.concatenate(
         (view.by_camera.T @ view.residuals, (points @ residuals[:, :, None]).ravel())
@@ -240,13 +278,15 @@ def _bar_row(bar: ScaleBar, points: FloatArray, first: int) -> tuple[IndexArray,
 
 
 def prior_cost(network: Network, estimate: Estimate) -> float:
-    """Return the weighted sum of squares of what deviates from the priors and the bars."""
+    """Return the weighted sum of squares of what deviates from priors, bars and no bend."""
     cost = float(np.sum(((estimate.cameras - network.cameras.values) / network.cameras.sd) ** 2))
     prior: PointPrior = network.points
     if prior.information is not None:
         gaps = estimate.points - prior.nominal
         cost += float(np.einsum("ni,nij,nj->", gaps, prior.information, gaps))
         cost += sum(_bar_row(bar, estimate.points, 0)[2] ** 2 for bar in prior.bars)
+    if network.bends is not None:
+        cost += float(np.sum((estimate.bends / network.bends.sd) ** 2))
     return cost
 
 
@@ -264,7 +304,7 @@ def moved(
             strict=True,
         )
     ]
-    poses = np.array(pose_steps).reshape(-1, 6)
+    poses = np.array(pose_steps)
     cameras = estimate.cameras.size
     points = estimate.points
     if not network.points.is_fixed:

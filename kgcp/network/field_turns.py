@@ -61,12 +61,13 @@ def _best_turn(problem: CalibrationProblem, state: AdjustedNetwork, view: int) -
     own = observed.chosen((observed.view == view) & state.solution.is_used)
     own = replace(own, view=np.zeros(len(own.view), dtype=np.intp))
     points, pose = state.estimate.points, state.poses[view]
-    _, cost = refined_poses(state.camera, own, points, [pose])
+    bends = state.network.bends
+    _, cost = refined_poses(state.camera, own, points, [pose], bends)
     turns = []
     for permutation in problem.field.symmetries():
         turned = replace(own, point=permutation[own.point])
         guess = _turned_pose(pose, problem.field.points_m(), permutation)
-        refined, other = refined_poses(state.camera, turned, points, [guess])
+        refined, other = refined_poses(state.camera, turned, points, [guess], bends)
         turns.append(
             _Turn(
                 float(other[0] / cost[0]),

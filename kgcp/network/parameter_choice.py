@@ -14,7 +14,7 @@ from kgcp.network.bursts import place_numbers
 from kgcp.network.calibration_records import LensModel
 from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem, NetworkUnknowns
 from kgcp.network.covariance import precision
-from kgcp.network.records import Estimate, Network, Observations, PointPrior
+from kgcp.network.records import Network, Observations, PointPrior
 from kgcp.network.start import refined_poses
 
 DETERMINED = 0.3  # of its prior deviation: what is known no better is not determined
@@ -119,12 +119,12 @@ class _CrossValidation:
         misfits: list[FloatArray] = []
         for fold in range(min(_FOLDS, int(self.places.max()) + 1)):
             is_left_out = self.places % _FOLDS == fold
-            start = _part_of_estimate(estimate, ~is_left_out)
+            start = estimate.part(~is_left_out)
             values = adjust_network(_part(own, ~is_left_out), start, ROBUST).estimate.cameras[0]
             left = _part(judged, is_left_out).observations
             poses = [state.poses[view] for view in np.flatnonzero(is_left_out).tolist()]
             camera = state.model.camera(values)
-            _, costs = refined_poses(camera, left, estimate.points, poses)
+            _, costs = refined_poses(camera, left, estimate.points, poses, network.bends)
             misfits.append(costs / np.bincount(left.view))
         return float(np.mean(np.concatenate(misfits)))
 
@@ -137,12 +137,4 @@ def _part(network: Network, which: BoolArray) -> Network:
         network,
         view_camera=network.view_camera[which],
         observations=replace(observed, view=index[observed.view]),
-    )
-
-
-def _part_of_estimate(estimate: Estimate, which: BoolArray) -> Estimate:
-    return replace(
-        estimate,
-        rotations=estimate.rotations[which],
-        translations=estimate.translations[which],
     )

@@ -87,12 +87,7 @@ def without(
     stays = ~is_left_out
     views = tuple(view for view, is_in in zip(problem.views, stays, strict=True) if is_in)
     problem = replace(problem, views=views)
-    estimate = replace(
-        state.estimate,
-        rotations=state.estimate.rotations[stays],
-        translations=state.estimate.translations[stays],
-    )
-    return problem, problem.with_estimate(state, estimate)
+    return problem, problem.with_estimate(state, state.estimate.part(stays))
 
 
 def _own_rms_px(state: AdjustedNetwork) -> FloatArray:

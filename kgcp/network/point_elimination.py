@@ -21,7 +21,7 @@ from kgcp.network.records import Estimate, Network
 class PointReducedSystem:
     """Normal equations of cameras and poses, and what brings the points back."""
 
-    normal: FloatArray  # (x, x): cameras, then poses
+    normal: FloatArray  # (x, x): cameras, then of each photograph its pose and its bends
     right: FloatArray  # (x,)
     coupling: FloatArray  # (x, m, 3): with the points
     point_inverses: FloatArray  # (m, 3, 3)
@@ -42,7 +42,8 @@ def reduce_points(
     if information is None:
         raise ValueError("the points are no unknowns")
     cameras, parameters = network.cameras.values.size, network.cameras.values.shape[1]
-    size = cameras + 6 * len(equations)
+    own_count = 6 + network.bend_count
+    size = cameras + own_count * len(equations)
     normal, right = np.zeros((size, size)), np.zeros(size)
     known = network.cameras.sd.ravel() ** -2.0
     normal[np.arange(cameras), np.arange(cameras)] = known
@@ -55,11 +56,13 @@ def reduce_points(
         if view.by_point is None:
             continue
         first = int(network.view_camera[index]) * parameters
-        pose = cameras + 6 * index
-        columns = np.concatenate((first + np.arange(parameters), pose + np.arange(6)))
+        pose = cameras + own_count * index + np.arange(own_count)
+        columns = np.concatenate((first + np.arange(parameters), pose))
         own = np.hstack((view.by_camera, view.by_pose))
         normal[np.ix_(columns, columns)] += own.T @ own
         right[columns] += own.T @ view.residuals
+        normal[np.ix_(pose, pose)] += view.bend_rows.T @ view.bend_rows
+        right[pose] += view.bend_rows.T @ view.bend_residuals
         count = len(view.rows)
         points = network.observations.point[view.rows]
         across = view.by_point.transpose(0, 2, 1)
@@ -92,7 +95,9 @@ def moved_by_points(network: Network, estimate: Estimate, system: PointReducedSy
     left = system.point_right - np.einsum("xmi,x->mi", system.coupling, step)
     points = estimate.points + np.einsum("mij,mj->mi", system.point_inverses, left)
     cameras = network.cameras.values.size
-    return estimate.moved(step[:cameras], step[cameras:].reshape(-1, 6), points)
+    return estimate.moved(
+        step[:cameras], step[cameras:].reshape(len(estimate.rotations), -1), points
+    )
 
 
 def determined_by_priors(network: Network, system: PointReducedSystem) -> float:
@@ -103,6 +108,14 @@ def determined_by_priors(network: Network, system: PointReducedSystem) -> float:
     inverse = np.linalg.inv(system.normal)
     cameras = network.cameras.values.size
     by_cameras = float(inverse.diagonal()[:cameras] @ network.cameras.sd.ravel() ** -2.0)
+    if network.bends is not None:
+        by_cameras += float(np.sum(bend_cofactors_of(network, system))) / network.bends.sd**2
     carried = np.einsum("xmi,mij->mxj", system.coupling, system.point_inverses)
     cofactors = system.point_inverses + carried.transpose(0, 2, 1) @ (inverse @ carried)
     return by_cameras + float(np.sum(cofactors * information))
+
+
+def bend_cofactors_of(network: Network, system: PointReducedSystem) -> FloatArray:
+    """Return the cofactors (v, b) of the bends, all else unknown as well."""
+    of_views = np.linalg.inv(system.normal).diagonal()[network.cameras.values.size :]
+    return np.asarray(of_views.reshape(len(network.view_camera), -1)[:, 6:])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -68,6 +68,14 @@ class PointPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BendPrior:
+    """How a sheet may bend from photograph to photograph, out of its plane."""
+
+    shapes: FloatArray  # (m, b): heights of the points in each of b bends
+    sd: float  # of the amount of each bend in each photograph
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CalibrationPrior:
     """What is known beforehand of the parameters of the cameras."""
 
@@ -104,6 +112,12 @@ class Network:
     observations: Observations
     points: PointPrior
     cameras: CalibrationPrior
+    bends: BendPrior | None = None  # None: the points are where they are in all photographs
+
+    @property
+    def bend_count(self) -> int:
+        """How many bends each photograph has."""
+        return 0 if self.bends is None else self.bends.shapes.shape[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,21 +128,40 @@ class Estimate:
     rotations: FloatArray  # (v, 3, 3): p_cam = R p + t
     translations: FloatArray  # (v, 3)
     points: FloatArray  # (m, 3)
+    # (v, b): how much of each bend the field has in each photograph
+    bends: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def part(self, which: BoolArray | IndexArray) -> Estimate:
+        """Return the estimate of some photographs."""
+        bends = self.bends[which] if self.bends.size else self.bends
+        return replace(
+            self,
+            rotations=self.rotations[which],
+            translations=self.translations[which],
+            bends=bends,
+        )
+
+    def unbent(self, count: int) -> Estimate:
+        """Return the estimate with so many bends, of which the field has none."""
+        return replace(self, bends=np.zeros((len(self.rotations), count)))
 
     def moved(self, cameras: FloatArray, poses: FloatArray, points: FloatArray) -> Estimate:
-        """Return the values after steps of cameras (c p,) and poses (v, 6), as in `Pose.moved`.
+        """Return the values after steps of cameras (c p,), and of poses and bends (v, 6 + b).
+
+        Poses move as in `Pose.moved`.
 
         Parameters
         ----------
         points : (m, 3) array
             The new ones.
         """
-        turns = np.array([rotation_about(turn) for turn in poses[:, 3:]])
+        turns = np.array([rotation_about(turn) for turn in poses[:, 3:6]])
         return Estimate(
             self.cameras + cameras.reshape(self.cameras.shape),
             turns @ self.rotations,
             self.translations + poses[:, :3],
             points,
+            self.bends + poses[:, 6:] if self.bends.size else self.bends,
         )
 
 

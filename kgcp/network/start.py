@@ -15,6 +15,7 @@ from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.equations import whitened
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.records import (
+    BendPrior,
     CalibrationPrior,
     Estimate,
     Network,
@@ -103,9 +104,16 @@ def better_poses(
 
 
 def refined_poses(
-    camera: Camera, observations: Observations, points: FloatArray, poses: list[Pose]
+    camera: Camera,
+    observations: Observations,
+    points: FloatArray,
+    poses: list[Pose],
+    bends: BendPrior | None = None,
 ) -> tuple[Estimate, FloatArray]:
-    """Return poses adjusted to the discs for a known camera, and their sums of squares (v,)."""
+    """Return poses adjusted to the discs for a known camera, and their sums of squares (v,).
+
+    With `bends`, the field may bend in each photograph, and what it bends counts in the sum.
+    """
     model = FrameCameraModel(camera, ())
     values = model.values_of(camera)[None]
     network = Network(
@@ -114,17 +122,21 @@ def refined_poses(
         observations,
         PointPrior(points, None),
         CalibrationPrior(values, np.full_like(values, _KNOWN)),
+        bends,
     )
     start = Estimate(
         values,
         np.array([pose.rotation for pose in poses]),
         np.array([pose.translation_m for pose in poses]),
         points,
+        np.zeros((len(poses), network.bend_count)),
     )
     solution = adjust_network(network, start, PLAIN)
     weights = np.ones(len(observations.view))
     squares = np.sum(whitened(network, solution.residuals, weights) ** 2, axis=1)
     costs = np.bincount(observations.view, squares, len(poses))
+    if bends is not None:
+        costs += np.sum((solution.estimate.bends / bends.sd) ** 2, axis=1)
     return solution.estimate, np.where(_is_in_front(observations, solution.estimate), costs, np.inf)
 
 

@@ -14,6 +14,7 @@ from kgcp.geometry.attitude import rotation_onto
 from kgcp.network.calibration_records import CameraCalibration, PointModel
 from kgcp.network.equations import view_rows, whitened
 from kgcp.network.records import PointPrior
+from kgcp.network.sheet_bends import bend_displacements
 from kgcp.quality.disc_light import DiscLight
 from kgcp.quality.eccentricity import parameters_if_neglected
 from kgcp.quality.frame_rays import ray_deviations_px
@@ -65,6 +66,14 @@ class FieldDeviation:
         return f"discs are off by {' and by '.join(found)}" if found else ""
 
 
+@dataclass(frozen=True, slots=True)
+class FieldBending:
+    """How much a field bends from photograph to photograph, in the mean of all."""
+
+    height_m: float  # RMS of the discs
+    image_px: float  # RMS of what it displaces their images
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationNumbers:
     """What the verdict depends on."""
@@ -86,6 +95,7 @@ class CalibrationNumbers:
     ray_sd_px: FloatArray
     flatness_m: float | None  # RMS of the field's heights; None: it was taken as flat
     field: FieldDeviation | None  # None: it was taken as stated
+    bending: FieldBending | None  # None: it is the same in all photographs, as far as they tell
     light: DiscLight | None  # None: levels are not known
 
     @property
@@ -150,8 +160,23 @@ def calibration_numbers(
         if calibration.points_used is PointModel.FIXED
         else float(np.sqrt(np.mean((heights - heights.mean()) ** 2))),
         _field_deviation(calibration),
+        _field_bending(calibration),
         light,
     )
+
+
+def _field_bending(calibration: CameraCalibration) -> FieldBending | None:
+    network, solution = calibration.network, calibration.solution
+    if network.bends is None:
+        return None
+    estimate, is_used = solution.estimate, solution.is_used
+    moved_px = bend_displacements(network, estimate)[is_used]
+    heights_m = np.sum(
+        network.bends.shapes[network.observations.point]
+        * estimate.bends[network.observations.view],
+        axis=1,
+    )[is_used]
+    return FieldBending(_rms(heights_m), float(np.sqrt(np.mean(np.sum(moved_px**2, axis=1)))))
 
 
 def _field_deviation(calibration: CameraCalibration) -> FieldDeviation | None:
@@ -180,7 +205,7 @@ def change_if_neglected(calibration: CameraCalibration) -> dict[str, float]:
     One linear step of the adjustment of cameras and poses, the field as it is.
     """
     network, solution = calibration.network, calibration.solution
-    fixed = replace(network, points=PointPrior(solution.estimate.points, None))
+    fixed = replace(network, points=PointPrior(solution.estimate.points, None), bends=None)
     weights = solution.is_used.astype(np.float64)
     equations = view_rows(fixed, solution.estimate, weights)
     shifts = whitened(fixed, calibration.eccentricity.total_px, weights)
@@ -243,11 +268,7 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield (
             f"discs fit {ratio:.1f} times worse ({numbers.rms_px:.3f} px) than they are measured"
         )
-    if numbers.field is not None and numbers.field.doubt:
-        yield (
-            f"the field is not what it is said to be: {numbers.field.doubt}"
-            f" ({numbers.rms_fixed_px:.2f} px as stated, {numbers.rms_px:.3f} px in its own shape)"
-        )
+    yield from _field_doubts(numbers)
     if numbers.coverage < _COVERAGE:
         yield f"discs cover {100.0 * numbers.coverage:.0f} % of the frame"
     if numbers.normals_deg < _NORMALS_DEG:
@@ -277,8 +298,29 @@ def _doubts(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         yield numbers.light.doubt
 
 
+def _field_doubts(numbers: CalibrationNumbers) -> Iterator[str]:
+    if numbers.field is not None and numbers.field.doubt:
+        yield (
+            f"the field is not what it is said to be: {numbers.field.doubt}"
+            f" ({numbers.rms_fixed_px:.2f} px as stated, {numbers.rms_px:.3f} px in its own shape)"
+        )
+    if numbers.bending is not None and _bends_much(numbers):
+        bending = numbers.bending
+        yield (
+            "the field bends from photograph to photograph, by"
+            f" {1000.0 * bending.height_m:.2g} mm ({bending.image_px:.2f} px)"
+        )
+
+
 def _fits_badly(numbers: CalibrationNumbers) -> bool:
     return numbers.rms_px > _OPERATOR_RATIO * numbers.operator_sd_px
+
+
+def _bends_much(numbers: CalibrationNumbers) -> bool:
+    """Return whether bends of the field displace discs by more than errors of their operator."""
+    if numbers.bending is None:
+        return False
+    return numbers.bending.image_px > _OPERATOR_RATIO * numbers.operator_sd_px
 
 
 def _has_other_discs(calibration: CameraCalibration) -> bool:
@@ -315,6 +357,14 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
     if calibration.undetermined:
         names = ", ".join(calibration.undetermined)
         yield f"Not determined by these photographs: {names}; come nearer, and tilt more."
+    yield from _field_advice(calibration, numbers)
+    if numbers.light is not None and numbers.light.doubt:
+        yield "Give photographs as the camera took them, no negatives, and white not burnt."
+
+
+def _field_advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iterator[str]:
+    if _bends_much(numbers):
+        yield "Mount the sheet on a stiff plate, or let it lie and move the camera."
     if _has_other_discs(calibration):
         yield (
             "Measure the diameter and the pitch of the print, on which the camera does not depend;"
@@ -322,5 +372,3 @@ def _advice(calibration: CameraCalibration, numbers: CalibrationNumbers) -> Iter
         )
     if calibration.is_turn_unclear:
         yield "Give the field a mark: one disc that is hollow, larger or missing."
-    if numbers.light is not None and numbers.light.doubt:
-        yield "Give photographs as the camera took them, no negatives, and white not burnt."

@@ -27,6 +27,7 @@ from kgcp.network.camera_network import AdjustedNetwork, CalibrationProblem
 from kgcp.network.frame_camera import FrameCameraModel
 from kgcp.network.photographs_apart import _own_rms_px
 from kgcp.network.records import CalibrationPrior
+from kgcp.network.sheet_bends import bend_shapes
 from kgcp.quality.calibration_verdict import (
     CalibrationGrade,
     calibration_numbers,
@@ -59,7 +60,8 @@ def views(
         about = np.array([np.cos(angle), np.sin(angle), 0.0])
         rotation = rotation_about(tilt * about) @ rotation_about(np.array([0.0, 0.0, turn]))
         middle = [0.03 * np.cos(angle), 0.02 * np.sin(angle), distance_m]
-        centres = (points - points.mean(axis=0)) @ rotation.T + middle
+        own = points if points.ndim == 2 else points[index]  # bent otherwise in each photograph
+        centres = (own - own.mean(axis=0)) @ rotation.T + middle
         axes = np.broadcast_to(rotation[:, :2], (len(centres), 3, 2))
         circles = Circles3D(centres, axes, FIELD.radii_m())
         vectors = circle_images(camera, circles).moments
@@ -127,6 +129,33 @@ def test_a_field_that_is_not_flat_is_noticed_and_estimated() -> None:
     assert 0.1 < numbers.rms_fixed_px < 3.0
     assert numbers.flatness_m == pytest.approx(0.0002, rel=0.4)
     assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0]
+
+
+@pytest.mark.parametrize("points", [PointModel.STIFF, PointModel.FREE])
+def test_a_sheet_that_bends_between_photographs_is_told_of_if_it_is_free(
+    points: PointModel,
+) -> None:
+    rng = np.random.default_rng(9)
+    amounts = 0.0001 * rng.standard_normal((len(TURNS), 3))
+    result = calibrated(views(bend_m=_heights_m(amounts)), points)
+    numbers = calibration_numbers(result)
+    verdict = judge(result, numbers)
+    if points is PointModel.STIFF:
+        assert numbers.bending is None
+        assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0]
+        return
+    assert numbers.bending is not None
+    assert 0.00005 < numbers.bending.height_m < 0.0003
+    assert "the field bends from photograph to photograph, by 0.1" in verdict.sentence
+    assert "Mount the sheet on a stiff plate, or let it lie and move the camera." in verdict.advice
+    assert numbers.rms_px < 1.5 * SD_PX * np.sqrt(2.0)
+    assert abs(result.camera.fx - 1500.0) < 4.0 * numbers.sd[0] < 4.0
+
+
+def _heights_m(amounts_m: FloatArray) -> FloatArray:
+    """Return the displacements (v, m, 3) of a sheet that is bent so much in each photograph."""
+    heights = amounts_m @ bend_shapes(FIELD.points_m()).T
+    return np.asarray(heights[:, :, None] * [0.0, 0.0, 1.0])
 
 
 def test_a_field_as_flat_as_it_is_stated_is_good() -> None:

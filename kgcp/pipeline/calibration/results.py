@@ -191,6 +191,8 @@ def _summary(
         "largest_angle_deg": numbers.normals_deg,
         "radius_scale": calibration.radius_scale,
         "flatness_m": numbers.flatness_m,
+        "bending_m": None if numbers.bending is None else numbers.bending.height_m,
+        "bending_px": None if numbers.bending is None else numbers.bending.image_px,
         "change_if_eccentricity_neglected": change_if_neglected(calibration),
         "not_used": {row.photo: row.reason for row in photos if row.reason},
         "photo_rms_px": {
