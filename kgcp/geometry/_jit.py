@@ -105,7 +105,7 @@ def compiled_if_often(function: _Function) -> _Function:
 
 
 def interpreted(function: _Function) -> _Function:
-    """Return a compiled function as Python runs it, for calls so few that numba is not loaded."""
+    """Return a compiled function as Python runs it, for calls too few to load numba for."""
     return cast("_Function", cast("_Compilable", function).interpreted)
 
 

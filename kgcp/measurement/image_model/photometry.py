@@ -160,7 +160,7 @@ GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
 _MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
 _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
-_NONE = np.empty(0)
+_NO_VALUES = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,7 +316,7 @@ class PhotometricModel:
         `detail` is what is sharpened in the light at full strength, None: nothing; `slope` that of
         the curve to grey values, None: there is none.
         """
-        rows, in_light = [*_FILTERED], (0.0, _NONE)
+        rows, in_light = [*_FILTERED], (0.0, _NO_VALUES)
         if self.tone.is_shaped:
             rows += _TONE_ROWS
         if detail is not None:
@@ -331,7 +331,7 @@ class PhotometricModel:
             np.array(rows),
             _RARE_ROWS,
             in_light,
-            _NONE if slope is None else slope,
+            _NO_VALUES if slope is None else slope,
             others,
             light.sharpening,
         )
