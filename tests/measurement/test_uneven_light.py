@@ -131,6 +131,40 @@ def test_dirt_under_a_film_curve_that_is_not_known_is_no_other_size(
     assert 0.2 < math.sqrt(np.mean(np.square(sigmas))) < 1.5
 
 
+@pytest.mark.parametrize("lights", [highlight, dirt])
+def test_where_a_fit_with_levels_starts_does_not_matter(
+    photograph: Photograph,
+    start_near: StartNear,
+    monkeypatch: pytest.MonkeyPatch,
+    lights: Lights,
+) -> None:
+    """With white and the plate's levels free at once, fits stayed 2 σ off, where they began."""
+    camera, srgb = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.SRGB)
+    fits: list[TargetFit] = []
+
+    def kept(fit: TargetFit) -> PoseCovariance:
+        fits.append(fit)
+        return pose_covariance(fit)
+
+    monkeypatch.setattr(fit_target, "pose_covariance", kept)
+    for seed in range(3):
+        rng = np.random.default_rng(500 + seed)
+        pose = some_pose(rng)
+        grey = photograph(camera, pose, rng, sensor=srgb, gain=0.65, field=lights(rng))
+        fits.clear()
+        measure_by_model(grey, camera, TARGET_PLATE.target, start_near(camera, pose, rng))
+        fit = fits[0]
+        centre_m, cov = fit.parameters.pose.translation_m, pose_covariance(fit).pose_cov
+        ray = centre_m / np.linalg.norm(centre_m)
+        sd_m = math.sqrt(ray @ cov[:3, :3] @ ray)
+        for sigmas in (-2.0, 2.0):
+            off = Pose(fit.parameters.pose.rotation, centre_m + sigmas * sd_m * ray)
+            start = fit.parameters.at(off)
+            again, _ = random_levels.fit_levels(fit.sample.problem, [start], off, fit.unknowns)
+            apart_m = ray @ (again.parameters.pose.translation_m - centre_m)
+            assert abs(apart_m) < 0.4 * sd_m
+
+
 def phone_photograph(pose: Pose, rng: np.random.Generator) -> GreyArray:
     """A phone's picture of a plate between dark and bright ground, which change its levels."""
     sensor = Sensor(tone=ToneCurve.SRGB, sharpening=0.8, sharpening_px=1.2)

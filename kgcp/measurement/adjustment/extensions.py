@@ -33,7 +33,7 @@ from kgcp.measurement.adjustment.random_levels import even_field, fit_levels, ne
 from kgcp.measurement.adjustment.skewed import needs_skew, with_skew
 from kgcp.measurement.adjustment.solver import TargetFit, adjust
 from kgcp.measurement.adjustment.two_poses import TwoPoses, fit_at, fit_both_poses
-from kgcp.measurement.adjustment.unknowns import unknowns_of, without_fine_light
+from kgcp.measurement.adjustment.unknowns import unknowns_of, without_even_light
 from kgcp.measurement.image_model.blur import Blur
 from kgcp.measurement.image_model.photometry import PARAM_COUNT, Light, Param, Tone, decoded
 from kgcp.measurement.records import ToneBase
@@ -189,7 +189,7 @@ def _with_skew(problem: FitProblem, poses: TwoPoses) -> TwoPoses:
         gaussian = replace(gaussian, field=best.parameters.field)
         unknowns = unknowns_of(problem, has_streak=False)
         is_even = gaussian.field is None
-        spreads.append((gaussian, unknowns if is_even else without_fine_light(unknowns)))
+        spreads.append((gaussian, unknowns if is_even else without_even_light(unknowns)))
     skewed = []
     for parameters, unknowns in spreads:
         with contextlib.suppress(Rejection):  # then the plain model is the better one
@@ -256,13 +256,13 @@ def _of_levels(light: Light, black: float, white: float) -> Light:
 
 
 def _in_even_light(light: Light) -> Light:
-    """Return the levels and the tone curve without what `without_fine_light` leaves out."""
+    """Return ink, plate and the tone curve without the other unknowns of even light."""
     return replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0, linear_sharpening=0.0)
 
 
 def _fitted(problem: FitProblem, poses: TwoPoses, starts: list[Parameters]) -> TwoPoses:
     """Fit both poses with levels that vary: these may hide a dot, which even levels must show."""
     check_code(poses.best)
-    unknowns = without_fine_light(poses.best.unknowns)
+    unknowns = without_even_light(poses.best.unknowns)
     best, other = fit_levels(problem, starts, poses.other.parameters.pose, unknowns)
     return TwoPoses(best, other)

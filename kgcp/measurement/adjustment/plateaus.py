@@ -169,8 +169,10 @@ def field_of(
     values = np.zeros_like(field.values)
     seen = decoded(plateaus.levels[:, at], problem.tone)
     levels = seen - np.array([[light.black], [light.white]])
-    values[:, -len(at) :] = levels / (light.white - light.black)
-    return replace(field, values=values)
+    added = levels / (light.white - light.black)
+    offsets = added.mean(axis=1)
+    values[:, -len(at) :] = added - offsets[:, None]
+    return replace(field, values=values, offsets=offsets)
 
 
 def step_across(problem: FitProblem, plateaus: Plateaus) -> FloatArray | None:

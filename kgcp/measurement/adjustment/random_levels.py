@@ -41,6 +41,7 @@ from kgcp.measurement.adjustment.solver import (
 from kgcp.measurement.image_model.light_field import (
     EDGE_MEAN,
     EDGE_PRECISION,
+    OFFSET_PRECISION,
     SPAN,
     LightField,
     knots_over,
@@ -102,6 +103,7 @@ def even_field(problem: FitProblem) -> LightField:
         knots=knots,
         values=np.zeros((2, count)),
         precision=np.full((2, count), _FIRST_SD**-2),
+        offsets=np.zeros(2),
         edges=np.empty((0, 5)),
         centre_px=problem.centre_px,
     )
@@ -292,8 +294,8 @@ def _equations(
     """Return the equations of pose, blur, light and shadows' edges, with the levels eliminated."""
     field = _field_of(parameters)
     by_level = jacobian[PARAM_COUNT:] / sd
-    scaled = scaled_rows(jacobian, unknowns.free, sd)
-    precision = unknowns.free_precision
+    scaled = np.vstack((scaled_rows(jacobian, unknowns.free, sd), by_level))
+    precision = np.append(unknowns.free_precision, (OFFSET_PRECISION, OFFSET_PRECISION))
     if len(field.edges):
         scaled = np.vstack((scaled, field.edge_rows(sample.pixels, by_level)))
         precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
@@ -317,15 +319,16 @@ class _WithLevels:
         of_levels = reduced.gradient_of_levels(current.score, field.values)
         pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
         pull_of_edges = (EDGE_PRECISION * (EDGE_MEAN - field.edges)).ravel()
-        gradient = reduced.scaled @ current.score + np.append(pull, pull_of_edges)
+        pulls = np.concatenate((pull, -OFFSET_PRECISION * field.offsets, pull_of_edges))
+        gradient = reduced.scaled @ current.score + pulls
         alone = reduced.half_solved(of_levels)
         gradient -= reduced.half_mixed.T @ alone
         damped = _damped(reduced.normal, parameters, damping)
         solution, promised = solve_damped(damped, gradient, 0.5 * float(alone @ alone))
         values = reduced.step_of_levels(alone, solution)
-        edges = solution[len(free) :].reshape(-1, 5)
-        moved = parameters.moved(unknowns.step_of(solution[: len(free)]))
-        return replace(moved, field=field.moved(values, edges)), promised
+        of_light, offsets, edges = np.split(solution, (len(free), len(free) + 2))
+        moved = parameters.moved(unknowns.step_of(of_light))
+        return replace(moved, field=field.moved(values, offsets, edges.reshape(-1, 5))), promised
 
 
 def _damped(normal: FloatArray, parameters: Parameters, damping: float) -> FloatArray:

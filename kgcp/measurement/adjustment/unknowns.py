@@ -38,7 +38,10 @@ _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]
 _SHAPED = [Param.CURVATURE, Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING]
 # What levels that vary replace.
-_FINE_LIGHT = [Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE, Param.LINEAR_SHARPENING]
+_EVEN_LIGHT = [
+    *(Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE),
+    Param.LINEAR_SHARPENING,
+]
 _OF_TONE = {
     Tone.LINEAR: [],
     Tone.SRGB: [Param.SHARPENING],
@@ -80,14 +83,18 @@ def _unknowns(tone: Tone, *, has_streak: bool, moves: bool) -> Unknowns:
     return Unknowns(estimated, mean, precision, precision[estimated])
 
 
-def without_fine_light(unknowns: Unknowns) -> Unknowns:
+def without_even_light(unknowns: Unknowns) -> Unknowns:
     """Return the unknowns of a fit whose levels vary.
 
-    The levels take what gradient and curvature of the light would. Beside them the two sharpenings
-    are too much: of a highlight on a ring of 107 px they came out with 0.85 and −0.74, and the
-    distance off by 4.6 σ.
+    The levels take what gradient and curvature of the light would, and their offsets what ink and
+    plate would. These two stay as the scale of the levels and of the tone curve. A white that is
+    free stretches that scale while the levels shrink, and the image hardly changes: along this
+    curved valley all steps fail, and fits stay where they start.
+
+    Beside the levels the two sharpenings are too much: of a highlight on a ring of 107 px they came
+    out with 0.85 and −0.74, and the distance off by 4.6 σ.
     """
-    free = unknowns.free[~np.isin(unknowns.free, _FINE_LIGHT)]
+    free = unknowns.free[~np.isin(unknowns.free, _EVEN_LIGHT)]
     return replace(unknowns, free=free, free_precision=unknowns.precision[free])
 
 

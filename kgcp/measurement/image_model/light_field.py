@@ -1,7 +1,7 @@
 """Uneven light: how the levels of ink and plate vary over a window.
 
-The levels have a smooth part, splines on two grids of knots, and may have straight edges of
-shadows. Both add to the levels of ink and of plate, before tone curve and sharpening as those do.
+The levels have offsets, a smooth part, splines on two grids of knots, and may have straight edges
+of shadows. All add to the levels of ink and of plate, before tone curve and sharpening as those do.
 """
 
 from __future__ import annotations
@@ -162,6 +162,7 @@ class LightField:
     knots: Knots
     values: FloatArray  # (2, k): of ink and plate at all knots
     precision: FloatArray  # (2, k): of the values' prior, about 0
+    offsets: FloatArray  # (2,): added to the levels of ink and plate everywhere
     # (s, 5): straight edges of shadows: direction of its normal [rad], offset along that from the
     # centre [px], logarithm of the penumbra's σ [px], and what is added beyond to the levels of ink
     # and plate
@@ -171,7 +172,9 @@ class LightField:
     @property
     def penalty(self) -> float:
         """The priors' part of the negative log-likelihood."""
-        return float(0.5 * np.sum(self.precision * self.values**2)) + edge_penalty(self.edges)
+        of_offsets = 0.5 * OFFSET_PRECISION * float(self.offsets @ self.offsets)
+        of_values = 0.5 * float(np.sum(self.precision * self.values**2))
+        return of_values + of_offsets + edge_penalty(self.edges)
 
     def added(self, pixels: FloatArray) -> FloatArray:
         """Return what is added to the levels of ink and plate (2, n) at pixels (2, n)."""
@@ -186,7 +189,7 @@ class LightField:
             values = self.values[:, first : first + self.knots.counts[g]].copy()
             _add_grid(pixels, corner, spacing, counts, values, seen)
             first += self.knots.counts[g]
-        added, gradient = seen[:2], seen[2:]
+        added, gradient = seen[:2] + self.offsets[:, None], seen[2:]
         for edge in self.edges:
             z = sigmas_beyond(edge, pixels - self.centre_px[:, None])
             added += edge[INK:, None] * ndtr(z)
@@ -213,9 +216,14 @@ class LightField:
             rows[k, INK:] = by_level * ndtr(z)
         return rows.reshape(-1, pixels.shape[1])
 
-    def moved(self, values: FloatArray, edges: FloatArray) -> LightField:
+    def moved(self, values: FloatArray, offsets: FloatArray, edges: FloatArray) -> LightField:
         """Return the field after a step."""
-        return replace(self, values=self.values + values, edges=self.edges + edges)
+        return replace(
+            self,
+            values=self.values + values,
+            offsets=self.offsets + offsets,
+            edges=self.edges + edges,
+        )
 
 
 def sigmas_beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:
@@ -233,6 +241,7 @@ def _density(z: FloatArray) -> FloatArray:
 # steps of half the contrast. Direction and offset have none.
 EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
 EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
+OFFSET_PRECISION = 4.0  # of offsets, as weak as that of steps
 
 
 def edge_penalty(edges: FloatArray) -> float:

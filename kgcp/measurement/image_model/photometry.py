@@ -228,7 +228,7 @@ class PhotometricModel:
         """Return the mask of what is sharpened before the tone curve; None: nothing is.
 
         Before a straight line it would be the same as after it, and in uneven light it is not
-        estimated (`without_fine_light`).
+        estimated (`without_even_light`).
         """
         return self.mask if self.tone is Tone.UNKNOWN and added is None else None
 

@@ -21,6 +21,7 @@ def _field(columns: int = 64, rows: int = 48) -> LightField:
         knots,
         np.zeros((2, count)),
         np.ones((2, count)),
+        np.zeros(2),
         np.empty((0, 5)),
         np.array([132.0, 224.0]),
     )
@@ -69,6 +70,18 @@ def test_derivatives_by_a_shadow_s_edge_are_those_of_differences() -> None:
         more, less = (replace(field, edges=edge + sign * change) for sign in (1.0, -1.0))
         slope = (more.added(pixels) - less.added(pixels)) / (2.0 * step)
         assert np.abs(rows[k] - np.sum(by_level * slope, axis=0)).max() < 1e-7
+
+
+def test_offsets_add_to_the_levels_everywhere_and_have_a_weak_prior() -> None:
+    field, pixels = _field(), _pixels()
+    field = replace(field, values=np.random.default_rng(3).normal(size=field.values.shape))
+    moved = field.moved(np.zeros_like(field.values), np.array([0.1, -0.3]), np.empty((0, 5)))
+    (added, gradient), (before, gradient_before) = (
+        each.added_with_gradient(pixels) for each in (moved, field)
+    )
+    assert added - before == pytest.approx(np.repeat([[0.1], [-0.3]], pixels.shape[1], axis=1))
+    assert gradient == pytest.approx(gradient_before)
+    assert moved.penalty - field.penalty == pytest.approx(0.5 * (0.1**2 + 0.3**2) / 0.5**2)
 
 
 def test_a_slope_of_the_knots_is_a_slope_of_the_field() -> None:
