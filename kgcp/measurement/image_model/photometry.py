@@ -152,6 +152,7 @@ def light_of_levels(black: float, white: float, tone: Tone) -> Light:
 # Gradient and curvature of the light are left out: over a whole ring, they are flat over the mask.
 _FILTERED = [Param.BLACK, Param.WHITE, *range(9)]
 _TONE_ROWS = [Param.TONE_1, Param.TONE_2, Param.TONE_3]
+_LEVEL_ROWS = [Param.BLACK, Param.WHITE, *_TONE_ROWS]
 SKEW_PARAMS = [int(Param.SKEW_XXX), int(Param.SKEW_XXY), int(Param.SKEW_XYY), int(Param.SKEW_YYY)]
 _RARE_ROWS = np.array([Param.STREAK_X, Param.STREAK_Y, *SKEW_PARAMS])
 _SHARE_STEPS = 400
@@ -204,7 +205,7 @@ class PhotometricModel:
         lit, curved = _light_at(self.offsets, values)
         ink, between = (0.0, 1.0) if added is None else (added[0], 1.0 + added[1] - added[0])
         x = lit * (ink + between * share) + (lit - 1.0) * light.black / (light.white - light.black)
-        carried: FloatArray = curved * lit * between * _tone_slopes(x, values) * rows
+        carried: FloatArray = curved * lit * between * _slopes_of_toned(x, values)[-1] * rows
         mask = self._mask_in_light(added)
         if mask is not None and light.linear_sharpening:
             value += light.linear_sharpening * mask.detail(value, light.black, light.white)
@@ -235,17 +236,26 @@ class PhotometricModel:
     def _sharpen_levels(
         self, mask: Mask, jacobian: FloatArray, light: Light, added: FloatArray
     ) -> None:
-        """Sharpen the derivatives by what is added to ink and to plate."""
-        ink, plate = (_tone_slopes(x, light.values) for x in (added[0], 1.0 + added[1]))
-        if self.tone.is_srgb:
-            slope = np.empty(len(ink))
-            encode_pixels(toned(added[0], light.values), slope)
-            ink *= slope
-            encode_pixels(toned(1.0 + added[1], light.values), slope)
-            plate *= slope
+        """Sharpen the derivatives by what is added to ink and to plate.
+
+        Those by the levels and by the tone curve lack what the mask takes from pixels that are not
+        modelled, each of which has its own level.
+        """
+        ink, plate = (self._level_slopes(x, light) for x in (added[0], 1.0 + added[1]))
+        for k, row in enumerate(_LEVEL_ROWS):
+            jacobian[row] -= light.sharpening * (mask.ink * ink[k] + mask.plate * plate[k])
         by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
-        by_ink += light.sharpening * mask.detail(by_ink, ink, 0.0)
-        by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate)
+        by_ink += light.sharpening * mask.detail(by_ink, ink[-1], 0.0)
+        by_plate += light.sharpening * mask.detail(by_plate, 0.0, plate[-1])
+
+    def _level_slopes(self, x: FloatArray, light: Light) -> FloatArray:
+        """Return the derivatives (6, n) of grey values by `_LEVEL_ROWS`, and by the light x."""
+        slopes = _slopes_of_toned(x, light.values)
+        if self.tone.is_srgb:
+            of_curve = np.empty(len(x))
+            encode_pixels(toned(x, light.values), of_curve)
+            slopes *= of_curve
+        return slopes
 
     def _added(self, added: FloatArray | None) -> FloatArray:
         return _NOTHING if added is None else added
@@ -284,7 +294,7 @@ class PhotometricModel:
             if slope is not None:
                 jacobian *= slope
             return value, jacobian
-        self._sharpen(self.mask, jacobian, light, detail, slope)
+        self._sharpen(self.mask, jacobian, light, added, detail, slope)
         if added is not None:
             self._sharpen_levels(self.mask, jacobian, light, added)
         detail = self._detail(self.mask, value, light, added)
@@ -308,6 +318,7 @@ class PhotometricModel:
         mask: Mask,
         jacobian: FloatArray,
         light: Light,
+        added: FloatArray | None,
         detail: FloatArray | None,
         slope: FloatArray | None,
     ) -> None:
@@ -323,7 +334,9 @@ class PhotometricModel:
             rows.append(Param.LINEAR_SHARPENING)
             in_light = light.linear_sharpening, detail
         others = (1.0, 1.0)
-        if slope is not None:
+        if added is not None:  # `_sharpen_levels` counts them
+            others = (0.0, 0.0)
+        elif slope is not None:
             ink, plate = srgb_slope(np.array([light.black, light.white])).tolist()
             others = (ink, plate)
         mask.sharpen_around_curve(
@@ -345,18 +358,20 @@ def share_at(level: float, light: Light, tone: Tone) -> float:
 @inlined
 def _toned(
     x: float, tone_1: float, tone_2: float, tone_3: float
-) -> tuple[float, float, float, float]:
-    """Return the tone curve at a share x, its slope, arch and lean.
+) -> tuple[float, float, float, float, float]:
+    """Return the tone curve at a share x, its slope, and its derivatives by its parameters.
 
-    The derivatives by the three tone parameters are arch, arch · lean and arch · lean² where the
-    curve follows its formula, and nearly so beyond, where it goes on straight.
+    Beyond ink and plate it soon goes on straight.
     """
     within = min(max(x, -_CURVED_BELOW), 1.0 + _CURVED_ABOVE)
-    arch, lean = within * (1.0 - within), 2.0 * within - 1.0
+    beyond, arch, lean = x - within, within * (1.0 - within), 2.0 * within - 1.0
     tone = within + arch * (tone_1 + lean * (tone_2 + lean * tone_3))
+    slope_2, slope_3 = 6.0 * arch - 1.0, lean * (8.0 * arch - 1.0)
     slope = 1.0 - tone_1 * lean
-    slope += tone_2 * (6.0 * arch - 1.0) + tone_3 * lean * (8.0 * arch - 1.0)
-    return tone + slope * (x - within), slope, arch, lean
+    slope += tone_2 * slope_2 + tone_3 * slope_3
+    by_1, by_2 = arch - beyond * lean, arch * lean + beyond * slope_2
+    by_3 = arch * lean * lean + beyond * slope_3
+    return tone + slope * beyond, slope, by_1, by_2, by_3
 
 
 @compiled
@@ -368,7 +383,7 @@ def _share_at(level: float, light: tuple[float, ...]) -> float:
         return 0.0
     for k in range(1, _SHARE_STEPS + 1):
         t = k / _SHARE_STEPS
-        tone, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
+        tone, _, _, _, _ = _toned(t, tone_1, tone_2, tone_3)
         grey = black + (white - black) * tone
         if grey > level:
             return (k - 1 + (level - highest) / (grey - highest)) / _SHARE_STEPS
@@ -381,7 +396,7 @@ def toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
     """Return the levels, before a known encoding, of light between that of ink, 0, and plate, 1."""
     level = np.empty(len(x))
     for i in range(len(x)):
-        tone, _, _, _ = _toned(x[i], light[5], light[6], light[7])
+        tone, _, _, _, _ = _toned(x[i], light[5], light[6], light[7])
         level[i] = light[0] + (light[1] - light[0]) * tone
     return level
 
@@ -394,12 +409,14 @@ def toned_between(share: FloatArray, light: Light) -> FloatArray:
 
 
 @compiled
-def _tone_slopes(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
-    """Return the derivatives of `toned`."""
-    slopes = np.empty(len(x))
+def _slopes_of_toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
+    """Return the derivatives (6, n) of `toned`: by ink, plate, the tone parameters, and by x."""
+    slopes, contrast = np.empty((6, len(x))), light[1] - light[0]
     for i in range(len(x)):
-        _, slope, _, _ = _toned(x[i], light[5], light[6], light[7])
-        slopes[i] = (light[1] - light[0]) * slope
+        tone, slope, by_1, by_2, by_3 = _toned(x[i], light[5], light[6], light[7])
+        slopes[0, i], slopes[1, i] = 1.0 - tone, tone
+        slopes[2, i], slopes[3, i], slopes[4, i] = contrast * by_1, contrast * by_2, contrast * by_3
+        slopes[5, i] = contrast * slope
     return slopes
 
 
@@ -438,7 +455,7 @@ def _expose(
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         lit, curved, _ = _lit(offsets[0, i], offsets[1, i], light)
         x = lit * (ink + (plate - ink) * share[i]) + (lit - 1.0) * black / (white - black)
-        tone, _, _, _ = _toned(x, tone_1, tone_2, tone_3)
+        tone, _, _, _, _ = _toned(x, tone_1, tone_2, tone_3)
         value[i] = curved * (black + (white - black) * tone)
 
 
@@ -465,7 +482,7 @@ def _expose_with_slopes(
         ink, plate = added[0, each * i], 1.0 + added[1, each * i]
         lit, curved, bulge = _lit(offsets[0, i], offsets[1, i], light)
         x = ink + (plate - ink) * share[i]
-        tone, slope, arch, lean = _toned(
+        tone, slope, by_1, by_2, by_3 = _toned(
             lit * x + (lit - 1.0) * black / contrast, tone_1, tone_2, tone_3
         )
         core = black + contrast * tone
@@ -477,9 +494,9 @@ def _expose_with_slopes(
         jacobian[12, i] = curved * (tone - of_ink_light * black)
         by_light = curved * slope * (black + contrast * x)
         jacobian[13, i], jacobian[14, i] = by_light * offsets[0, i], by_light * offsets[1, i]
-        bend = curved * contrast * arch if has_tone else 0.0
+        bend = curved * contrast if has_tone else 0.0
         jacobian[15, i] = core * bulge
-        jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend, bend * lean, bend * lean * lean
+        jacobian[16, i], jacobian[17, i], jacobian[18, i] = bend * by_1, bend * by_2, bend * by_3
         jacobian[19, i] = jacobian[20, i] = 0.0
         if each:
             jacobian[25, i] = gain * slope * (1.0 - share[i])

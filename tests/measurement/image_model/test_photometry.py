@@ -123,6 +123,39 @@ def test_photometric_rows_of_the_jacobian_are_derivatives(
     np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, rtol=1e-6, atol=2e-7)
 
 
+@pytest.mark.parametrize("tone", [Tone.LINEAR, Tone.SRGB, Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
+def test_rows_of_the_jacobian_are_derivatives_in_uneven_light(tone: Tone) -> None:
+    """Levels differ from pixel to pixel, also of those that are only sharpened with others."""
+    light = replace(LIGHT if tone.is_shaped else UNSHAPED, linear_sharpening=0.0)
+    light = replace(light, slope_x=0.0, slope_y=0.0, curvature=0.0)
+    photometry = make_imager(tone, SHARPENING_PX)
+    share = make_share(photometry)
+    # darker and brighter by more than the tone curve is bent
+    added = np.random.default_rng(10).uniform(-0.2, 0.3, (2, len(share.value)))
+    added[0] = np.abs(added[0]) if tone is Tone.SRGB else added[0]
+    levels, jacobian = photometry.linearised(share, light, added)
+    np.testing.assert_allclose(levels, photometry.levels(share.value, light, added), atol=1e-14)
+
+    names = ["black", "white", "sharpening"] + ["tone_1", "tone_2", "tone_3"] * tone.is_shaped
+    for name in names:
+        high, low = (
+            photometry.levels(share.value, replace(light, **{name: value}), added)
+            for value in (getattr(light, name) + STEP, getattr(light, name) - STEP)
+        )
+        expected = (high - low) / (2.0 * STEP)
+        np.testing.assert_allclose(jacobian[Param[name.upper()]], expected, rtol=1e-6, atol=1e-6)
+
+    for k in range(2):  # levels are flat over the mask
+        change = np.zeros_like(added)
+        change[k] = 1.0
+        high, low = (
+            photometry.levels(share.value, light, added + sign * STEP * change)
+            for sign in (1.0, -1.0)
+        )
+        expected = (high - low) / (2.0 * STEP)
+        np.testing.assert_allclose(jacobian[PARAM_COUNT + k], expected, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("tone", [Tone.UNKNOWN, Tone.UNKNOWN_FROM_LINE])
 def test_the_light_varies_before_the_tone_curve(tone: Tone) -> None:
     """Ink without light stays black; other pixels look as if they were whiter in even light."""
