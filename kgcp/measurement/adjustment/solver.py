@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
+from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.level_equations import LevelEquations
 from kgcp.measurement.adjustment.normal_equations import (
     Equations,
@@ -37,12 +38,12 @@ _SETTLED_NOISE, _SETTLED_PX = 0.15, 0.02
 _SETTLED_BLUR, _SETTLED_STREAK = 0.02, 0.01
 _NOISE_ROUNDS = 3
 _SLACK_PX = 0.4  # by which an approximate pose may be off
-_LARGE_CHANGE = 0.01  # of the contrast, in the mean over the pixels
+_LARGE_CHANGE = 0.01  # of the contrast, root of the mean square over the pixels
 _STEPS_BEFORE_HOPELESS = 2
 _NEGLIGIBLE = 1e-6
 _AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
-_MAX_DAMPING = 1e6
+_MAX_DAMPING = 1e3
 _LEAST_CONTRAST = 0.1  # of the mean over the plate
 
 
@@ -78,6 +79,14 @@ class TargetFit:
     def total(self) -> float:
         """Negative log-likelihood with the priors."""
         return negative_log_posterior(self.misfit, self.unknowns, self.parameters)
+
+
+def moved_to(fit: TargetFit, pose: Pose) -> TargetFit:
+    """Return a fit with another pose that is not adjusted; the Jacobian stays that of the first."""
+    parameters = fit.parameters.at(pose)
+    prediction = predict(fit.sample, parameters)
+    current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
+    return replace(fit, parameters=parameters, prediction=prediction, misfit=current)
 
 
 def predict(sample: Sample, parameters: Parameters) -> PredictedImage:
@@ -234,7 +243,7 @@ def minimise(
     steps: int,
     least_gain: float,
     linear: tuple[PredictedImage, FloatArray] | None = None,
-    large_change: float = _LARGE_CHANGE,
+    large_gain: float = math.inf,
     stops_at_new_jacobian: bool = False,
     hopeless_total: float = math.inf,
     equations_of: EquationsOf | None = None,
@@ -242,10 +251,11 @@ def minimise(
     """Minimise the negative log-likelihood by damped Gauss-Newton steps (Levenberg-Marquardt).
 
     At most `steps` of them, and none after one that gained less than `least_gain`. The Jacobian,
-    and the equations with it, is computed again only while steps change the grey values by more
-    than the share `large_change` of the contrast: near the minimum it hardly changes, and it takes
-    most of the time. With `stops_at_new_jacobian`, the step after which it is computed again is the
-    last one; so is the second step, or a later one, that leaves more than `hopeless_total`.
+    and the equations with it, is computed again only after steps that change the grey values by
+    more than 1 % of the contrast, or that promise more than `large_gain`: near the minimum it
+    hardly changes, and it takes most of the time. With `stops_at_new_jacobian`, the step after
+    which it is computed again is the last one; so is the second step, or a later one, that leaves
+    more than `hopeless_total`.
     `equations_of` makes the equations at some parameters; None: those of pose, blur and light.
     """
     damping, light = _DAMPING, parameters.light
@@ -257,10 +267,13 @@ def minimise(
     equations_of = equations_of or _plain_equations_of(sd, unknowns)
     equations = equations_of(parameters, jacobian, current)
     for number in range(steps):
+        rejected = 0
         while True:
             candidate, promised = equations.proposed(current, parameters, damping)
             change = relative_sd * math.sqrt(2.0 * promised / len(sd))
-            if change > large_change and number < steps - 1:
+            is_large = change > _LARGE_CHANGE or promised > large_gain
+            needs_jacobian = is_large and number < steps - 1
+            if needs_jacobian and not rejected:
                 attempt, attempt_jacobian = linearise(sample, candidate)
             else:
                 attempt, attempt_jacobian = predict(sample, candidate), jacobian
@@ -269,7 +282,9 @@ def minimise(
             is_better = trial_total <= total + _NEGLIGIBLE
             if is_better or promised < least_gain or damping > _MAX_DAMPING:
                 break
-            damping = max(10.0 * damping, _DAMPED)
+            damping, rejected = max(10.0 * damping, _DAMPED), rejected + 1
+        if is_better and needs_jacobian and rejected:  # not before: the next one might fail, too
+            attempt, attempt_jacobian = linearise(sample, candidate)
         if not is_better:
             break
         gain, total = total - trial_total, trial_total

@@ -18,10 +18,9 @@ from kgcp.measurement.adjustment.masks import first_levels
 from kgcp.measurement.adjustment.parameters import Parameters
 from kgcp.measurement.adjustment.pixels import select_pixels
 from kgcp.measurement.adjustment.problem import FitProblem
-from kgcp.measurement.adjustment.solver import TargetFit, adjust, approach, minimise, predict
+from kgcp.measurement.adjustment.solver import TargetFit, adjust, approach, minimise, moved_to
 from kgcp.measurement.adjustment.unknowns import adjust_with_streak, unknowns_of
 from kgcp.measurement.image_model.blur import Blur
-from kgcp.measurement.image_model.noise import misfit
 from kgcp.measurement.plate_prior import NormalPrior
 
 _START_SLACK_PX = 1.5
@@ -161,13 +160,14 @@ def _mirrored_fit(fit: TargetFit, hopeless: float = _HOPELESS) -> TargetFit:
 
 def fit_at(fit: TargetFit, pose: Pose) -> TargetFit:
     """Fit another pose to the pixels of a fit, unless it is hopeless."""
-    parameters = fit.parameters.at(pose)
-    prediction = predict(fit.sample, parameters)
-    current = misfit(fit.sample.levels, prediction.levels, fit.sd, fit.sample.censoring)
-    there = replace(fit, parameters=parameters, prediction=prediction, misfit=current)
+    there = moved_to(fit, pose)
     if there.total - fit.total > _HOPELESS:
         return there
-    steps = _MIRRORED_STEPS[-1]
     return minimise(
-        fit.sample, parameters, fit.sd, fit.unknowns, steps=steps, least_gain=_MIRRORED_GAIN
+        fit.sample,
+        there.parameters,
+        fit.sd,
+        fit.unknowns,
+        steps=_MIRRORED_STEPS[-1],
+        least_gain=_MIRRORED_GAIN,
     )
