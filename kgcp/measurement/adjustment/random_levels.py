@@ -52,6 +52,7 @@ from kgcp.measurement.image_model.photometry import (
     PARAM_COUNT,
     Param,
     encoded,
+    followed,
     plateau_levels,
     toned,
 )
@@ -336,7 +337,13 @@ class _WithLevels:
         values = reduced.step_of_levels(alone, solution)
         of_light, offsets, edges = np.split(solution, (len(free), len(free) + 2))
         moved = parameters.moved(unknowns.step_of(of_light))
-        return replace(moved, field=field.moved(values, offsets, edges.reshape(-1, 5))), promised
+        before, after = parameters.light.values, moved.light.values
+
+        def follow(light: FloatArray, step: FloatArray) -> FloatArray:
+            return followed(light.ravel(), step.ravel(), before, after).reshape(light.shape)
+
+        field = field.moved(values, offsets, edges.reshape(-1, 5), follow)
+        return replace(moved, field=field), promised
 
 
 def _damped(normal: FloatArray, parameters: Parameters, damping: float) -> FloatArray:

@@ -7,7 +7,9 @@ of shadows. All add to the levels of ink and of plate, before tone curve and sha
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import ndtr
@@ -15,7 +17,10 @@ from scipy.special import ndtr
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
+Follow = Callable[[FloatArray, FloatArray], FloatArray]
+"""Where light (2, n), of ink 0 and of plate 1 where it is even, is after a step (2, n)."""
 SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
+_EVEN = np.array(((0.0,), (1.0,)))  # light of ink and of plate where it is even
 ANGLE, OFFSET, LOG_WIDTH, INK, PLATE = range(5)  # of a shadow's edge
 
 
@@ -35,6 +40,11 @@ class Knots:
     def counts(self) -> tuple[int, ...]:
         """Number of knots of each grid."""
         return tuple(c * r for c, r in zip(self.columns, self.rows, strict=True))
+
+    def of_grid(self, grid: int) -> slice:
+        """Return which of all knots are those of a grid."""
+        first = sum(self.counts[:grid])
+        return slice(first, first + self.counts[grid])
 
     def weights(self, pixels: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Return the knots (n, 9 g) that points (2, n) depend on, and by how much each."""
@@ -182,13 +192,9 @@ class LightField:
 
     def added_with_gradient(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what `added` does, and the gradient (2, n) [1/px] of plate's contrast to ink."""
-        seen, first = np.zeros((4, pixels.shape[1])), 0
-        for g, spacing in enumerate(self.knots.spacings_px):
-            counts = self.knots.columns[g], self.knots.rows[g]
-            corner = self.knots.x0, self.knots.y0
-            values = self.values[:, first : first + self.knots.counts[g]].copy()
-            _add_grid(pixels, corner, spacing, counts, values, seen)
-            first += self.knots.counts[g]
+        seen = np.zeros((4, pixels.shape[1]))
+        for grid in range(len(self.knots.spacings_px)):
+            _add_values(self.knots, grid, self.values[:, self.knots.of_grid(grid)], pixels, seen)
         added, gradient = seen[:2] + self.offsets[:, None], seen[2:]
         for edge in self.edges:
             z = sigmas_beyond(edge, pixels - self.centre_px[:, None])
@@ -216,14 +222,67 @@ class LightField:
             rows[k, INK:] = by_level * ndtr(z)
         return rows.reshape(-1, pixels.shape[1])
 
-    def moved(self, values: FloatArray, offsets: FloatArray, edges: FloatArray) -> LightField:
-        """Return the field after a step."""
-        return replace(
-            self,
-            values=self.values + values,
-            offsets=self.offsets + offsets,
-            edges=self.edges + edges,
-        )
+    def moved(
+        self, values: FloatArray, offsets: FloatArray, edges: FloatArray, follow: Follow
+    ) -> LightField:
+        """Return the field after a step of values, offsets and shadows' edges.
+
+        Light moves on curves, as `follow` says: to x + step + besides(x, step). What is besides is
+        nearly linear in x. So offsets, grids and edges share it as they share the light.
+        """
+        base, step = _EVEN + self.offsets[:, None], offsets[:, None]
+
+        def besides(added: FloatArray, step: FloatArray) -> FloatArray:
+            return follow(base + added, step) - (base + added + step)
+
+        nothing = np.zeros((2, 1))
+        of_offsets = besides(nothing, step)
+        edges, values = self.edges + edges, self.values + values
+        for old, new in zip(self.edges, edges, strict=True):
+            amplitude, change = old[INK:, None], (new - old)[INK:, None]
+            new[INK:] += (besides(amplitude, step + change) - of_offsets)[:, 0]
+        added, taken = nothing, of_offsets
+        for grid in range(len(self.knots.spacings_px)):
+            part = self.knots.of_grid(grid)
+            own, own_step = self.values[:, part], values[:, part] - self.values[:, part]
+            change = besides(added + own, step + own_step) - taken
+            values[:, part] += change
+            if grid + 1 < len(self.knots.spacings_px):
+                places = _places(self.knots, grid + 1)
+                coarser = (own, own_step, change)
+                of_coarser = (_of_grid(self.knots, grid, each, places) for each in coarser)
+                added, step, taken = (
+                    sum_so_far + more
+                    for sum_so_far, more in zip((added, step, taken), of_coarser, strict=True)
+                )
+        offsets = self.offsets + offsets + of_offsets[:, 0]
+        return replace(self, values=values, offsets=offsets, edges=edges)
+
+
+@lru_cache(maxsize=4)
+def _places(knots: Knots, grid: int) -> FloatArray:
+    """Return where the knots of a grid are (2, k) [px]."""
+    spacing = knots.spacings_px[grid]
+    x = knots.x0 + spacing * (np.arange(knots.columns[grid]) - 0.5)
+    y = knots.y0 + spacing * (np.arange(knots.rows[grid]) - 0.5)
+    columns, rows = np.meshgrid(x, y)
+    return np.stack((columns.ravel(), rows.ravel()))
+
+
+def _add_values(
+    knots: Knots, grid: int, values: FloatArray, pixels: FloatArray, seen: FloatArray
+) -> None:
+    """Add to `seen` what `_add_grid` does, for the values (2, k) of one grid."""
+    counts = knots.columns[grid], knots.rows[grid]
+    spacing = knots.spacings_px[grid]
+    _add_grid(pixels, (knots.x0, knots.y0), spacing, counts, values.copy(), seen)
+
+
+def _of_grid(knots: Knots, grid: int, values: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Return what the values (2, k) of one grid add at pixels (2, n)."""
+    seen = np.zeros((4, pixels.shape[1]))
+    _add_values(knots, grid, values, pixels, seen)
+    return seen[:2]
 
 
 def sigmas_beyond(edge: FloatArray, offsets: FloatArray) -> FloatArray:

@@ -160,6 +160,7 @@ GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
 _MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
+_NEWTON_STEPS, _LEAST_SLOPE, _MOST_MOVED = 4, 0.1, 0.3  # along the tone curve
 _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 _NO_VALUES = np.empty(0)
 
@@ -418,6 +419,31 @@ def _slopes_of_toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
         slopes[2, i], slopes[3, i], slopes[4, i] = contrast * by_1, contrast * by_2, contrast * by_3
         slopes[5, i] = contrast * slope
     return slopes
+
+
+@compiled
+def followed(
+    x: FloatArray, step: FloatArray, before: tuple[float, ...], after: tuple[float, ...]
+) -> FloatArray:
+    """Return where light x (n,) is after a step of x and of a `Light`, levels as the step promises.
+
+    The promise is the levels' change to first order. Where the curve after the step is too flat to
+    tell, x just moves by the step.
+    """
+    moved, contrast = np.empty(len(x)), after[1] - after[0]
+    for i in range(len(x)):
+        tone, slope, by_1, by_2, by_3 = _toned(x[i], before[5], before[6], before[7])
+        shape = tone + slope * step[i] + by_1 * (after[5] - before[5])
+        shape += by_2 * (after[6] - before[6]) + by_3 * (after[7] - before[7])
+        level = before[0] + (before[1] - before[0]) * shape
+        level += (1.0 - tone) * (after[0] - before[0]) + tone * (after[1] - before[1])
+        goal, at, is_steep = (level - after[0]) / contrast, x[i] + step[i], True
+        for _ in range(_NEWTON_STEPS):
+            tone, slope, _, _, _ = _toned(at, after[5], after[6], after[7])
+            is_steep &= slope > _LEAST_SLOPE
+            at += min(max((goal - tone) / max(slope, _LEAST_SLOPE), -_MOST_MOVED), _MOST_MOVED)
+        moved[i] = at if is_steep else x[i] + step[i]
+    return moved
 
 
 @inlined

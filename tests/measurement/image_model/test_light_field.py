@@ -10,12 +10,15 @@ from scipy.interpolate import BSpline
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.light_field import LightField, knots_over
+from kgcp.measurement.image_model.photometry import Light, followed
 
 _SPACING_PX = 8.0
 
 
-def _field(columns: int = 64, rows: int = 48) -> LightField:
-    knots = knots_over(100.0, 200.0, columns, rows, (_SPACING_PX,))
+def _field(
+    columns: int = 64, rows: int = 48, spacings_px: tuple[float, ...] = (_SPACING_PX,)
+) -> LightField:
+    knots = knots_over(100.0, 200.0, columns, rows, spacings_px)
     count = sum(knots.counts)
     return LightField(
         knots,
@@ -75,7 +78,8 @@ def test_derivatives_by_a_shadow_s_edge_are_those_of_differences() -> None:
 def test_offsets_add_to_the_levels_everywhere_and_have_a_weak_prior() -> None:
     field, pixels = _field(), _pixels()
     field = replace(field, values=np.random.default_rng(3).normal(size=field.values.shape))
-    moved = field.moved(np.zeros_like(field.values), np.array([0.1, -0.3]), np.empty((0, 5)))
+    nothing, offsets = np.zeros_like(field.values), np.array([0.1, -0.3])
+    moved = field.moved(nothing, offsets, np.empty((0, 5)), np.add)
     (added, gradient), (before, gradient_before) = (
         each.added_with_gradient(pixels) for each in (moved, field)
     )
@@ -119,3 +123,39 @@ def test_gradient_of_the_contrast_is_that_of_what_is_added() -> None:
         change = field.added(pixels + step * towards) - field.added(pixels - step * towards)
         by_steps[axis] = (change[1] - change[0]) / (2.0 * step)
     np.testing.assert_allclose(field.added_with_gradient(pixels)[1], by_steps, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("spacings_px", [(_SPACING_PX,), (3.0 * _SPACING_PX, _SPACING_PX)])
+@pytest.mark.parametrize("edges", [0, 1])
+def test_steps_follow_levels_of_another_scale_everywhere(
+    edges: int, spacings_px: tuple[float, ...]
+) -> None:
+    """Where ink and plate change alone, light changes in proportion, whatever adds it."""
+    rng = np.random.default_rng(5)
+    edge = np.array([[0.4, 3.0, 0.7, -0.1, -0.4]])[:edges]
+    field, pixels = _field(spacings_px=spacings_px), _pixels()
+    shape = field.values.shape
+    field = replace(field, values=0.1 * rng.normal(size=shape), offsets=np.array([0.1, -0.2]))
+    field = replace(field, edges=edge)
+    before, after = Light(0.1, 0.7), Light(0.15, 0.9)
+
+    def follow(light: FloatArray, step: FloatArray) -> FloatArray:
+        moved = followed(light.ravel(), step.ravel(), before.values, after.values)
+        return moved.reshape(light.shape)
+
+    values, offsets = 0.05 * rng.normal(size=shape), np.array([-0.1, 0.2])
+    change = np.zeros_like(edge)
+    change[:, 3:] = 0.1
+    step = replace(field, values=field.values + values, offsets=field.offsets + offsets)
+    step = replace(step, edges=edge + change)
+    base = np.array([[0.0], [1.0]])
+    light = base + field.added(pixels)
+    expected = follow(light, base + step.added(pixels) - light)
+    moved = field.moved(values, offsets, change, follow)
+    np.testing.assert_allclose(base + moved.added(pixels), expected, atol=1e-12)
+    # the same levels to first order, at the new scale
+    levels = before.black + (before.white - before.black) * light
+    levels += (before.white - before.black) * (base + step.added(pixels) - light)
+    levels += (1.0 - light) * (after.black - before.black) + light * (after.white - before.white)
+    seen = after.black + (after.white - after.black) * expected
+    np.testing.assert_allclose(seen, levels, atol=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 
 import cv2
@@ -24,6 +25,7 @@ from kgcp.measurement.image_model.photometry import (
     Tone,
     decoded,
     encoded,
+    followed,
     plateau_levels,
     toned,
     toned_between,
@@ -192,6 +194,36 @@ def test_sharpening_is_an_unsharp_mask_on_the_whole_window(modelled: float) -> N
     mask = unsharp_mask((HEIGHT, WIDTH), index, plateau, SHARPENING_PX)
     sharp = PhotometricModel(even, TONE, mask).levels(share, light)
     np.testing.assert_allclose(sharp, sharpened(grey, light.sharpening)[index], atol=1e-12)
+
+
+@given(
+    st.lists(st.floats(-0.15, 1.2), min_size=5, max_size=5),
+    st.lists(st.floats(-0.2, 0.2), min_size=5, max_size=5),
+)
+def test_light_that_follows_a_step_has_the_levels_that_it_promises(
+    light: list[float], change: list[float]
+) -> None:
+    x, step = np.array(light), 0.1 * np.array(change)
+    before = Light(0.1, 0.8, tone_1=0.3, tone_2=-0.2, tone_3=0.1)
+
+    def after(share: float) -> Light:
+        names = ("black", "white", "tone_1", "tone_2", "tone_3")
+        steps = zip(names, change, strict=True)
+        return replace(before, **{n: getattr(before, n) + 0.5 * share * c for n, c in steps})
+
+    high, low = (toned(x + s * step, after(s).values) for s in (STEP, -STEP))
+    promised = toned(x, before.values) + (high - low) / (2.0 * STEP)
+    moved = followed(x, step, before.values, after(1.0).values)
+    np.testing.assert_allclose(toned(moved, after(1.0).values), promised, atol=1e-6)
+
+
+def test_light_just_moves_where_the_tone_curve_is_flat() -> None:
+    flat = Light(0.1, 0.8, tone_1=1.0)  # its slope is 0 at the plate
+    x, step = np.array([0.2, 1.0]), np.array([0.01, 0.01])
+    moved = followed(x, step, Light(0.1, 0.8).values, flat.values)
+    assert moved[1] == x[1] + step[1]
+    # elsewhere x' (2 − x') = 0.2 + 0.01 + 0.2 · 0.8
+    assert moved[0] == pytest.approx(1.0 - math.sqrt(1.0 - 0.37), abs=1e-9)
 
 
 def test_ink_and_plate_have_their_levels_whatever_the_tone() -> None:
