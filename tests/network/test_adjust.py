@@ -12,6 +12,7 @@ import pytest
 from benchmarks.calibrate.jaicov import compare, read_network
 from kgcp.network.adjust import PLAIN, adjust_network
 from kgcp.network.covariance import (
+    beyond_independent,
     fitting_covariances,
     precision,
     tangled,
@@ -76,7 +77,7 @@ def test_deviations_are_those_of_the_errors(rng: np.random.Generator) -> None:
         factors.append(known.variance_factor)
         assert known.redundancy.sum() == pytest.approx(2 * 35 * 8 - 5 - 48, abs=1e-6)
     assert 0.8 < np.sqrt(np.mean(np.square(formal))) < 1.25
-    assert 0.55 < np.sqrt(np.mean(np.square(clustered))) < 1.05
+    assert 0.8 < np.sqrt(np.mean(np.square(clustered))) < 1.15
     assert 0.75 < np.sqrt(np.mean(np.square(pose))) < 1.3
     assert np.mean(factors) == pytest.approx(1.0, abs=0.05)
 
@@ -154,6 +155,22 @@ def test_what_all_discs_of_a_photograph_share_shows_in_the_clustered_deviations(
     by_formal, by_cluster = np.sqrt(np.mean(np.square(ratios), axis=(0, 2)))
     assert by_cluster < 1.3
     assert by_formal > 1.15 * by_cluster
+
+
+@pytest.mark.parametrize(("places", "parameters"), [(3, 4), (5, 5), (12, 6)])
+def test_few_places_with_independent_errors_scatter_hardly_more_than_expected(
+    rng: np.random.Generator, places: int, parameters: int
+) -> None:
+    """Chance makes an excess of 0.3 to 0.5 of the variances, were only what is below 0 cut off."""
+    expected = np.tile(np.eye(parameters) / places, (places, 1, 1))
+    pulls = rng.standard_normal((200, places, parameters)) / np.sqrt(places)
+    excess = [np.trace(beyond_independent(each, expected)) / parameters for each in pulls]
+    assert 0.02 < np.mean(excess) < 0.25
+    large = 5.0 * pulls[0]
+    whole = large.T @ large - np.eye(parameters)
+    is_more = np.linalg.eigvalsh(whole) > 0.0
+    found = np.linalg.eigvalsh(beyond_independent(large, expected))
+    assert found[is_more] == pytest.approx(np.linalg.eigvalsh(whole)[is_more], rel=0.05)
 
 
 def test_covariances_are_made_to_fit_the_residuals(rng: np.random.Generator) -> None:

@@ -95,7 +95,8 @@ def learn_tone(photographs: Sequence[Sequence[DiscTask]], response: Response) ->
     tone = Tone.of(response)
     if tone is Tone.LINEAR:
         return CameraTone(tone)
-    fits = _first_fits([task for tasks in photographs for task in _to_learn_from(tasks)])
+    chosen = [task for tasks in photographs for task in _to_learn_from(tasks)]
+    fits = _first_fits(chosen, is_tone_stated=tone is Tone.SRGB)
     plain = _joints(fits, (tone,) if tone is Tone.SRGB else tuple(_BENT))
     bent = _joints(fits, tuple(_BENT.values())) if tone is Tone.UNKNOWN else []
     sds = [fit.sd for fit in fits]
@@ -150,7 +151,7 @@ def _to_learn_from(tasks: Sequence[DiscTask]) -> list[DiscTask]:
     return [large[i] for i in half[::step][:count]]
 
 
-def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
+def _first_fits(tasks: Sequence[DiscTask], *, is_tone_stated: bool) -> list[DiscFit]:
     """Adjust discs each by itself, by sRGB's curve; those that lead anywhere.
 
     Of burnt discs the upper end of the curve is not seen, and the edge of a shadow looks like one
@@ -158,10 +159,11 @@ def _first_fits(tasks: Sequence[DiscTask]) -> list[DiscFit]:
     beside a second order of its own, held fast while all are adjusted together, the curve would be
     bent to fit it.
     """
+    free = DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX, is_tone_stated=is_tone_stated)
     fits, clean = [], []
     for task in tasks:
         with contextlib.suppress(DiscRejection, NoFit, np.linalg.LinAlgError):
-            fit = adjust_disc(task, DiscUnknowns.of(Tone.SRGB, sharpening_px=SHARPENING_PX))
+            fit = adjust_disc(task, free)
             check_disc_fit(fit, task.outline)
             fits.append(fit)
             if not fit.sample.is_burnt and not is_in_curved_light(fit, task):

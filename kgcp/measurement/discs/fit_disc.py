@@ -25,6 +25,7 @@ from kgcp.measurement.image_model.noise import (
 )
 from kgcp.measurement.image_model.photometry import Tone
 from kgcp.measurement.image_model.sharpening import Mask, unsharp_mask
+from kgcp.measurement.image_model.srgb import srgb_decoded, srgb_slope
 
 MUCH_CLIPPED = 0.05  # share of pixels, above which a level is hardly seen
 SHARPENING_PX = 1.0  # σ of a camera's unsharp mask, until more is known
@@ -95,6 +96,7 @@ class DiscUnknowns:
     rows: IndexArray  # (p,): the free parameters
     mean: FloatArray  # (21,)
     precision: FloatArray  # (21, 21); zeros: nothing is known
+    is_tone_stated: bool  # or it is one to start from
 
     @classmethod
     def of(
@@ -104,6 +106,7 @@ class DiscUnknowns:
         *,
         sharpening_px: float = 0.0,
         has_ink_slope: bool = False,
+        is_tone_stated: bool = True,
     ) -> DiscUnknowns:
         """Return the unknowns of a disc.
 
@@ -115,6 +118,8 @@ class DiscUnknowns:
             σ of the camera's unsharp mask [px]; 0: it does not sharpen.
         has_ink_slope : bool
             Whether the darker level has a gradient of its own: large discs.
+        is_tone_stated : bool
+            Whether the tone is the camera's, or one to start from.
         """
         rows = [*_ALWAYS, *_LIGHT]
         rows += _WAVES if tone.is_shaped else ()
@@ -131,7 +136,7 @@ class DiscUnknowns:
             mean[Row.WHITE], precision[Row.WHITE, Row.WHITE] = _WHITE, _WHITE_SD**-2
         is_fixed = ~np.isin(np.arange(COUNT), free)
         precision[is_fixed], precision[:, is_fixed] = 0.0, 0.0
-        return cls(tone, sharpening_px, free, mean, precision)
+        return cls(tone, sharpening_px, free, mean, precision, is_tone_stated)
 
     def without_ink_slope(self) -> DiscUnknowns:
         """Return the unknowns without a gradient of the darker level's own."""
@@ -262,6 +267,7 @@ class DiscSample:
     window: DiscWindow  # that they are from
     index: IndexArray  # (n,): where in it
     radius_px: float  # that gradients of the light refer to
+    is_noise_of_light: bool  # or of grey values: whether it grows evenly before the tone curve
 
     @classmethod
     def of(
@@ -292,6 +298,7 @@ class DiscSample:
             window,
             index,
             radius_px,
+            free.is_tone_stated and free.tone is Tone.SRGB,
         )
 
     @property
@@ -435,12 +442,19 @@ def _linearised(sample: DiscSample, state: DiscState) -> _Linear:
 
 
 def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoise:
-    """Return the noise of every pixel; clipped ones would make their own."""
+    """Return the noise of every pixel; clipped ones would make their own.
+
+    Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
+    noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
+    """
     limits = sample.censoring
     usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
-    return estimate_noise(
-        sample.levels - levels, share, usable, sample.window.levels_per_count, from_edges=True
-    )
+    residuals, step = sample.levels - levels, sample.window.levels_per_count
+    if not sample.is_noise_of_light:
+        return estimate_noise(residuals, share, usable, step, from_edges=True)
+    slope = srgb_slope(srgb_decoded(levels))
+    of_light = estimate_noise(residuals / slope, share, usable, step / slope.max(), from_edges=True)
+    return GreyNoise(of_light.sd * slope, of_light.plateau_sd * slope)
 
 
 def _minimise(

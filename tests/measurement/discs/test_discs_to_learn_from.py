@@ -36,7 +36,8 @@ def test_small_discs_are_learned_from_in_number(
     """Of discs below 5 px nine, as of large ones: more of them do not tell tone from blur."""
     seen: list[int] = []
 
-    def first_fits(chosen: Sequence[DiscTask]) -> list[DiscFit]:
+    def first_fits(chosen: Sequence[DiscTask], *, is_tone_stated: bool) -> list[DiscFit]:
+        assert not is_tone_stated
         seen.append(len(chosen))
         return []
 

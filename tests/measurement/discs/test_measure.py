@@ -25,6 +25,7 @@ from kgcp.measurement.discs.records import (
     ellipse_of_moments,
     moments_of_ellipse,
 )
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor, ToneCurve
 
@@ -247,6 +248,27 @@ def test_light_does_not_fall_off_over_a_small_disc(monkeypatch: pytest.MonkeyPat
     own = rms_px()
     monkeypatch.setattr(fit_disc, "_FALL", 100.0)
     assert 0.005 < own < 0.8 * rms_px()
+
+
+def test_ink_of_small_discs_is_as_noisy_as_the_curve_of_srgb_makes_it() -> None:
+    """It is noisier than paper, and hardly seen: what edges show had been cut off at paper's."""
+    camera, pose = Camera(110, 70, 2e5, 2e5, 54.5, 34.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    sensor, rng, variances = Sensor(tone=ToneCurve.SRGB), np.random.default_rng(1), []
+    lattice = 20.0 * np.array([(i, j) for i in range(-2, 3) for j in (-1, 0, 1)])
+    for _ in range(6):
+        middles = (lattice + rng.uniform(-0.5, 0.5, lattice.shape)) / 2e5
+        discs = tuple(SimulatedDisc((x, y, 0.0), 4.8 / 2e5) for x, y in middles.tolist())
+        photo = photograph(camera, pose, FieldScene(discs, 0.62, 0.1), Optics(0.6), sensor, rng)
+        outlines = [each for each in find_outlines(photo) if each.polarity is Polarity.DARK]
+        for outline in outlines:
+            task = adjust_disc.DiscTask(photo, outline, [])
+            fit = adjust_disc.adjust_disc(task, fit_disc.DiscUnknowns.of(Tone.SRGB))
+            darkest = np.argsort(fit.share)[:5]
+            variances.append(np.median(fit.noise.sd[darkest]) ** 2)
+    assert len(variances) == 90
+    of_light = np.sqrt(sensor.full_well_e * 0.1 + sensor.read_noise_e**2) / sensor.full_well_e
+    of_ink = np.hypot(of_light * sensor.tone.slope(np.array(0.1)), 1.0 / 255.0 / np.sqrt(12.0))
+    assert np.sqrt(np.mean(variances)) == pytest.approx(of_ink, rel=0.08)
 
 
 def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyArray, FloatArray]:
