@@ -138,7 +138,7 @@ def test_where_a_fit_with_levels_starts_does_not_matter(
     monkeypatch: pytest.MonkeyPatch,
     lights: Lights,
 ) -> None:
-    """With white and the plate's levels free at once, fits stayed 2 σ off, where they began."""
+    """With white and the plate's levels free at once, fits in dirt stayed 2 σ off."""
     camera, srgb = replace(LENS, response=Response.UNKNOWN), Sensor(tone=ToneCurve.SRGB)
     fits: list[TargetFit] = []
 

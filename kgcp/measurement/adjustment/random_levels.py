@@ -42,7 +42,7 @@ from kgcp.measurement.adjustment.solver import (
 from kgcp.measurement.image_model.light_field import (
     EDGE_MEAN,
     EDGE_PRECISION,
-    OFFSET_PRECISION,
+    LEVEL_OFFSET_PRECISION,
     SPAN,
     LightField,
     knots_over,
@@ -52,7 +52,7 @@ from kgcp.measurement.image_model.photometry import (
     PARAM_COUNT,
     Param,
     encoded,
-    followed,
+    light_after_step,
     plateau_levels,
     toned,
 )
@@ -254,7 +254,7 @@ def _minimise(
     linear: tuple[PredictedImage, FloatArray] | None = None,
     hopeless_total: float = math.inf,
 ) -> TargetFit:
-    """Minimise the negative log-likelihood with all priors; the fit has the last equations."""
+    """Minimise the negative log-likelihood with all priors; the fit has the equations, too."""
     latest: _WithLevels | None = None
     latest_jacobian: FloatArray | None = None
 
@@ -276,7 +276,7 @@ def _minimise(
         hopeless_total=hopeless_total,
         equations_of=equations_of,
     )
-    if latest is None or latest_jacobian is not fit.jacobian:  # a step has followed
+    if latest is None or latest_jacobian is not fit.jacobian:  # it has been computed again since
         latest = equations_of(fit.parameters, fit.jacobian, fit.misfit)
     return replace(fit, level_equations=latest.reduced)
 
@@ -303,7 +303,7 @@ def _equations(
     field = _field_of(parameters)
     by_level = jacobian[PARAM_COUNT:] / sd
     scaled = np.vstack((scaled_rows(jacobian, unknowns.free, sd), by_level))
-    precision = np.append(unknowns.free_precision, (OFFSET_PRECISION, OFFSET_PRECISION))
+    precision = np.append(unknowns.free_precision, (LEVEL_OFFSET_PRECISION,) * 2)
     if len(field.edges):
         scaled = np.vstack((scaled, field.edge_rows(sample.pixels, by_level)))
         precision = np.append(precision, np.tile(EDGE_PRECISION, len(field.edges)))
@@ -327,7 +327,7 @@ class _WithLevels:
         of_levels = reduced.gradient_of_levels(current.score, field.values)
         pull = unknowns.precision[free] * (unknowns.mean[free] - parameters.vector[free])
         pull_of_edges = (EDGE_PRECISION * (EDGE_MEAN - field.edges)).ravel()
-        pulls = np.concatenate((pull, -OFFSET_PRECISION * field.offsets, pull_of_edges))
+        pulls = np.concatenate((pull, -LEVEL_OFFSET_PRECISION * field.offsets, pull_of_edges))
         gradient = reduced.scaled @ current.score + pulls
         alone = reduced.half_solved(of_levels)
         gradient -= reduced.half_mixed.T @ alone
@@ -338,10 +338,11 @@ class _WithLevels:
         moved = parameters.moved(unknowns.step_of(of_light))
         before, after = parameters.light.values, moved.light.values
 
-        def follow(light: FloatArray, step: FloatArray) -> FloatArray:
-            return followed(light.ravel(), step.ravel(), before, after).reshape(light.shape)
+        def light_after(light: FloatArray, step: FloatArray) -> FloatArray:
+            moved_light = light_after_step(light.ravel(), step.ravel(), before, after)
+            return moved_light.reshape(light.shape)
 
-        field = field.moved(values, offsets, edges.reshape(-1, 5), follow)
+        field = field.moved(values, offsets, edges.reshape(-1, 5), light_after)
         return replace(moved, field=field), promised
 
 

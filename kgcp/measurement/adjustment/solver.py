@@ -43,7 +43,7 @@ _STEPS_BEFORE_HOPELESS = 2
 _NEGLIGIBLE = 1e-6
 _AS_PROMISED = 0.02  # so near its promise, a step has reached the minimum
 _DAMPING, _DAMPED = 1e-7, 1e-3
-_MAX_DAMPING = 1e3
+_MAX_DAMPING = 1e3  # steps of a thousandth: smaller ones only repeat what fails
 _LEAST_CONTRAST = 0.1  # of the mean over the plate
 
 
@@ -255,8 +255,8 @@ def minimise(
     more than 1 % of the contrast, or that promise more than `large_gain`: near the minimum it
     hardly changes, and it takes most of the time. With `stops_at_new_jacobian`, the step after
     which it is computed again is the last one; so is the second step, or a later one, that leaves
-    more than `hopeless_total`.
-    `equations_of` makes the equations at some parameters; None: those of pose, blur and light.
+    more than `hopeless_total`. `equations_of` makes the equations at some parameters; None: those
+    of pose, blur and light.
     """
     damping, light = _DAMPING, parameters.light
     contrast = max(light.white - light.black, sample.problem.window.levels_per_count)

@@ -37,11 +37,9 @@ _ALWAYS = [*range(6), Param.BLUR_MEAN, Param.BLACK, Param.WHITE, Param.SLOPE_X, 
 _GAUSSIAN = [Param.BLUR_DIFFERENCE, Param.BLUR_XY]
 _STREAK = [Param.STREAK_X, Param.STREAK_Y]
 _SHAPED = [Param.CURVATURE, Param.TONE_1, Param.TONE_2, Param.TONE_3, Param.SHARPENING]
+_GRADIENT = [Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE]
 # What levels that vary replace.
-_EVEN_LIGHT = [
-    *(Param.BLACK, Param.WHITE, Param.SLOPE_X, Param.SLOPE_Y, Param.CURVATURE),
-    Param.LINEAR_SHARPENING,
-]
+_EVEN_LIGHT = [Param.BLACK, Param.WHITE, *_GRADIENT, Param.LINEAR_SHARPENING]
 _OF_TONE = {
     Tone.LINEAR: [],
     Tone.SRGB: [Param.SHARPENING],

@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from kgcp.geometry._jit import compiled, inlined
 from kgcp.geometry.arrays import FloatArray, IndexArray
 
-Follow = Callable[[FloatArray, FloatArray], FloatArray]
+LightAfterStep = Callable[[FloatArray, FloatArray], FloatArray]
 """Where light (2, n), of ink 0 and of plate 1 where it is even, is after a step (2, n)."""
 SPAN = 3  # knots in reach of a point, along either axis: quadratic splines
 _EVEN = np.array(((0.0,), (1.0,)))  # light of ink and of plate where it is even
@@ -182,7 +182,7 @@ class LightField:
     @property
     def penalty(self) -> float:
         """The priors' part of the negative log-likelihood."""
-        of_offsets = 0.5 * OFFSET_PRECISION * float(self.offsets @ self.offsets)
+        of_offsets = 0.5 * LEVEL_OFFSET_PRECISION * float(self.offsets @ self.offsets)
         of_values = 0.5 * float(np.sum(self.precision * self.values**2))
         return of_values + of_offsets + edge_penalty(self.edges)
 
@@ -223,38 +223,39 @@ class LightField:
         return rows.reshape(-1, pixels.shape[1])
 
     def moved(
-        self, values: FloatArray, offsets: FloatArray, edges: FloatArray, follow: Follow
+        self,
+        values: FloatArray,
+        offsets: FloatArray,
+        edges: FloatArray,
+        light_after: LightAfterStep,
     ) -> LightField:
         """Return the field after a step of values, offsets and shadows' edges.
 
-        Light moves on curves, as `follow` says: to x + step + besides(x, step). What is besides is
-        nearly linear in x. So offsets, grids and edges share it as they share the light.
+        Light moves on curves, as `light_after` says: to x + step + a correction, which is nearly
+        linear in x. So offsets, grids and edges share it as they share the light.
         """
         base, step = _EVEN + self.offsets[:, None], offsets[:, None]
 
-        def besides(added: FloatArray, step: FloatArray) -> FloatArray:
-            return follow(base + added, step) - (base + added + step)
+        def correction(added: FloatArray, step: FloatArray) -> FloatArray:
+            return light_after(base + added, step) - (base + added + step)
 
         nothing = np.zeros((2, 1))
-        of_offsets = besides(nothing, step)
+        of_offsets = correction(nothing, step)
         edges, values = self.edges + edges, self.values + values
         for old, new in zip(self.edges, edges, strict=True):
             amplitude, change = old[INK:, None], (new - old)[INK:, None]
-            new[INK:] += (besides(amplitude, step + change) - of_offsets)[:, 0]
+            new[INK:] += (correction(amplitude, step + change) - of_offsets)[:, 0]
         added, taken = nothing, of_offsets
         for grid in range(len(self.knots.spacings_px)):
             part = self.knots.of_grid(grid)
             own, own_step = self.values[:, part], values[:, part] - self.values[:, part]
-            change = besides(added + own, step + own_step) - taken
+            change = correction(added + own, step + own_step) - taken
             values[:, part] += change
             if grid + 1 < len(self.knots.spacings_px):
                 places = _places(self.knots, grid + 1)
-                coarser = (own, own_step, change)
-                of_coarser = (_of_grid(self.knots, grid, each, places) for each in coarser)
-                added, step, taken = (
-                    sum_so_far + more
-                    for sum_so_far, more in zip((added, step, taken), of_coarser, strict=True)
-                )
+                added = added + _of_grid(self.knots, grid, own, places)
+                step = step + _of_grid(self.knots, grid, own_step, places)
+                taken = taken + _of_grid(self.knots, grid, change, places)
         offsets = self.offsets + offsets + of_offsets[:, 0]
         return replace(self, values=values, offsets=offsets, edges=edges)
 
@@ -300,7 +301,7 @@ def _density(z: FloatArray) -> FloatArray:
 # steps of half the contrast. Direction and offset have none.
 EDGE_MEAN = np.array((0.0, 0.0, 0.7, 0.0, 0.0))
 EDGE_PRECISION = np.array((0.0, 0.0, 1.0, 4.0, 4.0))
-OFFSET_PRECISION = 4.0  # of offsets, as weak as that of steps
+LEVEL_OFFSET_PRECISION = 4.0  # of offsets, as weak as that of steps
 
 
 def edge_penalty(edges: FloatArray) -> float:

@@ -160,7 +160,8 @@ GEOMETRY_ROWS = 11  # of pose and blur, without the skew
 # Beyond ink and plate, where curves still follow their formula; light in shade is mostly between.
 _CURVED_BELOW, _CURVED_ABOVE = 0.05, 0.1
 _MEAN_SQUARE = 0.625  # of the distances of both edges from the centre, in ring radii
-_NEWTON_STEPS, _LEAST_SLOPE, _MOST_MOVED = 4, 0.1, 0.3  # along the tone curve
+# Newton's method along the tone curve goes astray where that is flatter, or by longer steps.
+_NEWTON_STEPS, _LEAST_SLOPE, _MOST_MOVED = 4, 0.1, 0.3
 _NOTHING = np.zeros((2, 1))  # added to the levels of all pixels
 _NO_VALUES = np.empty(0)
 
@@ -243,7 +244,7 @@ class PhotometricModel:
         modelled, each of which has its own level.
         """
         ink, plate = (self._level_slopes(x, light) for x in (added[0], 1.0 + added[1]))
-        for k, row in enumerate(_LEVEL_ROWS):
+        for k, row in enumerate(_LEVEL_ROWS if self.tone.is_shaped else _LEVEL_ROWS[:2]):
             jacobian[row] -= light.sharpening * (mask.ink * ink[k] + mask.plate * plate[k])
         by_ink, by_plate = jacobian[PARAM_COUNT], jacobian[PARAM_COUNT + 1]
         by_ink += light.sharpening * mask.detail(by_ink, ink[-1], 0.0)
@@ -422,13 +423,13 @@ def _slopes_of_toned(x: FloatArray, light: tuple[float, ...]) -> FloatArray:
 
 
 @compiled
-def followed(
+def light_after_step(
     x: FloatArray, step: FloatArray, before: tuple[float, ...], after: tuple[float, ...]
 ) -> FloatArray:
-    """Return where light x (n,) is after a step of x and of a `Light`, levels as the step promises.
+    """Return light x (n,) after a step of x and of a `Light`, with the levels that it promises.
 
-    The promise is the levels' change to first order. Where the curve after the step is too flat to
-    tell, x just moves by the step.
+    The promise is their change to first order, by the derivatives before the step. Where the curve
+    after it is too flat to tell, x just moves by the step.
     """
     moved, contrast = np.empty(len(x)), after[1] - after[0]
     for i in range(len(x)):

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.measurement.image_model.light_field import LightField, knots_over
-from kgcp.measurement.image_model.photometry import Light, followed
+from kgcp.measurement.image_model.photometry import Light, light_after_step
 
 _SPACING_PX = 8.0
 
@@ -139,8 +139,8 @@ def test_steps_follow_levels_of_another_scale_everywhere(
     field = replace(field, edges=edge)
     before, after = Light(0.1, 0.7), Light(0.15, 0.9)
 
-    def follow(light: FloatArray, step: FloatArray) -> FloatArray:
-        moved = followed(light.ravel(), step.ravel(), before.values, after.values)
+    def light_after(light: FloatArray, step: FloatArray) -> FloatArray:
+        moved = light_after_step(light.ravel(), step.ravel(), before.values, after.values)
         return moved.reshape(light.shape)
 
     values, offsets = 0.05 * rng.normal(size=shape), np.array([-0.1, 0.2])
@@ -150,8 +150,8 @@ def test_steps_follow_levels_of_another_scale_everywhere(
     step = replace(step, edges=edge + change)
     base = np.array([[0.0], [1.0]])
     light = base + field.added(pixels)
-    expected = follow(light, base + step.added(pixels) - light)
-    moved = field.moved(values, offsets, change, follow)
+    expected = light_after(light, base + step.added(pixels) - light)
+    moved = field.moved(values, offsets, change, light_after)
     np.testing.assert_allclose(base + moved.added(pixels), expected, atol=1e-12)
     # the same levels to first order, at the new scale
     levels = before.black + (before.white - before.black) * light
