@@ -10,7 +10,7 @@ import itertools
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -36,6 +36,7 @@ _BRIGHT, _DARK = 0.62, 0.10
 _GRADIENT = 0.05  # of the light over one radius, at most over …
 _LARGEST_FALL = 0.3  # … the photograph's half width
 _PSF_PX = 0.6
+_BOUND_LIGHTS = 9  # in which the bound is computed, from the darkest to the brightest
 _LEARNED_FROM = 5  # photographs, the tone curve and the sharpening: as `kgcp calibrate`
 _LEAST_DRAWS = 4  # for standard errors by the scatter between draws
 _POSE = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
@@ -90,15 +91,24 @@ class Outcome:
     present: int
     errors: FloatArray  # (n, 5)
     covariances: FloatArray  # (n, 5, 5)
-    bound_px2: FloatArray  # (2, 2): of a disc in the frame's middle
+    bound_px2: FloatArray  # (n,): least variance of x and y, their mean, in each disc's own light
     along_light_px: FloatArray  # (n,): errors of the centre along the light's gradient
     ms_per_disc: float
     draw: IndexArray  # (n,): which discs share what was learned of the camera
 
     @property
     def over_bound(self) -> float:
-        """RMS of the centre over the bound."""
-        return float(np.sqrt(np.mean(self.errors[:, :2] ** 2) / (0.5 * np.trace(self.bound_px2))))
+        """RMS of the centre's errors over their bounds."""
+        return float(np.sqrt(np.mean(self._squares_over_bound)))
+
+    @property
+    def bound_px(self) -> float:
+        """RMS of the bounds [px]."""
+        return float(np.sqrt(np.mean(self.bound_px2)))
+
+    @property
+    def _squares_over_bound(self) -> FloatArray:
+        return np.asarray(np.mean(self.errors[:, :2] ** 2, axis=1) / self.bound_px2)
 
     @property
     def bias_px(self) -> float:
@@ -108,8 +118,7 @@ class Outcome:
     @property
     def over_bound_se(self) -> float:
         """Standard error of `over_bound`."""
-        squares = np.mean(self.errors[:, :2] ** 2, axis=1) / (0.5 * np.trace(self.bound_px2))
-        return self._se_of_mean(squares) / (2.0 * self.over_bound)
+        return self._se_of_mean(self._squares_over_bound) / (2.0 * self.over_bound)
 
     @property
     def bias_se_px(self) -> float:
@@ -159,6 +168,7 @@ def measure(setup: Setup) -> Outcome:
     camera = Camera(width, height, _FOCAL_PX, _FOCAL_PX, 0.5 * (width - 1), 0.5 * (height - 1))
     sensor = Sensor(tone=case.tone, sharpening=case.sharpening)
     fall = min(setup.gradient / radius, _LARGEST_FALL / (0.5 * width))
+    middle_px = 0.5 * np.array([width - 1, height - 1])
     scenes, photos = [], []
     for _ in range(setup.photographs):
         scene = _scene(setup, pitch, fall, rng)
@@ -176,23 +186,26 @@ def measure(setup: Setup) -> Outcome:
         for photo, own in zip(photos, outlines, strict=True)
     ]
     seconds = time.process_time() - start
-    errors, covariances, along = [], [], []
+    bound_by_light = _bound_by_light(setup, sensor, fall)
+    errors, covariances, along, bounds = [], [], [], []
     for scene, discs in zip(scenes, measured, strict=True):
         truth = circle_images(camera, field_circles(_POSE, scene.discs)).moments
         direction = np.array(scene.gradient) / max(math.hypot(*scene.gradient), 1e-12)
         for expected in truth:
+            light = 1.0 + float((expected[:2] - middle_px) @ scene.gradient)
             disc = nearest_disc(discs, expected, radius)
             if disc is not None:
                 errors.append(disc.vector - expected)
                 covariances.append(disc.cov)
                 along.append(float((disc.vector - expected)[:2] @ direction))
+                bounds.append(bound_by_light(light))
     present = setup.photographs * _COLUMNS * _ROWS
     return Outcome(
         setup,
         present,
         np.array(errors).reshape(-1, 5),
         np.array(covariances).reshape(-1, 5, 5),
-        _bound(setup, sensor, fall),
+        np.array(bounds),
         np.array(along),
         1e3 * seconds / present,
         np.zeros(len(errors), dtype=np.intp),
@@ -207,6 +220,7 @@ def pooled(outcomes: Sequence[Outcome]) -> Outcome:
         present=sum(each.present for each in outcomes),
         errors=np.concatenate([each.errors for each in outcomes]),
         covariances=np.concatenate([each.covariances for each in outcomes]),
+        bound_px2=np.concatenate([each.bound_px2 for each in outcomes]),
         along_light_px=np.concatenate([each.along_light_px for each in outcomes]),
         ms_per_disc=float(np.mean([each.ms_per_disc for each in outcomes])),
         draw=np.repeat(np.arange(len(outcomes)), [len(each.errors) for each in outcomes]),
@@ -254,23 +268,33 @@ def nearest_disc(discs: Sequence[object], expected: FloatArray, radius_px: float
     return near[0] if len(near) == 1 else None
 
 
-def _bound(setup: Setup, sensor: Sensor, fall: float) -> FloatArray:
-    """Return the bound of a disc with its place between pixels and tilt in the middle of all."""
+def _bound_by_light(setup: Setup, sensor: Sensor, fall: float) -> Callable[[float], float]:
+    """Return the bound as a function of the light on a disc, 1 in the middle of a photograph.
+
+    Of a disc with some place between pixels, tilted in some direction: mean variance of x and y.
+    """
     case, radius = CASES[setup.case], setup.radius_px
     side = 2 * math.ceil(radius + 12.0) + 1
     camera = Camera(side, side, _FOCAL_PX, _FOCAL_PX, 0.5 * (side - 1), 0.5 * (side - 1))
     place = (0.31 / _FOCAL_PX, 0.17 / _FOCAL_PX, 0.0)
-    normal = _normal(setup.ratio, 0.6)
-    disc = SimulatedDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, normal)
-    scene = FieldScene((disc,), *_levels(setup.polarity), gradient=(fall, 0.0))
-    return centroid_bound(
-        camera,
-        scene,
-        Optics(_PSF_PX),
-        replace(sensor, sharpening=0.0),
-        case.gain,
-        tone_is_unknown=case.response is Response.UNKNOWN,
-    )
+    disc = SimulatedDisc(place, 2.0 * radius / _FOCAL_PX, 0.0, _normal(setup.ratio, 0.6))
+    farthest_px = 0.5 * math.hypot(_COLUMNS, _ROWS) * (2.0 * radius + _GAP_PX)
+    lights = np.linspace(1.0 - fall * farthest_px, 1.0 + fall * farthest_px, _BOUND_LIGHTS)
+    bounds_px2 = []
+    for light in lights.tolist():
+        ground, ink = _levels(setup.polarity)
+        gradient = (fall / light, 0.0)
+        scene = FieldScene((disc,), ground * light, ink * light, gradient=gradient)
+        bound = centroid_bound(
+            camera,
+            scene,
+            Optics(_PSF_PX),
+            replace(sensor, sharpening=0.0),
+            case.gain,
+            tone_is_unknown=case.response is Response.UNKNOWN,
+        )
+        bounds_px2.append(0.5 * float(np.trace(bound)))
+    return lambda light: math.exp(float(np.interp(light, lights, np.log(bounds_px2))))
 
 
 def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
@@ -310,9 +334,8 @@ def line(outcome: Outcome) -> str:
     )
     if not len(outcome.errors):
         return head
-    bound = math.sqrt(0.5 * float(np.trace(outcome.bound_px2)))
     return (
-        f"{head}{bound:10.5f}{outcome.over_bound:9.2f} ± {outcome.over_bound_se:.2f}"
+        f"{head}{outcome.bound_px:10.5f}{outcome.over_bound:9.2f} ± {outcome.over_bound_se:.2f}"
         f"{CASES[setup.case].limit:7.2f}"
         f"{outcome.bias_px:9.4f} ± {outcome.bias_se_px:.4f}{outcome.radius_bias_px:9.4f}"
         f"{outcome.z:6.2f} ± {outcome.z_se:.2f}"

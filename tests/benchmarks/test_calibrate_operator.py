@@ -36,7 +36,7 @@ def test_other_operators_are_biased_where_the_light_falls_off() -> None:
 
 def test_bound_is_the_formula_s() -> None:
     """σ_c = (σ_n / C) √(2 s / (√π R)) with the noise in the middle of the edge."""
-    bound_px = float(np.sqrt(0.5 * np.trace(outcome("linear", ratio=1.0).bound_px2)))
+    bound_px = outcome("linear", ratio=1.0).bound_px
     middle, contrast = 0.5 * (0.62 + 0.10), 0.62 - 0.10
     noise = np.sqrt(10_000.0 * middle + 64.0 + (10_000.0 / 255.0) ** 2 / 12.0) / 10_000.0
     spread = np.sqrt(0.6**2 + 1.0 / 12.0)

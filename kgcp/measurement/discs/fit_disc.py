@@ -35,6 +35,8 @@ _STEPS = 12
 _ENOUGH = 0.02  # of log-likelihood, promised by a step
 _LITTLE = 1e-4  # of a step
 _NOISE_ROUNDS, _SETTLED_NOISE = 3, 0.05
+_LEAST_LEFT = 0.25  # of a pixel's variance, after the fit
+_CLIP_SIGMAS = 2.5  # of the noise: a pixel whose model is nearer to what clips tells no noise
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 
 # Independent normal priors of what a disc alone hardly tells; lengths in radii.
@@ -377,8 +379,11 @@ class DiscFit:
 
     @property
     def noise(self) -> GreyNoise:
-        """The noise that the residuals show."""
-        return _noise(self.sample, self.share, self.levels)
+        """The noise that the residuals show, by what the fit leaves of them."""
+        inverse = np.linalg.inv(self.normal)
+        taken = self.misfit.weight * np.sum((inverse @ self.scaled) * self.scaled, axis=0)
+        left = np.maximum(1.0 - taken, _LEAST_LEFT)
+        return _noise(self.sample, self.share, self.levels, left)
 
 
 def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFit:
@@ -441,20 +446,33 @@ def _linearised(sample: DiscSample, state: DiscState) -> _Linear:
     return _Linear(share.value, *sample.level_model.linearised(share, state.vector))
 
 
-def _noise(sample: DiscSample, share: FloatArray, levels: FloatArray) -> GreyNoise:
+def _noise(
+    sample: DiscSample, share: FloatArray, levels: FloatArray, left: FloatArray | float = 1.0
+) -> GreyNoise:
     """Return the noise of every pixel; clipped ones would make their own.
+
+    Just below what clips, only pixels whose noise is negative are seen: they would make the noise
+    of small discs appear smaller by a third. Pixels are therefore chosen by the model, not by what
+    they show. `left` is the share of a pixel's variance that the fit leaves in its residual.
 
     Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
     noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
     """
     limits = sample.censoring
-    usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
-    residuals, step = sample.levels - levels, sample.window.levels_per_count
-    if not sample.is_noise_of_light:
-        return estimate_noise(residuals, share, usable, step, from_edges=True)
-    slope = srgb_slope(srgb_decoded(levels))
-    of_light = estimate_noise(residuals / slope, share, usable, step / slope.max(), from_edges=True)
-    return GreyNoise(of_light.sd * slope, of_light.plateau_sd * slope)
+    is_seen = ~(limits.at_high | limits.at_low)
+    residuals, step = (sample.levels - levels) / np.sqrt(left), sample.window.levels_per_count
+    slope = srgb_slope(srgb_decoded(levels)) if sample.is_noise_of_light else np.ones_like(levels)
+    margin = np.zeros_like(levels)
+    for _ in range(2):
+        usable = is_seen & (levels > limits.low + margin) & (levels < limits.high - margin)
+        of_light = estimate_noise(
+            residuals / slope, share, usable, step / slope.max(), from_edges=True
+        )
+        noise = GreyNoise(of_light.sd * slope, of_light.plateau_sd * slope)
+        if is_seen.all():
+            break
+        margin = _CLIP_SIGMAS * noise.sd
+    return noise
 
 
 def _minimise(

