@@ -294,7 +294,10 @@ def _bound_by_light(setup: Setup, sensor: Sensor, fall: float) -> Callable[[floa
             tone_is_unknown=case.response is Response.UNKNOWN,
         )
         bounds_px2.append(0.5 * float(np.trace(bound)))
-    return lambda light: math.exp(float(np.interp(light, lights, np.log(bounds_px2))))
+    # in the brightest light, where nearly all of a disc is clipped, its equations can be singular
+    is_determined = np.array(bounds_px2) > 0.0
+    lights, logarithms = lights[is_determined], np.log(np.array(bounds_px2)[is_determined])
+    return lambda light: math.exp(float(np.interp(light, lights, logarithms)))
 
 
 def setups(arguments: argparse.Namespace) -> Iterator[Setup]:
