@@ -268,8 +268,30 @@ def test_ink_of_small_discs_is_as_noisy_as_the_curve_of_srgb_makes_it() -> None:
     assert len(variances) == 90
     of_light = np.sqrt(sensor.full_well_e * 0.1 + sensor.read_noise_e**2) / sensor.full_well_e
     of_ink = np.hypot(of_light * sensor.tone.slope(np.array(0.1)), 1.0 / 255.0 / np.sqrt(12.0))
-    # That of paper is 0.82 of it. Five pixels tell it to 40 %, and a variance is never below 0.
+    # Paper's noise is 0.82 of it. One disc tells it to 40 %, and what would be below 0 is cut off,
+    # which makes the mean larger.
     assert 0.9 < np.sqrt(np.mean(variances)) / of_ink < 1.35
+
+
+def test_clipping_and_the_fit_make_noise_at_the_edges_of_burnt_discs_no_smaller() -> None:
+    camera, pose = Camera(110, 70, 2e5, 2e5, 54.5, 34.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    sensor, rng, ratios = Sensor(), np.random.default_rng(2), []
+    lattice = 20.0 * np.array([(i, j) for i in range(-2, 3) for j in (-1, 0, 1)])
+    for _ in range(6):
+        middles = (lattice + rng.uniform(-0.5, 0.5, lattice.shape)) / 2e5
+        discs = tuple(SimulatedDisc((x, y, 0.0), 6.0 / 2e5) for x, y in middles.tolist())
+        scene = FieldScene(discs, 0.1, 0.62)
+        photo = photograph(camera, pose, scene, Optics(0.6), sensor, rng, 1.5 / 0.62)
+        for outline in find_outlines(photo):
+            task = adjust_disc.DiscTask(photo, outline, [])
+            fit = adjust_disc.adjust_disc(task, fit_disc.DiscUnknowns.of(Tone.LINEAR))
+            is_edge = (fit.share > 0.2) & (fit.share < 0.8)
+            exposure = fit.levels[is_edge]
+            electrons2 = sensor.full_well_e * exposure + sensor.read_noise_e**2
+            truth = np.hypot(np.sqrt(electrons2) / sensor.full_well_e, 1.0 / 255.0 / np.sqrt(12.0))
+            ratios.append(np.median(fit.noise.sd[is_edge] / truth))
+    assert len(ratios) == 90
+    assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.1
 
 
 def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyArray, FloatArray]:
