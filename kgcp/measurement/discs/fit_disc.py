@@ -399,9 +399,11 @@ def fit_disc(sample: DiscSample, start: DiscState, free: DiscUnknowns) -> DiscFi
     Raises
     ------
     NoFit
-        If the equations cannot be solved.
+        If there are fewer pixels than unknowns, or the equations cannot be solved.
     """
     state, free = start, sample.unknowns(free)
+    if len(sample.levels) < len(free.rows):  # all others belong to something else
+        raise NoFit
     linear = _linearised(sample, state)
     sd = _noise(sample, linear.share, linear.levels).sd
     for _ in range(_NOISE_ROUNDS):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kgcp.geometry.arrays import FloatArray, GreyArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, GreyArray, IndexArray
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
@@ -292,6 +292,26 @@ def test_clipping_and_the_fit_make_noise_at_the_edges_of_burnt_discs_no_smaller(
             ratios.append(np.median(fit.noise.sd[is_edge] / truth))
     assert len(ratios) == 90
     assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.1
+
+
+@pytest.mark.parametrize("response", list(Response))
+def test_a_disc_of_which_no_pixel_is_left_is_refused(
+    response: Response, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On ground with texture all pixels of a window may be taken for something else."""
+    pose, rng = Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), np.random.default_rng(1)
+    scene = FieldScene((SimulatedDisc((0.0, 0.0, 0.0), 0.03),), 0.8, 0.1)
+    photo = photograph(CAMERA, pose, scene, Optics(0.6), Sensor(), rng)
+    (outline,) = find_outlines(photo)
+    assert isinstance(measure_disc(photo, outline, response=response), Disc)
+
+    def all_pixels(fit: fit_disc.DiscFit) -> BoolArray:
+        return np.ones(len(fit.sample.window.levels), dtype=np.bool_)
+
+    monkeypatch.setattr(adjust_disc, "foreign_pixels", all_pixels)
+    outcome = measure_disc(photo, outline, response=response)
+    assert isinstance(outcome, DiscMiss)
+    assert outcome.reason is DiscReason.POOR_FIT
 
 
 def under_shadows(depth: float, width_px: float, aside_px: float) -> tuple[GreyArray, FloatArray]:
