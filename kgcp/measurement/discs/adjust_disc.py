@@ -14,6 +14,7 @@ from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, 
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
+    LEAST_REDUNDANCY,
     MUCH_CLIPPED,
     DiscFit,
     DiscSample,
@@ -250,8 +251,10 @@ def check_disc_fit(fit: DiscFit, outline: DiscOutline) -> None:
     DiscRejection
         `POOR_FIT` or `NO_CONTRAST`.
     """
-    clips = fit.sample.censoring
-    seen = ~(clips.at_high | clips.at_low)
+    seen = fit.sample.is_seen
+    if fit.redundancy < LEAST_REDUNDANCY:
+        detail = f"only {np.count_nonzero(seen)} of its pixels are not clipped"
+        raise DiscRejection(DiscReason.POOR_FIT, detail)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
     black, white = fit.state.plateaus(fit.free.tone)
     residual = median_at_edges(fit.sd, fit.share, 0.2, 0.8, math.nan)

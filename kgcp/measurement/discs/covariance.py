@@ -1,8 +1,8 @@
 """Covariance of a disc's centroid and moments, from the residuals as they are.
 
 As for coded targets (`adjustment.covariance`): scores are summed over arcs of the edge, and their
-scatter is held against what independent residuals of this very fit would leave. Unlike theirs,
-variances are nowhere below those of independent pixels: a disc has few arcs.
+scatter is held against what independent residuals of this very fit would leave. A disc has few
+arcs: only a whole photograph shows that variances are below those of independent pixels.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
-from kgcp.measurement.discs.fit_disc import DiscFit
+from kgcp.measurement.discs.fit_disc import LEAST_REDUNDANCY, DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
 
@@ -26,6 +26,8 @@ _ARC_PX = 6.0
 _FEWEST_ARCS = 8
 _ARCS_IN_COMMON = 40.0  # what all discs of a photograph scatter counts like so many arcs
 _LEAST_LEFT = 1.0  # of the scatter, after the fit
+_OUTLYING_RATIO = 3.0  # of the median; larger ratios are those of single discs
+_LEAST_FACTOR = 0.25  # of variances, as for coded targets
 # Variances of ratios that independent residuals show, by one arc and by one pixel of an edge
 _ARC_VARIANCE, _PIXEL_VARIANCE = 2.0, 2.5
 # Of centre and edge, whatever the noise; 0.0005 px made deviations of simulated discs of R 60 px
@@ -43,7 +45,7 @@ _TONED_SHARE = 0.15
 _TONED_RING_SHARE, _LEAST_GAP_PX, _LEAST_GAP = 0.01, 1.9, 3.0
 # … and where the light falls off, it displaces opposite edges differently: of the blur, for light
 # that falls off by all of itself over one radius.
-_TONED_FALL = 0.1
+_TONED_FALL = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +56,7 @@ class DiscScatter:
     common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
     arcs: int  # that it was found from
+    is_burnt: bool = False  # whether a level is clipped
 
     def cov(self, inflation: float) -> FloatArray:
         """Return the covariance (5, 5) for an inflation of the independent part."""
@@ -88,11 +91,15 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     bent_px = _bend_px(fit)
     common[:2, :2] += bent_px @ bent_px
     to_moments = moments_by_stretch(fit.state.geometry)
+    # errors over deviations of a noise that is estimated are distributed as Student's t
+    redundancy = max(fit.redundancy, LEAST_REDUNDANCY)
+    of_noise = redundancy / (redundancy - 2.0)
     return DiscScatter(
-        to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T,
+        of_noise * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,
         ratio,
         arcs,
+        fit.sample.is_burnt,
     )
 
 
@@ -118,20 +125,29 @@ def scatter_ratio(
 
 
 def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
-    """Return by how much to inflate the covariances (n,) of the discs of one photograph.
+    """Return what to multiply the covariances (n,) of the discs of one photograph with.
 
     The ratio of one disc is uncertain, and that of a photograph is not: compression and jagged
     print are the same for all. Each disc's own ratio counts like its arcs, the photograph's like
     forty. What may be above 1 by chance is taken off: a disc alone has eight arcs or a few more.
+
+    Below 1 counts what the whole photograph shows beyond chance. Compression and a camera's
+    denoising leave residuals of which neighbours undo each other: those of JPEG with quality 92 let
+    arcs scatter by 0.6 to 0.75 of what independent ones would, and errors by as much. Not of burnt
+    discs: what their levels leave open is known beforehand rather than by residuals.
     """
     if not scatters:
         return np.empty(0)
     ratios = np.array([each.ratio for each in scatters])
     arcs = np.array([each.arcs for each in scatters], dtype=np.float64)
+    in_common = float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
+    of_chance = np.array(_ARC_VARIANCE / arcs.sum())
+    shown = max(1.0 - float(beyond_chance(np.array(1.0 - in_common), of_chance)), _LEAST_FACTOR)
+    least = np.where([each.is_burnt for each in scatters], 1.0, shown)
     weight = arcs + _ARCS_IN_COMMON
-    pooled = (arcs * ratios + _ARCS_IN_COMMON * np.median(ratios)) / weight
+    pooled = (arcs * ratios + _ARCS_IN_COMMON * in_common) / weight
     shared = _ARCS_IN_COMMON * (2.0 * arcs + _ARCS_IN_COMMON) / arcs.sum()
-    return 1.0 + beyond_chance(pooled - 1.0, _ARC_VARIANCE * (arcs + shared) / weight**2)
+    return least + beyond_chance(pooled - least, _ARC_VARIANCE * (arcs + shared) / weight**2)
 
 
 def beyond_chance(excess: FloatArray, variance: FloatArray) -> FloatArray:
@@ -164,7 +180,7 @@ def common_displacement_px(fit: DiscFit) -> float:
     """
     noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
     state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
-    is_edge = (fit.share > 0.2) & (fit.share < 0.8) & ~(limits.at_high | limits.at_low)
+    is_edge = (fit.share > 0.2) & (fit.share < 0.8) & fit.sample.is_seen
     chance = np.array(_PIXEL_VARIANCE / max(int(np.count_nonzero(is_edge)), 1))
     excess = beyond_chance((noise.sd / noise.plateau_sd) ** 2 - 1.0, chance) * noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from kgcp.geometry.arrays import FloatArray, IndexArray
+from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
 from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_products
 from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, limited
 from kgcp.measurement.discs.disc_levels import COUNT, CURVES, GEOMETRY_COUNT, LevelModel, Row
@@ -67,6 +67,8 @@ _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
 # what is estimated besides at the edge of a shadow
 _UNEVEN = np.array((*_INK_SLOPES, *CURVES.tolist()))
 _UNEVEN_PRECISIONS = np.array([_SHADOW_SLOPE_SD] * 2 + [_SHADOW_CURVE_SD] * 3) ** -2.0
+LEAST_REDUNDANCY = 6.0
+"""With fewer pixels beyond the unknowns, no deviation can be stated."""
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
 """What all discs share: the camera's tone curve and sharpening."""
 
@@ -304,6 +306,11 @@ class DiscSample:
         )
 
     @property
+    def is_seen(self) -> BoolArray:
+        """Which pixels (n,) are not clipped."""
+        return np.asarray(~(self.censoring.at_high | self.censoring.at_low))
+
+    @property
     def is_burnt(self) -> bool:
         """Whether a level is clipped, and so hardly seen."""
         return self.censoring.share > MUCH_CLIPPED
@@ -378,18 +385,33 @@ class DiscFit:
         return np.array(((2.0 * xx, xy), (xy, 2.0 * yy)))
 
     @property
-    def noise(self) -> GreyNoise:
-        """The noise that the residuals show, allowing for what the fit has taken from them.
+    def leverage(self) -> FloatArray:
+        """Elements (n,) of the hat matrix's diagonal: how much of its own residual a pixel takes.
 
-        A fit by p parameters leaves 1 − h of a pixel's variance in its residual, where the leverage
-        h is the pixel's element of the diagonal of the hat matrix.
+        Raises
+        ------
+        NoFit
+            If the equations are singular.
         """
         try:
             inverse = np.linalg.inv(self.normal)
         except np.linalg.LinAlgError:
             raise NoFit from None
-        leverage = self.misfit.weight * np.sum((inverse @ self.scaled) * self.scaled, axis=0)
-        residual_share = np.maximum(1.0 - leverage, _LEAST_RESIDUAL_SHARE)
+        own = np.sum((inverse @ self.scaled) * self.scaled, axis=0)
+        return np.asarray(self.misfit.weight * own)
+
+    @property
+    def redundancy(self) -> float:
+        """Pixels that are not clipped, beyond those that unknowns take: degrees of freedom."""
+        return float(np.sum(1.0 - self.leverage[self.sample.is_seen]))
+
+    @property
+    def noise(self) -> GreyNoise:
+        """The noise that the residuals show, allowing for what the fit has taken from them.
+
+        A pixel of leverage h leaves 1 − h of its variance in its residual.
+        """
+        residual_share = np.maximum(1.0 - self.leverage, _LEAST_RESIDUAL_SHARE)
         return _noise(self.sample, self.share, self.levels, residual_share)
 
 
@@ -471,8 +493,7 @@ def _noise(
     Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
     noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
     """
-    limits = sample.censoring
-    is_seen = ~(limits.at_high | limits.at_low)
+    limits, is_seen = sample.censoring, sample.is_seen
     residuals, step = (
         (sample.levels - levels) / np.sqrt(residual_share),
         sample.window.levels_per_count,
