@@ -56,7 +56,7 @@ class DiscScatter:
     common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
     arcs: int  # that it was found from
-    is_burnt: bool = False  # whether a level is clipped
+    is_noise_alone: bool = True  # nothing is clipped, and light is linear
 
     def cov(self, inflation: float) -> FloatArray:
         """Return the covariance (5, 5) for an inflation of the independent part."""
@@ -99,7 +99,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
         to_moments @ common @ to_moments.T,
         ratio,
         arcs,
-        fit.sample.is_burnt,
+        not (fit.sample.is_burnt or fit.free.is_light_curved),
     )
 
 
@@ -134,7 +134,8 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     Below 1 counts what the whole photograph shows beyond chance. Compression and a camera's
     denoising leave residuals of which neighbours undo each other: those of JPEG with quality 92 let
     arcs scatter by 0.6 to 0.75 of what independent ones would, and errors by as much. Not of burnt
-    discs: what their levels leave open is known beforehand rather than by residuals.
+    discs, whose levels are known beforehand rather than by residuals, nor of discs at the edge of a
+    shadow, whose residuals are not those of noise.
     """
     if not scatters:
         return np.empty(0)
@@ -143,7 +144,7 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     in_common = float(np.mean(np.minimum(ratios, _OUTLYING_RATIO * np.median(ratios))))
     of_chance = np.array(_ARC_VARIANCE / arcs.sum())
     shown = max(1.0 - float(beyond_chance(np.array(1.0 - in_common), of_chance)), _LEAST_FACTOR)
-    least = np.where([each.is_burnt for each in scatters], 1.0, shown)
+    least = np.where([each.is_noise_alone for each in scatters], shown, 1.0)
     weight = arcs + _ARCS_IN_COMMON
     pooled = (arcs * ratios + _ARCS_IN_COMMON * in_common) / weight
     shared = _ARCS_IN_COMMON * (2.0 * arcs + _ARCS_IN_COMMON) / arcs.sum()
