@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.discs.covariance import DiscScatter, beyond_chance, inflations
+from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
+from kgcp.measurement.discs.covariance import (
+    DiscScatter,
+    beyond_chance,
+    inflations,
+    scatter_of,
+)
+from kgcp.measurement.discs.fit_disc import DiscUnknowns
 from kgcp.measurement.discs.measure import measure_disc
 from kgcp.measurement.discs.outlines import find_outlines
-from kgcp.measurement.discs.records import Disc
+from kgcp.measurement.discs.records import Disc, DiscMiss, DiscReason
+from kgcp.measurement.image_model.photometry import Tone
 from kgcp.simulation.disc_field import FieldScene, SimulatedDisc, field_circles, photograph
 from kgcp.simulation.imaging import Optics, Sensor
 
@@ -45,6 +55,44 @@ def test_what_all_discs_of_a_photograph_show_is_no_chance() -> None:
     scatters = [DiscScatter(np.eye(5), np.zeros((5, 5)), each, ARCS) for each in ratios]
     assert 1.3 < np.mean(inflations(scatters)) < 1.42
     assert inflations([]).shape == (0,)
+
+
+def test_a_whole_photograph_shows_that_noise_undoes_itself() -> None:
+    ratios = 0.6 * np.random.default_rng(7).chisquare(ARCS, 100) / ARCS
+    ratios[:3] = 20.0  # clutter
+    scatters = [DiscScatter(np.eye(5), np.zeros((5, 5)), each, ARCS) for each in ratios]
+    factors = inflations(scatters)
+    assert 0.58 < np.median(factors) < 0.7
+    assert np.all(factors[:3] > 3.0)
+    # neither of burnt discs nor at the edge of a shadow, as residuals are not those of noise alone
+    others = [replace(each, is_noise_alone=False) for each in scatters]
+    assert np.all(inflations(others) >= 1.0)
+    assert np.median(inflations(others)) == 1.0
+
+
+def test_deviations_by_little_redundancy_are_those_of_students_t() -> None:
+    camera, pose = Camera(40, 40, 2e5, 2e5, 19.5, 19.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    scene = FieldScene((SimulatedDisc((1.5e-6, 1e-6, 0.0), 6.0 / 2e5),), 0.62, 0.1)
+    optics, rng = Optics(0.6), np.random.default_rng(8)
+    (outline,) = find_outlines(photograph(camera, pose, scene, optics, Sensor(), rng))
+    found = []
+    for gain in (1.0, 2.4, 5.5):
+        photo = photograph(camera, pose, scene, optics, Sensor(), rng, gain)
+        fit = adjust_disc(DiscTask(photo, outline, []), DiscUnknowns.of(Tone.LINEAR))
+        plain = np.linalg.inv(fit.normal)[:2, :2]
+        found.append((fit.redundancy, scatter_of(fit).independent[0, 0] / plain[0, 0]))
+        is_seen = fit.sample.is_seen.sum()
+        assert is_seen - len(fit.free.rows) <= fit.redundancy < is_seen
+    (plenty, of_plenty), (little, of_little), (too_little, _) = found
+    assert plenty > 60.0
+    assert 6.0 < little < 20.0
+    assert of_plenty == pytest.approx(plenty / (plenty - 2.0))
+    assert of_little == pytest.approx(little / (little - 2.0))
+    assert too_little < 6.0
+    outcome = measure_disc(photo, outline, response=Response.LINEAR)
+    assert isinstance(outcome, DiscMiss)
+    assert outcome.reason is DiscReason.POOR_FIT
+    assert "of its pixels are not clipped" in outcome.detail
 
 
 def test_the_radius_of_a_disc_alone_is_as_good_as_it_says() -> None:
