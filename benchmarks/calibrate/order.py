@@ -112,5 +112,5 @@ def _is_hole_seen(grey: GreyArray, places_px: FloatArray, appearance: FloatArray
     """Return where the middle of a disc is more like the ground than like the disc."""
     columns, rows = np.rint(places_px).astype(int).T
     middle = grey[rows, columns] / np.iinfo(grey.dtype).max
-    inside, outside = appearance[:, 0], np.clip(appearance[:, 1], 0.0, 1.0)
+    inside, outside = np.clip(appearance[:, :2], 0.0, 1.0).T  # of burnt levels, what is seen
     return np.asarray(np.abs(middle - outside) < np.abs(middle - inside))

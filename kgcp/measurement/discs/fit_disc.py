@@ -37,6 +37,10 @@ _LITTLE = 1e-4  # of a step
 _NOISE_ROUNDS, _SETTLED_NOISE = 3, 0.05
 _LEAST_RESIDUAL_SHARE = 0.25  # of a pixel's variance, that a fit leaves in its residual
 _CLIP_SIGMAS = 2.5  # a pixel whose model is nearer to a clipping limit tells nothing of the noise
+_FEWEST_OF_NOISE = 8  # pixels
+# Of the range between the limits. Beyond, residuals are not noise but what the model lacks: a wider
+# margin would leave only edges, and these would make it larger still.
+_MOST_MARGIN = 0.1
 _DAMPING, _DAMPED, _MOST_DAMPING = 1e-6, 1e-3, 1e6
 
 # Independent normal priors of what a disc alone hardly tells; lengths in radii.
@@ -487,7 +491,8 @@ def _noise(
 
     Just below a clipping limit, only pixels with negative noise are seen. Taken for all, they made
     the noise at the edges of burnt discs of R 3 px 28 % too small. So pixels are chosen by their
-    modelled level, a margin away from the limits; the margin needs a first estimate of the noise.
+    modelled level, a margin away from the limits; the margin needs a first estimate of the noise. A
+    model that is far off may put all of them beyond: then those that are not clipped have to do.
     `residual_share` is the share of a pixel's variance that is left in its residual.
 
     Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
@@ -499,16 +504,18 @@ def _noise(
         sample.window.levels_per_count,
     )
     slope = srgb_slope(srgb_decoded(levels)) if sample.is_noise_of_light else np.ones_like(levels)
-    margin = np.zeros_like(levels)
+    usable, margin = is_seen, np.zeros_like(levels)
     for _ in range(2):
-        usable = is_seen & (levels > limits.low + margin) & (levels < limits.high - margin)
+        chosen = is_seen & (levels > limits.low + margin) & (levels < limits.high - margin)
+        if np.count_nonzero(chosen) >= _FEWEST_OF_NOISE:
+            usable = chosen
         of_light = estimate_noise(
             residuals / slope, share, usable, step / slope.max(), from_edges=True
         )
         noise = GreyNoise(of_light.sd * slope, of_light.plateau_sd * slope)
         if is_seen.all():
             break
-        margin = _CLIP_SIGMAS * noise.sd
+        margin = np.minimum(_CLIP_SIGMAS * noise.sd, _MOST_MARGIN * (limits.high - limits.low))
     return noise
 
 

@@ -6,6 +6,7 @@ costs no more than one of every disc.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import BoolArray, FloatArray
 from kgcp.measurement.adjustment.normal_equations import weighted_products
+from kgcp.measurement.discs.affine_model import mean_radius_px
 from kgcp.measurement.discs.disc_levels import COUNT
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
@@ -271,7 +273,8 @@ def _minimised(
         )
         settled = at([fit.state.moved(_own_step(fit), free.tone) for fit in trial])
         trial = [min(pair, key=_own_total) for pair in zip(trial, settled, strict=True)]
-        trial_total = _total(trial, usual)
+        is_near = all(map(_is_near, trial, states))
+        trial_total = _total(trial, usual) if is_near else math.inf
         if trial_total <= total:
             fits, total, damping = trial, trial_total, max(0.1 * damping, _DAMPING)
             continue
@@ -279,6 +282,15 @@ def _minimised(
         if damping > _MOST_DAMPING:
             break
     return fits
+
+
+def _is_near(fit: DiscFit, start: DiscState) -> bool:
+    """Return whether a disc is still the one that the adjustment began with.
+
+    One that ran away would leave its equations singular, and with them those of what all share.
+    """
+    moved_px = np.abs(fit.state.geometry - start.geometry).max()
+    return bool(moved_px <= mean_radius_px(start.geometry))
 
 
 def _own_total(fit: DiscFit) -> float:

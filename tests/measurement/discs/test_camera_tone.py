@@ -7,11 +7,11 @@ import pytest
 
 from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.pose import Pose
-from kgcp.measurement.discs.adjust_disc import DiscTask
+from kgcp.measurement.discs.adjust_disc import DiscTask, adjust_disc
 from kgcp.measurement.discs.camera_tone import _with_waves, _worthy, learn_tone
 from kgcp.measurement.discs.disc_levels import COUNT, Row
-from kgcp.measurement.discs.fit_disc import DiscState
-from kgcp.measurement.discs.joint_tone import JointFit
+from kgcp.measurement.discs.fit_disc import DiscState, DiscUnknowns
+from kgcp.measurement.discs.joint_tone import JointFit, adjust_together
 from kgcp.measurement.discs.outlines import find_outlines
 from kgcp.measurement.image_model.noise import Censoring
 from kgcp.measurement.image_model.photometry import Tone
@@ -157,6 +157,32 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
     assert camera.known is not None
     assert camera.tone is Tone.UNKNOWN_FROM_LINE
     assert camera.known.mean[:4] == pytest.approx(np.zeros(4), abs=0.02)
+
+
+def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:
+    camera, pose = (
+        Camera(260, 60, 2e5, 2e5, 129.5, 29.5),
+        Pose(np.eye(3), np.array([0.0, 0.0, 1.0])),
+    )
+    places = (-90.0, -30.0, 30.0, 90.0)
+    discs = tuple(SimulatedDisc((x / 2e5, 0.0, 0.0), 20.0 / 2e5) for x in places)
+    scene, rng = FieldScene(discs, 0.1, 0.62), np.random.default_rng(1)
+    sensor = Sensor(tone=ToneCurve.FILM)
+    photo = photograph(camera, pose, scene, Optics(0.6), sensor, rng, 1.5 / 0.62)
+    free = DiscUnknowns.of(Tone.UNKNOWN_FROM_LINE, sharpening_px=1.0)
+    fits = [adjust_disc(DiscTask(photo, each, []), free) for each in find_outlines(photo)]
+    samples, states = [fit.sample for fit in fits], [fit.state for fit in fits]
+    vector = states[1].vector.copy()
+    vector[[Row.BLACK, Row.WHITE]] = 0.95, 0.96
+    states[1] = DiscState(vector)
+    together = adjust_together(samples, states, free.tone, 1.0, [fit.sd for fit in fits])
+    moved_px = [
+        np.abs(now.state.geometry - fit.state.geometry).max()
+        for now, fit in zip(together.fits, fits, strict=True)
+    ]
+    assert max(moved_px) <= 10.1
+    assert np.delete(moved_px, 1).max() < 0.3
+    assert np.linalg.eigvalsh(together.precision)[0] > 0.0
 
 
 def test_a_state_by_another_curve_shows_the_same_grey_values() -> None:

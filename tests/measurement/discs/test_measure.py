@@ -13,6 +13,7 @@ from kgcp.geometry.camera import Camera, Response
 from kgcp.geometry.circle_image import circle_images
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.discs import adjust_disc, covariance, fit_disc
+from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.measure import measure_disc, measure_discs
 from kgcp.measurement.discs.outlines import find_outlines, follow_outlines
 from kgcp.measurement.discs.records import (
@@ -292,6 +293,27 @@ def test_clipping_and_the_fit_make_noise_at_the_edges_of_burnt_discs_no_smaller(
             ratios.append(np.median(fit.noise.sd[is_edge] / truth))
     assert len(ratios) == 90
     assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.1
+
+
+@pytest.mark.parametrize("levels", [(0.1, 0.62), (0.62, 0.1)])
+def test_noise_about_a_wrong_model_of_a_burnt_disc_is_not_small(
+    levels: tuple[float, float],
+) -> None:
+    """If all pixels were too near to what clips, nothing but the files' steps would be left."""
+    camera, pose = Camera(60, 60, 2e5, 2e5, 29.5, 29.5), Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    scene = FieldScene((SimulatedDisc((0.0, 0.0, 0.0), 20.0 / 2e5),), *levels)
+    rng = np.random.default_rng(1)
+    photo = photograph(camera, pose, scene, Optics(0.6), Sensor(), rng, 1.5 / 0.62)
+    task = adjust_disc.DiscTask(photo, find_outlines(photo)[0], [])
+    fit = adjust_disc.adjust_disc(task, fit_disc.DiscUnknowns.of(Tone.LINEAR))
+    noise = []
+    for variance_px2 in (0.4, 1.0, 2.0, 4.0):
+        vector = fit.state.vector.copy()
+        vector[Row.BLUR_MEAN] = variance_px2
+        sd = fit_disc.noise_at(fit.sample, fit_disc.DiscState(vector)).sd
+        noise.append(float(sd.mean()))
+    assert noise == sorted(noise)
+    assert noise[-1] > 0.1
 
 
 @pytest.mark.parametrize("response", list(Response))
