@@ -92,7 +92,10 @@ def measure_by_gaussian(task: DiscTask) -> Disc | DiscMiss:
         return DiscMiss(task.outline, DiscReason.CROWDED, "too few pixels")
     geometry = outline_geometry(task.outline)
     off_px = distances_px(places, geometry)
-    inside = float(np.median(levels[off_px <= min(-0.5, float(np.median(off_px)))]))
+    is_inmost = off_px <= min(-0.5, float(np.median(off_px)))
+    if not is_inmost.any():  # all its own pixels belong to something else
+        return DiscMiss(task.outline, DiscReason.CROWDED, "no pixel within the disc")
+    inside = float(np.median(levels[is_inmost]))
     outside = float(np.median(levels[off_px > min(_AROUND_PX, float(off_px.max()) - 0.5)]))
     radius_px = task.radius_px
     start = np.array((*geometry, inside - outside, outside, 1.4 / radius_px))
