@@ -499,10 +499,8 @@ def _noise(
     noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
     """
     limits, is_seen = sample.censoring, sample.is_seen
-    residuals, step = (
-        (sample.levels - levels) / np.sqrt(residual_share),
-        sample.window.levels_per_count,
-    )
+    residuals = (sample.levels - levels) / np.sqrt(residual_share)
+    step = sample.window.levels_per_count
     slope = srgb_slope(srgb_decoded(levels)) if sample.is_noise_of_light else np.ones_like(levels)
     usable, margin = is_seen, np.zeros_like(levels)
     for _ in range(2):
