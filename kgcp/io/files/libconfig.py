@@ -71,7 +71,9 @@ def _tokens(text: str) -> Iterator[_Token]:
         if match is None:
             if text.startswith("@include", place):
                 raise ValueError(f"line {line} includes another file")
-            raise ValueError(f"line {line} has {text[place : place + 20].split(maxsplit=1)[0]!r}")
+            # what Python takes for white space may be none of libconfig's, such as a vertical tab
+            words = text[place : place + 20].split(maxsplit=1) or [text[place]]
+            raise ValueError(f"line {line} has {words[0]!r}")
         kind = str(match.lastgroup)
         if kind != "space":
             yield _Token(kind, match[kind], line)
