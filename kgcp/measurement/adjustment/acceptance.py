@@ -43,8 +43,7 @@ def check_fit(fit: TargetFit) -> None:
     Rejection
         `POOR_FIT`.
     """
-    censoring = fit.sample.censoring
-    seen = ~(censoring.at_high | censoring.at_low)
+    seen = ~fit.sample.censoring.is_clipped
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5))
     noise = edge_noise(fit)
     if outlying > _MAX_OUTLIERS or noise > _MAX_EDGE_NOISE:

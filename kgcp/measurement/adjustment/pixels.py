@@ -64,7 +64,7 @@ class Sample:
         """Share of clipped pixels (n,) in each."""
         bins = self.problem.window.clipped
         if bins is None:
-            return self.censoring.at_high | self.censoring.at_low
+            return self.censoring.is_clipped
         return bins[self.index]
 
 

@@ -224,7 +224,7 @@ def noise_of(sample: Sample, prediction: PredictedImage, *, is_even: bool = True
     are clipped, or should be, have none: a white that is not bounded would make its own noise.
     """
     limits, levels = sample.censoring, prediction.levels
-    usable = ~(limits.at_high | limits.at_low) & (levels > limits.low) & (levels < limits.high)
+    usable = ~limits.is_clipped & (levels > limits.low) & (levels < limits.high)
     return estimate_noise(
         sample.levels - prediction.levels,
         prediction.share,

@@ -14,7 +14,6 @@ from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, 
 from kgcp.measurement.discs.disc_levels import Row
 from kgcp.measurement.discs.fit_disc import (
     CAMERA_ROWS,
-    LEAST_REDUNDANCY,
     MUCH_CLIPPED,
     DiscFit,
     DiscSample,
@@ -46,6 +45,7 @@ _MAX_GROWN_PX, _MAX_GROWN = 2.0, 0.4  # and the edge: burnt light displaces it b
 # Residuals at the edge, of the contrast, and share of outliers. Small discs that are burnt and
 # sharpened leave up to 0.19; what is not a disc, mostly more than 0.3.
 _MAX_EDGE_NOISE, _MAX_OUTLIERS = 0.2, 0.3
+_LEAST_REDUNDANCY = 6.0  # with less, errors have no deviation worth stating (Student's t)
 _LEAST_CURVED_PX = 6.0  # radius from which on discs tell a curved light from their blur
 _CURVED = 25.0  # least χ² of five terms: noise alone makes more in one of ten thousand discs
 _FOREIGN_SIGMAS, _FOREIGN_CONTRAST = 6.0, 0.12  # residuals of what is neither disc nor ground
@@ -251,9 +251,9 @@ def check_disc_fit(fit: DiscFit, outline: DiscOutline) -> None:
     DiscRejection
         `POOR_FIT` or `NO_CONTRAST`.
     """
-    seen = fit.sample.is_seen
-    if fit.redundancy < LEAST_REDUNDANCY:
-        detail = f"only {np.count_nonzero(seen)} of its pixels are not clipped"
+    seen = ~fit.sample.censoring.is_clipped
+    if fit.redundancy < _LEAST_REDUNDANCY:
+        detail = f"only {np.count_nonzero(seen)} unclipped pixels for {len(fit.free.rows)} unknowns"
         raise DiscRejection(DiscReason.POOR_FIT, detail)
     outlying = float(np.mean(fit.misfit.weight[seen] < 0.5)) if seen.any() else 1.0
     black, white = fit.state.plateaus(fit.free.tone)

@@ -18,7 +18,7 @@ from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.discs.affine_model import Geometry, mean_radius_px
 from kgcp.measurement.discs.disc_levels import GEOMETRY_COUNT
-from kgcp.measurement.discs.fit_disc import LEAST_REDUNDANCY, DiscFit
+from kgcp.measurement.discs.fit_disc import DiscFit
 from kgcp.measurement.discs.pixel_choice import outward_px
 from kgcp.measurement.image_model.noise import median_at_edges
 
@@ -57,7 +57,7 @@ class DiscScatter:
     common: FloatArray  # (5, 5): what an edge displaced as a whole adds, and the floor
     ratio: float  # mean ratio of the scatter of scores to that of independent residuals
     arcs: int  # that it was found from
-    is_noise_alone: bool = True  # nothing is clipped, and light is linear
+    is_noise_alone: bool  # nothing is clipped, and light is linear
 
     def cov(self, inflation: float) -> FloatArray:
         """Return the covariance (5, 5) for an inflation of the independent part."""
@@ -65,7 +65,10 @@ class DiscScatter:
 
 
 def scatter_of(fit: DiscFit) -> DiscScatter:
-    """Return the parts of the covariance of centroid and second moments."""
+    """Return the parts of the covariance of centroid and second moments.
+
+    Of a fit that `check_disc_fit` accepts: one with enough redundancy.
+    """
     scaled, inverse = fit.scaled, np.linalg.inv(fit.normal).astype(np.float64)
     own = inverse[:GEOMETRY_COUNT]
     root = np.linalg.cholesky(own[:, :GEOMETRY_COUNT])
@@ -93,8 +96,7 @@ def scatter_of(fit: DiscFit) -> DiscScatter:
     common[:2, :2] += bent_px @ bent_px
     to_moments = moments_by_stretch(fit.state.geometry)
     # errors over deviations of a noise that is estimated are distributed as Student's t
-    redundancy = max(fit.redundancy, LEAST_REDUNDANCY)
-    of_noise = redundancy / (redundancy - 2.0)
+    of_noise = fit.redundancy / (fit.redundancy - 2.0)
     return DiscScatter(
         of_noise * (to_moments @ own[:, :GEOMETRY_COUNT] @ to_moments.T),
         to_moments @ common @ to_moments.T,
@@ -132,11 +134,12 @@ def inflations(scatters: Sequence[DiscScatter]) -> FloatArray:
     print are the same for all. Each disc's own ratio counts like its arcs, the photograph's like
     forty. What may be above 1 by chance is taken off: a disc alone has eight arcs or a few more.
 
-    Below 1 counts what the whole photograph shows beyond chance. Compression and a camera's
-    denoising leave residuals of which neighbours undo each other: those of JPEG with quality 92 let
-    arcs scatter by 0.6 to 0.75 of what independent ones would, and errors by as much. Not of burnt
-    discs, whose levels are known beforehand rather than by residuals, nor of discs at the edge of a
-    shadow, whose residuals are not those of noise.
+    A factor is below 1 if the whole photograph shows that, beyond chance. Compression and a
+    camera's denoising leave residuals that cancel each other over neighbouring pixels: by JPEG of
+    quality 92, the squared scatter of arcs is 0.6 to 0.75 of what independent residuals would
+    leave, and squared errors are smaller in the same way. It does not hold for burnt discs, whose
+    levels are known beforehand rather than by residuals, nor for discs at the edge of a shadow,
+    whose residuals are not those of noise.
     """
     if not scatters:
         return np.empty(0)
@@ -182,7 +185,7 @@ def common_displacement_px(fit: DiscFit) -> float:
     """
     noise, blur_px = fit.noise, fit.state.blur.mean_sd_px
     state, tone, limits = fit.state, fit.free.tone, fit.sample.censoring
-    is_edge = (fit.share > 0.2) & (fit.share < 0.8) & fit.sample.is_seen
+    is_edge = (fit.share > 0.2) & (fit.share < 0.8) & ~limits.is_clipped
     chance = np.array(_PIXEL_VARIANCE / max(int(np.count_nonzero(is_edge)), 1))
     excess = beyond_chance((noise.sd / noise.plateau_sd) ** 2 - 1.0, chance) * noise.plateau_sd**2
     at_edges = median_at_edges(excess, fit.share, 0.3, 0.7, 0.0)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from kgcp.geometry.arrays import BoolArray, FloatArray, IndexArray
+from kgcp.geometry.arrays import FloatArray, IndexArray
 from kgcp.measurement.adjustment.normal_equations import scaled_rows, weighted_products
 from kgcp.measurement.discs.affine_model import NO_INNER, DiscPixels, Geometry, limited
 from kgcp.measurement.discs.disc_levels import COUNT, CURVES, GEOMETRY_COUNT, LevelModel, Row
@@ -71,8 +71,6 @@ _INK_SLOPES = (Row.INK_SLOPE_X, Row.INK_SLOPE_Y)
 # what is estimated besides at the edge of a shadow
 _UNEVEN = np.array((*_INK_SLOPES, *CURVES.tolist()))
 _UNEVEN_PRECISIONS = np.array([_SHADOW_SLOPE_SD] * 2 + [_SHADOW_CURVE_SD] * 3) ** -2.0
-LEAST_REDUNDANCY = 6.0
-"""With fewer pixels beyond the unknowns, no deviation can be stated."""
 CAMERA_ROWS = (*_WAVES, Row.SHARPENING)
 """What all discs share: the camera's tone curve and sharpening."""
 
@@ -310,11 +308,6 @@ class DiscSample:
         )
 
     @property
-    def is_seen(self) -> BoolArray:
-        """Which pixels (n,) are not clipped."""
-        return np.asarray(~(self.censoring.at_high | self.censoring.at_low))
-
-    @property
     def is_burnt(self) -> bool:
         """Whether a level is clipped, and so hardly seen."""
         return self.censoring.share > MUCH_CLIPPED
@@ -407,7 +400,7 @@ class DiscFit:
     @property
     def redundancy(self) -> float:
         """Pixels that are not clipped, beyond those that unknowns take: degrees of freedom."""
-        return float(np.sum(1.0 - self.leverage[self.sample.is_seen]))
+        return float(np.sum(1.0 - self.leverage[~self.sample.censoring.is_clipped]))
 
     @property
     def noise(self) -> GreyNoise:
@@ -498,7 +491,7 @@ def _noise(
     Before sRGB's curve, if that is the camera's: noise grows with the light there. After it, ink is
     noisier than paper, which `estimate_noise` takes for impossible where ink is hardly seen.
     """
-    limits, is_seen = sample.censoring, sample.is_seen
+    limits, is_seen = sample.censoring, ~sample.censoring.is_clipped
     residuals = (sample.levels - levels) / np.sqrt(residual_share)
     step = sample.window.levels_per_count
     slope = srgb_slope(srgb_decoded(levels)) if sample.is_noise_of_light else np.ones_like(levels)

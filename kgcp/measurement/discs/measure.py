@@ -243,7 +243,7 @@ def _neighbours(outlines: Sequence[DiscOutline]) -> list[list[int]]:
 def _disc(fit: DiscFit, scatter: DiscScatter, outline: DiscOutline, inflation: float) -> Disc:
     x, y, xx, xy, yy = fit.state.geometry.tolist()
     moments = 0.25 * np.array((xx * xx + xy * xy, xy * (xx + yy), xy * xy + yy * yy))
-    blur, clips = fit.state.blur, fit.sample.censoring
+    blur = fit.state.blur
     gradient = fit.state.slope / fit.sample.radius_px
     # The light falls on the scene before it is blurred: a gradient g displaces the whole image of
     # the disc by −B g, if B is the blur's covariance.
@@ -259,7 +259,7 @@ def _disc(fit: DiscFit, scatter: DiscScatter, outline: DiscOutline, inflation: f
         outside=outside,
         gradient=gradient,
         blur_px=blur.mean_sd_px,
-        clipped=float(np.mean(clips.at_high | clips.at_low)),
+        clipped=fit.sample.censoring.share,
         inflation=inflation,
         pixels=len(fit.levels),
     )

@@ -53,9 +53,14 @@ class Censoring:
     at_low: BoolArray
 
     @property
+    def is_clipped(self) -> BoolArray:
+        """Which pixels (n,) are clipped, at either end."""
+        return self.at_high | self.at_low
+
+    @property
     def share(self) -> float:
         """Share of clipped pixels; 0 of none."""
-        return float(np.count_nonzero(self.at_high | self.at_low) / max(len(self.at_high), 1))
+        return float(np.count_nonzero(self.is_clipped) / max(len(self.at_high), 1))
 
 
 def find_censoring(levels: FloatArray, levels_per_count: float) -> Censoring:

@@ -160,10 +160,8 @@ def test_the_edge_of_a_shadow_does_not_bend_the_curve() -> None:
 
 
 def test_a_disc_that_begins_far_off_does_not_run_away_from_all_others() -> None:
-    camera, pose = (
-        Camera(260, 60, 2e5, 2e5, 129.5, 29.5),
-        Pose(np.eye(3), np.array([0.0, 0.0, 1.0])),
-    )
+    camera = Camera(260, 60, 2e5, 2e5, 129.5, 29.5)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
     places = (-90.0, -30.0, 30.0, 90.0)
     discs = tuple(SimulatedDisc((x / 2e5, 0.0, 0.0), 20.0 / 2e5) for x in places)
     scene, rng = FieldScene(discs, 0.1, 0.62), np.random.default_rng(1)
