@@ -20,7 +20,6 @@ from scipy.special import expit, ndtri
 from kgcp.errors import Reason, Rejection
 from kgcp.geometry._jit import compiled
 from kgcp.geometry.arrays import FloatArray, IndexArray
-from kgcp.geometry.attitude import cross_matrix
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.adjustment.normal_equations import normal_matrix
@@ -35,6 +34,7 @@ from kgcp.measurement.image_model.photometry import (
     share_at,
 )
 from kgcp.measurement.image_model.rolling_shutter import RollingShutter
+from kgcp.measurement.image_model.rotation_displacement import mean_square_displacement
 from kgcp.measurement.records import Uncertainty
 
 _ARC_PX = 6.0
@@ -127,9 +127,7 @@ def pose_covariance(fit: TargetFit) -> PoseCovariance:
         pose_cov[[0, 1], [0, 1]] += across_m * across_m
     shutter = fit.sample.problem.shutter
     if shutter is not None:
-        by_rotation = _by_rotation(fit, shutter) * shutter.rotation.sd_rad_s
-        turned = inverse[:6] @ (scaled * misfit.weight) @ (by_rotation / fit.sd).T
-        pose_cov += turned @ turned.T
+        pose_cov += _by_unknown_rotation(fit, shutter)
     return PoseCovariance(pose_cov, max(1.0, mean))
 
 
@@ -146,15 +144,15 @@ def unevenness_factor(fit: TargetFit, inflation: float) -> float:
     return float(_ON_EVEN_SMALL_RINGS ** min(max(inflation - 1.0, 0.0), 1.0))
 
 
-def _by_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
-    """Return the derivatives (3, n) of grey values by the scene's rotation during the readout.
-
-    A target's pose turns about the camera: its centre t by Ω × t, its axes by Ω, as much longer as
-    a row is exposed later.
-    """
-    by_translation, by_turn = fit.jacobian[:3], fit.jacobian[3:6]
-    turned = cross_matrix(fit.parameters.matrix[:, 3]) @ by_translation
-    return np.asarray((turned + by_turn) * shutter.delay_s[fit.sample.index])
+def _by_unknown_rotation(fit: TargetFit, shutter: RollingShutter) -> FloatArray:
+    """Return what the scene's rotation during the readout adds to the covariance (6, 6)."""
+    problem = fit.sample.problem
+    return mean_square_displacement(
+        fit.parameters.pose,
+        problem.circles.part(slice(0, problem.measured_count)),
+        shutter.delay_s_px * problem.focal_px,
+        shutter.rotation.sd_rad_s,
+    )
 
 
 def _skew_displacement_px(fit: TargetFit, variances: FloatArray) -> float:
