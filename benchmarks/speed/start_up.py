@@ -51,14 +51,12 @@ def run(program: list[str], environment: Mapping[str, str] | None = None) -> Run
     """Run a program to its end, and to that of its processes."""
     begin_s, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     names = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    done = subprocess.run(
-        program,
-        env={**names, **(environment or {})},
-        stderr=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
-    wall_s = time.perf_counter() - begin_s
+    # a file: the end of a pipe is that of the last process, some 0.1 s after that of the program
+    with tempfile.TemporaryFile("w+") as messages:
+        subprocess.run(program, env={**names, **(environment or {})}, stderr=messages, check=True)
+        wall_s = time.perf_counter() - begin_s
+        messages.seek(0)
+        text = messages.read()
     while True:
         try:
             os.wait()
@@ -66,7 +64,7 @@ def run(program: list[str], environment: Mapping[str, str] | None = None) -> Run
             break
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Run(wall_s, cpu_s, done.stderr)
+    return Run(wall_s, cpu_s, text)
 
 
 def detecting(flight: Path, *options: str) -> list[str]:
