@@ -22,7 +22,7 @@ from kgcp.errors import KgcpError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-_SPARED_CALLS = 20_000  # by Python take some 0.1 s, loading numba and its tables 0.5 s
+_SPARED_CALLS = 100_000  # by Python take as long as loading numba and its tables: 0.5 s
 
 
 class _Compilable:
