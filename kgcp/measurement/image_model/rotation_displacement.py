@@ -38,7 +38,11 @@ _ROTATIONS = math.sqrt(5.0) * _VERTICES / math.hypot(1.0, _GOLDEN)
 _WEIGHT = 1.0 / 20.0
 _POINTS = 24, 8  # on large circles and on dots: a shear has the second harmonic, tilts up to four
 _DOT_SHARE = 0.3  # of the largest radius, below which a circle is a dot
-_STEPS, _SETTLED = 12, 1e-7  # of the plate's size
+_STEPS, _SETTLED = 20, 1e-5  # the latter in radians, and of the depth
+# What a step changes at most, in radians and of the depth: of a plate that faces the camera, images
+# hardly depend on the tilt, so that derivatives alone ask for any.
+_LARGEST_STEP = 0.1
+_RIDGE = 1e-9  # of the diagonal: keeps the equations of such a plate regular
 
 
 def mean_square_displacement(
@@ -71,8 +75,9 @@ def pose_displacements(
 ) -> FloatArray:
     """Return by how much (k, 6) poses of known rotations (k, 3) are off the one of none.
 
-    Edges count by their lengths, and square to themselves only. As Gauss-Newton steps go, points
-    are compared that had the same place on their circle.
+    Edges count by their lengths, and square to themselves only: Gauss-Newton steps compare points
+    that have the same place on their circle. Steps are limited, and so are displacements, however
+    fast the rotations.
     """
     points_m, tangents, lengths_m = _edges_of(circles)
     seen = pose.transform(points_m)
@@ -83,11 +88,11 @@ def pose_displacements(
     targets = rays[:, :2] - by_time * delays_s[:, None]
     turns = np.repeat(np.eye(3)[None], len(targets), axis=0)
     moves_m = np.zeros((len(targets), 3))
-    size_m = float(circles.radii_m.max())
     for _ in range(_STEPS):
         axes = turns @ pose.rotation[:, :2]
         on_plate = points_m @ np.swapaxes(axes, 1, 2)
-        placed = on_plate + (pose.translation_m + moves_m)[:, None]
+        centres_m = pose.translation_m + moves_m
+        placed = on_plate + centres_m[:, None]
         images = placed[..., :2] / placed[..., 2:]
         along = tangents @ np.swapaxes(axes, 1, 2)
         along = along[..., :2] - images * along[..., 2:]
@@ -98,10 +103,15 @@ def pose_displacements(
         by_place = np.concatenate((normals, depth), axis=-1) / placed[..., 2:]
         jacobian = np.concatenate((by_place, np.cross(on_plate, by_place)), axis=-1)
         weighted = np.swapaxes(jacobian * lengths_m[:, None], 1, 2)
-        steps = np.linalg.solve(weighted @ jacobian, weighted @ off[..., None])[..., 0]
+        normal = weighted @ jacobian
+        normal[:, range(6), range(6)] *= 1.0 + _RIDGE
+        steps = np.linalg.solve(normal, weighted @ off[..., None])[..., 0]
+        shifts = np.linalg.norm(steps[:, :3], axis=1) / centres_m[:, 2]
+        sizes = np.maximum(np.linalg.norm(steps[:, 3:], axis=1), shifts)
+        steps *= np.minimum(1.0, _LARGEST_STEP / np.maximum(sizes, _SETTLED))[:, None]
         moves_m += steps[:, :3]
         turns = np.array([rotation_about(step) for step in steps[:, 3:]]) @ turns
-        if max(np.abs(steps[:, :3]).max() / size_m, np.abs(steps[:, 3:]).max()) < _SETTLED:
+        if sizes.max() < _SETTLED:
             break
     return np.concatenate((moves_m, _rotation_vectors(turns)), axis=1)
 

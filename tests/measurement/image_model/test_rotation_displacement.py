@@ -106,3 +106,16 @@ def test_derivatives_alone_would_not_do() -> None:
     )
     assert by_slopes > 10.0
     assert 1.0 < by_squares < 6.0
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 0.05, 1.0, 70.0])
+@pytest.mark.parametrize("distance_m", [2.0, 300.0])
+@pytest.mark.parametrize("sd_deg_s", [0.1, 5.0, 1000.0])
+def test_any_plate_and_any_motion_have_a_covariance(
+    tilt_deg: float, distance_m: float, sd_deg_s: float
+) -> None:
+    pose = facing(tilt_deg, distance_m=distance_m)
+    stated = mean_square_displacement(pose, CIRCLES, DELAY_S, math.radians(sd_deg_s))
+    assert np.isfinite(stated).all()
+    assert np.sqrt(np.diag(stated)[3:]).max() < math.pi
+    assert np.sqrt(np.diag(stated)[:3]).max() < distance_m
