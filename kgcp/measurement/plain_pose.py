@@ -3,7 +3,8 @@
 The circles' sizes are known, and roughly how their plane lies. Moments of circles are projected
 through the lens (`geometry.circle_image`), so that the result has neither eccentricity nor
 distortion within the target: its place is that of the circles' centre. The plane's prior is an
-observation like the others. What it leaves open of the centre is therefore in the covariance.
+observation like the others. What it leaves open of the centre is therefore in the covariance; so is
+what a rolling shutter does to the image, by a motion that is not known.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from kgcp.geometry.circle import circle_planes
 from kgcp.geometry.circle_image import Circles3D, circle_slopes
 from kgcp.geometry.conic import Ellipse, fit_ellipse
 from kgcp.geometry.pose import Pose
+from kgcp.measurement.image_model.rolling_shutter import motion_per_row
 from kgcp.measurement.plate_prior import NormalPrior
 
 _STEPS = 12
@@ -112,10 +114,10 @@ def fit_circles(
     numpy.linalg.LinAlgError
         If the circles leave the space before the camera, or the equations are singular.
     """
-    roots: FloatArray = np.linalg.cholesky(images.covs).astype(np.float64)
+    root: FloatArray = np.linalg.cholesky(moments_cov(camera, images)).astype(np.float64)
     pose = start
     for _ in range(_STEPS):
-        residuals, design, axes = _equations(camera, images, roots, pose, prior)
+        residuals, design, axes = _equations(camera, images, root, pose, prior)
         scale = np.array([*(pose.distance_m,) * 3, 1.0, 1.0])
         normal = (design * scale).T @ (design * scale)
         step = scale * np.linalg.solve(normal, (design * scale).T @ residuals)
@@ -125,7 +127,7 @@ def fit_circles(
         pose = pose_towards(moved.translation_m, moved.normal)
         if np.abs(step / scale).max() < _SETTLED:
             break
-    residuals, design, axes = _equations(camera, images, roots, pose, prior)
+    residuals, design, axes = _equations(camera, images, root, pose, prior)
     to_six = np.zeros((6, 5))
     to_six[:3, :3], to_six[3:, 3:] = np.eye(3), axes
     cov = to_six @ np.linalg.inv(design.T @ design) @ to_six.T
@@ -134,7 +136,7 @@ def fit_circles(
 
 
 def _equations(
-    camera: Camera, images: CircleMoments, roots: FloatArray, pose: Pose, prior: NormalPrior
+    camera: Camera, images: CircleMoments, root: FloatArray, pose: Pose, prior: NormalPrior
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted residuals (5k + 2,), the design (5k + 2, 5) and axes of the two turns."""
     circles = circles_about(pose, images.radii_m)
@@ -144,12 +146,33 @@ def _equations(
     if not np.isfinite(off).all():
         raise np.linalg.LinAlgError("circles are not wholly before the camera")
     by_pose = np.concatenate((slopes.by_centre, slopes.by_rotation @ axes), axis=2)
-    residuals = np.linalg.solve(roots, off[:, :, None])[:, :, 0].ravel()
-    design = np.linalg.solve(roots, by_pose).reshape(-1, 5)
+    residuals = np.linalg.solve(root, off.ravel())
+    design = np.linalg.solve(root, by_pose.reshape(-1, 5))
     turn = axes.T @ _turn_to(pose.normal, prior.direction_camera)
     weight = 1.0 / math.radians(prior.sd_deg)
     of_prior = np.hstack((np.zeros((2, 3)), weight * np.eye(2)))
     return np.concatenate((residuals, weight * turn)), np.vstack((design, of_prior)), axes
+
+
+def moments_cov(camera: Camera, images: CircleMoments) -> FloatArray:
+    """Return the covariance (5k, 5k) of all circles' moments, with what a rolling shutter does.
+
+    While rows are exposed one after the other, the image moves by v per row: that shears it by
+    x + vₓ (y − y₀), y + v_y (y − y₀), and its second moments with it. Of v only the deviation is
+    known, by the camera's `motion_sd_deg_s`; it is the same for all circles.
+    """
+    count = len(images.moments)
+    by_circle = np.zeros((count, 5, count, 5))
+    by_circle[range(count), :, range(count)] = images.covs
+    cov = by_circle.reshape(5 * count, 5 * count)
+    if not camera.readout_s:
+        return cov
+    by_motion = np.zeros((count, 5, 2))
+    _, _, _, xy, yy = images.moments.T
+    by_motion[:, 2, 0], by_motion[:, 3, 0] = 2.0 * xy, yy
+    by_motion[:, 3, 1], by_motion[:, 4, 1] = xy, 2.0 * yy
+    by_rotation = by_motion.reshape(-1, 2) @ motion_per_row(camera, images.moments[0, :2])
+    return np.asarray(cov + math.radians(camera.motion_sd_deg_s) ** 2 * by_rotation @ by_rotation.T)
 
 
 def _turn_to(direction: FloatArray, wanted: FloatArray) -> FloatArray:

@@ -38,6 +38,7 @@ from kgcp.measurement.plain_pose import (
     CirclesFit,
     circles_about,
     fit_circles,
+    moments_cov,
     pose_of_ellipse,
     pose_towards,
 )
@@ -447,7 +448,7 @@ def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> 
         appearance=_appearance(camera, target, candidate),
         alternative=alternative,
         uncertainty=propagate(camera, pose, pose_cov),
-        image=CircleImage(images.moments[0], images.covs[0]),
+        image=CircleImage(images.moments[0], moments_cov(camera, images)[:5, :5]),
     )
 
 

@@ -257,6 +257,7 @@ class CircleImage:
     moments : (5,) array
         As `discs.records.MOMENTS`.
     cov : (5, 5) array
+        With what an unknown motion does to them under a rolling shutter.
     """
 
     moments: FloatArray

@@ -352,3 +352,49 @@ def test_unknown_normal_widens_the_centre(sd_deg: float) -> None:
     fit = fit_circles(CAMERA, images, pose, NormalPrior(normal, sd_deg))
     sd_px = propagate(CAMERA, fit.pose, fit.pose_cov).centre_cov_px2[0, 0] ** 0.5
     assert sd_px == pytest.approx(RADIUS_PX**2 / CAMERA.fx * math.radians(sd_deg), rel=0.02)
+
+
+ROLLING = replace(CAMERA, readout_s=0.03)
+
+
+def read_row_by_row(pose: Pose, radius_m: float, rate_rad_s: FloatArray) -> FloatArray:
+    """Return the moments (5,) of a circle's image while the scene turns about the camera."""
+    angles = np.linspace(0.0, 2.0 * math.pi, 400, endpoint=False)
+    circle = pose.transform(radius_m * np.stack((np.cos(angles), np.sin(angles)), axis=1))
+    centre_px = ROLLING.project(pose.translation_m[None])[0]
+    outline = ROLLING.project(circle)
+    for _ in range(4):
+        delays_s = ROLLING.readout_s * (outline[:, 1] - centre_px[1]) / (ROLLING.height - 1)
+        turned = [
+            rotation_about(delay * rate_rad_s) @ point
+            for delay, point in zip(delays_s, circle, strict=True)
+        ]
+        outline = ROLLING.project(np.array(turned))
+    off = cv2.moments((outline - centre_px).astype(np.float32)[:, None])
+    second = np.array((off["mu20"], off["mu11"], off["mu02"])) / off["m00"]
+    first = np.array((off["m10"], off["m01"])) / off["m00"]
+    return np.concatenate((centre_px + first, second))
+
+
+@pytest.mark.parametrize("target", [DISC, RING], ids=["disc", "ring"])
+def test_motion_under_a_rolling_shutter_is_in_the_sigmas(target: PlainTarget) -> None:
+    """Forty of R 20 px: twice as near as others here."""
+    rng, radii = np.random.default_rng(6), np.array(target.radii_m)
+    cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])
+    off: dict[Camera, list[float]] = {ROLLING: [], CAMERA: []}
+    for _ in range(40):
+        x_px, y_px = rng.uniform((70.0, 60.0), (120.0, 90.0)).tolist()
+        pose = pose_towards(0.5 * pose_at(x_px, y_px, target).translation_m, NORMAL)
+        rate_rad_s = rng.normal(0.0, math.radians(ROLLING.motion_sd_deg_s), 3)
+        seen = np.array([read_row_by_row(pose, radius, rate_rad_s) for radius in radii.tolist()])
+        seen += rng.multivariate_normal(np.zeros(5), cov, len(radii))
+        images = CircleMoments(radii, seen, np.array([cov] * len(radii)))
+        turn = rotation_about(rng.normal(0.0, math.radians(3.0), 3))
+        prior = NormalPrior(turn @ NORMAL, 3.0)
+        for camera, errors in off.items():
+            fit = fit_circles(camera, images, pose, prior)
+            sd_m = propagate(camera, fit.pose, fit.pose_cov).sd_distance_m
+            errors.append((fit.pose.distance_m - pose.distance_m) / sd_m)
+    z, z_still = (float(np.sqrt(np.mean(np.square(errors)))) for errors in off.values())
+    assert 0.75 < z < 1.3
+    assert z_still > 10.0

@@ -31,8 +31,7 @@ class RollingShutter:
         cls, camera: Camera, rows: FloatArray, centre_row: float, rotation: SceneRotation
     ) -> Self:
         """Return the delays of pixels in the rows (n,) of a camera's frame."""
-        delay_s_px = camera.readout_s / (camera.height - 1)
-        return cls((rows - centre_row) * delay_s_px, delay_s_px, rotation)
+        return cls((rows - centre_row) * _delay_s_px(camera), _delay_s_px(camera), rotation)
 
     def rays_at_one_moment(self, rays: FloatArray) -> FloatArray:
         """Return where pixels would have looked, had all been exposed with the target's centre.
@@ -56,3 +55,28 @@ class RollingShutter:
         moved[:2] -= by_time * self.delay_s
         moved[[3, 5]] -= by_time * self.delay_s_px
         return moved
+
+
+def motion_per_row(camera: Camera, centre_px: FloatArray) -> FloatArray:
+    """Return by how much the image moves from one row to the next, per rotation of the scene.
+
+    Parameters
+    ----------
+    centre_px : (2,) array
+        Where in the raw image.
+
+    Returns
+    -------
+    (2, 3) array
+        Derivatives of the motion [px/px] by the rotation about the camera's axes [rad/s].
+    """
+    x, y = camera.undistort(centre_px[None])[0].tolist()
+    # Ω × d for d = (x, y, 1), brought back to the third component 1
+    by_rotation = np.array([[-x * y, 1.0 + x * x, -y], [-1.0 - y * y, x * y, x]])
+    by_place = camera.distort_jacobian(np.array([x, y]))
+    return np.asarray(_delay_s_px(camera) * by_place @ by_rotation)
+
+
+def _delay_s_px(camera: Camera) -> float:
+    """Return how much later a row is exposed than the one before it [s/px]."""
+    return camera.readout_s / (camera.height - 1)
