@@ -398,3 +398,21 @@ def test_motion_under_a_rolling_shutter_is_in_the_sigmas(target: PlainTarget) ->
     z, z_still = (float(np.sqrt(np.mean(np.square(errors)))) for errors in off.values())
     assert 0.75 < z < 1.3
     assert z_still > 10.0
+
+
+def test_a_rolling_shutter_widens_what_is_reported() -> None:
+    pose = pose_at(90.4, 71.7)
+    grey, prediction = frame_with((DISC, pose)), prediction_of(pose)
+    still = look_for_plain(grey, CAMERA, DISC, prediction)
+    rolling = look_for_plain(grey, ROLLING, DISC, prediction)
+    assert isinstance(still, Measurement)
+    assert isinstance(rolling, Measurement)
+    assert still.uncertainty is not None
+    assert rolling.uncertainty is not None
+    assert rolling.uncertainty.sd_distance_m > 5.0 * still.uncertainty.sd_distance_m
+    assert still.image is not None
+    assert rolling.image is not None
+    assert np.all(rolling.image.moments == still.image.moments)
+    widened = np.diag(rolling.image.cov) / np.diag(still.image.cov)
+    assert np.all(widened[:2] == 1.0)
+    assert widened[4] > 25.0
