@@ -65,7 +65,10 @@ def rotations_between_frames(
         if not is_near[row]:
             rotations.append(a_priori)
             continue
-        nearest = np.argsort(np.abs(time_s[compared] - time_s[row]), kind="stable")[:_NEAREST]
+        place = int(np.searchsorted(compared, row))
+        around = np.arange(max(place - _NEAREST, 0), min(place + _NEAREST, len(compared)))
+        order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")
+        nearest = around[order[:_NEAREST]]
         sd = math.hypot(math.sqrt(float(off2[nearest].mean())), _UNSEEN_SHARE * a_priori.sd_rad_s)
         rotations.append(combine(near[row], sd, a_priori))
     return rotations

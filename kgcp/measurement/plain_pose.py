@@ -4,7 +4,7 @@ The circles' sizes are known, and roughly how their plane lies. Moments of circl
 through the lens (`geometry.circle_image`), so that the result has neither eccentricity nor
 distortion within the target: its place is that of the circles' centre. The plane's prior is an
 observation like the others. What it leaves open of the centre is therefore in the covariance; so is
-what a rolling shutter does to the image, by a motion that is not known.
+what a rolling shutter does to the image, as far as the motion is not known.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kgcp.geometry.circle_image import Circles3D, circle_slopes
 from kgcp.geometry.conic import Ellipse, fit_ellipse
 from kgcp.geometry.pose import Pose
 from kgcp.measurement.image_model.rolling_shutter import motion_per_row
-from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 
 _STEPS = 12
 _SETTLED = 1e-9  # of the distance, and radians
@@ -105,16 +105,23 @@ def circles_about(pose: Pose, radii_m: FloatArray) -> Circles3D:
 
 
 def fit_circles(
-    camera: Camera, images: CircleMoments, start: Pose, prior: NormalPrior
+    camera: Camera,
+    images: CircleMoments,
+    start: Pose,
+    prior: NormalPrior,
+    rotation: SceneRotation | None = None,
 ) -> CirclesFit:
     """Adjust a pose to the images of concentric circles, by Gauss and Newton.
+
+    `rotation` is that of the scene during the readout; None: `SceneRotation.unknown`.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If the circles leave the space before the camera, or the equations are singular.
     """
-    root: FloatArray = np.linalg.cholesky(moments_cov(camera, images)).astype(np.float64)
+    images, cov_together = at_one_moment(camera, images, rotation)
+    root: FloatArray = np.linalg.cholesky(cov_together).astype(np.float64)
     pose = start
     for _ in range(_STEPS):
         residuals, design, axes = _equations(camera, images, root, pose, prior)
@@ -154,25 +161,31 @@ def _equations(
     return np.concatenate((residuals, weight * turn)), np.vstack((design, of_prior)), axes
 
 
-def moments_cov(camera: Camera, images: CircleMoments) -> FloatArray:
-    """Return the covariance (5k, 5k) of all circles' moments, with what a rolling shutter does.
+def at_one_moment(
+    camera: Camera, images: CircleMoments, rotation: SceneRotation | None
+) -> tuple[CircleMoments, FloatArray]:
+    """Return images as if all rows had been exposed at once, and their covariance (5k, 5k).
 
     While rows are exposed one after the other, the image moves by v per row: that shears it by
-    x + vₓ (y − y₀), y + v_y (y − y₀), and its second moments with it. Of v only the deviation is
-    known, by the camera's `motion_sd_deg_s`; it is the same for all circles.
+    x + vₓ (y − y₀), y + v_y (y − y₀), and its second moments with it. It is the same v for all
+    circles. What is known of it is taken off, the rest is in the covariance.
     """
     count = len(images.moments)
     by_circle = np.zeros((count, 5, count, 5))
     by_circle[range(count), :, range(count)] = images.covs
     cov = by_circle.reshape(5 * count, 5 * count)
     if not camera.readout_s:
-        return cov
+        return images, cov
+    rotation = rotation or SceneRotation.unknown(camera)
     by_motion = np.zeros((count, 5, 2))
     _, _, _, xy, yy = images.moments.T
     by_motion[:, 2, 0], by_motion[:, 3, 0] = 2.0 * xy, yy
     by_motion[:, 3, 1], by_motion[:, 4, 1] = xy, 2.0 * yy
     by_rotation = by_motion.reshape(-1, 2) @ motion_per_row(camera, images.moments[0, :2])
-    return np.asarray(cov + math.radians(camera.motion_sd_deg_s) ** 2 * by_rotation @ by_rotation.T)
+    moved = (by_rotation @ np.array(rotation.velocity_rad_s)).reshape(count, 5)
+    cov = cov + rotation.sd_rad_s**2 * by_rotation @ by_rotation.T
+    covs = np.array([cov[5 * k : 5 * k + 5, 5 * k : 5 * k + 5] for k in range(count)])
+    return CircleMoments(images.radii_m, images.moments - moved, covs), cov
 
 
 def _turn_to(direction: FloatArray, wanted: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.camera import Camera
-from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.targets.plain import PlainTarget
 
 SIGMAS = 4.0
@@ -46,6 +46,8 @@ class PlainPrediction:
         Of its outer circle where it is widest [px].
     source : str
         What it was made from, in few words.
+    rotation : SceneRotation or None
+        How the scene turns during the readout; None: not known.
     """
 
     centre_px: FloatArray
@@ -55,6 +57,7 @@ class PlainPrediction:
     normal: NormalPrior | None
     radius_px: float
     source: str
+    rotation: SceneRotation | None = None
 
     def __str__(self) -> str:
         """Text for the detail of a row."""

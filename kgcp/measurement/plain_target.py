@@ -36,9 +36,9 @@ from kgcp.measurement.plain_checks import check_agreement, check_edge, tolerated
 from kgcp.measurement.plain_pose import (
     CircleMoments,
     CirclesFit,
+    at_one_moment,
     circles_about,
     fit_circles,
-    moments_cov,
     pose_of_ellipse,
     pose_towards,
 )
@@ -125,7 +125,7 @@ def look_for_plain(
         candidate = _on_texture(grey, camera, target, prediction, candidate)
     except Rejection as rejection:
         return Miss(target.name, rejection.reason, rejection.detail)
-    return _measurement(camera, target, candidate)
+    return _measurement(camera, target, prediction, candidate)
 
 
 def _check_prediction(camera: Camera, target: PlainTarget, prediction: PlainPrediction) -> None:
@@ -201,7 +201,9 @@ def _checked(
 ) -> _Candidate:
     """Return measured circles with their poses, if they agree with the prediction."""
     try:
-        tolerant = fit_circles(camera, tolerated(circles.images), start, prediction.prior)
+        tolerant = fit_circles(
+            camera, tolerated(circles.images), start, prediction.prior, prediction.rotation
+        )
         check_agreement(camera, target, prediction, tolerant, len(circles.discs))
         fit, other = _best_fits(camera, circles.images, start, prediction)
     except np.linalg.LinAlgError:
@@ -421,11 +423,11 @@ def _best_fits(
     camera: Camera, images: CircleMoments, start: Pose, prediction: PlainPrediction
 ) -> tuple[CirclesFit, CirclesFit | None]:
     """Return the better of both normals' fits, and the other one if it is another."""
-    fits = [fit_circles(camera, images, start, prediction.prior)]
+    fits = [fit_circles(camera, images, start, prediction.prior, prediction.rotation)]
     mirrored = fits[0].pose.mirrored()
     begin = pose_towards(mirrored.translation_m, mirrored.normal)
     try:
-        fits.append(fit_circles(camera, images, begin, prediction.prior))
+        fits.append(fit_circles(camera, images, begin, prediction.prior, prediction.rotation))
     except np.linalg.LinAlgError:
         return fits[0], None
     best, other = sorted(fits, key=lambda each: each.chi2)
@@ -434,9 +436,11 @@ def _best_fits(
     return best, other
 
 
-def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> Measurement:
+def _measurement(
+    camera: Camera, target: PlainTarget, prediction: PlainPrediction, candidate: _Candidate
+) -> Measurement:
     pose, pose_cov, alternative = _over_both(candidate.fit, candidate.other)
-    images = candidate.circles.images
+    images, _ = at_one_moment(camera, candidate.circles.images, prediction.rotation)
     return Measurement(
         target=target.name,
         ring=target.name,
@@ -448,7 +452,7 @@ def _measurement(camera: Camera, target: PlainTarget, candidate: _Candidate) -> 
         appearance=_appearance(camera, target, candidate),
         alternative=alternative,
         uncertainty=propagate(camera, pose, pose_cov),
-        image=CircleImage(images.moments[0], moments_cov(camera, images)[:5, :5]),
+        image=CircleImage(images.moments[0], images.covs[0]),
     )
 
 

@@ -16,6 +16,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight
 from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
 from kgcp.targets.layout import Target
+from kgcp.targets.plain import AnyTarget
 
 Priors = Mapping[str, PlatePrior]
 
@@ -41,7 +42,7 @@ def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) ->
         target.name: _with_rates(
             flight, data, frames, _rotations(flight, data, frames, time_s, target)
         )
-        for target in flight.targets
+        for target in flight.all_targets
     }
     unknown: list[NormalPrior | None] = [None] * len(frames)
     priors: list[Priors] = []
@@ -50,7 +51,7 @@ def priors_of_frames(flight: Flight, data: FlightData, frames: Sequence[str]) ->
             target.name: PlatePrior(
                 by_target.get(target.name, unknown)[row], rotations[target.name].get(row)
             )
-            for target in flight.targets
+            for target in flight.all_targets
         }
         priors.append({name: prior for name, prior in known.items() if prior != PlatePrior()})
     return priors
@@ -103,7 +104,7 @@ def _rotations(
     data: FlightData,
     frames: Sequence[str],
     time_s: Sequence[float | None],
-    target: Target,
+    target: AnyTarget,
 ) -> dict[int, SceneRotation]:
     """Return by row how the scene about a target turns while the frame is read."""
     camera = flight.camera

@@ -119,7 +119,13 @@ def examine_frame(job: DetectionJob, frame_input: FrameInput) -> FrameResult:
         examination = examine(grey, job.camera, job.targets, job.settings, job.priors(frame_input))
         measured = [each for each in examination.outcomes if isinstance(each, Measurement)]
         plain = [
-            look_for_plain(grey, job.camera, target, frame_input.plain.get(target.name), measured)
+            look_for_plain(
+                grey,
+                job.camera,
+                target,
+                _predicted(frame_input, frame_input.plain, target),
+                measured,
+            )
             for target in job.plain_targets
         ]
         outcomes = completed(job, (*examination.outcomes, *plain))
@@ -233,6 +239,16 @@ def result_without_second_look(guided_input: GuidedInput, reason: Reason) -> Fra
     return replace(guided_input.first, outcomes=outcomes)
 
 
+def _predicted(
+    frame_input: FrameInput, plain: Mapping[str, PlainPrediction], target: PlainTarget
+) -> PlainPrediction | None:
+    """Return where a plain target must be, with what is known of the scene's rotation."""
+    prediction, prior = plain.get(target.name), frame_input.priors.get(target.name)
+    if prediction is None or prior is None:
+        return prediction
+    return replace(prediction, rotation=prior.rotation)
+
+
 def _outcomes_of_second_look(
     job: DetectionJob,
     guided_input: GuidedInput,
@@ -245,7 +261,7 @@ def _outcomes_of_second_look(
     measured = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
     plain: dict[str, Outcome] = {}
     for target in job.plain_targets:
-        prediction = guided_input.plain.get(target.name)
+        prediction = _predicted(guided_input.input, guided_input.plain, target)
         if prediction is not None:
             outcome = look_for_plain(grey, job.camera, target, prediction, measured)
             if isinstance(outcome, Measurement):

@@ -25,7 +25,7 @@ from kgcp.measurement.plain_pose import (
 )
 from kgcp.measurement.plain_prediction import PlainPrediction
 from kgcp.measurement.plain_target import look_for_plain
-from kgcp.measurement.plate_prior import NormalPrior
+from kgcp.measurement.plate_prior import NormalPrior, SceneRotation
 from kgcp.measurement.records import Measurement, Miss, Outcome
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import PlainPlate, image_plate
@@ -398,6 +398,27 @@ def test_motion_under_a_rolling_shutter_is_in_the_sigmas(target: PlainTarget) ->
     z, z_still = (float(np.sqrt(np.mean(np.square(errors)))) for errors in off.values())
     assert 0.75 < z < 1.3
     assert z_still > 10.0
+
+
+def test_motion_that_is_known_is_taken_off() -> None:
+    rng, radii = np.random.default_rng(8), np.array(RING.radii_m)
+    cov = 1e-5 * np.diag([1.0, 1.0, 100.0, 100.0, 100.0])
+    percent, z = [], []
+    for _ in range(20):
+        pose = pose_towards(0.5 * pose_at(95.2, 74.1, RING).translation_m, NORMAL)
+        x, y, about_z = rng.normal(0.0, math.radians(5.0), 3).tolist()
+        sd_rad_s = math.radians(0.1)
+        off = rng.normal(0.0, sd_rad_s, 3)
+        rate_rad_s = np.array((x, y, about_z)) + off
+        seen = np.array([read_row_by_row(pose, radius, rate_rad_s) for radius in radii.tolist()])
+        images = CircleMoments(radii, seen, np.array([cov] * len(radii)))
+        rotation = SceneRotation((x, y, about_z), sd_rad_s)
+        fit = fit_circles(ROLLING, images, pose, NormalPrior(NORMAL, 0.5), rotation)
+        off_m = fit.pose.distance_m - pose.distance_m
+        percent.append(100.0 * off_m / pose.distance_m)
+        z.append(off_m / propagate(ROLLING, fit.pose, fit.pose_cov).sd_distance_m)
+    assert float(np.sqrt(np.mean(np.square(percent)))) < 0.1
+    assert float(np.sqrt(np.mean(np.square(z)))) < 1.5
 
 
 def test_a_rolling_shutter_widens_what_is_reported() -> None:

@@ -12,6 +12,7 @@ from kgcp.io.flight.data import FlightData
 from kgcp.io.flight.flight import Flight, read_flight
 from kgcp.measurement.plate_prior import NormalPrior, PlatePrior, SceneRotation
 from kgcp.pipeline.frame_priors import priors_of_frames
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 SAMPLE = Path(__file__).parents[2] / "sample_flight"
 
@@ -71,6 +72,20 @@ def test_frames_before_and_after_tell_of_motion_while_rows_are_read(sd_deg_s: fl
     assert len(sds) == len(known)
     assert (sds <= sd_deg_s).all()
     assert (sds < sd_deg_s).sum() > len(known) // 2
+
+
+def test_motion_about_a_plain_target_is_known_too() -> None:
+    flight = read_flight(SAMPLE)
+    camera = replace(flight.camera, readout_s=0.02)
+    plain = PlainTarget(
+        "W", (0.4,), PlainPolarity.BRIGHT, (692000.0, 5336000.0, 545.0), border_m=0.4
+    )
+    flight = replace(flight, camera=camera, plain_targets=(plain,))
+    known = priors(flight)
+    assert all(each["W"].normal is None for each in known.values())
+    sds = [each["W"].rotation.sd_rad_s for each in known.values() if each["W"].rotation]
+    assert len(sds) == len(known)
+    assert min(sds) < np.radians(camera.motion_sd_deg_s)
 
 
 def test_rates_beside_the_times_are_the_camera_s(tmp_path: Path) -> None:
