@@ -14,6 +14,8 @@ from kgcp.errors import Reason
 from kgcp.geometry.camera import Camera
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.guided import Prediction
+from kgcp.measurement.plain_prediction import PlainPrediction
+from kgcp.measurement.plate_prior import PlatePrior, SceneRotation
 from kgcp.measurement.records import FrameResult, Measurement, Miss
 from kgcp.pipeline.execution.journal import to_text
 from kgcp.pipeline.execution.kept_frames import KeptFrames
@@ -30,6 +32,7 @@ from kgcp.simulation.flight import DECOY_PLATE, TARGET_PLATE
 from kgcp.simulation.imaging import Optics, Sensor
 from kgcp.simulation.plate import image_plate
 from kgcp.targets.layout import Ring, Target
+from kgcp.targets.plain import PlainPolarity, PlainTarget
 
 CAMERA = Camera(480, 360, 900.0, 904.0, 236.3, 184.2)
 A = Target(replace(TARGET_PLATE.target.ring, sd_outer_diameter_m=1e-3))
@@ -146,3 +149,28 @@ def test_outcomes_are_completed_together_as_one_by_one(folder: Path) -> None:
         assert isinstance(expected, Measurement)
         assert outcome.pose is alone.pose
         assert outcome.eccentricity_px == pytest.approx(expected.eccentricity_px, abs=1e-11)
+
+
+def test_what_is_known_of_motion_goes_with_a_plain_target_s_prediction(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[SceneRotation | None] = []
+
+    def look(*arguments: object) -> Miss:
+        prediction = arguments[3]
+        assert isinstance(prediction, PlainPrediction)
+        seen.append(prediction.rotation)
+        return Miss("W", Reason.NO_PREDICTION)
+
+    monkeypatch.setattr("kgcp.pipeline.frame_task.look_for_plain", look)
+    rotation = SceneRotation((0.1, 0.0, 0.0), 0.01)
+    plain = PlainTarget("W", (0.4,), PlainPolarity.BRIGHT, (0.0, 0.0, 0.0), border_m=0.4)
+    where = PlainPrediction(
+        np.array([200.0, 100.0]), np.eye(2), POSE.translation_m, 0.01, None, 9.0, "a test"
+    )
+    job = DetectionJob(folder, CAMERA, None, (A,), STRICT, plain_targets=(plain,))
+    known = replace(FRAME_INPUT, priors={"W": PlatePrior(rotation=rotation)}, plain={"W": where})
+    first = examine_frame(job, known)
+    examine_frame_again(job, GuidedInput(known, first, {}, {"W": where}))
+    examine_frame(job, replace(known, priors={}))
+    assert seen == [rotation, rotation, None]
