@@ -250,14 +250,15 @@ class Measurement:
 class CircleImage:
     """The image of one circle: its centroid [px] and second moments [px²].
 
-    Nothing that is known of target or frame beforehand has a part in it.
+    Nothing that is known of target or frame beforehand has a part in it, but for motion under a
+    rolling shutter: the image is that of one moment.
 
     Attributes
     ----------
     moments : (5,) array
         As `discs.records.MOMENTS`.
     cov : (5, 5) array
-        With what an unknown motion does to them under a rolling shutter.
+        With what is not known of that motion.
     """
 
     moments: FloatArray
