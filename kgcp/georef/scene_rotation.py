@@ -65,6 +65,7 @@ def rotations_between_frames(
         if not is_near[row]:
             rotations.append(a_priori)
             continue
+        # times ascend: the nearest frames are among as many on either side
         place = int(np.searchsorted(compared, row))
         around = np.arange(max(place - _NEAREST, 0), min(place + _NEAREST, len(compared)))
         order = np.argsort(np.abs(time_s[compared[around]] - time_s[row]), kind="stable")

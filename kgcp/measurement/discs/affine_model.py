@@ -94,7 +94,7 @@ class DiscPixels:
         on_disc = np.zeros((PLATE_ROWS, views.shape[1]))
         on_disc[0] = self.background
         render(views, blur.vector, self.circles, self.starts, self.members, on_disc)
-        members = self.members[: self.starts[1]]
+        members = self.members[: self.starts[1]]  # the same for all circles
         _add_pixels_shape(views, inverse, blur.total_covariance, self.circles, members, on_disc)
         slopes = np.empty((SLOPE_ROWS, views.shape[1]))
         _carry_slopes(inverse, blur.vector, views, on_disc, slopes)

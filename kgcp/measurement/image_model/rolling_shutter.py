@@ -46,11 +46,7 @@ class RollingShutter:
         (6, n) array
             As `rays`; the derivatives are those along the moved rows.
         """
-        x, y = rays[:2]
-        about_x, about_y, about_z = self.rotation.velocity_rad_s
-        # Ω × d for d = (x, y, 1), brought back to the third component 1
-        across = about_x * y - about_y * x
-        by_time = np.array((about_y - about_z * y - x * across, about_z * x - about_x - y * across))
+        by_time = np.tensordot(self.rotation.velocity_rad_s, ray_motions(*rays[:2]), axes=(0, 1))
         moved = rays.copy()
         moved[:2] -= by_time * self.delay_s
         moved[[3, 5]] -= by_time * self.delay_s_px
@@ -70,11 +66,27 @@ def motion_per_row(camera: Camera, centre_px: FloatArray) -> FloatArray:
     (2, 3) array
         Derivatives of the motion [px/px] by the rotation about the camera's axes [rad/s].
     """
-    x, y = camera.undistort(centre_px[None])[0].tolist()
-    # Ω × d for d = (x, y, 1), brought back to the third component 1
-    by_rotation = np.array([[-x * y, 1.0 + x * x, -y], [-1.0 - y * y, x * y, x]])
-    by_place = camera.distort_jacobian(np.array([x, y]))
-    return np.asarray(_delay_s_px(camera) * by_place @ by_rotation)
+    ray = camera.undistort(centre_px[None])[0]
+    by_place = camera.distort_jacobian(ray)
+    return np.asarray(_delay_s_px(camera) * by_place @ ray_motions(*ray[:, None])[..., 0])
+
+
+def ray_motions(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return how rays (x, y, 1) move where the scene turns.
+
+    That is Ω × d for the rays d, brought back to the third component 1.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+
+    Returns
+    -------
+    (2, 3, n) array
+        Derivatives of x and y by time, by each component of Ω [rad/s].
+    """
+    one = np.ones_like(x)
+    return np.array([[-x * y, one + x * x, -y], [-one - y * y, x * y, x]])
 
 
 def _delay_s_px(camera: Camera) -> float:

@@ -1,13 +1,13 @@
 """What an unknown rotation of the scene, while a rolling shutter reads it, makes of a pose.
 
-Rows that are exposed later are displaced, as if the image were sheared. Of a plate that faces the
-camera, a shear shows as a tilt of which only the square is seen: 0.4 % look like 5°. So the pose
-does not follow the rotation linearly, and its mean square displacement is not that of its
-derivatives: in simulated flights whose motion was not known (`benchmarks.accuracy.presets`, preset
-`rolling`), squared Mahalanobis distances of poses had a median of 15, and of up to 140.
+Rows that are exposed later are displaced, as if the image were sheared. The image of a plate that
+nearly faces the camera depends on the square of its tilt: a shear of 0.4 % looks like a tilt of 5°.
+So the pose does not follow the rotation linearly, and derivatives do not give its mean square
+displacement. With them, squared Mahalanobis distances of poses had a median of 15 in simulated
+flights whose motion was not known (`benchmarks.accuracy.presets`, preset `rolling`).
 
-The displacement is found for some rotations instead. Of each, the edges that the camera would have
-seen are known, and the pose that fits them best.
+The displacement is found for some rotations instead. For each, it is known which edges the camera
+would have seen without it; the pose that fits them best is searched for.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from kgcp.geometry.arrays import FloatArray
 from kgcp.geometry.pose import Pose, rotation_about
 from kgcp.measurement.image_model.plate import Circles
+from kgcp.measurement.image_model.rolling_shutter import ray_motions
 
-# Rotations (12, 3) whose mean squares, each with the weight 1/20, integrate all polynomials up to
-# the fifth degree over three independent unit normal variables: their second moments are
-# 12/20 · 5/3 = 1, and the radius of 5 makes the fourth ones those of a normal distribution, too, as
-# the twelve vertices of an icosahedron are evenly spread. The thirteenth, without a rotation,
-# displaces nothing.
+# Rotations (12, 3): with weights of 1/20, sums over them are the means of all polynomials up to the
+# fifth degree in three independent unit normal variables. The vertices of an icosahedron are evenly
+# spread; the squared radius of 5 gives the second moments, 12/20 · 5/3 = 1, and the fourth. The
+# thirteenth point, without a rotation, displaces nothing.
 _GOLDEN = 0.5 * (1.0 + math.sqrt(5.0))
 _VERTICES = np.array(
     [
@@ -36,7 +36,8 @@ _VERTICES = np.array(
 )
 _ROTATIONS = math.sqrt(5.0) * _VERTICES / math.hypot(1.0, _GOLDEN)
 _WEIGHT = 1.0 / 20.0
-_POINTS = 24, 8  # on large circles and on dots: a shear has the second harmonic, tilts up to four
+# Around a circle, shears displace edges by the second harmonic, and tilts by the first four.
+_POINTS, _POINTS_OF_DOTS = 24, 8
 _DOT_SHARE = 0.3  # of the largest radius, below which a circle is a dot
 _STEPS, _SETTLED = 20, 1e-5  # the latter in radians, and of the depth
 # What a step changes at most, in radians and of the depth: of a plate that faces the camera, images
@@ -55,7 +56,7 @@ def mean_square_displacement(
     pose : Pose
         As it was measured, without any rotation.
     circles : Circles
-        Those of the plate that were measured.
+        Those of the plate that were measured, dots included: without, nothing tells the heading.
     delay_s : float
         How much later a ray is exposed than the target's centre, per unit of its y.
     sd_rad_s : float
@@ -81,11 +82,10 @@ def pose_displacements(
     """
     points_m, tangents, lengths_m = _edges_of(circles)
     seen = pose.transform(points_m)
-    rays = seen / seen[:, 2:]
+    rays = seen[:, :2] / seen[:, 2:]
     delays_s = delay_s * (rays[:, 1] - pose.translation_m[1] / pose.translation_m[2])
-    by_time = np.cross(rotations_rad_s[:, None], rays)
-    by_time = by_time[..., :2] - rays[:, :2] * by_time[..., 2:]
-    targets = rays[:, :2] - by_time * delays_s[:, None]
+    by_time = np.moveaxis(rotations_rad_s @ ray_motions(*rays.T), 0, -1)  # (k, n, 2)
+    targets = rays - by_time * delays_s[:, None]
     turns = np.repeat(np.eye(3)[None], len(targets), axis=0)
     moves_m = np.zeros((len(targets), 3))
     for _ in range(_STEPS):
@@ -94,11 +94,13 @@ def pose_displacements(
         centres_m = pose.translation_m + moves_m
         placed = on_plate + centres_m[:, None]
         images = placed[..., :2] / placed[..., 2:]
+        # normals of the edges in the image, and how far along them the edges must move
         along = tangents @ np.swapaxes(axes, 1, 2)
         along = along[..., :2] - images * along[..., 2:]
         normals = np.stack((-along[..., 1], along[..., 0]), axis=-1)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         off = np.sum(normals * (targets - images), axis=-1)
+        # derivatives along the normals by where a point is in the camera frame, then by the pose
         depth = -np.sum(normals * images, axis=-1, keepdims=True)
         by_place = np.concatenate((normals, depth), axis=-1) / placed[..., 2:]
         jacobian = np.concatenate((by_place, np.cross(on_plate, by_place)), axis=-1)
@@ -108,7 +110,7 @@ def pose_displacements(
         steps = np.linalg.solve(normal, weighted @ off[..., None])[..., 0]
         shifts = np.linalg.norm(steps[:, :3], axis=1) / centres_m[:, 2]
         sizes = np.maximum(np.linalg.norm(steps[:, 3:], axis=1), shifts)
-        steps *= np.minimum(1.0, _LARGEST_STEP / np.maximum(sizes, _SETTLED))[:, None]
+        steps *= (_LARGEST_STEP / np.maximum(sizes, _LARGEST_STEP))[:, None]
         moves_m += steps[:, :3]
         turns = np.array([rotation_about(step) for step in steps[:, 3:]]) @ turns
         if sizes.max() < _SETTLED:
@@ -121,7 +123,7 @@ def _edges_of(circles: Circles) -> tuple[FloatArray, FloatArray, FloatArray]:
     points, tangents, lengths = [], [], []
     least_m = _DOT_SHARE * float(circles.radii_m.max())
     for centre_m, radius_m in zip(circles.centres_m.T, circles.radii_m.tolist(), strict=True):
-        count = _POINTS[radius_m < least_m]
+        count = _POINTS_OF_DOTS if radius_m < least_m else _POINTS
         angles = 2.0 * np.pi / count * np.arange(count)
         outward = np.stack((np.cos(angles), np.sin(angles)), axis=1)
         points.append(centre_m + radius_m * outward)

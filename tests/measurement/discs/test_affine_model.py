@@ -59,7 +59,23 @@ def test_share_is_that_of_a_blurred_ellipse_in_square_pixels(name: str, *, is_da
     hole = seen_by_pixels(centre + stretch @ inner[0, :2], stretch, 0.5, relative)
     value = ring.white_share(geometry, blur).value
     assert value == pytest.approx(1.0 - expected + hole if is_dark else expected - hole, abs=1e-3)
-    assert ring.shares_within(geometry, blur)[1] == pytest.approx(hole, abs=2e-3)
+
+
+def test_shares_within_circles_are_those_of_a_gaussian_blur() -> None:
+    geometry, sd = SHAPES["small"]
+    inner = np.array([[0.1, -0.05, 0.5]])
+    stretch = geometry[[2, 3, 3, 4]].reshape(2, 2)
+    relative = sd / np.sqrt(np.linalg.det(stretch))
+    (xx, xy), (_, yy) = relative**2 * stretch @ stretch
+    blur = Blur(xx, yy, xy)
+    ring = DiscPixels.of(places(), geometry, blur, is_dark=True, inner=inner)
+    offset = np.linalg.inv(stretch) @ (places() - geometry[:2, None])
+    for share, (x, y, radius) in zip(
+        ring.shares_within(geometry, blur), ((0.0, 0.0, 1.0), *inner.tolist()), strict=True
+    ):
+        square = (offset[0] - x) ** 2 + (offset[1] - y) ** 2
+        expected = ncx2.cdf((radius / relative) ** 2, 2, square / relative**2)
+        assert share == pytest.approx(expected, abs=3e-4)
 
 
 def test_a_straight_edge_in_square_pixels_is_not_that_of_a_gaussian() -> None:

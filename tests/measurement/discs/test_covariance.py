@@ -59,7 +59,7 @@ def test_what_all_discs_of_a_photograph_show_is_no_chance() -> None:
     assert inflations([]).shape == (0,)
 
 
-def test_a_whole_photograph_shows_that_noise_undoes_itself() -> None:
+def test_a_whole_photograph_shows_that_noise_cancels() -> None:
     ratios = 0.6 * np.random.default_rng(7).chisquare(ARCS, 100) / ARCS
     ratios[:3] = 20.0  # clutter
     scatters = [
